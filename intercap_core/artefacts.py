@@ -1,0 +1,376 @@
+"""The one place that opens HDF5: declared schemas, atomic writes, reads that validate.
+
+An artefact is what one stage computed for one sequence. It is written under a temporary name in
+its own folder, synced and renamed, so a file under its final name is whole; its ``complete`` mark
+is set last all the same. Every dataset carries a fletcher32 checksum, its units and its frame.
+Nothing in the file depends on when, where or by whom it was written, so the same input gives the
+same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin  # registers the depth codec with HDF5 before any file is opened
+import numpy as np
+
+from intercap_core.errors import UserError
+
+CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
+
+
+@dataclass(frozen=True)
+class Field:
+    """One dataset of a schema.
+
+    ``dims`` names each axis; the same name has the same length throughout one file, and a digit
+    string is a fixed length. ``dtype`` is a numpy name or ``"str"``. ``frame`` is the coordinate
+    frame of the values, or empty where they have none.
+    """
+
+    dims: tuple[str, ...]
+    dtype: str
+    doc: str
+    units: str = "1"
+    frame: str = ""
+    optional: bool = False
+    codec: str = "gzip"  # "gzip", "depth" (blosc2, lossless) or "none" (already compressed)
+
+
+@dataclass(frozen=True)
+class Schema:
+    """What one stage's artefact holds. A key may contain ``{camera}``: one dataset a camera."""
+
+    name: str
+    version: int
+    stage: str
+    fields: Mapping[str, Field]
+    attributes: Mapping[str, str] = field(default_factory=dict)  # name -> what it says
+    frame: str = "master colour camera: x right, y down, z forward"
+    units: str = "metres, seconds, radians unless a dataset says otherwise"
+
+    def field_of(self, key: str) -> Field:
+        """Return the field that declares dataset ``key``; raises KeyError where none does."""
+        if key in self.fields:
+            return self.fields[key]
+        for template, declared in self.fields.items():
+            head, _, tail = template.partition("{camera}")
+            if tail and key.startswith(head) and key.endswith(tail):
+                middle = key[len(head) : len(key) - len(tail)]
+                if middle and "/" not in middle:
+                    return declared
+        raise KeyError(f"schema {self.name!r} declares no dataset {key!r}")
+
+
+def _filters(declared: Field, dtype: np.dtype) -> dict[str, Any]:
+    if declared.codec == "depth":
+        return dict(hdf5plugin.Blosc2(cname="zstd", clevel=3, filters=hdf5plugin.Blosc2.BITSHUFFLE))
+    if declared.codec == "gzip":
+        return {"compression": "gzip", "compression_opts": 1, "shuffle": dtype.itemsize > 1}
+    return {}
+
+
+def _chunks(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
+    """Rows of the first axis, as many as fit in ``CHUNK_BYTES``; the other axes whole."""
+    row = itemsize * int(np.prod([max(1, n) for n in shape[1:]], dtype=np.int64))
+    rows = max(1, min(max(1, shape[0]), CHUNK_BYTES // row))
+    return (rows, *(max(1, n) for n in shape[1:]))
+
+
+class Writer:
+    """Fills one artefact. Obtained from :func:`write`; not made directly."""
+
+    def __init__(self, file: h5py.File, schema: Schema) -> None:
+        self._file = file
+        self._schema = schema
+        self._dims: dict[str, int] = {}
+        self.attributes: dict[str, Any] = {}
+
+    def _check(self, key: str, shape: tuple[int, ...], free_first: bool = False) -> Field:
+        declared = self._schema.field_of(key)
+        if len(shape) != len(declared.dims):
+            raise ValueError(f"{key}: shape {shape} does not fit dims {declared.dims}")
+        camera = key if declared.dims and "{camera}" in _template(self._schema, declared) else ""
+        for axis, (dim, length) in enumerate(zip(declared.dims, shape, strict=True)):
+            if free_first and axis == 0:
+                continue
+            scope = (
+                dim if dim in _SHARED_DIMS or not camera else f"{camera.rsplit('/', 1)[0]}:{dim}"
+            )
+            expected = int(dim) if dim.isdigit() else self._dims.setdefault(scope, length)
+            if expected != length:
+                raise ValueError(f"{key}: axis {dim} has {length} entries, {expected} elsewhere")
+        return declared
+
+    def put(self, key: str, values: Any) -> None:
+        """Write one whole dataset; ``values`` is cast to the declared dtype.
+
+        Raises ValueError where the shape contradicts the schema or another dataset's axis, and
+        KeyError where the schema declares no such dataset.
+        """
+        declared = self._schema.field_of(key)
+        if declared.dtype == "str":
+            encoded = [str(v).encode() for v in values]
+            width = max([len(e) for e in encoded] + [1])
+            array = np.array(encoded, dtype=f"S{width}")
+        else:
+            array = np.asarray(values)
+            target = np.dtype(declared.dtype)
+            if target.kind in "iu" and array.dtype.kind == "f":
+                raise ValueError(f"{key}: float values for an integer dataset")
+            array = np.ascontiguousarray(array, dtype=target)
+        declared = self._check(key, array.shape)
+        dataset = self._create(key, declared, array.shape, array.dtype)
+        if array.size:
+            dataset[...] = array
+
+    def stream(self, key: str, row_shape: tuple[int, ...] = ()) -> RowStream:
+        """Open a dataset that grows by rows along its first axis; memory stays flat."""
+        declared = self._check(key, (0, *row_shape), free_first=True)
+        dataset = self._create(key, declared, (0, *row_shape), np.dtype(declared.dtype))
+        return RowStream(dataset)
+
+    def _create(
+        self, key: str, declared: Field, shape: tuple[int, ...], dtype: np.dtype
+    ) -> h5py.Dataset:
+        chunks = _chunks(shape, dtype.itemsize)
+        if declared.codec == "depth":
+            chunks = (1, *shape[1:])  # one image a chunk: frames are read one by one
+        elif shape[0] == 0 and len(shape) == 1:
+            chunks = (CHUNK_BYTES // dtype.itemsize,)
+        dataset = self._file.create_dataset(
+            key,
+            shape=shape,
+            dtype=dtype,
+            chunks=chunks,
+            maxshape=tuple(None if n == 0 or i == 0 else n for i, n in enumerate(shape)),
+            fletcher32=True,
+            track_times=False,
+            **_filters(declared, dtype),
+        )
+        dataset.attrs["units"] = declared.units
+        if declared.frame:
+            dataset.attrs["frame"] = declared.frame
+        return dataset
+
+
+# Axes that mean the same thing over the whole file, also inside a camera's group.
+_SHARED_DIMS = frozenset({"T", "T+1", "C"})
+
+
+def _template(schema: Schema, declared: Field) -> str:
+    return next(key for key, value in schema.fields.items() if value is declared)
+
+
+class RowStream:
+    """Appends rows to a growing dataset, a chunk's worth at a time."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+
+    def append(self, rows: np.ndarray) -> None:
+        """Append ``rows`` of shape (n, *row_shape)."""
+        start = self._dataset.shape[0]
+        self._dataset.resize(start + len(rows), axis=0)
+        self._dataset[start:] = rows
+
+    def __len__(self) -> int:
+        return int(self._dataset.shape[0])
+
+
+@contextlib.contextmanager
+def write(
+    path: Path, schema: Schema, *, settings_digest: str = "", **attributes: Any
+) -> Iterator[Writer]:
+    """Write an artefact atomically: on any error nothing appears under ``path``.
+
+    ``attributes`` are the schema's root attributes (str, int, float or bool); more can be set on
+    ``Writer.attributes`` until the block ends. Raises ValueError where the finished file lacks a
+    dataset or attribute that the schema requires.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with h5py.File(temporary, "w", libver=("v110", "v110"), locking="best-effort") as file:
+            writer = Writer(file, schema)
+            writer.attributes.update(attributes)
+            yield writer
+            _finish(file, writer, schema, settings_digest)
+        with open(temporary, "rb") as handle:
+            os.fsync(handle.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: str) -> None:
+    missing = [
+        key
+        for key, declared in schema.fields.items()
+        if not declared.optional and "{camera}" not in key and key not in file
+    ]
+    unset = sorted(set(schema.attributes) ^ set(writer.attributes))
+    if missing or unset:
+        raise ValueError(f"artefact {schema.name!r}: missing {missing}, attributes off: {unset}")
+    file.attrs["schema"] = schema.name
+    file.attrs["schema_version"] = schema.version
+    file.attrs["frame"] = schema.frame
+    file.attrs["units"] = schema.units
+    file.attrs["settings_digest"] = settings_digest
+    for key in sorted(writer.attributes):
+        file.attrs[key] = writer.attributes[key]
+    file.attrs["complete"] = True
+
+
+class Artefact:
+    """A validated artefact that is open for reading. Obtained from :func:`read`."""
+
+    def __init__(self, file: h5py.File, path: Path, schema: Schema) -> None:
+        self._file = file
+        self._schema = schema
+        self.path = path
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The root attributes as Python values."""
+        return {
+            k: v.item() if isinstance(v, np.generic) else v for k, v in self._file.attrs.items()
+        }
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._file
+
+    def keys(self, prefix: str = "") -> list[str]:
+        """The sorted names of all datasets whose name starts with ``prefix``."""
+        found: list[str] = []
+
+        def visit(name: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and name.startswith(prefix):
+                found.append(name)
+
+        self._file.visititems(visit)
+        return sorted(found)
+
+    def __getitem__(self, key: str) -> np.ndarray:
+        """Read one whole dataset; text comes back as an object array of ``str``."""
+        return self.rows(key, slice(None))
+
+    def rows(self, key: str, selection: Any) -> np.ndarray:
+        """Read part of a dataset, e.g. one image: ``rows("cameras/k1/depth", 7)``."""
+        if key not in self._file:
+            raise UserError(
+                f"{self.path}: dataset {key!r} is missing; re-run stage "
+                f"'{self._schema.stage}' for this sequence"
+            )
+        try:
+            values = self._file[key][selection]
+        except OSError as error:
+            raise UserError(
+                f"{self.path}: dataset {key!r} is damaged (its checksum does not match); delete "
+                f"the file and re-run stage '{self._schema.stage}' for this sequence"
+            ) from error
+        if isinstance(values, np.ndarray) and values.dtype.kind == "S":
+            return np.array([v.decode() for v in values.ravel()], dtype=object).reshape(
+                values.shape
+            )
+        return values
+
+    def text(self, key: str) -> list[str]:
+        """Read a dataset of text as a list."""
+        return [str(v) for v in self[key]]
+
+
+@contextlib.contextmanager
+def read(path: Path, schema: Schema) -> Iterator[Artefact]:
+    """Open an artefact for reading after checking that it is what ``schema`` declares.
+
+    Raises :class:`UserError` with one sentence that names the file, what is wrong with it and
+    which stage to re-run.
+    """
+    path = Path(path)
+    again = f"re-run stage '{schema.stage}' for this sequence"
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such file; {again}")
+    try:
+        file = h5py.File(path, "r", locking="best-effort")
+    except OSError as error:
+        raise UserError(
+            f"{path}: not a readable HDF5 file (damaged or half-written); delete it and {again}"
+        ) from error
+    with file:
+        _validate(file, path, schema, again)
+        yield Artefact(file, path, schema)
+
+
+def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> None:
+    found = str(file.attrs.get("schema", "none"))
+    if found != schema.name:
+        raise UserError(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
+    version = int(file.attrs.get("schema_version", 0))
+    if version != schema.version:
+        raise UserError(
+            f"{path}: schema {schema.name!r} has version {version}, this program reads version "
+            f"{schema.version}; {again}"
+        )
+    if not bool(file.attrs.get("complete", False)):
+        raise UserError(f"{path}: was never finished (no 'complete' mark); delete it and {again}")
+    for name in schema.attributes:
+        if name not in file.attrs:
+            raise UserError(f"{path}: attribute {name!r} is missing; {again}")
+    lengths: dict[str, int] = {}
+    for key, declared in schema.fields.items():
+        if "{camera}" in key:
+            continue
+        if key not in file:
+            if declared.optional:
+                continue
+            raise UserError(f"{path}: dataset {key!r} is missing; {again}")
+        _check_dataset(file[key], key, declared, lengths, path, again)
+
+
+def _check_dataset(
+    dataset: h5py.Dataset,
+    key: str,
+    declared: Field,
+    lengths: dict[str, int],
+    path: Path,
+    again: str,
+) -> None:
+    text = declared.dtype == "str"
+    if (text and dataset.dtype.kind != "S") or (
+        not text and dataset.dtype != np.dtype(declared.dtype)
+    ):
+        raise UserError(
+            f"{path}: dataset {key!r} has type {dataset.dtype}, expected {declared.dtype}; {again}"
+        )
+    if len(dataset.shape) != len(declared.dims):
+        raise UserError(
+            f"{path}: dataset {key!r} has shape {dataset.shape}, expected {declared.dims}; {again}"
+        )
+    for dim, length in zip(declared.dims, dataset.shape, strict=True):
+        expected = int(dim) if dim.isdigit() else lengths.setdefault(dim, length)
+        if length != expected:
+            raise UserError(
+                f"{path}: dataset {key!r} has {length} entries along {dim}, expected {expected}; "
+                f"{again}"
+            )
+
+
+def pack_ragged(items: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Concatenate byte strings: returns offsets (N+1,) int64 and bytes (B,) uint8."""
+    offsets = np.zeros(len(items) + 1, np.int64)
+    np.cumsum([len(item) for item in items], out=offsets[1:])
+    return offsets, np.frombuffer(b"".join(items), np.uint8)
+
+
+def unpack_ragged(offsets: np.ndarray, values: np.ndarray) -> list[bytes]:
+    """Invert :func:`pack_ragged`."""
+    data = values.tobytes()
+    return [data[a:b] for a, b in zip(offsets[:-1], offsets[1:], strict=True)]

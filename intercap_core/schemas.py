@@ -1,0 +1,336 @@
+"""What every artefact holds: names, shapes, types, units and frames.
+
+Axes: T frame sets, C cameras, J=55 joints, K=135 keypoints, R contact regions, V body vertices,
+Vo object vertices. "master" is the frame of the master colour camera (x right, y down, z forward).
+A rotation matrix or transform ``a_from_b`` maps b's coordinates to a's. Change a schema's meaning
+and its version goes up: older files are then refused with the stage to re-run.
+"""
+
+from __future__ import annotations
+
+from intercap_core.artefacts import Field, Schema
+
+CONTACT_REGIONS = (
+    "left_hand", "right_hand", "left_foot", "right_foot", "left_thigh", "right_thigh", "seat",
+    "back", "chest", "left_forearm", "right_forearm", "mouth", "left_shoulder", "right_shoulder",
+)  # fmt: skip
+METRIC_REGIONS = CONTACT_REGIONS[:12]
+
+_CAMERA_MODELS = {
+    "camera_names": Field(("C",), "str", "one name a camera, in the order of every C axis"),
+    "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),
+    "colour_intrinsics": Field(("C", "4"), "float64", "fx, fy, cx, cy; pixel centres at integers", "px"),
+    "colour_distortion": Field(("C", "8"), "float64", "OpenCV k1 k2 p1 p2 k3 k4 k5 k6"),
+    "depth_size": Field(("C", "2"), "int32", "width and height of the depth image, 0 without depth", "px"),
+    "depth_intrinsics": Field(("C", "4"), "float64", "fx, fy, cx, cy; NaN without depth", "px"),
+    "depth_distortion": Field(("C", "8"), "float64", "OpenCV k1 k2 p1 p2 k3 k4 k5 k6"),
+    "colour_from_depth": Field(("C", "4", "4"), "float64", "depth camera to colour camera", "m", "colour camera"),
+}  # fmt: skip
+
+FRAMES = Schema(
+    name="frames",
+    version=1,
+    stage="frames",
+    frame="each camera's own images",
+    attributes={
+        "sequence": "sequence name",
+        "master": "name of the master camera",
+        "fps": "nominal frame sets a second",
+    },
+    fields={
+        **_CAMERA_MODELS,
+        "master_from_colour": Field(("C", "4", "4"), "float64", "extrinsics as given, unrefined", "m", "master"),
+        "gravity": Field(("C", "3"), "float64", "mean accelerometer direction (down), NaN where none", "1", "colour camera"),
+        "present": Field(("C",), "bool", "the recording could be read"),
+        "truncated": Field(("C",), "bool", "the recording ends before its time or is cut"),
+        "note": Field(("C",), "str", "what is degraded about this camera, in words"),
+        "times": Field(("T",), "float64", "time of each set since the first, master clock", "s"),
+        "dropped": Field(("T",), "bool", "dropped by annotation: treated as seen by no camera"),
+        "colour_index": Field(("T", "C"), "int32", "this set's image in cameras/<c>/colour, -1 = none"),
+        "depth_index": Field(("T", "C"), "int32", "this set's image in cameras/<c>/depth, -1 = none"),
+        "skew": Field(("T", "C"), "float32", "device time minus the set's time, NaN = none", "s"),
+        "cameras/{camera}/colour": Field(("B",), "uint8", "JPEG packets as recorded, end to end", codec="none"),
+        "cameras/{camera}/colour_offsets": Field(("N+1",), "int64", "start of each packet, and the end"),
+        "cameras/{camera}/colour_time": Field(("N",), "int64", "device time of each colour image", "us"),
+        "cameras/{camera}/depth": Field(("D", "H", "W"), "uint16", "depth as recorded, 0 = invalid", "mm", "depth camera", codec="depth"),
+        "cameras/{camera}/depth_time": Field(("D",), "int64", "device time of each depth image", "us"),
+    },
+)  # fmt: skip
+
+DETECTIONS = Schema(
+    name="detections",
+    version=1,
+    stage="detections",
+    frame="colour image of each camera, pixels",
+    attributes={"sequence": "sequence name"},
+    fields={
+        "camera_names": Field(("C",), "str", "one name a camera"),
+        "keypoints_found": Field(("T", "C"), "bool", "a keypoint file exists for this image"),
+        "candidates_found": Field(("T", "C"), "bool", "candidates are known for this image (maybe none)"),
+        "cameras/{camera}/people_offsets": Field(("T+1",), "int64", "first person of each set, and the end"),
+        "cameras/{camera}/people": Field(("P", "135", "3"), "float32", "x, y, confidence in the 135-point order", "px", "colour image"),
+        "cameras/{camera}/candidate_offsets": Field(("T+1",), "int64", "first candidate of each set, and the end"),
+        "cameras/{camera}/candidate_labels": Field(("N",), "str", "label as the detector gave it"),
+        "cameras/{camera}/candidate_scores": Field(("N",), "float32", "the detector's score"),
+        "cameras/{camera}/candidate_boxes": Field(("N", "4"), "float32", "x, y, width, height", "px", "colour image"),
+        "cameras/{camera}/rle_offsets": Field(("N+1",), "int64", "start of each candidate's RLE, and the end"),
+        "cameras/{camera}/rle": Field(("B",), "uint8", "COCO compressed RLE strings, end to end, at the colour image's size"),
+    },
+)  # fmt: skip
+
+SCENE = Schema(
+    name="scene",
+    version=1,
+    stage="scene",
+    attributes={
+        "sequence": "sequence name",
+        "master": "name of the master camera",
+        "fps": "nominal frame sets a second",
+        "extrinsics_refined": "the refined extrinsics are better on held-out points and were kept",
+        "ground_found": "a floor was seen or annotated",
+        "ground_source": "'fitted', 'annotated' or 'none'",
+        "ground_rms": "RMS distance of the floor's inliers to the plane, metres",
+        "ground_inliers": "number of floor points that support the plane",
+    },
+    fields={
+        **_CAMERA_MODELS,
+        "present": Field(("C",), "bool", "this camera has images"),
+        "times": Field(("T",), "float64", "time of each set since the first", "s"),
+        "master_from_colour": Field(("C", "4", "4"), "float64", "refined extrinsics", "m", "master"),
+        "master_from_colour_start": Field(("C", "4", "4"), "float64", "extrinsics as given", "m", "master"),
+        "depth_bias": Field(("C",), "float64", "to subtract from each camera's depth", "m"),
+        "pairs": Field(("P", "2"), "int32", "camera indices of each overlapping pair"),
+        "pair_points": Field(("P",), "int64", "overlapping points of the pair"),
+        "pair_residual_before": Field(("P",), "float32", "median point-to-plane distance at the start, held-out points", "m"),
+        "pair_residual_after": Field(("P",), "float32", "the same after refinement", "m"),
+        "time_offset": Field(("C",), "float64", "exposure later than the set's time by this much", "s"),
+        "slip": Field(("T", "C"), "int32", "whole frames this camera is late by, in this set"),
+        "ground_point": Field(("3",), "float64", "a point of the floor; NaN where none", "m", "master"),
+        "ground_normal": Field(("3",), "float64", "unit normal, up; NaN where none", "1", "master"),
+        "zup_from_master": Field(("4", "4"), "float64", "gravity-aligned, z up, ground at z = 0", "m", "z-up"),
+        "cameras/{camera}/background": Field(("H", "W"), "uint16", "background depth, 0 = unknown", "mm", "depth camera"),
+    },
+)  # fmt: skip
+
+PERSON = Schema(
+    name="person",
+    version=1,
+    stage="person",
+    attributes={"sequence": "sequence name"},
+    fields={
+        "camera_names": Field(("C",), "str", "one name a camera"),
+        "person": Field(("T", "C"), "int32", "index among the image's people, -1 = not seen"),
+        "keypoints": Field(("T", "C", "135", "3"), "float32", "the subject's x, y, confidence; 0 = not seen", "px", "colour image"),
+        "joints": Field(("T", "135", "3"), "float32", "triangulated keypoints; NaN = too few views", "m", "master"),
+        "joint_views": Field(("T", "135"), "int8", "views that agree on the point"),
+        "joint_error": Field(("T", "135"), "float32", "RMS reprojection error of those views", "px"),
+        "inlier": Field(("T", "C", "135"), "bool", "this view agrees on the point"),
+        "missing": Field(("T",), "bool", "the subject was found in fewer than two views"),
+        "mask_offsets": Field(("M+1",), "int64", "start of each mask's RLE, in the order of (T, C)"),
+        "mask_rle": Field(("B",), "uint8", "COCO compressed RLE of the person, empty = no mask"),
+    },
+)  # fmt: skip
+
+OBJECT_TRACK = Schema(
+    name="object_track",
+    version=1,
+    stage="object_track",
+    attributes={
+        "sequence": "sequence name",
+        "object": "object name",
+        "seed_frame": "frame that the track started from",
+        "seed_source": "'annotated' or 'search'",
+    },
+    fields={
+        "camera_names": Field(("C",), "str", "one name a camera"),
+        "rotation": Field(("T", "3", "3"), "float64", "master_from_object", "1", "master"),
+        "translation": Field(("T", "3"), "float64", "master_from_object, of the mesh's origin", "m", "master"),
+        "candidate": Field(("T", "C"), "int32", "candidate kept in each view, -1 = none"),
+        "overlap": Field(("T", "C"), "float32", "IoU of the kept candidate and the visible render; NaN = none"),
+        "depth_residual": Field(("T", "C"), "float32", "median |depth residual|; NaN = none", "m"),
+        "silhouette_residual": Field(("T", "C"), "float32", "median contour distance; NaN = none", "px"),
+        "views": Field(("T",), "int8", "views that the pose rests on"),
+        "covariance": Field(("T", "6", "6"), "float64", "of (rotation vector, translation), rotation applied on the left", "rad, m", "master"),
+        "lost": Field(("T",), "bool", "the tracker does not believe its pose"),
+        "recovered": Field(("T",), "bool", "first frame after a re-initialisation"),
+        "disagree": Field(("T",), "bool", "forward and backward passes end apart"),
+    },
+)  # fmt: skip
+
+
+def _body(*, one_shape: bool) -> dict[str, Field]:
+    rotation = ("rad", "parent joint")
+    return {
+        "betas": Field(("S",) if one_shape else ("T", "S"), "float32", "shape coefficients"),
+        "expression": Field(("T", "X"), "float32", "expression coefficients"),
+        "global_orient": Field(
+            ("T", "3"), "float32", "rotation vector of the pelvis", "rad", "master"
+        ),
+        "transl": Field(("T", "3"), "float32", "translation", "m", "master"),
+        "body_pose": Field(("T", "63"), "float32", "rotation vectors of joints 1-21", *rotation),
+        "jaw_pose": Field(("T", "3"), "float32", "rotation vector", *rotation),
+        "leye_pose": Field(("T", "3"), "float32", "rotation vector", *rotation),
+        "reye_pose": Field(("T", "3"), "float32", "rotation vector", *rotation),
+        "left_hand_pose": Field(
+            ("T", "45"), "float32", "full rotation vectors, mean included", *rotation
+        ),
+        "right_hand_pose": Field(
+            ("T", "45"), "float32", "full rotation vectors, mean included", *rotation
+        ),
+        "joints": Field(("T", "55", "3"), "float32", "posed joints", "m", "master"),
+        "keypoint_residual": Field(
+            ("T", "C"), "float32", "median reprojection error; NaN = not seen", "px"
+        ),
+        "cloud_residual": Field(
+            ("T",), "float32", "median distance of person points to the mesh; NaN = none", "m"
+        ),
+    }
+
+
+BODY_FIT = Schema(
+    name="body_fit",
+    version=1,
+    stage="body_fit",
+    attributes={
+        "sequence": "sequence name",
+        "subject": "subject name",
+        "gender": "which body file was used",
+        "body_model": "digest of the body file",
+    },
+    fields={
+        **_body(one_shape=False),
+        "joint_sigma": Field(
+            ("T", "55"), "float32", "stated standard deviation of each joint", "m"
+        ),
+        "failed": Field(("T",), "bool", "no believable fit in this frame"),
+        "bridged": Field(("T",), "bool", "filled in from its neighbours"),
+    },
+)
+
+JOINT = Schema(
+    name="joint",
+    version=1,
+    stage="joint",
+    attributes={
+        "sequence": "sequence name",
+        "subject": "subject name",
+        "object": "object name",
+        "gender": "which body file was used",
+        "body_model": "digest of the body file",
+        "iterations": "Gauss-Newton steps taken",
+    },
+    fields={
+        **_body(one_shape=True),
+        "rotation": Field(("T", "3", "3"), "float64", "master_from_object", "1", "master"),
+        "translation": Field(
+            ("T", "3"), "float64", "master_from_object, of the mesh's origin", "m", "master"
+        ),
+        "region_names": Field(("R",), "str", "contact regions of the body"),
+        "contact_probability": Field(("T", "R"), "float32", "that the region touches the object"),
+        "contact_annotated": Field(("T", "R"), "int8", "1 touching, 0 not, -1 not annotated"),
+        "time_offset": Field(("C",), "float64", "refined exposure offset of each camera", "s"),
+        "energy_names": Field(("E",), "str", "terms of the energy"),
+        "energy_before": Field(("E",), "float64", "weighted energy of each term at the start"),
+        "energy_after": Field(("E",), "float64", "weighted energy of each term at the end"),
+        "flagged": Field(("T",), "bool", "body or object of this frame should not be trusted"),
+        "flag_reason": Field(("T",), "str", "why, in words; empty = not flagged"),
+    },
+)
+
+TRUTH = Schema(
+    name="truth",
+    version=1,
+    stage="studio",
+    attributes={
+        "sequence": "sequence name",
+        "interaction": "script that was played",
+        "subject": "studio subject",
+        "object": "object name",
+        "ground_offset": "n . x + d = 0 of the floor, metres",
+        "fps": "frame sets a second",
+    },
+    fields={
+        "times": Field(("T",), "float64", "time of each set since the first", "s"),
+        "body_vertices": Field(("T", "Vt", "3"), "float32", "skin without clothing, the truth's own mesh", "m", "master"),
+        "body_faces": Field(("Ft", "3"), "int32", "of the truth's own mesh"),
+        "correspondence_face": Field(("V",), "int32", "truth face under each vertex of the open body's mesh, rest pose"),
+        "correspondence_weights": Field(("V", "3"), "float32", "barycentric"),
+        "joints": Field(("T", "55", "3"), "float32", "true joints", "m", "master"),
+        "fingertips": Field(("T", "10", "3"), "float32", "left thumb to little finger, then right", "m", "master"),
+        "object_vertices": Field(("Vo", "3"), "float32", "the true object's mesh", "m", "object"),
+        "object_faces": Field(("Fo", "3"), "int32", "of the true object's mesh"),
+        "rotation": Field(("T", "3", "3"), "float64", "master_from_object", "1", "master"),
+        "translation": Field(("T", "3"), "float64", "master_from_object", "m", "master"),
+        "object_views": Field(("T",), "int8", "views that truly see the object"),
+        "region_names": Field(("R",), "str", "contact regions"),
+        "region_contact": Field(("T", "R"), "bool", "true distance at most 4.5 mm somewhere in the region"),
+        "camera_names": Field(("C",), "str", "one name a camera"),
+        "master_from_colour": Field(("C", "4", "4"), "float64", "true extrinsics", "m", "master"),
+        "time_offset": Field(("C",), "float64", "true exposure offset", "s"),
+        "slip": Field(("T", "C"), "int32", "whole frames late"),
+        "ground_normal": Field(("3",), "float64", "true floor normal, up", "1", "master"),
+        "body_visible": Field(("T", "Vt"), "bool", "some camera truly sees the vertex (of the clothed body)"),
+        "object_visible": Field(("T", "Vo"), "bool", "some camera truly sees the vertex"),
+    },
+)  # fmt: skip
+
+_PER_STAGE_TRUTH = {
+    f"truth/{stage}/{key}": Field(dims, "float32", doc, units, optional=True)
+    for stage in ("object_track", "body_fit", "joint")
+    for key, dims, doc, units in (
+        ("body_pve", ("T",), "mean vertex error", "m"),
+        ("body_mpjpe", ("T",), "mean error of the 22 body joints", "m"),
+        ("hand_mpjpe", ("T", "2"), "mean error of 15 joints and 5 tips, left and right", "m"),
+        ("hand_mpjpe_wrist", ("T", "2"), "the same after aligning the wrist", "m"),
+        ("object_translation", ("T",), "error at the centre of mass", "m"),
+        ("object_rotation", ("T",), "angle, the smallest over the symmetry group", "deg"),
+        ("acceleration_body", ("T",), "error of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
+        ("acceleration_hands", ("T",), "the same over 30 finger joints", "m/frame^2"),
+        ("acceleration_object", ("T",), "the same at the object's centre", "m/frame^2"),
+        ("region_contact", ("T", "12"), "1 where the fit touches within 4.5 mm", "1"),
+        ("vertex_contact_counts", ("T", "4"), "true and false positives, false and true negatives at 4.5 mm", "1"),
+        ("body_floor", ("T",), "vertex-to-cloud of the true body over what cameras could see", "m"),
+        ("object_floor", ("T",), "vertex-to-cloud of the true object over what cameras could see", "m"),
+    )
+}  # fmt: skip
+
+METRICS = Schema(
+    name="metrics",
+    version=1,
+    stage="metrics",
+    attributes={
+        "sequence": "sequence name",
+        "subject": "subject name",
+        "object": "object name",
+        "fps": "frame sets a second",
+        "has_truth": "errors against truth are in truth/",
+    },
+    fields={
+        "body_to_object": Field(("T", "V"), "float32", "signed distance of each body vertex to the object's surface, negative inside, capped at 0.25", "m"),
+        "object_to_body": Field(("T", "Vo"), "float32", "signed distance of each object vertex to the body's surface, negative inside, capped at 0.25", "m"),
+        "contact_frame": Field(("T",), "bool", "a body vertex within 4.5 mm of the object"),
+        "region_names": Field(("R",), "str", "contact regions"),
+        "region_contact": Field(("T", "R"), "bool", "the region has a vertex within 4.5 mm"),
+        "penetration_mean": Field(("T",), "float32", "over body vertices inside the object; 0 = none", "m"),
+        "penetration_median": Field(("T",), "float32", "the same, median", "m"),
+        "penetration_max": Field(("T",), "float32", "the same, deepest", "m"),
+        "penetration_object": Field(("T",), "float32", "mean depth of object samples inside the body", "m"),
+        "ground_penetration": Field(("T",), "float32", "deepest vertex below the floor", "m"),
+        "body_to_cloud": Field(("T",), "float32", "mean over all body vertices, as the paper; NaN = no cloud", "m"),
+        "object_to_cloud": Field(("T",), "float32", "mean over all object vertices; NaN = no cloud", "m"),
+        "body_visible_to_cloud": Field(("T",), "float32", "area-sampled, over what cameras can see", "m"),
+        "object_visible_to_cloud": Field(("T",), "float32", "area-sampled, over what cameras can see", "m"),
+        "cloud_to_body": Field(("T",), "float32", "mean over the person's cloud", "m"),
+        "acceleration_body": Field(("T",), "float32", "norm of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
+        "acceleration_object": Field(("T",), "float32", "the same at the object's centre", "m/frame^2"),
+        "flagged": Field(("T",), "bool", "some stage does not trust this frame"),
+        "flag_reason": Field(("T",), "str", "why; empty = not flagged"),
+        **_PER_STAGE_TRUTH,
+        "truth/contact_region": Field(("T", "12"), "bool", "true contact by region", optional=True),
+        "truth/penetration_mean": Field(("T",), "float32", "the truth's own penetration", "m", optional=True),
+        "truth/object_views": Field(("T",), "int8", "views that truly see the object", optional=True),
+        "truth/object_moving": Field(("T",), "bool", "the true object moves", optional=True),
+    },
+)  # fmt: skip
+
+STAGES = (FRAMES, DETECTIONS, SCENE, PERSON, OBJECT_TRACK, BODY_FIT, JOINT, METRICS)
