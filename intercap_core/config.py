@@ -1,0 +1,362 @@
+"""Settings, tables and annotations: pydantic models that say what each entry means.
+
+Everything that a user writes is read here and checked before any job starts. Relative paths in a
+settings file or a table are relative to the folder of that file. ``config/README.md`` and the
+JSON schemas in ``config/schemas/`` are generated from these models.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from intercap_core.schemas import CONTACT_REGIONS
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=80)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+Vector3 = tuple[float, float, float]
+RegionName = Literal[CONTACT_REGIONS]  # type: ignore[valid-type]
+
+
+class Model(BaseModel):
+    """Base of every settings model: unknown keys are mistakes, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+# --- settings by stage -----------------------------------------------------------------------
+
+
+class FramesSettings(Model):
+    """Recordings to synchronised frame sets."""
+
+    max_skew_ms: Positive = 8.0
+    """An image belongs to a set when its device time is within this many milliseconds of it."""
+
+
+class DetectionsSettings(Model):
+    """Keypoints and segmentation candidates, read from files."""
+
+    min_score: Fraction = 0.05
+    """Candidates below this detector score are left out."""
+
+
+class SceneSettings(Model):
+    """Extrinsics, ground plane and background."""
+
+    refine_extrinsics: bool = True
+    """Refine the camera poses from the static background; the start is kept where that does not
+    improve held-out points."""
+    floor_tolerance_mm: Positive = 15.0
+    """Background points this close to the plane count as floor."""
+
+
+class PersonSettings(Model):
+    """The subject over views, and the triangulated keypoints."""
+
+    min_confidence: Fraction = 0.3
+    """Keypoints below this confidence do not take part."""
+    max_reprojection_px: Positive = 20.0
+    """A view disagrees with a triangulated point beyond this error (at 1080p)."""
+
+
+class ObjectTrackSettings(Model):
+    """The object's pose in every frame (equation 1)."""
+
+    min_overlap: Fraction = 0.3
+    """A view's candidate is kept when its IoU with the predicted silhouette is at least this."""
+    background_term: bool = True
+    """Also penalise render over known background, beside the paper's one-sided silhouette."""
+    lost_overlap: Fraction = 0.25
+    """The track counts as lost when the mean overlap over its views falls below this."""
+
+
+class BodyFitSettings(Model):
+    """SMPL-X parameters in every frame (equation 2)."""
+
+    hands: bool = True
+    """Fit finger poses; without, hands stay at their mean."""
+    face: bool = True
+    """Fit jaw and expression from the face keypoints."""
+    shape: Literal["shared", "per_frame"] = "shared"
+    """One shape for the sequence, or a free shape in every frame as in the paper's first stage."""
+    points_per_frame: Annotated[int, Field(ge=200, le=20000)] = 1500
+    """Person points kept of each frame's fused cloud."""
+    cloud_weight: Positive = 1.0
+    """Weight of the cloud against the keypoints (lambda_D)."""
+
+
+class JointSettings(Model):
+    """Body and object together, over all frames (equation 6)."""
+
+    contact_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of contact (lambda_Q)."""
+    ground_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of not sinking into the floor (lambda_G)."""
+    penetration_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of body and object not entering each other (lambda_P)."""
+    body_smoothness: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of the body's smooth motion (lambda_S)."""
+    object_smoothness: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of the object's small acceleration (lambda_A)."""
+    detect_contact: bool = True
+    """Find contact from the geometry where it is not annotated."""
+
+
+class MetricsSettings(Model):
+    """Distances, penetration and errors against truth."""
+
+    contact_mm: Positive = 4.5
+    """A body vertex this close to the object's surface is in contact."""
+
+
+class ReportSettings(Model):
+    """The HTML page."""
+
+    cameras: Annotated[int, Field(ge=1, le=16)] = 2
+    """Cameras shown with overlays, for each sequence."""
+    frames: Annotated[int, Field(ge=1, le=50)] = 4
+    """Frames shown with overlays, for each camera."""
+
+
+class ExportSettings(Model):
+    """Files for other people's tools."""
+
+    formats: tuple[Literal["intercap", "amass", "bop", "glb"], ...] = (
+        "intercap",
+        "amass",
+        "bop",
+        "glb",
+    )
+    """Which exports are written."""
+    frame: Literal["z-up", "camera"] = "z-up"
+    """Frame of amass and glb: gravity-aligned with the ground at z = 0, or the master camera.
+    The intercap and bop layouts are in camera frames by definition."""
+
+
+class StudioCapture(Model):
+    """One virtual recording."""
+
+    interaction: Name
+    """Script to play, e.g. suitcase_carry, cup_drink, stool_sit."""
+    subject: Name
+    """Studio subject that plays it (see subjects.tsv)."""
+    seed: int
+    """Seed of the motion and of every error."""
+    frames: Annotated[int, Field(ge=2, le=3000)] = 45
+    """Number of frame sets."""
+    annotate: bool = False
+    """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
+
+
+class StudioSettings(Model):
+    """Virtual recordings made before the rest runs; absent for real recordings."""
+
+    captures: dict[Name, StudioCapture]
+    """One entry for each sequence that the studio makes."""
+    fps: Literal[5, 15, 30] = 15
+    """Frame sets a second."""
+    noise: Annotated[float, Field(ge=0, le=4)] = 1.0
+    """Scale of every error; 1 is the headline."""
+    noise_family: Literal["a", "b"] = "a"
+    """Shapes of the error distributions."""
+    colour_mode: Literal["720P", "1080P"] = "1080P"
+    """Resolution of the colour cameras."""
+    cameras: Annotated[int, Field(ge=1, le=16)] = 6
+    """Kinects in the ring."""
+
+
+class BodyModels(Model):
+    """SMPL-X files; without one, the open body is used."""
+
+    neutral: Path | None = None
+    """SMPLX_NEUTRAL.npz."""
+    female: Path | None = None
+    """SMPLX_FEMALE.npz."""
+    male: Path | None = None
+    """SMPLX_MALE.npz."""
+
+
+class Config(Model):
+    """config.yaml."""
+
+    dataset: Name
+    """Name of the dataset; results go to results/<dataset>/."""
+    sequences: Path = Path("sequences.tsv")
+    """Table of recordings."""
+    subjects: Path = Path("subjects.tsv")
+    """Table of people."""
+    objects: Path = Path("objects.yaml")
+    """The objects' meshes."""
+    annotations: Path = Path("annotations")
+    """Folder of <sequence>.yaml files, all optional."""
+    results: Path = Path("results")
+    """Folder for everything that is computed, relative to where the workflow runs."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the fits run."""
+    body_models: BodyModels = BodyModels()
+    """SMPL-X files; without one, the open body is used."""
+    frames: FramesSettings = FramesSettings()
+    """Recordings to synchronised frame sets."""
+    detections: DetectionsSettings = DetectionsSettings()
+    """Keypoints and segmentation candidates."""
+    scene: SceneSettings = SceneSettings()
+    """Extrinsics, ground plane and background."""
+    person: PersonSettings = PersonSettings()
+    """The subject over views."""
+    object_track: ObjectTrackSettings = ObjectTrackSettings()
+    """The object's pose in every frame."""
+    body_fit: BodyFitSettings = BodyFitSettings()
+    """The body in every frame."""
+    joint: JointSettings = JointSettings()
+    """Body and object together."""
+    metrics: MetricsSettings = MetricsSettings()
+    """Distances and errors."""
+    report: ReportSettings = ReportSettings()
+    """The HTML page."""
+    export: ExportSettings = ExportSettings()
+    """Files for other tools."""
+    studio: StudioSettings | None = None
+    """Virtual recordings to make; absent for real ones."""
+
+
+# --- tables ----------------------------------------------------------------------------------
+
+
+class SequenceEntry(Model):
+    """One row of sequences.tsv."""
+
+    sequence: Name
+    """Name of the sequence; letters, digits, _ and - only."""
+    subject: Name
+    """Row of subjects.tsv."""
+    object: Name
+    """Key of objects.yaml."""
+    recordings: Path
+    """Folder that holds <camera>.mkv files."""
+    calibration: Path
+    """Camera poses: a rig JSON file, or a folder of Color*.json files as InterCap released."""
+    keypoints: Path | None = None
+    """Folder of <camera>/<frame>_keypoints.json files as OpenPose writes them."""
+    candidates: Path | None = None
+    """Folder of <camera>.json files: instance segmentation in COCO's result format."""
+    truth: Path | None = None
+    """Truth of a virtual recording; read by the metrics alone."""
+
+
+class SubjectEntry(Model):
+    """One row of subjects.tsv."""
+
+    subject: Name
+    """Name of the person."""
+    gender: Literal["female", "male", "neutral"]
+    """Which body file is used."""
+
+
+class ContinuousSymmetry(Model):
+    """As in BOP's models_info."""
+
+    axis: Vector3
+    """Unit axis in the mesh's frame."""
+    offset: Vector3 = (0.0, 0.0, 0.0)
+    """A point on the axis, metres."""
+
+
+class Symmetry(Model):
+    """Motions that leave the object looking the same."""
+
+    discrete: tuple[tuple[float, ...], ...] = ()
+    """4x4 transforms, row by row, metres; the identity is implied."""
+    continuous: tuple[ContinuousSymmetry, ...] = ()
+    """Axes of rotational symmetry."""
+    sphere: bool = False
+    """Any rotation about the mesh's origin looks the same."""
+
+    @model_validator(mode="after")
+    def _sixteen(self) -> Symmetry:
+        for row, transform in enumerate(self.discrete):
+            if len(transform) != 16:
+                raise ValueError(f"discrete[{row}] has {len(transform)} numbers, expected 16")
+        return self
+
+
+class ObjectEntry(Model):
+    """One entry of objects.yaml."""
+
+    name: Name
+    """The entry's key, repeated by the loader."""
+    mesh: Path
+    """Watertight mesh in metres (.ply or .obj)."""
+    contact_vertices: Path | None = None
+    """Vertices that people are likely to touch: a JSON list, or a pickle as InterCap released."""
+    symmetry: Symmetry = Symmetry()
+    """Symmetry group."""
+    labels: tuple[str, ...] = ()
+    """Detector classes that this object may be given (COCO names); empty = any."""
+
+
+# --- annotations -----------------------------------------------------------------------------
+
+
+class ContactInterval(Model):
+    """One body part touching the object for a while."""
+
+    part: RegionName
+    """Contact region of the body."""
+    start: Annotated[int, Field(ge=0)]
+    """First frame set in contact, from 0."""
+    end: Annotated[int, Field(gt=0)]
+    """First frame set after the contact."""
+
+    @model_validator(mode="after")
+    def _forward(self) -> ContactInterval:
+        if self.end <= self.start:
+            raise ValueError(f"interval is reversed: start {self.start}, end {self.end}")
+        return self
+
+
+class InitialObjectPose(Model):
+    """The object's pose in one frame, in the master camera's frame."""
+
+    frame: Annotated[int, Field(ge=0)] = 0
+    """Frame set of the pose."""
+    rotation_vector: Vector3
+    """Axis times angle of master_from_object, radians."""
+    translation: Vector3
+    """Of the mesh's origin, metres."""
+
+
+class Annotation(Model):
+    """annotations/<sequence>.yaml; every section is optional."""
+
+    contact: tuple[ContactInterval, ...] | None = None
+    """Frames in which body parts touch the object; absent = find them."""
+    object_pose: InitialObjectPose | None = None
+    """Where the object is in one frame; absent = search."""
+    floor: tuple[Vector3, ...] | None = None
+    """Three or more points of the floor, master camera frame, metres; absent = fit."""
+    drop_frames: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Frame sets to treat as not recorded."""
+
+    @model_validator(mode="after")
+    def _floor_points(self) -> Annotation:
+        if self.floor is not None and len(self.floor) < 3:
+            raise ValueError(f"floor has {len(self.floor)} points, a plane needs 3 or more")
+        return self
+
+    def check_frames(self, count: int) -> str | None:
+        """Say which entry lies past the recording's ``count`` frame sets, or None."""
+        for index, interval in enumerate(self.contact or ()):
+            if interval.end > count:
+                return f"contact[{index}].end is {interval.end}, the recording has {count} frames"
+        if self.object_pose is not None and self.object_pose.frame >= count:
+            return (
+                f"object_pose.frame is {self.object_pose.frame}, the recording has {count} frames"
+            )
+        beyond = [frame for frame in self.drop_frames if frame >= count]
+        if beyond:
+            return f"drop_frames holds {beyond[0]}, the recording has {count} frames"
+        return None
