@@ -21,10 +21,12 @@ _CAMERA_MODELS = {
     "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),
     "colour_intrinsics": Field(("C", "4"), "float64", "fx, fy, cx, cy; pixel centres at integers", "px"),
     "colour_distortion": Field(("C", "8"), "float64", "OpenCV k1 k2 p1 p2 k3 k4 k5 k6"),
+    "colour_metric_radius": Field(("C",), "float64", "the model holds up to this sqrt(x^2 + y^2) at z = 1"),
     "depth_size": Field(("C", "2"), "int32", "width and height of the depth image, 0 without depth", "px"),
     "depth_intrinsics": Field(("C", "4"), "float64", "fx, fy, cx, cy; NaN without depth", "px"),
     "depth_distortion": Field(("C", "8"), "float64", "OpenCV k1 k2 p1 p2 k3 k4 k5 k6"),
-    "colour_from_depth": Field(("C", "4", "4"), "float64", "depth camera to colour camera", "m", "colour camera"),
+    "depth_metric_radius": Field(("C",), "float64", "the same of the depth camera; NaN without depth"),
+    "colour_from_depth": Field(("C", "4", "4"), "float64", "depth camera to colour camera; NaN without depth", "m", "colour camera"),
 }  # fmt: skip
 
 FRAMES = Schema(

@@ -1,0 +1,119 @@
+"""One lens: image size, pinhole matrix and OpenCV's rational distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from intercap_core.camera import projection
+
+DEFAULT_METRIC_RADIUS = 1.7  # what the Azure Kinect SDK takes where a calibration says 0
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """A lens and its image; pixel (0, 0) is the centre of the first pixel.
+
+    ``distortion`` (8,) is OpenCV's k1, k2, p1, p2, k3, k4, k5, k6. The calibration holds up to
+    ``metric_radius`` = sqrt(x^2 + y^2) of the normalised plane; see :mod:`.projection` beyond it.
+    Lengths are pixels of this image. Raises ValueError for a shape or size that cannot be.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(8))
+    metric_radius: float = DEFAULT_METRIC_RADIUS
+
+    def __post_init__(self) -> None:
+        distortion = np.array(self.distortion, np.float64)
+        if distortion.shape != (8,):
+            raise ValueError(f"distortion has shape {distortion.shape}, expected (8,)")
+        if min(self.width, self.height) < 1 or min(self.fx, self.fy, self.metric_radius) <= 0:
+            raise ValueError("an image size, focal length or metric radius is not positive")
+        distortion.setflags(write=False)
+        object.__setattr__(self, "distortion", distortion)
+
+    @classmethod
+    def from_parameters(cls, size: Any, parameters: Any) -> Intrinsics:
+        """Make a lens of ``size`` (2,) = width, height from :attr:`parameters` (13,)."""
+        width, height = (int(n) for n in size)
+        fx, fy, cx, cy, *rest = (float(p) for p in parameters)
+        return cls(width, height, fx, fy, cx, cy, np.array(rest[:8]), rest[8])
+
+    @cached_property
+    def parameters(self) -> np.ndarray:
+        """(13,) float64: fx, fy, cx, cy, the distortion, metric radius (:mod:`.projection`)."""
+        head = (self.fx, self.fy, self.cx, self.cy)
+        values = np.array([*head, *self.distortion, self.metric_radius])
+        values.setflags(write=False)
+        return values
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The pinhole matrix (3, 3)."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def project(self, points: Any) -> Any:
+        """Project points (..., 3), this camera's frame, metres, to pixels (..., 2)."""
+        return projection.project(points, self.parameters)
+
+    def project_with_jacobian(self, points: Any) -> tuple[Any, Any]:
+        """Return pixels (..., 2) and d pixel / d point (..., 2, 3) of points (..., 3)."""
+        return projection.project_with_jacobian(points, self.parameters)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the undistorted rays (..., 3), z = 1, of pixels (..., 2)."""
+        return projection.unproject(pixels, self.parameters)
+
+    def inside_model(self, points: Any) -> Any:
+        """Tell for points (..., 3) whether they are in front and within the metric radius."""
+        return projection.inside_model(points, self.parameters)
+
+    def sees(self, points: Any) -> Any:
+        """Tell for points (..., 3) whether they are imaged: covered and inside the image."""
+        pixels = self.project(points)
+        u, v = pixels[..., 0], pixels[..., 1]
+        inside = (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
+        return inside & self.inside_model(points)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z, computed once.
+
+        NaN where the calibration does not hold (outside the metric radius).
+        """
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        xy = self.unproject(np.stack([u, v], -1))[..., :2]
+        xy[~(np.hypot(xy[..., 0], xy[..., 1]) <= self.metric_radius)] = np.nan
+        table = xy.astype(np.float32)
+        table.setflags(write=False)
+        return table
+
+    def scaled(self, factor: float) -> Intrinsics:
+        """Return the lens of the image resized by ``factor`` (sizes rounded, edges kept)."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.distortion,
+            self.metric_radius,
+        )
+
+    def cropped(self, x0: int, y0: int, width: int, height: int) -> Intrinsics:
+        """Return the lens of the window whose first pixel is (x0, y0)."""
+        cx, cy = self.cx - x0, self.cy - y0
+        return Intrinsics(
+            width, height, self.fx, self.fy, cx, cy, self.distortion, self.metric_radius
+        )

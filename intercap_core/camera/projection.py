@@ -1,0 +1,182 @@
+"""The rational lens model of OpenCV, for numpy arrays and torch tensors alike.
+
+A camera is the vector ``parameters`` (..., 13): fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6,
+metric_radius. Its leading axes broadcast against those of the points, so ``(C, 1, 13)``
+parameters project points (T, C, K, 3) of all cameras at once.
+
+With x = X/Z, y = Y/Z, s = x^2 + y^2 and the radial factor
+d(s) = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3):
+
+    u = fx (x d + 2 p1 x y + p2 (s + 2 x^2)) + cx
+    v = fy (y d + p1 (s + 2 y^2) + 2 p2 x y) + cy
+
+(https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html). The pixel (0, 0) is the *centre* of the
+first pixel. A calibration is valid up to ``metric_radius`` = sqrt(s) only; beyond it the rational
+factor may turn back into the image. There the whole map is continued by a straight line along the
+ray from the principal point (the distorted position at the radius, scaled), so that a projection
+is always finite and monotone; :func:`inside_model` tells which points the calibration covers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+NUM_PARAMETERS = 13
+MIN_DEPTH_M = 1e-3  # nearer (or behind) is projected as if at this depth
+_NEWTON_STEPS = 8
+_CONVERGED = 1e-12  # normalised image plane; 1e-9 px at f = 1000
+_BLOCK = 16384  # points a block: the temporaries of one Newton step stay in the cache
+_TABLE_SIZE = 1024  # radii tabulated for the start of Newton's iteration
+
+
+def _namespace(array: Any) -> Any:
+    """Return torch for a tensor, numpy otherwise (torch is never imported for numpy's sake)."""
+    if type(array).__module__.partition(".")[0] == "torch":
+        import torch
+
+        return torch
+    return np
+
+
+def _as_parameters(parameters: Any, points: Any, xp: Any) -> Any:
+    if xp is np:
+        return np.asarray(parameters, points.dtype)
+    if not isinstance(parameters, xp.Tensor):
+        parameters = np.array(parameters)
+    return xp.as_tensor(parameters, dtype=points.dtype, device=points.device)
+
+
+def _radial(s: Any, q: Any) -> tuple[Any, Any]:
+    """Return the radial factor d (...) at s = r^2 and 2 dd/ds, so that dd/dx = x * (2 dd/ds)."""
+    k1, k2, k3, k4, k5, k6 = (q[..., i] for i in (4, 5, 8, 9, 10, 11))
+    denominator = 1 + s * (k4 + s * (k5 + s * k6))
+    d = (1 + s * (k1 + s * (k2 + s * k3))) / denominator
+    slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
+    return d, 2 * slope / denominator
+
+
+def _distort(x: Any, y: Any, q: Any, xp: Any) -> tuple[Any, ...]:
+    """Distort x, y (...) of the normalised plane, continued beyond the metric radius.
+
+    Returns xd, yd and the function that gives their derivatives (dxd/dx, dxd/dy, dyd/dx, dyd/dy).
+    """
+    limit = q[..., 12]
+    squared = x * x + y * y
+    outside = squared > limit * limit
+    # The inner choice keeps sqrt away from 0, where autograd's derivative of it is infinite.
+    one = xp.ones_like(squared)
+    stretch = xp.where(outside, xp.sqrt(xp.where(outside, squared, one)) / limit, one)
+    x, y = x / stretch, y / stretch  # on the rim where outside
+    s = x * x + y * y
+    d, dd = _radial(s, q)
+    p1, p2 = q[..., 6], q[..., 7]
+    xd = x * d + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+    yd = y * d + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+
+    def derivatives() -> tuple[Any, Any, Any, Any]:
+        xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
+        xy = x * y * dd + 2 * p1 * x + 2 * p2 * y  # the model's Jacobian is symmetric
+        yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
+        # Outside, the map is (distorted rim point) * stretch: the model's derivative across the
+        # ray, and the distorted rim point over the radius along it.
+        zero = xp.zeros_like(s)
+        safe = xp.where(outside, s, one)
+        along_x = xp.where(outside, (xd - xx * x - xy * y) / safe, zero)
+        along_y = xp.where(outside, (yd - xy * x - yy * y) / safe, zero)
+        return xx + along_x * x, xy + along_x * y, xy + along_y * x, yy + along_y * y
+
+    return xd * stretch, yd * stretch, derivatives
+
+
+def _normalise(points: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
+    """Return X/Z, Y/Z, 1/Z (Z at least ``MIN_DEPTH_M``) and where Z was not raised, each (...)."""
+    z = points[..., 2]
+    free = z > MIN_DEPTH_M
+    inverse_z = 1 / xp.where(free, z, xp.full_like(z, MIN_DEPTH_M))
+    return points[..., 0] * inverse_z, points[..., 1] * inverse_z, inverse_z, free
+
+
+def project(points: Any, parameters: Any) -> Any:
+    """Project points (..., 3), camera frame, metres, to pixels (..., 2).
+
+    Always finite: see the module's text for points outside the metric radius; a point nearer than
+    ``MIN_DEPTH_M`` (or behind the camera) is treated as if at that depth.
+    """
+    xp = _namespace(points)
+    q = _as_parameters(parameters, points, xp)
+    x, y, _, _ = _normalise(points, xp)
+    xd, yd, _ = _distort(x, y, q, xp)
+    return xp.stack([q[..., 0] * xd + q[..., 2], q[..., 1] * yd + q[..., 3]], -1)
+
+
+def project_with_jacobian(points: Any, parameters: Any) -> tuple[Any, Any]:
+    """Project points (..., 3) to pixels (..., 2), with d pixel / d point (..., 2, 3), px/m.
+
+    Where :func:`project` raises the depth the pixel does not depend on Z and that column is zero.
+    """
+    xp = _namespace(points)
+    q = _as_parameters(parameters, points, xp)
+    x, y, inverse_z, free = _normalise(points, xp)
+    xd, yd, derivatives = _distort(x, y, q, xp)
+    fx, fy = q[..., 0], q[..., 1]
+    pixels = xp.stack([fx * xd + q[..., 2], fy * yd + q[..., 3]], -1)
+    xx, xy, yx, yy = derivatives()
+    by_z = xp.where(free, -inverse_z, xp.zeros_like(inverse_z))
+    u_row = [fx * xx * inverse_z, fx * xy * inverse_z, fx * (xx * x + xy * y) * by_z]
+    v_row = [fy * yx * inverse_z, fy * yy * inverse_z, fy * (yx * x + yy * y) * by_z]
+    return pixels, xp.stack([xp.stack(u_row, -1), xp.stack(v_row, -1)], -2)
+
+
+def inside_model(points: Any, parameters: Any) -> Any:
+    """Tell for points (..., 3) whether the calibration covers them: in front, within the radius."""
+    xp = _namespace(points)
+    q = _as_parameters(parameters, points, xp)
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    return (z > MIN_DEPTH_M) & (x * x + y * y <= (q[..., 12] * z) ** 2)
+
+
+def unproject(pixels: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Return the undistorted rays (..., 3), z = 1, float64, of pixels (..., 2).
+
+    The exact inverse of :func:`project` (Newton to 1e-12 in the normalised plane), also beyond the
+    metric radius. ``parameters`` is one camera's (13,). NaN where the model has no inverse: a
+    calibration whose image turns back inside its own radius.
+    """
+    pixels = np.asarray(pixels, np.float64)
+    q = np.asarray(parameters, np.float64)
+    flat = pixels.reshape(-1, 2)
+    rays = np.ones((len(flat), 3))
+    radii = np.linspace(0.0, q[12], _TABLE_SIZE)
+    distorted_radii = np.maximum.accumulate(radii * _radial(radii * radii, q)[0])
+    for start in range(0, len(flat), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        xd, yd = ((flat[block] - q[2:4]) / q[0:2]).T
+        rays[block, 0], rays[block, 1] = _undistort(xd, yd, q, radii, distorted_radii)
+    return rays.reshape(*pixels.shape[:-1], 3)
+
+
+def _undistort(
+    xd: np.ndarray, yd: np.ndarray, q: np.ndarray, radii: np.ndarray, distorted_radii: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Invert the distortion of xd, yd (N,): the radial part from the table, then Newton."""
+    distance = np.hypot(xd, yd)
+    inverse = np.interp(distance, distorted_radii, radii)
+    beyond = distance > distorted_radii[-1]
+    inverse[beyond] = distance[beyond] * (radii[-1] / distorted_radii[-1])
+    scale = np.divide(inverse, distance, out=np.ones_like(distance), where=distance > 0)
+    x, y = xd * scale, yd * scale
+    for _ in range(_NEWTON_STEPS):
+        found_x, found_y, derivatives = _distort(x, y, q, np)
+        r_x, r_y = found_x - xd, found_y - yd
+        if np.maximum(np.abs(r_x), np.abs(r_y)).max(initial=0.0) < _CONVERGED:
+            return x, y
+        xx, xy, yx, yy = derivatives()
+        determinant = xx * yy - xy * yx
+        x = x - (yy * r_x - xy * r_y) / determinant
+        y = y - (xx * r_y - yx * r_x) / determinant
+    found_x, found_y, _ = _distort(x, y, q, np)
+    lost = ~(np.hypot(found_x - xd, found_y - yd) < 1e-9)
+    x[lost], y[lost] = np.nan, np.nan
+    return x, y
