@@ -1,0 +1,1 @@
+"""Solids of the ten objects, built by constructive geometry to true sizes (metres, z up)."""
