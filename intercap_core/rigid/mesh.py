@@ -1,0 +1,240 @@
+"""An object's mesh as the stages use it: checked, repaired where safe, contact vertices, symmetry."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from intercap_core import safe_pickle
+from intercap_core.config import ObjectEntry
+from intercap_core.errors import UserError
+from intercap_core.rigid.symmetry import SymmetryGroup
+
+log = logging.getLogger(__name__)
+
+MAX_EXTENT_M = 5.0  # larger: the file is in millimetres (the smallest object is 95 mm high)
+MIN_EXTENT_M = 0.01
+MAX_OPEN_EDGES = 0.05  # share of edges with one face, above which inside and outside mean nothing
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMesh:
+    """A rigid object in its own frame (the file's), metres, faces outward.
+
+    ``vertices`` (V, 3) float64, ``faces`` (F, 3) int32, ``contact_vertices`` (K,) int64 sorted,
+    ``colours`` (V, 3) uint8. ``watertight``: inside and outside are defined everywhere.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    contact_vertices: np.ndarray
+    symmetry: SymmetryGroup
+    colours: np.ndarray
+    watertight: bool = True
+
+    @classmethod
+    def load(cls, entry: ObjectEntry) -> ObjectMesh:
+        """Load and check the mesh, contact vertices and symmetry of an objects.yaml entry.
+
+        Vertices that coincide are joined, inconsistent winding is turned and small holes are
+        closed, each with a warning. Raises UserError naming the file, what is wrong with it and
+        what to do: no such file, no faces, coordinates that are not numbers, millimetres, a
+        surface too open to have an inside, contact vertices that are not vertices.
+        """
+        path = Path(entry.mesh)
+        mesh = _read(path)
+        _check_size(path, mesh)
+        mesh, new_id = _repair(path, mesh)
+        try:
+            symmetry = SymmetryGroup.from_settings(entry.symmetry)
+        except ValueError as error:
+            raise UserError(
+                f"object {entry.name!r}: symmetry is impossible ({error}); correct it in "
+                "objects.yaml"
+            ) from None
+        contact = _contact_vertices(entry.contact_vertices, len(new_id))
+        ids = np.arange(len(mesh.vertices)) if contact is None else np.unique(new_id[contact])
+        colours = np.asarray(mesh.visual.vertex_colors, np.uint8)[:, :3]
+        return cls(
+            entry.name,
+            np.asarray(mesh.vertices, np.float64),
+            np.asarray(mesh.faces, np.int32),
+            ids.astype(np.int64),
+            symmetry,
+            np.ascontiguousarray(colours),
+            bool(mesh.is_watertight),
+        )
+
+    @cached_property
+    def face_normals(self) -> np.ndarray:
+        """Outward unit normals (F, 3)."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        normals = np.cross(b - a, c - a)
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
+
+    @cached_property
+    def centre_of_mass(self) -> np.ndarray:
+        """Centre of mass (3,) at uniform density; of the surface where it is not closed."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        centroids = (a + b + c) / 3
+        if not self.watertight:
+            areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            return (areas[:, None] * centroids).sum(0) / areas.sum()
+        middle = self.vertices.mean(0)  # tetrahedra from a near point keep the sum well scaled
+        volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
+        return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of a vertex from the centre of mass, metres."""
+        return float(np.linalg.norm(self.vertices - self.centre_of_mass, axis=1).max())
+
+    @cached_property
+    def diameter(self) -> float:
+        """Largest distance between two vertices, metres (BOP's scale of pose errors)."""
+        from scipy.spatial import ConvexHull
+        from scipy.spatial.distance import pdist
+
+        return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
+    try:
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    except Exception as error:  # the readers of trimesh raise whatever a broken file provokes
+        raise UserError(
+            f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again as "
+            ".ply or .obj"
+        ) from None
+    if vertices.ndim != 2 or len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
+        raise UserError(
+            f"{path}: holds {len(vertices)} vertices and {len(faces)} faces, expected a triangle "
+            "mesh; export the surface, not a point cloud"
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise UserError(
+            f"{path}: a face names vertex {faces.max()}, there are {len(vertices)}; export the "
+            "mesh again"
+        )
+    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+    if len(bad):
+        raise UserError(
+            f"{path}: vertex {bad[0]} is not a number (and {len(bad) - 1} more); export the mesh "
+            "again"
+        )
+    return mesh
+
+
+def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
+    extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+    if extent > MAX_EXTENT_M:
+        raise UserError(
+            f"{path}: is {extent:.4g} m long, which looks like millimetres; scale it by 0.001"
+        )
+    if extent < MIN_EXTENT_M:
+        raise UserError(
+            f"{path}: is only {extent:.3g} m long; scale it so that its unit is the metre"
+        )
+
+
+def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return a consistent mesh and each file vertex's new id (V_file,)."""
+    new_id = np.arange(len(mesh.vertices))
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
+        return mesh, new_id
+    colours = np.asarray(mesh.visual.vertex_colors)
+    vertices, first, new_id = np.unique(
+        np.asarray(mesh.vertices).round(7), axis=0, return_index=True, return_inverse=True
+    )
+    faces = new_id.reshape(-1)[np.asarray(mesh.faces)]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (
+        faces[:, 2] != faces[:, 0]
+    )
+    mesh = trimesh.Trimesh(
+        vertices, faces[proper], vertex_colors=colours[first], process=False, validate=False
+    )
+    done = []
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+        done.append("turned faces of inconsistent winding")
+    if not mesh.is_watertight:
+        before = len(mesh.faces)
+        trimesh.repair.fill_holes(mesh)
+        if len(mesh.faces) > before:
+            done.append(f"closed holes with {len(mesh.faces) - before} faces")
+    if mesh.volume < 0:
+        trimesh.repair.fix_inversion(mesh)
+        done.append("turned all faces outward")
+    if done:
+        log.warning("%s: %s", path, "; ".join(done))
+    if not mesh.is_watertight:
+        edges = np.sort(mesh.edges, axis=1)
+        _, count = np.unique(edges, axis=0, return_counts=True)
+        open_share = float((count != 2).mean())
+        if open_share > MAX_OPEN_EDGES:
+            raise UserError(
+                f"{path}: {open_share:.0%} of its edges do not join two faces, so it has no "
+                "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
+            )
+        log.warning("%s: %.1f %% of the edges are still open", path, 100 * open_share)
+    return mesh, new_id.reshape(-1)
+
+
+def _contact_vertices(path: Path | None, count: int) -> np.ndarray | None:
+    """Ids (K,) of likely-contact vertices, or None where there is no list."""
+    if path is None:
+        return None
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(
+            f"{path}: there is no such list of contact vertices; correct 'contact_vertices' in "
+            "objects.yaml or leave it out"
+        )
+    if path.suffix == ".pkl":
+        values = safe_pickle.load(path)
+    elif path.suffix == ".npz":
+        values = _from_npz(path)
+    else:
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except (ValueError, UnicodeDecodeError):
+            raise UserError(f"{path}: not a JSON list of vertex ids; write it as [0, 1, ...]"
+                            ) from None
+    if isinstance(values, set | frozenset):
+        values = sorted(values)
+    try:
+        ids = np.asarray(values)
+    except ValueError:
+        ids = np.empty(0, object)
+    whole = ids.dtype.kind in "iu" or (ids.dtype.kind == "f" and np.array_equal(ids, ids.round()))
+    if ids.ndim != 1 or len(ids) == 0 or not whole:
+        raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
+    if ids.min() < 0 or ids.max() >= count:
+        outside = int(ids.max() if ids.max() >= count else ids.min())
+        raise UserError(
+            f"{path}: names vertex {outside}, the mesh has {count}; the list belongs to another "
+            "mesh"
+        )
+    return ids.astype(np.int64)
+
+
+def _from_npz(path: Path) -> Any:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            names = file.files
+            return file["contact_vertices" if "contact_vertices" in names else names[0]]
+    except (OSError, ValueError, IndexError) as error:
+        raise UserError(
+            f"{path}: not a readable .npz of vertex ids ({error}); save it again"
+        ) from None
