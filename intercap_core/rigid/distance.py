@@ -11,8 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
-_RAYS_CLOSED = 1  # of a watertight mesh; measured without a sign error on 10 k points
-_RAYS_OPEN = 5  # rays that vote where faces are missing
+# Directions along which crossings are counted: one for a watertight mesh (measured without a sign
+# error on 10 k points), a vote of all where faces are missing (Open3D's own samples run nearly
+# parallel and fail together at a hole). No direction lies in a plane that people model in.
+_DIRECTIONS = np.array(
+    [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
+     [0.41, 0.53, -0.74]]
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,24 +56,34 @@ class DistanceField:
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"vertices {vertices.shape} and faces {faces.shape} are no mesh")
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
-        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
-        self._rays = _RAYS_CLOSED if watertight else _RAYS_OPEN
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces)
+        )
+        self._directions = _DIRECTIONS[:1] if watertight else _DIRECTIONS
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) to the surface, metres, negative inside."""
-        return self._run("compute_signed_distance", points, nsamples=self._rays)
+        distance = self.distance(points)
+        return np.where(self.inside(points), -distance, distance)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) to the surface, metres, never negative."""
-        return self._run("compute_distance", points)
+        query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
+        return self._scene.compute_distance(query).numpy().astype(np.float64)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Whether points (N, 3) are inside the solid: (N,) bool."""
-        return self._run("compute_occupancy", points, nsamples=self._rays) > 0.5
+        query = np.asarray(points, np.float32).reshape(-1, 3)
+        votes = np.zeros(len(query), int)
+        for direction in self._directions.astype(np.float32):
+            rays = np.concatenate([query, np.broadcast_to(direction, query.shape)], 1)
+            crossings = self._scene.count_intersections(o3d.core.Tensor.from_numpy(rays)).numpy()
+            votes += crossings % 2
+        return 2 * votes > len(self._directions)
 
     def closest(self, points: np.ndarray) -> Closest:
         """The closest surface points of points (N, 3)."""
-        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
+        query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
         answer = self._scene.compute_closest_points(query)
         uv = answer["primitive_uvs"].numpy().astype(np.float64)
         return Closest(
@@ -77,7 +92,3 @@ class DistanceField:
             np.column_stack([1 - uv.sum(1), uv]),
             answer["primitive_normals"].numpy().astype(np.float64),
         )
-
-    def _run(self, method: str, points: np.ndarray, **options: int) -> np.ndarray:
-        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
-        return getattr(self._scene, method)(query, **options).numpy().astype(np.float64)

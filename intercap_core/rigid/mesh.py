@@ -1,4 +1,4 @@
-"""An object's mesh as the stages use it: checked, repaired where safe, contact vertices, symmetry."""
+"""A rigid mesh as the stages use it: checked, repaired where safe, contact vertices, symmetry."""
 
 from __future__ import annotations
 
@@ -62,14 +62,13 @@ class ObjectMesh:
             ) from None
         contact = _contact_vertices(entry.contact_vertices, len(new_id))
         ids = np.arange(len(mesh.vertices)) if contact is None else np.unique(new_id[contact])
-        colours = np.asarray(mesh.visual.vertex_colors, np.uint8)[:, :3]
         return cls(
             entry.name,
             np.asarray(mesh.vertices, np.float64),
             np.asarray(mesh.faces, np.int32),
             ids.astype(np.int64),
             symmetry,
-            np.ascontiguousarray(colours),
+            _colours(mesh)[:, :3].copy(),
             bool(mesh.is_watertight),
         )
 
@@ -136,6 +135,17 @@ def _read(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
+def _colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
+    visual: Any = mesh.visual
+    if visual is not None and visual.kind == "texture":
+        visual = visual.to_color()
+    colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
+    if colours.shape != (len(mesh.vertices), 4):
+        return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
+    return colours
+
+
 def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     if extent > MAX_EXTENT_M:
@@ -153,13 +163,13 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
     new_id = np.arange(len(mesh.vertices))
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
         return mesh, new_id
-    colours = np.asarray(mesh.visual.vertex_colors)
+    colours = _colours(mesh)
     vertices, first, new_id = np.unique(
         np.asarray(mesh.vertices).round(7), axis=0, return_index=True, return_inverse=True
     )
     faces = new_id.reshape(-1)[np.asarray(mesh.faces)]
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (
-        faces[:, 2] != faces[:, 0]
+    proper = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     )
     mesh = trimesh.Trimesh(
         vertices, faces[proper], vertex_colors=colours[first], process=False, validate=False
@@ -209,8 +219,9 @@ def _contact_vertices(path: Path | None, count: int) -> np.ndarray | None:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (ValueError, UnicodeDecodeError):
-            raise UserError(f"{path}: not a JSON list of vertex ids; write it as [0, 1, ...]"
-                            ) from None
+            raise UserError(
+                f"{path}: not a JSON list of vertex ids; write it as [0, 1, ...]"
+            ) from None
     if isinstance(values, set | frozenset):
         values = sorted(values)
     try:

@@ -47,8 +47,10 @@ class SymmetryGroup:
         for row, transform in enumerate(given):
             rotation = transform[:3, :3]
             rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-            if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(
-                transform[3], (0, 0, 0, 1)
+            if (
+                not rigid
+                or np.linalg.det(rotation) < 0
+                or not np.allclose(transform[3], (0, 0, 0, 1))
             ):
                 raise ValueError(f"discrete[{row}] is not a rotation and translation")
         if len(symmetry.continuous) > 1:

@@ -7,6 +7,7 @@ smooth millimetre, and another scan would have other triangles.
 from __future__ import annotations
 
 import zlib
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -27,7 +28,7 @@ def true_mesh(entry: ObjectEntry, seed: int) -> tuple[np.ndarray, np.ndarray, np
     true pose is also the best pose of the tracked mesh. Four times the faces of the tracked mesh,
     every edge split at a random place. The same entry and seed give the same mesh.
     """
-    source = trimesh.load(entry.mesh, process=False, force="mesh")
+    source: Any = trimesh.load(entry.mesh, process=False, force="mesh")
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     vertices = np.asarray(source.vertices, np.float64)
     faces = np.asarray(source.faces, np.int64)
@@ -82,9 +83,7 @@ def _smooth_displacement(
     # least squares of normal displacement = n . (omega x v + t): what a tracker would take as pose
     rigid = np.concatenate([np.cross(vertices, normals), normals], 1)
     root = np.sqrt(weight)[:, None]
-    motion = np.linalg.lstsq(
-        root * rigid, root[:, 0] * (field * normals).sum(1), rcond=1e-4
-    )[0]
+    motion = np.linalg.lstsq(root * rigid, root[:, 0] * (field * normals).sum(1), rcond=1e-4)[0]
     field -= np.cross(motion[:3], vertices) + motion[3:]
     rms = np.sqrt(weight @ (field * normals).sum(1) ** 2)
     return field * SURFACE_ERROR_M / rms

@@ -17,13 +17,14 @@ def _facing_up(vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return normals[:, 2] > 0.3
 
 
-def _square_rod(start: Sequence[float], end: Sequence[float], size: float, end_size: float
-                ) -> Manifold:
+def _square_rod(
+    start: Sequence[float], end: Sequence[float], size: float, end_size: float
+) -> Manifold:
     return tube([start, end], [size / np.sqrt(2), end_size / np.sqrt(2)], 4, side=(1, 0, 0))
 
 
 def chair() -> Built:
-    """Wooden chair: seat top 45 cm, 42 cm wide, back 86 cm high (towards +y), rails between legs."""
+    """Wooden chair: seat at 45 cm, 42 cm wide, back (towards +y) 86 cm high, rails and rungs."""
     outline = np.array([[-0.21, -0.21], [0.21, -0.21], [0.195, 0.20], [-0.195, 0.20]])
     seat = plate(outline, 0.030, 0.03).translate((0, 0, 0.42))
     parts = [Part("seat", seat.refine_to_length(0.045), LIGHT_OAK, _facing_up)]
@@ -33,9 +34,13 @@ def chair() -> Built:
         post = _square_rod((x * 0.95, 0.175, 0.40), (x * 0.95, 0.255, 0.850), 0.040, 0.030)
         rail = box((0.018, 0.36, 0.045), (x * 0.97, 0.0, 0.397))
         rung = rod((x * 1.0, -0.183, 0.18), (x * 0.965, 0.198, 0.18), 0.010, segments=8)
-        parts += [Part("leg", front, OAK), Part("leg", back_leg, OAK),
-                  Part("post", post, OAK, lambda v, n: v[:, 2] > 0.55),
-                  Part("rail", rail, DARK_OAK), Part("rung", rung, DARK_OAK)]
+        parts += [
+            Part("leg", front, OAK),
+            Part("leg", back_leg, OAK),
+            Part("post", post, OAK, lambda v, n: v[:, 2] > 0.55),
+            Part("rail", rail, DARK_OAK),
+            Part("rung", rung, DARK_OAK),
+        ]
     parts += [
         Part("rail", box((0.35, 0.018, 0.045), (0, -0.178, 0.397)), DARK_OAK),
         Part("rail", box((0.34, 0.018, 0.045), (0, 0.176, 0.397)), DARK_OAK),
@@ -58,8 +63,15 @@ def chair() -> Built:
 
 def stool() -> Built:
     """Round seat of 34 cm, top at 45 cm, four splayed legs and two levels of rungs."""
-    rim = [(0.0, 0.0), (0.158, 0.0), (0.168, 0.008), (0.170, 0.022), (0.165, 0.033), (0.150, 0.038),
-           (0.0, 0.038)]
+    rim = [
+        (0.0, 0.0),
+        (0.158, 0.0),
+        (0.168, 0.008),
+        (0.170, 0.022),
+        (0.165, 0.033),
+        (0.150, 0.038),
+        (0.0, 0.038),
+    ]
     seat = revolve(rim, 40).translate((0, 0, 0.412)).refine_to_length(0.03)
     parts = [Part("seat", seat, TEAL, lambda v, n: (n[:, 2] > 0.3) | (v[:, 2] > 0.425))]
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
@@ -69,12 +81,19 @@ def stool() -> Built:
         return np.array([*(corner * reach), z])
 
     for corner in corners:
-        parts.append(Part("leg", rod(along(corner, 0.43), along(corner, 0.006), 0.0135,
-                                     segments=10), STEEL))
+        parts.append(
+            Part("leg", rod(along(corner, 0.43), along(corner, 0.006), 0.0135, segments=10), STEEL)
+        )
         foot = disc((*(corner * 0.165), 0.009), 2, 0.0175, 0.018, 12)
         parts.append(Part("foot", foot, GREY))
     for z, pairs in ((0.150, ((0, 1), (2, 3))), (0.210, ((1, 2), (3, 0)))):
         for a, b in pairs:
-            parts.append(Part("rung", rod(along(corners[a], z), along(corners[b], z), 0.0095,
-                                          segments=8), STEEL, True))
+            parts.append(
+                Part(
+                    "rung",
+                    rod(along(corners[a], z), along(corners[b], z), 0.0095, segments=8),
+                    STEEL,
+                    True,
+                )
+            )
     return union(parts, 0.038)

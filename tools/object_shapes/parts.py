@@ -54,15 +54,19 @@ def rounded_box(
 
 
 def rod(
-    start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None,
+    start: Sequence[float],
+    end: Sequence[float],
+    radius: float,
+    end_radius: float | None = None,
     segments: int = 12,
 ) -> Manifold:
     """A (tapered) cylinder between two points."""
     return tube([start, end], [radius, radius if end_radius is None else end_radius], segments)
 
 
-def disc(centre: Sequence[float], axis: int, radius: float, width: float, segments: int = 24
-         ) -> Manifold:
+def disc(
+    centre: Sequence[float], axis: int, radius: float, width: float, segments: int = 24
+) -> Manifold:
     """A cylinder of ``width`` along coordinate ``axis`` around ``centre``: a wheel, a button."""
     offset = np.zeros(3)
     offset[axis] = width / 2
@@ -91,12 +95,13 @@ def tube(
     else:
         tangents = np.gradient(points, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    first = np.asarray(side, float) if side is not None else np.eye(3)[
-        np.argmin(np.abs(tangents[0]))]
+    first = (
+        np.asarray(side, float) if side is not None else np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    )
     angles = 2 * np.pi * (np.arange(segments) + 0.5) / segments
     rings = []
     for point, tangent, r in zip(points, tangents, radii, strict=True):
-        u = (np.asarray(side, float) if side is not None else first)
+        u = np.asarray(side, float) if side is not None else first
         u = u - tangent * (u @ tangent)
         u /= np.linalg.norm(u)
         first = u
@@ -145,12 +150,19 @@ def plate(outline: np.ndarray, thickness: float, radius: float = 0.0, layers: in
     section = CrossSection([np.asarray(outline, float).tolist()])
     if radius:
         section = section.offset(-radius, JoinType.Round).offset(
-            radius, JoinType.Round, circular_segments=24)
+            radius, JoinType.Round, circular_segments=24
+        )
     return Manifold.extrude(section, thickness, layers)
 
 
-def arc(centre: Sequence[float], radius: float, start_deg: float, end_deg: float, count: int,
-        plane: tuple[int, int] = (0, 2)) -> np.ndarray:
+def arc(
+    centre: Sequence[float],
+    radius: float,
+    start_deg: float,
+    end_deg: float,
+    count: int,
+    plane: tuple[int, int] = (0, 2),
+) -> np.ndarray:
     """Points on a circle in the plane of two coordinate axes: (count, 3)."""
     angles = np.radians(np.linspace(start_deg, end_deg, count))
     points = np.tile(np.asarray(centre, float), (count, 1))
@@ -217,8 +229,9 @@ def _centroid(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return (volumes[:, None] * (a + b + c) / 4).sum(0) / volumes.sum()
 
 
-def ring_stack(heights: np.ndarray, radii: np.ndarray, *, lobes: int, depth: float,
-               twist_deg: float) -> Manifold:
+def ring_stack(
+    heights: np.ndarray, radii: np.ndarray, *, lobes: int, depth: float, twist_deg: float
+) -> Manifold:
     """Star-shaped rings of ``lobes`` pleats, turned along z like a furled canopy."""
     segments = 4 * lobes
     angles = 2 * np.pi * np.arange(segments) / segments
@@ -226,6 +239,9 @@ def ring_stack(heights: np.ndarray, radii: np.ndarray, *, lobes: int, depth: flo
     rings = []
     for height, radius, turn in zip(heights, radii, twist, strict=True):
         r = radius * (1 - depth * (0.5 - 0.5 * np.cos(lobes * angles)))
-        rings.append(np.stack([r * np.cos(angles + turn), r * np.sin(angles + turn),
-                               np.full(segments, height)], 1))
+        rings.append(
+            np.stack(
+                [r * np.cos(angles + turn), r * np.sin(angles + turn), np.full(segments, height)], 1
+            )
+        )
     return rings_to_solid(np.array(rings))

@@ -40,8 +40,7 @@ def _tile(built: Built, azimuth_deg: float, highlight: bool, name: str) -> np.nd
     middle = right * (across.max() + across.min()) / 2 + up * (along.max() + along.min()) / 2
     grid = (np.arange(side) + 0.5) / side - 0.5
     origin = (
-        middle + 3 * radius * back
-        + span * (grid[None, :, None] * right - grid[:, None, None] * up)
+        middle + 3 * radius * back + span * (grid[None, :, None] * right - grid[:, None, None] * up)
     )
     rays = np.concatenate([origin, np.broadcast_to(-back, origin.shape)], -1).astype(np.float32)
     scene = o3d.t.geometry.RaycastingScene()
@@ -59,12 +58,14 @@ def _tile(built: Built, azimuth_deg: float, highlight: bool, name: str) -> np.nd
         colours[touched] = 0.35 * colours[touched] + 0.65 * CONTACT_TINT
     colour = (weights[..., None] * colours[built.faces[face]]).sum(-2)
     light = back + 0.5 * up - 0.3 * right
-    shade = 0.45 + 0.55 * np.clip(hit["primitive_normals"].numpy() @ light / np.linalg.norm(light),
-                                  0, 1)
+    shade = 0.45 + 0.55 * np.clip(
+        hit["primitive_normals"].numpy() @ light / np.linalg.norm(light), 0, 1
+    )
     image = np.where(seen[..., None], colour * shade[..., None], 245)
     image = image.reshape(TILE, SUPERSAMPLE, TILE, SUPERSAMPLE, 3).mean((1, 3)).clip(0, 255)
     tile = np.ascontiguousarray(image.astype(np.uint8))
     if not highlight:
-        cv2.putText(tile, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1,
-                    cv2.LINE_AA)
+        cv2.putText(
+            tile, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA
+        )
     return tile

@@ -68,16 +68,18 @@ def football() -> Built:
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
     nearness = (vertices / np.linalg.norm(vertices, axis=1, keepdims=True) @ corners.T).max(1)
     colours = np.where((nearness > np.cos(np.radians(21.5)))[:, None], BLACK, WHITE)
-    return Built(vertices, np.asarray(ball.faces), colours.astype(np.uint8),
-                 np.arange(len(vertices)))
+    return Built(
+        vertices, np.asarray(ball.faces), colours.astype(np.uint8), np.arange(len(vertices))
+    )
 
 
 def tennis_racquet() -> Built:
     """68.5 cm: head with pierced string bed, open throat, octagonal grip; z along the handle."""
     centre, half_width, half_height, radius = 0.505, 0.118, 0.168, 0.011
     turn = np.linspace(0, 2 * np.pi, 49)[:-1]
-    ring = np.stack([half_width * np.cos(turn), np.zeros(48), centre + half_height * np.sin(turn)],
-                    1)
+    ring = np.stack(
+        [half_width * np.cos(turn), np.zeros(48), centre + half_height * np.sin(turn)], 1
+    )
     head = tube(ring, radius, 8, closed=True, side=(0, 1, 0))
 
     strings = CrossSection()
@@ -86,8 +88,9 @@ def tennis_racquet() -> Built:
         strings += CrossSection.square((width, 0.4), True).translate((x, 0))
     for z in np.linspace(-0.15, 0.15, 15):
         strings += CrossSection.square((0.3, width), True).translate((0, z))
-    oval = CrossSection([np.stack(
-        [half_width * np.cos(turn), half_height * np.sin(turn)], 1).tolist()])
+    oval = CrossSection(
+        [np.stack([half_width * np.cos(turn), half_height * np.sin(turn)], 1).tolist()]
+    )
     bed = Manifold.extrude(strings ^ oval, width).translate((0, 0, -width / 2))
     bed = bed.rotate((90, 0, 0)).translate((0, 0, centre))
 
@@ -95,12 +98,20 @@ def tennis_racquet() -> Built:
     arms = []
     for sign in (-1, 1):
         start = np.array([0.0095 * sign, 0, 0.185])
-        end = np.array([half_width * np.cos(np.radians(-128 if sign < 0 else -52)), 0,
-                        centre + half_height * np.sin(np.radians(-52))])
+        end = np.array(
+            [
+                half_width * np.cos(np.radians(-128 if sign < 0 else -52)),
+                0,
+                centre + half_height * np.sin(np.radians(-52)),
+            ]
+        )
         bow = np.array([0.030 * sign, 0, 0.260])
         s = np.linspace(0, 1, 7)[:, None]
-        arms.append(tube((1 - s) ** 2 * start + 2 * s * (1 - s) * bow + s**2 * end, radius, 8,
-                         side=(0, 1, 0)))
+        arms.append(
+            tube(
+                (1 - s) ** 2 * start + 2 * s * (1 - s) * bow + s**2 * end, radius, 8, side=(0, 1, 0)
+            )
+        )
     shaft = rod((0, 0, 0.170), (0, 0, 0.200), 0.0150, 0.0170, 8)
     grip = rod((0, 0, 0.004), (0, 0, 0.180), 0.0172, 0.0158, 8)
     butt = rod((0, 0, 0.0), (0, 0, 0.012), 0.0205, 0.0195, 8)
@@ -113,4 +124,3 @@ def tennis_racquet() -> Built:
         Part("butt", butt, BLACK, True),
     ]
     return union(parts, 0.030)
-

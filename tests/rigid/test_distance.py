@@ -1,0 +1,52 @@
+"""Signed distances against closed forms."""
+
+import numpy as np
+import trimesh
+
+from intercap_core.rigid.distance import DistanceField
+
+
+def test_box_against_the_closed_form():
+    half = np.array([0.2, 0.1, 0.05])
+    box = trimesh.creation.box(2 * half)
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (5000, 3))
+    outside = np.abs(points) - half
+    expected = np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(1), 0)
+    field = DistanceField(box.vertices, box.faces)
+    signed = field.signed_distance(points)
+    np.testing.assert_allclose(signed, expected, atol=1e-6)
+    np.testing.assert_array_equal(field.inside(points), expected < 0)
+    np.testing.assert_allclose(field.distance(points), np.abs(expected), atol=1e-6)
+
+
+def test_sphere_against_the_closed_form():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.11)
+    points = np.random.default_rng(1).normal(size=(4000, 3)) * 0.1
+    signed = DistanceField(ball.vertices, ball.faces).signed_distance(points)
+    np.testing.assert_allclose(signed, np.linalg.norm(points, axis=1) - 0.11, atol=1e-4)
+
+
+def test_closest_points_lie_on_their_faces():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.11)
+    points = np.random.default_rng(2).normal(size=(1000, 3)) * 0.1
+    field = DistanceField(ball.vertices, ball.faces)
+    found = field.closest(points)
+    corners = np.asarray(ball.vertices)[np.asarray(ball.faces)[found.faces]]
+    np.testing.assert_allclose(
+        (corners * found.barycentric[..., None]).sum(1), found.points, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(points - found.points, axis=1), field.distance(points), atol=1e-6
+    )
+    assert (np.einsum("ij,ij->i", found.normals, found.points) > 0).all()
+
+
+def test_inside_survives_missing_faces():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.11)
+    rng = np.random.default_rng(3)
+    kept = rng.permutation(len(ball.faces))[: int(0.98 * len(ball.faces))]
+    points = rng.normal(size=(4000, 3)) * 0.07
+    points = points[np.abs(np.linalg.norm(points, axis=1) - 0.11) > 0.005]
+    truth = np.linalg.norm(points, axis=1) < 0.11
+    field = DistanceField(ball.vertices, ball.faces[kept], watertight=False)
+    assert (field.inside(points) != truth).mean() < 0.005

@@ -1,0 +1,214 @@
+"""Bad meshes and lists get one sentence that names the file and the next step."""
+
+import json
+import logging
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core import safe_pickle
+from intercap_core.config import ObjectEntry, Symmetry
+from intercap_core.errors import UserError
+from intercap_core.rigid.mesh import ObjectMesh
+
+
+def _entry(path, **values):
+    return ObjectEntry(name="thing", mesh=path, **values)
+
+
+def _write(mesh, path: Path) -> Path:
+    mesh.export(path)
+    return path
+
+
+def _ball():
+    return trimesh.creation.icosphere(subdivisions=3, radius=0.11)
+
+
+def _no_faces(path):
+    trimesh.PointCloud(_ball().vertices).export(path)
+    return path
+
+
+def _not_a_number(path):
+    ball = _ball()
+    ball.vertices[7, 1] = np.nan
+    return _write(ball, path)
+
+
+def _millimetres(path):
+    ball = _ball()
+    ball.apply_scale(1000)
+    return _write(ball, path)
+
+
+def _tiny(path):
+    ball = _ball()
+    ball.apply_scale(0.001)
+    return _write(ball, path)
+
+
+def _half_open(path):
+    ball = _ball()
+    soup = ball.vertices[ball.faces[::2]].reshape(-1, 3)
+    loose = trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False)
+    return _write(loose, path)
+
+
+def _garbage(path):
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n1 2")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path, "no such mesh"),
+        (_no_faces, "0 faces"),
+        (_not_a_number, "vertex 7 is not a number"),
+        (_millimetres, "millimetres"),
+        (_tiny, "unit is the metre"),
+        (_half_open, "no inside"),
+        (_garbage, "export"),
+    ],
+)
+def test_bad_meshes_are_refused(tmp_path, make, words):
+    path = tmp_path / "thing.ply"
+    make(path)
+    with pytest.raises(UserError, match=words) as caught:
+        ObjectMesh.load(_entry(path))
+    assert str(path) in str(caught.value)
+
+
+def _inside_out(ball):
+    ball.invert()
+
+
+def _one_face_turned(ball):
+    ball.faces[3] = ball.faces[3][::-1]
+
+
+def _one_face_missing(ball):
+    ball.update_faces(np.arange(len(ball.faces)) != 11)
+
+
+def _corners_not_joined(ball):
+    soup = ball.vertices[ball.faces].reshape(-1, 3)
+    ball.vertices, ball.faces = soup, np.arange(len(soup)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(
+    "harm", [_inside_out, _one_face_turned, _one_face_missing, _corners_not_joined]
+)
+def test_small_faults_are_repaired(tmp_path, caplog, harm):
+    ball = _ball()
+    volume = ball.volume
+    ball = trimesh.Trimesh(ball.vertices.copy(), ball.faces.copy(), process=False)
+    harm(ball)
+    path = _write(ball, tmp_path / "thing.ply")
+    listed = [0, 1, 5]
+    positions = np.asarray(ball.vertices)[listed]
+    contact = tmp_path / "thing.json"
+    contact.write_text(json.dumps(listed))
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
+    repaired = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert mesh.watertight and repaired.is_winding_consistent
+    assert repaired.volume == pytest.approx(volume, rel=1e-3)
+    distance = np.linalg.norm(
+        positions[:, None] - mesh.vertices[mesh.contact_vertices][None], axis=-1
+    )
+    assert distance.min(1).max() < 1e-6, "contact vertices follow the joined vertices"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1, 2, 100000]", "names vertex 100000"),
+        ("[-1]", "names vertex -1"),
+        ("[]", "not a list"),
+        ('{"a": 1}', "not a list"),
+        ("[0.5]", "not a list"),
+        ("[[1], [2, 3]]", "not a list"),
+        ("[1, 2", "not a JSON list"),
+    ],
+)
+def test_bad_contact_lists_are_refused(tmp_path, text, words):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    contact = tmp_path / "thing.contact.json"
+    contact.write_text(text)
+    with pytest.raises(UserError, match=words) as caught:
+        ObjectMesh.load(_entry(mesh, contact_vertices=contact))
+    assert str(contact) in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["list", "array", "npz", "none"])
+def test_contact_lists_of_every_kind(tmp_path, kind):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    path: Path | None = tmp_path / ("03.npz" if kind == "npz" else "03.pkl")
+    if kind == "npz":
+        np.savez(path, contact_vertices=np.array([9, 3, 3]))
+    elif kind == "none":
+        path = None
+    else:
+        ids = [9, 3, 3] if kind == "list" else np.array([9, 3, 3])
+        path.write_bytes(pickle.dumps(ids, protocol=2))
+    loaded = ObjectMesh.load(_entry(mesh, contact_vertices=path)).contact_vertices
+    expected = np.arange(642) if kind == "none" else [3, 9]
+    np.testing.assert_array_equal(loaded, expected)
+
+
+def test_impossible_symmetry_names_the_object(tmp_path):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    flat = tuple(np.diag([2.0, 1, 1, 1]).ravel())
+    with pytest.raises(UserError, match="object 'thing': symmetry"):
+        ObjectMesh.load(_entry(mesh, symmetry=Symmetry(discrete=(flat,))))
+
+
+class _Attack:
+    def __reduce__(self):
+        return os.system, ("touch should_not_exist",)
+
+
+class _Evaluate:
+    def __reduce__(self):
+        return eval, ("1 + 1",)
+
+
+@pytest.mark.parametrize("value", [_Attack(), [np.arange(3), _Evaluate()], {"a": Path("x")}])
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_pickles_that_call_anything_are_refused(tmp_path, monkeypatch, value, protocol):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "evil.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=protocol))
+    with pytest.raises(UserError, match=r"evil\.pkl: not a pickle of numpy arrays"):
+        safe_pickle.load(path)
+    assert not (tmp_path / "should_not_exist").exists()
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
+def test_pickles_of_plain_values_load(tmp_path, protocol):
+    value = {
+        "ob_pose": [np.arange(3.0), np.ones((2, 2), np.float32)],
+        "names": ("a", b"b", None, True, 3, 2.5),
+        "scalar": np.float32(1.5),
+        "ids": {1, 2},
+    }
+    path = tmp_path / "plain.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=protocol))
+    loaded = safe_pickle.load(path)
+    np.testing.assert_array_equal(loaded["ob_pose"][1], value["ob_pose"][1])
+    assert loaded["names"] == value["names"] and loaded["ids"] == value["ids"]
+    assert loaded["scalar"] == np.float32(1.5)
+
+
+@pytest.mark.parametrize("data", [b"", b"not a pickle", pickle.dumps([1] * 50)[:-5]])
+def test_damaged_pickles_are_refused(tmp_path, data):
+    path = tmp_path / "damaged.pkl"
+    path.write_bytes(data)
+    with pytest.raises(UserError, match="damaged"):
+        safe_pickle.load(path)
