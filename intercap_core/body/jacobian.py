@@ -1,0 +1,215 @@
+"""Posed points and their exact derivatives with respect to every parameter.
+
+A turn of joint k by the world vector w about the joint moves a point by w x a_k, where
+a_k = sum over bones m below k of w_m (R_m x + t_m - p_k): the geometric Jacobian of a manipulator,
+blended. The turn belongs to the axis-angle theta_k through w = R_parent J_l(theta_k) d theta_k with
+the left Jacobian J_l of the rotation group. Shape moves a point by T S_n + sum_k w_k d t_k, T the
+blended rotation; pose blend shapes add T P d R_k / d theta_k.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from intercap_core.body.joints import NUM_JOINTS, PARENTS
+from intercap_core.body.kinematics import (
+    PosedJoints,
+    joint_shape_derivatives,
+    left_jacobian,
+    skew,
+)
+from intercap_core.body.parameters import NUM_POSE, TRANSL
+from intercap_core.body.selection import Selection
+
+_CHUNK_BYTES = 64e6  # working set of one step of `normal_equations`
+
+
+def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
+    """Rest points (B,N,3) after shape (B,S) and the pose blend shapes of local (B,55,3,3)."""
+    batch, count = shape.shape[0], selection.template.shape[0]
+    size = selection.directions.shape[-1]
+    points = selection.template + (
+        shape @ selection.directions.reshape(-1, size).T
+    ).reshape(batch, count, 3)
+    if selection.posedirs is not None:
+        eye = torch.eye(3, dtype=local.dtype, device=local.device)
+        feature = (local[:, 1:] - eye).reshape(batch, -1)
+        width = selection.posedirs.shape[-1]
+        points = points + (feature @ selection.posedirs.reshape(-1, width).T).reshape(
+            batch, count, 3
+        )
+    return points
+
+
+def blend(selection: Selection, posed: PosedJoints) -> tuple[Tensor, Tensor]:
+    """Linear blend skinning's matrix (B,N,3,3) and offset (B,N,3) of every point."""
+    batch = posed.rotations.shape[0]
+    both = torch.cat([posed.rotations.reshape(batch, NUM_JOINTS, 9), posed.offsets], 2)
+    mixed = selection.weights @ both
+    return mixed[..., :9].reshape(batch, -1, 3, 3), mixed[..., 9:]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """N posed points (B,N,3) of B bodies, in metres, and their derivatives.
+
+    turns (B,N,L,3): a_k of each joint in `selection.chain`. frames (B,55,3,3): world turn of a joint
+    for a change of its axis-angle. shape (B,N,3,S): derivatives by betas and expression.
+    correctives (B,N,3,54,3) or None: what the pose blend shapes add.
+    """
+
+    points: Tensor
+    turns: Tensor
+    frames: Tensor
+    shape: Tensor
+    correctives: Tensor | None
+    selection: Selection
+
+    @property
+    def num_parameters(self) -> int:
+        return TRANSL.stop + self.shape.shape[-1]
+
+    @property
+    def vertices(self) -> Tensor:
+        """(B,V,3)"""
+        return self.points[:, : self.selection.num_vertices]
+
+    @property
+    def joints(self) -> Tensor:
+        """(B,55,3); empty if the joints were not asked for."""
+        return self.points[:, self.selection.num_vertices :]
+
+    def full(self) -> Tensor:
+        """(B,N,3,P): every derivative, mostly zeros; for few points."""
+        batch, count = self.points.shape[:2]
+        eye = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
+        return self.along(eye.expand(batch, count, 3, 3))
+
+    def along(self, directions: Tensor) -> Tensor:
+        """Rows n^T d point / d parameters: directions (B,N,R,3) -> (B,N,R,P).
+
+        With R = 1 and the surface's normals these are the rows of point-to-plane residuals; with
+        R = 2 and the rows of a projection's derivative, those of a pixel residual.
+        """
+        batch, count, rows = directions.shape[:3]
+        out = directions.new_zeros(batch, count, rows, self.num_parameters)
+        chain = self.selection.chain
+        # n . (w x a) = w . (a x n)
+        twist = torch.linalg.cross(self.turns[:, :, :, None], directions[:, :, None], dim=-1)
+        frame = self.frames[:, chain]
+        columns = torch.einsum("bnlrc,bnlcd->bnrld", twist, frame)
+        index = (3 * chain[..., None] + torch.arange(3, device=chain.device)).reshape(count, -1)
+        out.scatter_add_(
+            3,
+            index[None, :, None].expand(batch, count, rows, -1),
+            columns.reshape(batch, count, rows, -1),
+        )
+        if self.correctives is not None:
+            extra = torch.einsum("bnrc,bncjd->bnrjd", directions, self.correctives)
+            out[..., 3:NUM_POSE] += extra.reshape(batch, count, rows, -1)
+        out[..., TRANSL] = directions
+        out[..., TRANSL.stop :] = directions @ self.shape
+        return out
+
+    def normal_equations(
+        self, directions: Tensor, weights: Tensor, residuals: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """J^T W J (B,P,P) and J^T W r (B,P) of the rows that `along` would give.
+
+        directions (B,N,R,3), weights (B,N,R), residuals (B,N,R). A limb's points touch the columns
+        of few joints, so each limb is one dense product over those.
+        """
+        batch = self.points.shape[0]
+        size = self.num_parameters
+        hessian = directions.new_zeros(batch, size, size)
+        gradient = directions.new_zeros(batch, size)
+        three = torch.arange(3, device=directions.device)
+        tail = torch.arange(TRANSL.start, size, device=directions.device)
+        for block in self.selection.blocks:
+            if self.correctives is None:
+                active = block.joints
+            else:
+                active = torch.arange(NUM_JOINTS, device=directions.device)
+            columns = torch.cat([(3 * active[:, None] + three).reshape(-1), tail])
+            cost = len(block.rows) * directions.shape[2] * len(columns) * directions.element_size()
+            step = max(1, int(_CHUNK_BYTES // max(cost, 1)))
+            for start in range(0, batch, step):
+                at = slice(start, start + step)
+                j = self._rows(at, block.rows, active, directions)
+                w = weights[at, block.rows].reshape(j.shape[:2])
+                r = residuals[at, block.rows].reshape(j.shape[:2])
+                weighted = j * w[..., None]
+                part = weighted.transpose(1, 2) @ j
+                frames = torch.arange(batch, device=j.device)[at]
+                hessian[frames[:, None, None], columns[:, None], columns] += part
+                gradient[frames[:, None], columns] += (weighted * r[..., None]).sum(1)
+        return hessian, gradient
+
+    def _rows(self, at: slice, rows: Tensor, active: Tensor, directions: Tensor) -> Tensor:
+        """(b, n*R, 3m + 3 + S): rows of some points over the columns of some joints."""
+        place = torch.zeros(NUM_JOINTS, dtype=torch.long, device=rows.device)
+        place[active] = torch.arange(len(active), device=rows.device)
+        chain = self.selection.chain[rows]
+        n = directions[at, rows]
+        batch, count, num_rows = n.shape[:3]
+        arms = self.turns.new_zeros(batch, count, len(active), 3)
+        arms.scatter_add_(
+            2, place[chain][None, :, :, None].expand(batch, -1, -1, 3), self.turns[at, rows]
+        )
+        twist = torch.linalg.cross(arms[:, :, None], n[:, :, :, None], dim=-1)
+        frame = self.frames[at][:, active]
+        pose = torch.einsum("bnrmc,bmcd->bnrmd", twist, frame).reshape(batch, count, num_rows, -1)
+        if self.correctives is not None:
+            extra = torch.einsum("bnrc,bncjd->bnrjd", n, self.correctives[at, rows])
+            pose[..., 3:] += extra.reshape(batch, count, num_rows, -1)
+        shape = n @ self.shape[at, rows]
+        return torch.cat([pose, n, shape], -1).reshape(batch, count * num_rows, -1)
+
+
+def linearise(
+    selection: Selection,
+    points: Tensor,
+    posed: PosedJoints,
+    axis_angle: Tensor,
+    joint_directions: Tensor,
+) -> Linearisation:
+    """Pose the rest points (B,N,3) and differentiate; axis_angle (B,55,3), directions (55,3,S)."""
+    batch, count = points.shape[:2]
+    matrix, offset = blend(selection, posed)
+    placed = (matrix @ points[..., None])[..., 0] + offset
+
+    bones = selection.bones
+    parts = (
+        torch.einsum("bnkij,bnj->bnki", posed.rotations[:, bones], points)
+        + posed.offsets[:, bones]
+    )
+    turns = torch.einsum("nlk,bnki->bnli", selection.below, parts)
+    turns = turns - selection.below.sum(2)[..., None] * posed.joints[:, selection.chain]
+
+    parent = torch.tensor([max(p, 0) for p in PARENTS], device=points.device)
+    around = posed.rotations[:, parent].clone()
+    around[:, 0] = torch.eye(3, dtype=points.dtype, device=points.device)
+    turn_of_local = left_jacobian(axis_angle)
+    frames = around @ turn_of_local
+
+    _, moved_offsets = joint_shape_derivatives(posed, joint_directions)
+    size = joint_directions.shape[-1]
+    shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(
+        batch, count, 3, size
+    )
+    shape = shape + matrix @ selection.directions
+
+    correctives = None
+    if selection.posedirs is not None:
+        # d R / d theta_c = skew(J_l e_c) R
+        change = skew(turn_of_local[:, 1:].transpose(-1, -2)) @ posed.local[:, 1:, None]
+        change = change.reshape(batch, NUM_JOINTS - 1, 3, 9)
+        tables = selection.posedirs.reshape(count, 3, NUM_JOINTS - 1, 9)
+        rest = torch.einsum("nija,bjca->bnijc", tables, change)
+        correctives = (matrix @ rest.reshape(batch, count, 3, -1)).reshape(rest.shape)
+    return Linearisation(placed, turns, frames, shape, correctives, selection)
+
+

@@ -1,0 +1,94 @@
+"""The 135 keypoints that detectors give, as fixed linear combinations of vertices and joints.
+
+Order: OpenPose body 25, left hand 21, right hand 21, face 51 (dlib 17 to 67), jaw line 17 (dlib 0
+to 16, taken for a head seen from the front).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_INDEX
+
+# (keypoint, joint name or "@" + name of a mesh point)
+_BODY: tuple[tuple[str, str], ...] = (
+    ("nose", "@nose"), ("neck", "neck"),
+    ("right_shoulder", "right_shoulder"), ("right_elbow", "right_elbow"),
+    ("right_wrist", "right_wrist"), ("left_shoulder", "left_shoulder"),
+    ("left_elbow", "left_elbow"), ("left_wrist", "left_wrist"), ("mid_hip", "pelvis"),
+    ("right_hip", "right_hip"), ("right_knee", "right_knee"), ("right_ankle", "right_ankle"),
+    ("left_hip", "left_hip"), ("left_knee", "left_knee"), ("left_ankle", "left_ankle"),
+    ("right_eye", "@right_eye"), ("left_eye", "@left_eye"), ("right_ear", "@right_ear"),
+    ("left_ear", "@left_ear"), ("left_big_toe", "@left_big_toe"),
+    ("left_small_toe", "@left_small_toe"), ("left_heel", "@left_heel"),
+    ("right_big_toe", "@right_big_toe"), ("right_small_toe", "@right_small_toe"),
+    ("right_heel", "@right_heel"),
+)  # fmt: skip
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+
+
+def _hand(side: str) -> list[tuple[str, str]]:
+    rows = [(f"{side}_hand_wrist", f"{side}_wrist")]
+    for finger in _FINGERS:
+        rows += [(f"{side}_{finger}{i}", f"{side}_{finger}{i}") for i in (1, 2, 3)]
+        rows.append((f"{side}_{finger}_tip", f"@{side}_{finger}"))
+    return rows
+
+
+_POINTS = (*_BODY, *_hand("left"), *_hand("right"))
+KEYPOINT_NAMES: tuple[str, ...] = (
+    *(name for name, _ in _POINTS),
+    *(f"face_{i}" for i in range(17, 68)),
+    *(f"face_{i}" for i in range(17)),
+)
+NUM_KEYPOINTS = len(KEYPOINT_NAMES)
+BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)
+FACE, CONTOUR = slice(67, 118), slice(118, 135)
+
+
+@dataclass(frozen=True)
+class KeypointMap:
+    """Keypoint i is joint `joint[i]`, or where that is -1, sum_k weights[i,k] vertex ids[i,k].
+
+    joint (135,), ids (135,3), weights (135,3); rows of joints have weights of zero.
+    vertex_ids (N,) are all ids used, ascending; `matrix` (135, N+55) maps those vertices followed
+    by the 55 joints to the keypoints.
+    """
+
+    joint: np.ndarray
+    ids: np.ndarray
+    weights: np.ndarray
+    vertex_ids: np.ndarray
+    matrix: np.ndarray
+
+
+def keypoint_map(
+    points: dict[str, int],
+    faces: np.ndarray,
+    landmark_faces: np.ndarray,
+    landmark_barycentric: np.ndarray,
+    contour_faces: np.ndarray,
+    contour_barycentric: np.ndarray,
+) -> KeypointMap:
+    """From named vertices and the file's landmarks (51) and frontal jaw line (17)."""
+    joint = np.full(NUM_KEYPOINTS, -1)
+    ids = np.zeros((NUM_KEYPOINTS, 3), int)
+    weights = np.zeros((NUM_KEYPOINTS, 3))
+    for row, (_, source) in enumerate(_POINTS):
+        if source.startswith("@"):
+            ids[row] = points[source[1:]]
+            weights[row, 0] = 1
+        else:
+            joint[row] = JOINT_INDEX[source]
+    ids[FACE], weights[FACE] = faces[landmark_faces], landmark_barycentric
+    ids[CONTOUR], weights[CONTOUR] = faces[contour_faces], contour_barycentric
+    vertex_rows = np.flatnonzero(joint < 0)
+    vertex_ids = np.unique(ids[vertex_rows])
+    matrix = np.zeros((NUM_KEYPOINTS, len(vertex_ids) + 55))
+    place = np.searchsorted(vertex_ids, ids[vertex_rows])
+    np.add.at(matrix, (vertex_rows[:, None], place), weights[vertex_rows])
+    joint_rows = np.flatnonzero(joint >= 0)
+    matrix[joint_rows, len(vertex_ids) + joint[joint_rows]] = 1
+    return KeypointMap(joint, ids, weights, vertex_ids, matrix)

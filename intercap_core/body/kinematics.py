@@ -1,0 +1,122 @@
+"""Rotations and the kinematic tree: world transforms of the 55 joints and their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from intercap_core.body.joints import NUM_JOINTS, PARENTS
+
+_SMALL_ANGLE_SQUARED = 1e-4  # below this the series' next term is under 1e-10
+
+
+def skew(v: Tensor) -> Tensor:
+    """(...,3) -> (...,3,3) with skew(v) @ x = v x x."""
+    zero = torch.zeros_like(v[..., 0])
+    x, y, z = v.unbind(-1)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape[:-1], 3, 3)
+
+
+def _coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(t)/t, (1-cos t)/t^2, (t-sin t)/t^3, smooth (also for autograd) through zero."""
+    small = theta_squared < _SMALL_ANGLE_SQUARED
+    t2 = torch.where(small, torch.ones_like(theta_squared), theta_squared)
+    t = t2.sqrt()
+    s2 = torch.where(small, theta_squared, torch.zeros_like(theta_squared))
+    a = torch.where(small, 1 - s2 / 6 + s2 * s2 / 120, torch.sin(t) / t)
+    b = torch.where(small, 0.5 - s2 / 24 + s2 * s2 / 720, 2 * torch.sin(t / 2) ** 2 / t2)
+    c = torch.where(small, 1 / 6 - s2 / 120 + s2 * s2 / 5040, (t - torch.sin(t)) / (t2 * t))
+    return a, b, c
+
+
+def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
+    """(...,3) -> (...,3,3), Rodrigues' formula."""
+    a, b, _ = (x[..., None, None] for x in _coefficients((axis_angle**2).sum(-1)))
+    k = skew(axis_angle)
+    return torch.eye(3, dtype=k.dtype, device=k.device) + a * k + b * (k @ k)
+
+
+def left_jacobian(axis_angle: Tensor) -> Tensor:
+    """(...,3) -> (...,3,3) J with exp(theta + d) = exp(J d) exp(theta) to first order in d.
+
+    Chirikjian 2011, "Stochastic Models, Information Theory, and Lie Groups" 2, section 10.8:
+    J = I + (1-cos t)/t^2 [theta] + (t - sin t)/t^3 [theta]^2.
+    """
+    _, b, c = (x[..., None, None] for x in _coefficients((axis_angle**2).sum(-1)))
+    k = skew(axis_angle)
+    return torch.eye(3, dtype=k.dtype, device=k.device) + b * k + c * (k @ k)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Joints of one depth of the tree, their parents, and the parents' place in level order."""
+
+    own: Tensor
+    parents: Tensor
+    parent_place: Tensor
+
+
+def _levels() -> tuple[tuple[_Level, ...], Tensor]:
+    depth = [0] * NUM_JOINTS
+    for joint in range(1, NUM_JOINTS):
+        depth[joint] = depth[PARENTS[joint]] + 1
+    order = sorted(range(NUM_JOINTS), key=lambda j: (depth[j], j))
+    place = {joint: i for i, joint in enumerate(order)}
+    levels = []
+    for level in range(1, max(depth) + 1):
+        own = [j for j in order if depth[j] == level]
+        parents = [PARENTS[j] for j in own]
+        at = [place[p] for p in parents]
+        levels.append(_Level(torch.tensor(own), torch.tensor(parents), torch.tensor(at)))
+    return tuple(levels), torch.tensor([place[j] for j in range(NUM_JOINTS)])
+
+
+_LEVELS, _PLACE = _levels()
+
+
+@dataclass(frozen=True)
+class PosedJoints:
+    """Rest joints (B,55,3), local and world rotations (B,55,3,3), posed joints (B,55,3) in metres.
+
+    A point x that follows joint k alone goes to rotations[k] @ x + offsets[k].
+    """
+
+    rest: Tensor
+    local: Tensor
+    rotations: Tensor
+    joints: Tensor
+    offsets: Tensor
+
+
+def pose_joints(rest: Tensor, local: Tensor, transl: Tensor) -> PosedJoints:
+    """rest (B,55,3), local rotations (B,55,3,3), transl (B,3) -> world transforms."""
+    device = rest.device
+    world, posed = local[:, :1], rest[:, :1] + transl[:, None]
+    for level in _LEVELS:
+        at = level.parent_place.to(device)
+        own, parents = level.own.to(device), level.parents.to(device)
+        rotation = world[:, at]
+        bone = (rotation @ (rest[:, own] - rest[:, parents])[..., None])[..., 0]
+        posed = torch.cat([posed, posed[:, at] + bone], 1)
+        world = torch.cat([world, rotation @ local[:, own]], 1)
+    back = _PLACE.to(device)
+    world, posed = world[:, back], posed[:, back]
+    offsets = posed - (world @ rest[..., None])[..., 0]
+    return PosedJoints(rest, local, world, posed, offsets)
+
+
+def joint_shape_derivatives(posed: PosedJoints, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """directions (55,3,S) of the rest joints -> d joints and d offsets, each (B,55,3,S)."""
+    device = directions.device
+    batch = posed.rotations.shape[0]
+    moved = torch.empty(
+        batch, *directions.shape, dtype=posed.rotations.dtype, device=device
+    )
+    moved[:, 0] = directions[0]
+    for level in _LEVELS:
+        own, parent = level.own.to(device), level.parents.to(device)
+        bone = directions[own] - directions[parent]
+        moved[:, own] = moved[:, parent] + posed.rotations[:, parent] @ bone
+    return moved, moved - posed.rotations @ directions

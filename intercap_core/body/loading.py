@@ -1,0 +1,181 @@
+"""Read an SMPL-X-format npz and say in one sentence what is wrong with another file."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.body.joints import NUM_JOINTS, PARENTS
+from intercap_core.errors import UserError
+
+OPEN_BODY = Path(__file__).parent / "data" / "open_body.npz"
+_REQUIRED = (
+    "v_template", "f", "shapedirs", "J_regressor", "kintree_table", "weights", "hands_meanl",
+    "hands_meanr", "hands_componentsl", "hands_componentsr", "lmk_faces_idx", "lmk_bary_coords",
+    "dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords",
+)  # fmt: skip
+_SMPLX_SHAPE_COLUMNS = 300  # a full file's expression starts here
+_HINT = "point the body model at an SMPLX_NEUTRAL/MALE/FEMALE.npz, or leave it out for the open body"
+
+
+@dataclass(frozen=True)
+class BodyFile:
+    """The arrays of the file in float64; posedirs is None if the file has no pose blend shapes."""
+
+    path: Path
+    template: np.ndarray
+    faces: np.ndarray
+    shape_directions: np.ndarray
+    expression_directions: np.ndarray
+    posedirs: np.ndarray | None
+    joint_regressor: np.ndarray
+    weights: np.ndarray
+    hand_mean: np.ndarray
+    hand_components: np.ndarray
+    hand_deviation: np.ndarray | None
+    landmark_faces: np.ndarray
+    landmark_barycentric: np.ndarray
+    contour_faces: np.ndarray
+    contour_barycentric: np.ndarray
+
+
+def load_body_file(path: Path | None, num_betas: int, num_expression: int) -> BodyFile:
+    """Read and check; `UserError` for anything but a complete SMPL-X file."""
+    path = OPEN_BODY if path is None else Path(path)
+    arrays = _read(path)
+    _check(path, arrays)
+    shape, expression = _directions(path, arrays["shapedirs"], num_betas, num_expression)
+    posedirs = arrays.get("posedirs")
+    if posedirs is not None and posedirs.size and np.any(posedirs):
+        posedirs = posedirs.astype(np.float64)
+    else:
+        posedirs = None
+    return BodyFile(
+        path=path,
+        template=arrays["v_template"].astype(np.float64),
+        faces=arrays["f"].astype(np.int64),
+        shape_directions=shape.astype(np.float64),
+        expression_directions=expression.astype(np.float64),
+        posedirs=posedirs,
+        joint_regressor=arrays["J_regressor"].astype(np.float64),
+        weights=arrays["weights"] / arrays["weights"].sum(1, keepdims=True, dtype=np.float64),
+        hand_mean=np.stack([arrays["hands_meanl"], arrays["hands_meanr"]]).astype(np.float64),
+        hand_components=np.stack(
+            [arrays["hands_componentsl"], arrays["hands_componentsr"]]
+        ).astype(np.float64),
+        hand_deviation=_hand_deviation(arrays),
+        landmark_faces=arrays["lmk_faces_idx"].astype(np.int64),
+        landmark_barycentric=arrays["lmk_bary_coords"].astype(np.float64),
+        contour_faces=arrays["dynamic_lmk_faces_idx"].astype(np.int64),
+        contour_barycentric=arrays["dynamic_lmk_bary_coords"].astype(np.float64),
+    )
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise UserError(f"Body file {path} does not exist: {_HINT}.")
+    if path.suffix == ".pkl":
+        raise UserError(
+            f"Body file {path} is a pickle, which could run code: {_HINT} (npz of the same model)."
+        )
+    wanted = {*_REQUIRED, "posedirs", "hands_coeffsl", "hands_coeffsr", "hands_deviationl",
+              "hands_deviationr"}  # fmt: skip
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not hasattr(file, "files"):
+                raise ValueError("a single array")
+            return {name: file[name] for name in file.files if name in wanted}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise UserError(f"Body file {path} is no readable npz ({error}): {_HINT}.") from error
+
+
+def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    tree = arrays.get("kintree_table")
+    joints = tree.shape[-1] if tree is not None and tree.ndim == 2 else None
+    if joints in (24, 52):
+        kind = "SMPL" if joints == 24 else "SMPL-H"
+        raise UserError(
+            f"Body file {path} is a {kind} model with {joints} joints; expected SMPL-X with "
+            f"{NUM_JOINTS}: {_HINT}."
+        )
+    if joints is not None and joints != NUM_JOINTS:
+        raise UserError(
+            f"Body file {path} has {joints} joints; expected SMPL-X's {NUM_JOINTS}: {_HINT}."
+        )
+    missing = [name for name in _REQUIRED if name not in arrays]
+    if missing:
+        what = "the hands (" if missing[0].startswith("hands") else "("
+        raise UserError(
+            f"Body file {path} lacks {what}{', '.join(missing)}): expected a complete SMPL-X file; "
+            f"{_HINT}."
+        )
+    vertices = arrays["v_template"].shape[0]
+    shapes = {
+        "v_template": (vertices, 3),
+        "f": (None, 3),
+        "shapedirs": (vertices, 3, None),
+        "J_regressor": (NUM_JOINTS, vertices),
+        "kintree_table": (2, NUM_JOINTS),
+        "weights": (vertices, NUM_JOINTS),
+        **{f"hands_mean{s}": (45,) for s in "lr"},
+        **{f"hands_components{s}": (45, 45) for s in "lr"},
+        "lmk_faces_idx": (51,),
+        "lmk_bary_coords": (51, 3),
+        "dynamic_lmk_faces_idx": (79, 17),
+        "dynamic_lmk_bary_coords": (79, 17, 3),
+    }
+    for name, shape in shapes.items():
+        found = arrays[name].shape
+        if len(found) != len(shape) or any(
+            want is not None and want != have for want, have in zip(shape, found, strict=True)
+        ):
+            raise UserError(
+                f"Body file {path} has {name} of shape {found}; expected "
+                f"{tuple('any' if s is None else s for s in shape)}: {_HINT}."
+            )
+    posedirs = arrays.get("posedirs")
+    if posedirs is not None and posedirs.size and posedirs.shape != (vertices, 3, 486):
+        raise UserError(
+            f"Body file {path} has posedirs of shape {posedirs.shape}; expected "
+            f"({vertices}, 3, 486): {_HINT}."
+        )
+    # The root's parent is stored as -1, or as the same bits unsigned
+    if tuple(int(p) for p in tree[0, 1:]) != PARENTS[1:]:  # type: ignore[index]
+        raise UserError(
+            f"Body file {path} has another joint tree than SMPL-X: its joints are in another "
+            f"order; {_HINT}."
+        )
+    for name in ("v_template", "shapedirs", "J_regressor", "weights"):
+        if not np.isfinite(arrays[name]).all():
+            raise UserError(f"Body file {path} has values in {name} that are not finite: {_HINT}.")
+
+
+def _directions(
+    path: Path, table: np.ndarray, num_betas: int, num_expression: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns 0.. and 300.. of a full file, or the two halves of a 20-column one."""
+    columns = table.shape[2]
+    start = _SMPLX_SHAPE_COLUMNS if columns > _SMPLX_SHAPE_COLUMNS else columns // 2
+    if num_betas > start or num_expression > columns - start:
+        raise UserError(
+            f"Body file {path} has {start} shape and {columns - start} expression components; "
+            f"{num_betas} and {num_expression} were asked for: ask for fewer."
+        )
+    return table[:, :, :num_betas], table[:, :, start : start + num_expression]
+
+
+def _hand_deviation(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
+    """(2,45) standard deviations of the hand components: stored, or of the registered hands.
+
+    SMPL-X files carry the coefficients of the scans that the hand space was learnt from.
+    """
+    stored = [arrays.get(f"hands_deviation{s}") for s in "lr"]
+    if all(x is not None and x.shape == (45,) for x in stored):
+        return np.stack([np.asarray(x, np.float64) for x in stored])
+    scans = [arrays.get(f"hands_coeffs{s}") for s in "lr"]
+    if all(x is not None and x.ndim == 2 and x.shape[1] == 45 and len(x) > 45 for x in scans):
+        return np.stack([np.asarray(x, np.float64).std(0) for x in scans])
+    return None

@@ -1,0 +1,96 @@
+"""Named points of a body mesh: keypoint vertices, motion-capture markers, contact regions.
+
+The open body's are in data/open_body_maps.json. SMPL-X's own 10,475-vertex mesh is known by its
+published vertex ids.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.errors import UserError
+
+SMPLX_VERTICES = 10_475
+
+# Vertex ids that the smplx package appends as joints 55 to 75 (its table of extra joints).
+_SMPLX_POINTS = {
+    "nose": 9120, "right_eye": 9929, "left_eye": 9448, "right_ear": 616, "left_ear": 6,
+    "left_big_toe": 5770, "left_small_toe": 5780, "left_heel": 8846,
+    "right_big_toe": 8463, "right_small_toe": 8474, "right_heel": 8635,
+    "left_thumb": 5361, "left_index": 4933, "left_middle": 5058, "left_ring": 5169,
+    "left_pinky": 5286,
+    "right_thumb": 8079, "right_index": 7669, "right_middle": 7794, "right_ring": 7905,
+    "right_pinky": 8022,
+}  # fmt: skip
+
+# Markers of the LEMO motion prior on SMPL-X: the SSM2 set's 67, then 4 of the face, 10 finger tips.
+_SMPLX_MARKERS = {
+    "C7": 3832, "CLAV": 5533, "LANK": 5882, "LFWT": 3486, "LBAK": 3336, "LBCEP": 4029,
+    "LBSH": 4137, "LBUM": 5694, "LBUST": 3228, "LCHEECK": 2081, "LELB": 4302, "LELBIN": 4363,
+    "LFIN": 4788, "LFRM2": 4379, "LFTHI": 3504, "LFTHIIN": 3998, "LHEE": 8846, "LIWR": 4726,
+    "LKNE": 3682, "LKNI": 3688, "LMT1": 5890, "LMT5": 5901, "LNWST": 3260, "LOWR": 4722,
+    "LBWT": 5697, "LRSTBEEF": 5838, "LSHO": 4481, "LTHI": 4088, "LTHMB": 4839, "LTIB": 3745,
+    "LTOE": 5787, "MBLLY": 5942, "RANK": 8576, "RFWT": 6248, "RBAK": 6127, "RBCEP": 6776,
+    "RBSH": 7192, "RBUM": 8388, "RBUSTLO": 8157, "RCHEECK": 8786, "RELB": 7040, "RELBIN": 7099,
+    "RFIN": 7524, "RFRM2": 7115, "RFRM2IN": 7303, "RFTHI": 6265, "RFTHIIN": 6746, "RHEE": 8634,
+    "RKNE": 6443, "RKNI": 6449, "RMT1": 8584, "RMT5": 8595, "RNWST": 6023, "ROWR": 7458,
+    "RBWT": 8391, "RRSTBEEF": 8532, "RSHO": 6627, "RTHI": 6832, "RTHMB": 7575, "RTIB": 6503,
+    "RTOE": 8481, "STRN": 5531, "T8": 5487, "LFHD": 707, "LBHD": 2026, "RFHD": 2198, "RBHD": 3066,
+    "CHN1": 8757, "CHN2": 9066, "MTH3": 8985, "MTH7": 8947, "LIDX3": 4931, "LMID3": 5045,
+    "LPNK3": 5268, "LRNG3": 5149, "LTHM4": 5346, "RIDX3": 7667, "RMID3": 7781, "RPNK3": 8001,
+    "RRNG3": 7884, "RTHM4": 8082,
+}  # fmt: skip
+MARKER_NAMES: tuple[str, ...] = tuple(_SMPLX_MARKERS)
+POINT_NAMES: tuple[str, ...] = tuple(_SMPLX_POINTS)
+
+
+@dataclass(frozen=True)
+class BodyMaps:
+    """points: vertex id by name (`POINT_NAMES`); markers (81,) in `MARKER_NAMES`' order; regions:
+    vertex ids by name, or None to find them on the template.
+    """
+
+    points: dict[str, int]
+    markers: np.ndarray
+    regions: dict[str, np.ndarray] | None
+
+
+def smplx_maps() -> BodyMaps:
+    return BodyMaps(_SMPLX_POINTS, np.array(list(_SMPLX_MARKERS.values())), None)
+
+
+def maps_path(body_path: Path) -> Path:
+    return body_path.with_name(body_path.stem + "_maps.json")
+
+
+def load_maps(body_path: Path, num_vertices: int) -> BodyMaps:
+    """The `<body>_maps.json` beside the body file, or SMPL-X's published ids."""
+    path = maps_path(body_path)
+    if path.exists():
+        try:
+            read = json.loads(path.read_text())
+            points = {name: int(read["points"][name]) for name in POINT_NAMES}
+            markers = np.array([int(read["markers"][name]) for name in MARKER_NAMES])
+            regions = {name: np.array(ids, int) for name, ids in read["regions"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UserError(
+                f"Body map {path} cannot be used ({error!r}): expected the objects points, markers "
+                "and regions, each with every name; compare it with the open body's map."
+            ) from error
+        used = [*points.values(), *markers, *(i for ids in regions.values() for i in ids)]
+        if min(used) < 0 or max(used) >= num_vertices:
+            raise UserError(
+                f"Body map {path} names vertices outside the body's {num_vertices}: take the map "
+                "that was made for this mesh."
+            )
+        return BodyMaps(points, markers, regions)
+    if num_vertices == SMPLX_VERTICES:
+        return smplx_maps()
+    raise UserError(
+        f"Body file {body_path} has {num_vertices} vertices, not SMPL-X's {SMPLX_VERTICES}, and no "
+        f"{path.name} beside it: add that map, or use an SMPLX_*.npz file."
+    )

@@ -1,0 +1,283 @@
+"""The body: any file in SMPL-X's format, posed, with exact derivatives.
+
+Loper et al. 2015 (SMPL) and Pavlakos et al. 2019 (SMPL-X):
+v = W(T + S [betas, expression] + P vec(R(theta) - I), J(T + S [betas, expression]), theta).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.jacobian import Linearisation, blend, linearise, shaped_points
+from intercap_core.body.joints import PARENTS
+from intercap_core.body.keypoints import KeypointMap, keypoint_map
+from intercap_core.body.kinematics import PosedJoints, pose_joints, rotation_from_axis_angle
+from intercap_core.body.loading import BodyFile, load_body_file
+from intercap_core.body.maps import MARKER_NAMES, load_maps
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.body.regions import find_regions
+from intercap_core.body.selection import Selection, select
+
+_KEPT_SELECTIONS = 8
+_MOUTH_OUTLINE = slice(31, 43)  # landmarks 48 to 59 of dlib's 68
+_FALLBACK_HAND_DEVIATION = 0.35  # rad; for files that do not tell
+
+
+@dataclass(frozen=True)
+class BodyOutput:
+    """vertices (B,V,3), or those asked for, and joints (B,55,3), metres."""
+
+    vertices: Tensor
+    joints: Tensor
+
+
+@dataclass(frozen=True)
+class BodyJacobian:
+    """Values and derivatives by the P parameters, in the order of `BodyParameters.vector`.
+
+    vertices (B,V,3), joints (B,55,3), d_vertices (B,V,3,P), d_joints (B,55,3,P); joints and
+    d_joints are None unless asked for.
+    """
+
+    vertices: Tensor
+    d_vertices: Tensor
+    joints: Tensor | None
+    d_joints: Tensor | None
+
+
+class BodyModel:
+    """A body of V vertices and 55 joints in SMPL-X's conventions (y up, facing +z, metres).
+
+    faces (F,3) int64. parents: of each joint, -1 for the pelvis. hand_mean (2,45) and
+    hand_components (2,45,45), left then right: axis-angle = mean + coefficients @ components;
+    hand_deviation (2,45): usual size of each coefficient. keypoint_map, regions (name to vertex
+    ids), markers (81,) LEMO's marker vertices by `marker_names`.
+    """
+
+    marker_names = MARKER_NAMES
+
+    def __init__(self, file: BodyFile, device: torch.device, dtype: torch.dtype) -> None:
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.as_tensor(array, dtype=dtype, device=device)
+
+        self.path = file.path
+        self.device, self.dtype = device, dtype
+        self.num_betas = file.shape_directions.shape[2]
+        self.num_expression = file.expression_directions.shape[2]
+        self.faces = torch.as_tensor(file.faces, device=device)
+        self.parents = PARENTS
+        directions = np.concatenate([file.shape_directions, file.expression_directions], 2)
+        rest_joints = file.joint_regressor @ file.template
+        self._template = tensor(file.template)
+        self._directions = tensor(directions)
+        self._posedirs = None if file.posedirs is None else tensor(file.posedirs)
+        self._weights = tensor(file.weights)
+        self._rest_joints = tensor(rest_joints)
+        self._joint_directions = tensor(np.einsum("jv,vcs->jcs", file.joint_regressor, directions))
+        self.hand_mean = tensor(file.hand_mean)
+        self.hand_components = tensor(file.hand_components)
+        deviation = file.hand_deviation
+        self.hand_deviation = tensor(
+            np.full((2, 45), _FALLBACK_HAND_DEVIATION) if deviation is None else deviation
+        )
+
+        maps = load_maps(file.path, len(file.template))
+        self.keypoint_map: KeypointMap = keypoint_map(
+            maps.points,
+            file.faces,
+            file.landmark_faces,
+            file.landmark_barycentric,
+            file.contour_faces[0],
+            file.contour_barycentric[0],
+        )
+        self._keypoint_matrix = tensor(self.keypoint_map.matrix)
+        self.markers = maps.markers
+        self.regions = maps.regions or _regions(file, rest_joints)
+        self._selections: OrderedDict[bytes, Selection] = OrderedDict()
+
+    @classmethod
+    def load(
+        cls,
+        path: Path | None = None,
+        *,
+        num_betas: int = 10,
+        num_expression: int = 10,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> BodyModel:
+        """Load an SMPL-X npz (300+100 or 10+10 shape columns), or the open body without a path.
+
+        Raises `UserError` for a file that is missing, is SMPL or SMPL-H, or is incomplete.
+        """
+        return cls(load_body_file(path, num_betas, num_expression), torch.device(device), dtype)
+
+    @property
+    def num_vertices(self) -> int:
+        return self._template.shape[0]
+
+    @property
+    def num_parameters(self) -> int:
+        return 168 + self.num_betas + self.num_expression
+
+    @property
+    def template(self) -> Tensor:
+        """(V,3) mean shape in the T-pose."""
+        return self._template
+
+    @property
+    def skinning_weights(self) -> Tensor:
+        """(V,55), rows sum to one."""
+        return self._weights
+
+    def zeros(self, batch: int = 1) -> BodyParameters:
+        """T-posed mean bodies with flat hands."""
+        return BodyParameters.zeros(
+            batch,
+            num_betas=self.num_betas,
+            num_expression=self.num_expression,
+            device=self.device,
+            dtype=self.dtype,
+        )
+
+    def parameters(self, vector: Tensor) -> BodyParameters:
+        """(B,P) parameter vector -> parameters."""
+        return BodyParameters.from_vector(vector, num_betas=self.num_betas)
+
+    def hand_pose(self, coefficients: Tensor, side: int) -> Tensor:
+        """(B,n) coefficients of the first n components -> (B,45) axis-angle; side 0 left, 1 right."""
+        count = coefficients.shape[-1]
+        return self.hand_mean[side] + coefficients @ self.hand_components[side, :count]
+
+    def forward(
+        self, params: BodyParameters, *, vertex_ids: Tensor | np.ndarray | None = None
+    ) -> BodyOutput:
+        """Posed vertices (B,V,3), or of `vertex_ids` (N,) alone (B,N,3), and joints (B,55,3)."""
+        selection = self._select(vertex_ids, joints=False)
+        points, posed, _ = self._rest(selection, params)
+        matrix, offset = blend(selection, posed)
+        vertices = (matrix @ points[..., None])[..., 0] + offset
+        return BodyOutput(vertices, posed.joints)
+
+    __call__ = forward
+
+    def linearise(
+        self,
+        params: BodyParameters,
+        *,
+        vertex_ids: Tensor | np.ndarray | None = None,
+        joints: bool = False,
+    ) -> Linearisation:
+        """Posed points with what their derivatives are made of; see `Linearisation`.
+
+        The points are the vertices (all, or `vertex_ids`), followed by the joints if asked for.
+        """
+        with torch.no_grad():
+            selection = self._select(vertex_ids, joints=joints)
+            points, posed, axis_angle = self._rest(selection, params)
+            return linearise(selection, points, posed, axis_angle, self._joint_directions)
+
+    def jacobian(
+        self,
+        params: BodyParameters,
+        *,
+        vertex_ids: Tensor | np.ndarray | None = None,
+        joints: bool = False,
+    ) -> BodyJacobian:
+        """Every derivative as a dense array; for more than a few hundred points use `linearise`."""
+        lin = self.linearise(params, vertex_ids=vertex_ids, joints=joints)
+        full = lin.full()
+        count = lin.selection.num_vertices
+        return BodyJacobian(
+            vertices=lin.vertices,
+            d_vertices=full[:, :count],
+            joints=lin.joints if joints else None,
+            d_joints=full[:, count:] if joints else None,
+        )
+
+    def keypoints(self, output: BodyOutput) -> Tensor:
+        """(B,135,3) from all vertices, or from those of `keypoint_map.vertex_ids`, and joints."""
+        vertices, ids = output.vertices, self.keypoint_map.vertex_ids
+        if vertices.shape[1] == self.num_vertices:
+            vertices = vertices[:, torch.as_tensor(ids, device=vertices.device)]
+        elif vertices.shape[1] != len(ids):
+            raise ValueError(
+                f"expected {self.num_vertices} vertices or the {len(ids)} of "
+                f"keypoint_map.vertex_ids, got {vertices.shape[1]}"
+            )
+        return self._keypoint_matrix @ torch.cat([vertices, output.joints], 1)
+
+    def keypoints_of(self, params: BodyParameters) -> Tensor:
+        """(B,135,3), evaluating only the vertices that keypoints use."""
+        return self.keypoints(self.forward(params, vertex_ids=self.keypoint_map.vertex_ids))
+
+    def keypoint_jacobian(self, params: BodyParameters) -> tuple[Tensor, Tensor]:
+        """Keypoints (B,135,3) and their derivatives (B,135,3,P)."""
+        lin = self.linearise(params, vertex_ids=self.keypoint_map.vertex_ids, joints=True)
+        full = lin.full()
+        batch = full.shape[0]
+        mixed = self._keypoint_matrix @ full.reshape(batch, full.shape[1], -1)
+        return self._keypoint_matrix @ lin.points, mixed.reshape(batch, -1, *full.shape[2:])
+
+    def _select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool) -> Selection:
+        """The selection for these vertices; the last few are kept."""
+        if vertex_ids is None:
+            ids, key = None, b"all"
+        else:
+            ids = torch.as_tensor(vertex_ids, dtype=torch.long, device=self.device)
+            key = ids.cpu().numpy().tobytes()
+        key += b"j" if joints else b"v"
+        if key not in self._selections:
+            at = slice(None) if ids is None else ids
+            self._selections[key] = select(
+                self._template[at],
+                self._directions[at],
+                None if self._posedirs is None else self._posedirs[at],
+                self._weights[at],
+                (self._rest_joints, self._joint_directions) if joints else None,
+            )
+            if len(self._selections) > _KEPT_SELECTIONS:
+                self._selections.popitem(last=False)
+        self._selections.move_to_end(key)
+        return self._selections[key]
+
+    def _rest(
+        self, selection: Selection, params: BodyParameters
+    ) -> tuple[Tensor, PosedJoints, Tensor]:
+        """Rest points (B,N,3), posed joints, axis-angle (B,55,3)."""
+        batch = params.batch
+        axis_angle = params.full_pose()
+        shape = torch.cat(
+            [params.betas.expand(batch, -1), params.expression.expand(batch, -1)], 1
+        )
+        if shape.shape[1] != self.num_betas + self.num_expression:
+            raise ValueError(
+                f"expected {self.num_betas} betas and {self.num_expression} expression "
+                f"coefficients, got {params.betas.shape[1]} and {params.expression.shape[1]}"
+            )
+        local = rotation_from_axis_angle(axis_angle)
+        rest = self._rest_joints + (
+            shape @ self._joint_directions.reshape(-1, shape.shape[1]).T
+        ).reshape(batch, -1, 3)
+        posed = pose_joints(rest, local, params.transl.expand(batch, -1))
+        return shaped_points(selection, shape, local), posed, axis_angle
+
+
+def _regions(file: BodyFile, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
+    corners = file.template[file.faces[file.landmark_faces]]
+    landmarks = np.einsum("nk,nkc->nc", file.landmark_barycentric, corners)
+    return find_regions(
+        file.template, file.faces, file.weights, rest_joints, landmarks[_MOUTH_OUTLINE]
+    )
+
+
+def with_hand_mean(model: BodyModel, params: BodyParameters) -> BodyParameters:
+    """The parameters with both hands in the model's mean pose."""
+    return replace(
+        params, left_hand_pose=model.hand_mean[:1], right_hand_pose=model.hand_mean[1:]
+    )

