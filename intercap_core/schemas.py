@@ -67,7 +67,9 @@ DETECTIONS = Schema(
     attributes={"sequence": "sequence name"},
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
-        "keypoints_found": Field(("T", "C"), "bool", "a keypoint file exists for this image"),
+        "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),
+        "note": Field(("C",), "str", "what is degraded about this camera's detections, in words"),
+        "keypoints_found": Field(("T", "C"), "bool", "a readable keypoint file exists for this image"),
         "candidates_found": Field(("T", "C"), "bool", "candidates are known for this image (maybe none)"),
         "cameras/{camera}/people_offsets": Field(("T+1",), "int64", "first person of each set, and the end"),
         "cameras/{camera}/people": Field(("P", "135", "3"), "float32", "x, y, confidence in the 135-point order", "px", "colour image"),
@@ -277,22 +279,24 @@ TRUTH = Schema(
 )  # fmt: skip
 
 _PER_STAGE_TRUTH = {
-    f"truth/{stage}/{key}": Field(dims, "float32", doc, units, optional=True)
+    f"truth/{stage}/{key}": Field(dims, dtype, doc, units, optional=True)
     for stage in ("object_track", "body_fit", "joint")
-    for key, dims, doc, units in (
-        ("body_pve", ("T",), "mean vertex error", "m"),
-        ("body_mpjpe", ("T",), "mean error of the 22 body joints", "m"),
-        ("hand_mpjpe", ("T", "2"), "mean error of 15 joints and 5 tips, left and right", "m"),
-        ("hand_mpjpe_wrist", ("T", "2"), "the same after aligning the wrist", "m"),
-        ("object_translation", ("T",), "error at the centre of mass", "m"),
-        ("object_rotation", ("T",), "angle, the smallest over the symmetry group", "deg"),
-        ("acceleration_body", ("T",), "error of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
-        ("acceleration_hands", ("T",), "the same over 30 finger joints", "m/frame^2"),
-        ("acceleration_object", ("T",), "the same at the object's centre", "m/frame^2"),
-        ("region_contact", ("T", "12"), "1 where the fit touches within 4.5 mm", "1"),
-        ("vertex_contact_counts", ("T", "4"), "true and false positives, false and true negatives at 4.5 mm", "1"),
-        ("body_floor", ("T",), "vertex-to-cloud of the true body over what cameras could see", "m"),
-        ("object_floor", ("T",), "vertex-to-cloud of the true object over what cameras could see", "m"),
+    for key, dims, dtype, doc, units in (
+        ("body_pve", ("T",), "float32", "mean vertex error", "m"),
+        ("body_mpjpe", ("T",), "float32", "mean error of the 22 body joints", "m"),
+        ("hand_mpjpe", ("T", "2"), "float32", "mean error of 15 joints and 5 tips, left and right", "m"),
+        ("hand_mpjpe_wrist", ("T", "2"), "float32", "the same after aligning the wrist", "m"),
+        ("joint_normalised", ("T", "22"), "float32", "error over stated deviation, median 1 if honest", "1"),
+        ("object_translation", ("T",), "float32", "error at the centre of mass", "m"),
+        ("object_rotation", ("T",), "float32", "angle, the smallest over the symmetry group", "deg"),
+        ("object_normalised", ("T",), "float32", "translation error over stated deviation, median 1 if honest", "1"),
+        ("object_centre", ("T", "3"), "float64", "centre of mass of the fitted object", "m"),
+        ("acceleration_body", ("T",), "float32", "error of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
+        ("acceleration_hands", ("T",), "float32", "the same over 30 finger joints", "m/frame^2"),
+        ("acceleration_object", ("T",), "float32", "the same at the object's centre", "m/frame^2"),
+        ("region_contact", ("T", "12"), "bool", "the fit touches within 4.5 mm; body_fit with the tracked object", "1"),
+        ("contact_frame", ("T",), "bool", "some vertex of the fit touches within 4.5 mm", "1"),
+        ("vertex_contact_counts", ("T", "W", "4"), "int32", "true and false positives, false and true negatives at each of sweep", "1"),
     )
 }  # fmt: skip
 
@@ -309,6 +313,8 @@ METRICS = Schema(
     },
     fields={
         "body_to_object": Field(("T", "V"), "float32", "signed distance of each body vertex to the object's surface, negative inside, capped at 0.25", "m"),
+        "object_sample_points": Field(("N", "3"), "float64", "points spread evenly over the object's surface", "m", "object"),
+        "object_sample_contact": Field(("N",), "int32", "frames in which the point is within 4.5 mm of the body"),
         "object_to_body": Field(("T", "Vo"), "float32", "signed distance of each object vertex to the body's surface, negative inside, capped at 0.25", "m"),
         "contact_frame": Field(("T",), "bool", "a body vertex within 4.5 mm of the object"),
         "region_names": Field(("R",), "str", "contact regions"),
@@ -316,22 +322,51 @@ METRICS = Schema(
         "penetration_mean": Field(("T",), "float32", "over body vertices inside the object; 0 = none", "m"),
         "penetration_median": Field(("T",), "float32", "the same, median", "m"),
         "penetration_max": Field(("T",), "float32", "the same, deepest", "m"),
-        "penetration_object": Field(("T",), "float32", "mean depth of object samples inside the body", "m"),
-        "ground_penetration": Field(("T",), "float32", "deepest vertex below the floor", "m"),
+        "penetration_object": Field(("T",), "float32", "mean depth of those object points that are inside the body", "m"),
+        "ground_penetration": Field(("T",), "float32", "deepest vertex of body or object below the floor; NaN = no floor", "m"),
         "body_to_cloud": Field(("T",), "float32", "mean over all body vertices, as the paper; NaN = no cloud", "m"),
         "object_to_cloud": Field(("T",), "float32", "mean over all object vertices; NaN = no cloud", "m"),
         "body_visible_to_cloud": Field(("T",), "float32", "area-sampled, over what cameras can see", "m"),
         "object_visible_to_cloud": Field(("T",), "float32", "area-sampled, over what cameras can see", "m"),
-        "cloud_to_body": Field(("T",), "float32", "mean over the person's cloud", "m"),
+        "cloud_to_body": Field(("T",), "float32", "mean over the person's points, each capped at 0.25", "m"),
         "acceleration_body": Field(("T",), "float32", "norm of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
         "acceleration_object": Field(("T",), "float32", "the same at the object's centre", "m/frame^2"),
         "flagged": Field(("T",), "bool", "some stage does not trust this frame"),
         "flag_reason": Field(("T",), "str", "why; empty = not flagged"),
         **_PER_STAGE_TRUTH,
+        "truth/sweep": Field(("W",), "float64", "contact thresholds of vertex_contact_counts", "m", optional=True),
         "truth/contact_region": Field(("T", "12"), "bool", "true contact by region", optional=True),
+        "truth/contact_frame": Field(("T",), "bool", "a true body vertex within 4.5 mm of the true object", optional=True),
         "truth/penetration_mean": Field(("T",), "float32", "the truth's own penetration", "m", optional=True),
+        "truth/body_floor": Field(("T",), "float32", "body_to_cloud with the true body", "m", optional=True),
+        "truth/object_floor": Field(("T",), "float32", "object_to_cloud with the true object", "m", optional=True),
+        "truth/body_visible_floor": Field(("T",), "float32", "body_visible_to_cloud with the true body", "m", optional=True),
+        "truth/object_visible_floor": Field(("T",), "float32", "object_visible_to_cloud with the true object", "m", optional=True),
         "truth/object_views": Field(("T",), "int8", "views that truly see the object", optional=True),
         "truth/object_moving": Field(("T",), "bool", "the true object moves", optional=True),
+        "truth/object_centre": Field(("T", "3"), "float64", "true centre of mass", "m", "master", optional=True),
+        "truth/extrinsics_before": Field(("C",), "float32", "RMS displacement over a 2 m cube by each camera's error as given", "m", optional=True),
+        "truth/extrinsics_after": Field(("C",), "float32", "the same after refinement", "m", optional=True),
+    },
+)  # fmt: skip
+
+HEATMAPS = Schema(
+    name="heatmaps",
+    version=1,
+    stage="dataset",
+    frame="none: values on meshes in rest pose",
+    attributes={
+        "dataset": "dataset name",
+        "contact_m": "distance that counts as contact, metres",
+        "body_frames": "frames that the body's map counts",
+    },
+    fields={
+        "body_likelihood": Field(("V",), "float32", "share of frames in which the vertex touches an object"),
+        "object_names": Field(("O",), "str", "objects in the order of object_offsets"),
+        "object_frames": Field(("O",), "int64", "frames that each object's map counts"),
+        "object_offsets": Field(("O+1",), "int64", "first surface point of each object, and the end"),
+        "object_points": Field(("N", "3"), "float64", "points spread evenly over each object's surface", "m", "object"),
+        "object_likelihood": Field(("N",), "float32", "share of frames in which the point touches the body"),
     },
 )  # fmt: skip
 

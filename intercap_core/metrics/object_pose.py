@@ -1,0 +1,82 @@
+"""Errors of an object's pose against the true one: arrays in, numbers out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.metrics.body import MEDIAN_CHI_3
+from intercap_core.rigid.symmetry import SymmetryGroup
+
+LOST_TRANSLATION_M = 0.050
+LOST_ROTATION_DEG = 20.0
+FOUND_TRANSLATION_M = 0.020
+FOUND_ROTATION_DEG = 10.0
+
+
+def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """A point (3,) of the object under poses (..., 3, 3), (..., 3): (..., 3)."""
+    return rotation @ point + translation
+
+
+def translation_error(
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    true_rotation: np.ndarray,
+    true_translation: np.ndarray,
+    centre: np.ndarray,
+) -> np.ndarray:
+    """Distance (...) of the object's centre of mass from where it truly is, metres.
+
+    Symmetries leave the centre of mass in place, so no element of the group makes it smaller.
+    """
+    fitted = posed_point(rotation, translation, centre)
+    true = posed_point(true_rotation, true_translation, centre)
+    return np.linalg.norm(fitted - true, axis=-1)
+
+
+def rotation_error_deg(
+    rotation: np.ndarray, true_rotation: np.ndarray, symmetry: SymmetryGroup
+) -> np.ndarray:
+    """Geodesic angle (...), the smallest over the symmetry group, degrees."""
+    return symmetry.rotation_error_deg(rotation, true_rotation)
+
+
+def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
+    """Which poses are truly lost (...): off by more than 50 mm or 20 degrees."""
+    return (translation_error_m > LOST_TRANSLATION_M) | (
+        rotation_error_degrees > LOST_ROTATION_DEG
+    )
+
+
+def first_seen_found(
+    translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray, views: np.ndarray
+) -> bool | None:
+    """Whether the first frame that truly has a view is within 20 mm and 10 degrees.
+
+    All (T,); None where no frame has a view.
+    """
+    seen = np.flatnonzero(views > 0)
+    if len(seen) == 0:
+        return None
+    first = seen[0]
+    return bool(
+        translation_error_m[first] < FOUND_TRANSLATION_M
+        and rotation_error_degrees[first] < FOUND_ROTATION_DEG
+    )
+
+
+def normalised_translation_error(
+    translation: np.ndarray, true_translation: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Mahalanobis length (T,) of the translation's error over its median: median 1 if honest.
+
+    ``covariance`` (T, 6, 6) of (rotation vector, translation); NaN where it says nothing.
+    """
+    block = covariance[:, 3:, 3:]
+    error = translation - true_translation
+    length = np.full(len(error), np.nan)
+    known = np.isfinite(block).all((1, 2))
+    known[known] = np.linalg.eigvalsh(block[known])[:, 0] > 0
+    solved = np.linalg.solve(block[known], error[known][..., None])[..., 0]
+    length[known] = np.sqrt(np.einsum("ti,ti->t", error[known], solved))
+    return length / MEDIAN_CHI_3

@@ -1,0 +1,132 @@
+"""The depth cameras' points of one frame that the segmentation gives to the person or the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.camera.clouds import colour_lookup, depth_points
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply
+from intercap_core.capture.frames import Frames
+from intercap_core.detection.masks import Runs
+
+# Depth pixels are looked at only this far around the projected meshes: a fit that is further off
+# than this has an error that needs no exact figure.
+MARGIN_M = 0.25
+_POINTS_PER_VIEW = 12000  # beyond it every second, third, ... pixel of a regular grid is taken
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMasks:
+    """Masks of one colour image: the person's and that of the object's kept candidate."""
+
+    person: Runs | None
+    object_: Runs | None
+
+
+def shown_set(slip: np.ndarray, t: int, c: int) -> int | None:
+    """The frame set whose image of camera ``c`` shows moment ``t``; None where none does.
+
+    ``slip`` (T, C): image of set s was taken ``slip[s, c]`` frames late and shows s + slip.
+    """
+    first = max(0, t - 8)
+    near = np.arange(first, min(len(slip), t + 9))
+    match = near[near + slip[near, c] == t]
+    return int(match[0]) if len(match) else None
+
+
+def segmented_points(
+    depth: np.ndarray, camera: Camera, masks: ViewMasks, near: np.ndarray, bias_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the person and of the object (N, 3) float32, master frame, metres.
+
+    ``depth`` (H, W) uint16 mm; ``near`` (M, 3) points of the meshes, master frame, around which
+    depth pixels are looked at; ``bias_m`` is subtracted from the depth. A point belongs to the
+    mask that covers the colour pixel showing it.
+    """
+    nothing = np.empty((0, 3), np.float32)
+    if camera.depth is None or (masks.person is None and masks.object_ is None):
+        return nothing, nothing
+    index = _candidates(depth, camera, near)
+    if len(index) == 0:
+        return nothing, nothing
+    lookup = colour_lookup(depth, camera, index)
+    colour_index = np.where(lookup.hidden, -1, lookup.colour_index)
+    cloud = depth_points(depth, camera, lookup.depth_index)
+    points = cloud.points
+    if bias_m:
+        points = points * (1 - np.float32(bias_m) / points[:, 2:])
+    points = apply(camera.master_from_depth, points)
+
+    def pick(runs: Runs | None) -> np.ndarray:
+        return nothing if runs is None else points[runs.sample_flat(colour_index)]
+
+    return pick(masks.person), pick(masks.object_)
+
+
+def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarray:
+    """Flat depth pixels in the box of ``near`` (M, 3) and in its range of depths, thinned."""
+    lens = camera.depth
+    assert lens is not None
+    local = apply(camera.depth_from_master, near)
+    local = local[lens.inside_model(local)]
+    if len(local) == 0:
+        return np.empty(0, np.int64)
+    pixels = lens.project(local)
+    nearest, farthest = local[:, 2].min() - MARGIN_M, local[:, 2].max() + MARGIN_M
+    margin = lens.fx * MARGIN_M / max(float(local[:, 2].min()), MARGIN_M)
+    x0, y0 = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
+    x1, y1 = (int(np.ceil(v + margin)) + 1 for v in pixels.max(0))
+    window = depth[y0:y1, x0:x1]
+    wanted = (window > 1e3 * max(nearest, 0.0)) & (window < 1e3 * farthest)
+    step = int(np.ceil(np.sqrt(np.count_nonzero(wanted) / _POINTS_PER_VIEW)))
+    rows, columns = np.nonzero(wanted[::step, ::step])
+    return (rows * step + y0) * lens.width + columns * step + x0
+
+
+class SegmentedClouds:
+    """Person's and object's points of every frame, over all views.
+
+    ``person_masks`` (T, C) of COCO RLE bytes, empty = none; ``candidate_masks`` the same of the
+    candidate that the object's track kept; ``slip`` (T, C) and ``depth_bias`` (C,) of the scene.
+    """
+
+    def __init__(
+        self,
+        frames: Frames,
+        rig: Rig,
+        person_masks: list[list[bytes]],
+        candidate_masks: list[list[bytes]],
+        slip: np.ndarray,
+        depth_bias: np.ndarray,
+    ) -> None:
+        self._frames = frames
+        self._rig = rig
+        self._masks = (person_masks, candidate_masks)
+        self._slip = slip
+        self._bias = depth_bias
+
+    def at(self, t: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points of person and object (N, 3) of frame ``t``, near the meshes' points (M, 3)."""
+        person, object_ = [], []
+        for c, camera in enumerate(self._rig):
+            shown = shown_set(self._slip, t, c)
+            if shown is None:
+                continue
+            depth = self._frames.depth(shown, c)
+            if depth is None:
+                continue
+            colour = camera.colour
+            runs = [
+                Runs(masks[shown][c], colour.height, colour.width) if masks[shown][c] else None
+                for masks in self._masks
+            ]
+            bias = float(self._bias[c])
+            found = segmented_points(depth, camera, ViewMasks(*runs), near, bias)
+            person.append(found[0])
+            object_.append(found[1])
+        if not person:
+            return np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+        return np.concatenate(person), np.concatenate(object_)
