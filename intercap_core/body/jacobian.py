@@ -56,8 +56,8 @@ def blend(selection: Selection, posed: PosedJoints) -> tuple[Tensor, Tensor]:
 class Linearisation:
     """N posed points (B,N,3) of B bodies, in metres, and their derivatives.
 
-    turns (B,N,L,3): a_k of each joint in `selection.chain`. frames (B,55,3,3): world turn of a joint
-    for a change of its axis-angle. shape (B,N,3,S): derivatives by betas and expression.
+    turns (B,N,L,3): a_k of each joint in `selection.chain`. frames (B,55,3,3): world turn of a
+    joint for a change of its axis-angle. shape (B,N,3,S): derivatives by betas and expression.
     correctives (B,N,3,54,3) or None: what the pose blend shapes add.
     """
 

@@ -18,7 +18,7 @@ _REQUIRED = (
     "dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords",
 )  # fmt: skip
 _SMPLX_SHAPE_COLUMNS = 300  # a full file's expression starts here
-_HINT = "point the body model at an SMPLX_NEUTRAL/MALE/FEMALE.npz, or leave it out for the open body"
+_HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the open body"
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ class BodyModel:
         return BodyParameters.from_vector(vector, num_betas=self.num_betas)
 
     def hand_pose(self, coefficients: Tensor, side: int) -> Tensor:
-        """(B,n) coefficients of the first n components -> (B,45) axis-angle; side 0 left, 1 right."""
+        """(B,n) coefficients of the first components -> (B,45) axis-angle; side 0 left, 1 right."""
         count = coefficients.shape[-1]
         return self.hand_mean[side] + coefficients @ self.hand_components[side, :count]
 

@@ -111,7 +111,7 @@ def _eye(front: _Front, weights: np.ndarray, eye: np.ndarray) -> tuple[np.ndarra
 
 
 def _nose(front: _Front, eye_y: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bridge (4,2) from the eyes down to the tip, and base (5,2) from the right wing to the left."""
+    """Bridge (4,2) from the eyes to the tip, and base (5,2) from the right wing to the left."""
     ys = eye_y - np.arange(0, 0.07, _STEP)
     _, _, z = front.cast(np.zeros(1), ys)
     tip = int(z[: round(0.06 / _STEP)].argmax())
@@ -176,8 +176,8 @@ def _contours(template: np.ndarray, source: Source, eye_y: float) -> tuple[np.nd
     forward = template[:, 2] - source_ear_z(template, weights)
     no_ear = np.ones(len(template), bool)
     no_ear[source.faces[_mask(source, "ears")]] = False
-    chosen = np.flatnonzero((head > 0.75) & skin & no_ear & (forward > 0.012) & (template[:, 1] < eye_y
-                            + 0.012))  # fmt: skip
+    low = template[:, 1] < eye_y + 0.012
+    chosen = np.flatnonzero((head > 0.75) & skin & no_ear & low & (forward > 0.012))
     one_face = np.full(len(template), -1)
     one_face[source.faces[::-1].ravel()] = np.repeat(np.arange(len(source.faces))[::-1], 3)
     angles = np.pi + np.pi * np.arange(17) / 16

@@ -1,0 +1,128 @@
+"""Pictures of the baked body for the documentation, and for looking at it with one's own eyes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from intercap_core.body.model import BodyModel, with_hand_mean
+from intercap_core.body.parameters import BodyParameters
+
+from .hands import mirrored, named_grasp
+from .pictures import save, shade
+
+_COLOURS = np.array([
+    [0.90, 0.30, 0.25], [0.25, 0.45, 0.90], [0.95, 0.70, 0.20], [0.30, 0.75, 0.85],
+    [0.45, 0.75, 0.35], [0.60, 0.40, 0.80], [0.95, 0.50, 0.70], [0.40, 0.40, 0.45],
+    [0.75, 0.85, 0.30], [0.85, 0.55, 0.30], [0.35, 0.65, 0.60], [0.80, 0.15, 0.40],
+    [0.55, 0.60, 0.95], [0.70, 0.50, 0.35],
+])  # fmt: skip
+
+
+def _tips(model: BodyModel) -> tuple[np.ndarray, np.ndarray]:
+    """Rest joints (55,3) and finger tips (10,3), left then right, of the mean body."""
+    out = model.forward(model.zeros())
+    points = model.keypoints(out)[0].numpy()
+    order = (1, 2, 4, 3, 0)  # OpenPose has the thumb first and the ring before the little finger
+    tips = [25 + 21 * side + 4 + 4 * f for side in (0, 1) for f in order]
+    return out.joints[0].numpy(), points[tips]
+
+
+def grasping(model: BodyModel, grasp: str) -> BodyParameters:
+    """Both hands in a named grasp, T-posed otherwise."""
+    joints, tips = _tips(model)
+    left = named_grasp(grasp, joints.astype(float), tips.astype(float))
+    params = model.zeros()
+    params.left_hand_pose[0] = torch.as_tensor(left)
+    params.right_hand_pose[0] = torch.as_tensor(mirrored(left))
+    return params
+
+
+def posed(model: BodyModel, **angles: tuple[float, float, float]) -> BodyParameters:
+    """The mean-handed body with some joints turned, axis-angle in radians by joint name."""
+    from intercap_core.body.joints import JOINT_INDEX
+
+    params = with_hand_mean(model, model.zeros())
+    for name, angle in angles.items():
+        k = JOINT_INDEX[name]
+        target = params.jaw_pose if name == "jaw" else params.body_pose
+        column = 0 if name == "jaw" else 3 * (k - 1)
+        target[0, column:column + 3] = torch.tensor(angle)
+    return params
+
+
+REACH = {
+    "left_shoulder": (0.2, -0.7, -0.5), "left_elbow": (0.0, -0.7, 0.0),
+    "right_shoulder": (0.1, 0.2, 1.2), "right_elbow": (0.0, 0.3, 0.0),
+    "right_hip": (-0.25, 0.0, 0.05), "right_knee": (0.5, 0.0, 0.0), "head": (0.2, 0.25, 0.0),
+    "spine2": (0.15, 0.0, 0.0),
+}  # fmt: skip
+SIT = {
+    "left_hip": (-1.5, 0.0, 0.1), "right_hip": (-1.45, 0.0, -0.1), "left_knee": (1.5, 0.0, 0.0),
+    "right_knee": (1.55, 0.0, 0.0), "left_shoulder": (0.0, -0.3, -1.1),
+    "right_shoulder": (0.0, 0.3, 1.1), "left_elbow": (0.0, -0.9, 0.0),
+    "right_elbow": (0.0, 0.9, 0.0), "spine1": (0.1, 0.0, 0.0),
+}  # fmt: skip
+
+
+def render(folder: Path) -> None:
+    model = BodyModel.load()
+    faces = model.faces.numpy()
+    middle = np.array([0, -0.45, 0.0])
+
+    def skin(params: BodyParameters) -> np.ndarray:
+        return model.forward(params).vertices[0].numpy()
+
+    rest = model.forward(model.zeros())
+    keypoints = model.keypoints(rest)[0].numpy()
+    v = rest.vertices[0].numpy()
+    view = {"centre": middle, "width_m": 2.0, "size": (400, 400)}
+    save(folder / "body_rest.png", [
+        shade(v, faces, points=rest.joints[0].numpy(), **view),
+        shade(v, faces, points=keypoints, yaw_deg=35, pitch_deg=10, **view),
+        shade(v, faces, points=v[model.markers], yaw_deg=-35, pitch_deg=10, **view),
+    ])  # fmt: skip
+    save(folder / "body_poses.png", [
+        shade(skin(posed(model, **pose)), faces, yaw_deg=yaw, centre=middle, width_m=1.7,
+              size=(340, 400))
+        for pose, yaw in ((REACH, 0), (REACH, 50), (SIT, 35), (SIT, 90))
+    ])  # fmt: skip
+    hand = {"width_m": 0.26, "size": (300, 260), "centre": np.array([0.82, 0.06, 0.0])}
+    save(folder / "body_grasps.png", [
+        np.concatenate([
+            shade(skin(grasping(model, name)), faces, pitch_deg=-60, **hand),
+            shade(skin(grasping(model, name)), faces, yaw_deg=20, pitch_deg=10, **hand),
+        ])
+        for name in ("relaxed", "fist", "medium_wrap", "pinch", "point")
+    ])  # fmt: skip
+    face = {"centre": np.array([0, 0.32, 0.1]), "width_m": 0.28, "size": (260, 300)}
+    smile = model.zeros()
+    smile.expression[0, 0] = 2.0
+    save(folder / "body_face.png", [
+        shade(v, faces, points=keypoints[67:], **face),
+        shade(skin(posed(model, jaw=(0.35, 0.0, 0.0))), faces, **face),
+        shade(skin(posed(model, jaw=(0.35, 0.0, 0.0))), faces, yaw_deg=50, **face),
+        shade(skin(smile), faces, **face),
+    ])  # fmt: skip
+    shapes = []
+    for k in range(4):
+        for sign in (-2.0, 2.0):
+            params = model.zeros()
+            params.betas[0, k] = sign
+            shapes.append(shade(skin(params), faces, centre=middle, width_m=2.1, size=(230, 230)))
+    save(folder / "body_shapes.png", [
+        np.concatenate(shapes[i:i + 2]) for i in range(0, len(shapes), 2)
+    ])  # fmt: skip
+    colours = np.full((len(v), 3), 0.82)
+    for ids, colour in zip(model.regions.values(), _COLOURS, strict=True):
+        colours[ids] = colour
+    low = {"centre": np.array([0.85, 0.05, 0.0]), "width_m": 0.3, "size": (300, 400)}
+    save(folder / "body_regions.png", [
+        shade(v, faces, colours=colours, **view),
+        shade(v, faces, colours=colours, yaw_deg=180, **view),
+        shade(v, faces, colours=colours, pitch_deg=-80, **low),
+        shade(v, faces, colours=colours, pitch_deg=-50, centre=np.array([0, -1.3, 0]),
+              width_m=0.6, size=(300, 400)),
+    ])  # fmt: skip
