@@ -185,6 +185,8 @@ class Config(Model):
 
     dataset: Name
     """Name of the dataset; results go to results/<dataset>/."""
+    exclude: tuple[Name, ...] = ()
+    """Sequences of the table to leave out of everything."""
     sequences: Path = Path("sequences.tsv")
     """Table of recordings."""
     subjects: Path = Path("subjects.tsv")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,14 +25,19 @@ class Project:
     """What one settings file and its tables say."""
 
     config: Config
-    root: Path
+    path: Path
     sequences: dict[str, SequenceEntry]
     subjects: dict[str, SubjectEntry]
     objects: dict[str, ObjectEntry]
 
+    @property
+    def results(self) -> Path:
+        """Folder of this dataset's artefacts."""
+        return self.config.results / self.config.dataset
+
     def annotation_path(self, sequence: str) -> Path:
         """Where this sequence's annotation file is, or would be."""
-        return self.root / self.config.annotations / f"{sequence}.yaml"
+        return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
     def annotation(self, sequence: str) -> Annotation:
         """Load this sequence's annotation; empty where there is no file.
@@ -38,26 +45,32 @@ class Project:
         Raises UserError naming file and field where the file is broken.
         """
         path = self.annotation_path(sequence)
-        if not path.exists():
-            return Annotation()
-        return _parse(Annotation, read_yaml(path) or {}, str(path), "annotation")
+        return read_annotation(path) if path.exists() else Annotation()
+
+    def recordings_made(self, sequence: str) -> Path | None:
+        """Folder into which the studio writes this sequence; None for a real recording."""
+        if self.config.studio is None or sequence not in self.config.studio.captures:
+            return None
+        return self.results / "recordings" / sequence
 
 
-def load_project(path: Path) -> Project:
+def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Project:
     """Read and check a settings file and all its tables.
 
-    Raises UserError naming the file, row and field of the first mistakes.
+    ``overrides`` are settings that win over the file's, nested as in the file. Raises UserError
+    naming the file, row and field of the first mistake.
     """
     path = Path(path)
-    config = _parse(Config, read_yaml(path) or {}, str(path), "setting")
-    root = path.parent
-    subjects = {
-        row.subject: row for row in _read_table(root / config.subjects, SubjectEntry, "subject")
-    }
-    objects = _read_objects(root / config.objects)
-    sequences: dict[str, SequenceEntry] = {}
-    table = root / config.sequences
-    for row in _read_table(table, SequenceEntry, "sequence"):
+    values = read_yaml(path) or {}
+    if not isinstance(values, dict):
+        raise UserError(f"{path}: expected names and values, found {type(values).__name__}")
+    config = _parse(Config, _merged(values, overrides or {}), str(path), "setting")
+    subjects_table = tidy(path.parent / config.subjects)
+    subjects = {row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject")}
+    objects = _read_objects(tidy(path.parent / config.objects))
+    table = tidy(path.parent / config.sequences)
+    rows = {row.sequence: row for row in _read_table(table, SequenceEntry, "sequence")}
+    for row in rows.values():
         for field, known in (("subject", subjects), ("object", objects)):
             value = getattr(row, field)
             if value not in known:
@@ -66,16 +79,81 @@ def load_project(path: Path) -> Project:
                     f"the table of {field}s ({', '.join(sorted(known)) or 'empty'}); correct the "
                     f"name or add the {field}"
                 )
-        sequences[row.sequence] = _absolute(row, table.parent)
+    unknown = sorted(set(config.exclude) - set(rows))
+    if unknown:
+        raise UserError(f"{path}: exclude names {unknown[0]!r}, which {table} does not list")
+    sequences = {
+        name: _absolute(row, table.parent)
+        for name, row in rows.items()
+        if name not in config.exclude
+    }
     if not sequences:
-        raise UserError(f"{table}: holds no sequence; add at least one row")
-    for sequence in (config.studio.captures if config.studio else {}) or {}:
-        if sequence not in sequences:
+        raise UserError(f"{table}: holds no sequence (or all are excluded); add at least one row")
+    config = config.model_copy(update={"body_models": _absolute(config.body_models, path.parent)})
+    project = Project(config, path, sequences, subjects, objects)
+    _check_files(project)
+    _check_studio(project, rows, table)
+    return project
+
+
+def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for key, value in overrides.items():
+        old = merged.get(key)
+        both = isinstance(old, dict) and isinstance(value, Mapping)
+        merged[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return merged
+
+
+def _check_files(project: Project) -> None:
+    """Meshes and body files are shared by sequences: what is missing stops the run."""
+    used = sorted({row.object for row in project.sequences.values()})
+    for name in used:
+        entry = project.objects[name]
+        for field in ("mesh", "contact_vertices"):
+            file = getattr(entry, field)
+            if file is not None and not file.is_file():
+                raise UserError(
+                    f"{tidy(project.path.parent / project.config.objects)}: object {name!r} has "
+                    f"{field} {file}, and there is no such file; correct the path"
+                )
+    for gender, file in project.config.body_models:
+        if file is not None and not file.is_file():
             raise UserError(
-                f"{path}: studio.captures names {sequence!r}, which {table} does not list; add "
-                "the row or remove the capture"
+                f"{project.path}: body_models.{gender} is {file}, and there is no such file; "
+                "correct the path, or remove the line to use the open body"
             )
-    return Project(config, root, sequences, subjects, objects)
+
+
+def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path) -> None:
+    captures = project.config.studio.captures if project.config.studio else {}
+    for sequence in captures:
+        if sequence not in rows:
+            raise UserError(
+                f"{project.path}: studio.captures names {sequence!r}, which {table} does not "
+                "list; add the row or remove the capture"
+            )
+        if sequence not in project.sequences:
+            continue
+        made = project.recordings_made(sequence)
+        given = project.sequences[sequence].recordings
+        if made is not None and made.resolve() != given.resolve():
+            raise UserError(
+                f"{table}: sequence {sequence!r} has recordings {given}, but the studio writes "
+                f"them to {made}; correct the path"
+            )
+
+
+def read_annotation(path: Path) -> Annotation:
+    """Read one annotation file; raises UserError naming file and field where it is broken."""
+    return _parse(Annotation, read_yaml(path) or {}, str(path), "annotation")
+
+
+def tidy(path: Path) -> Path:
+    """The path without "..", relative to the working directory where it lies below that."""
+    absolute = Path(os.path.abspath(path))
+    here = Path.cwd()
+    return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 
 def read_yaml(path: Path) -> Any:
@@ -84,6 +162,8 @@ def read_yaml(path: Path) -> Any:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such file; check the path") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
@@ -117,19 +197,26 @@ def _parse(model: type[M], values: Any, where: str, what: str) -> M:
 def _read_table(path: Path, model: type[M], key: str) -> list[M]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file; check the path in the settings") from None
-    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    except (OSError, UnicodeDecodeError):
+        raise UserError(
+            f"{path}: not a readable text file; check the path in the settings"
+        ) from None
+    numbered = [
+        (number, line)
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.startswith("#")
+    ]
+    reader = csv.DictReader((line for _, line in numbered), delimiter="\t", quoting=csv.QUOTE_NONE)
     rows: list[M] = []
     seen: dict[str, int] = {}
-    for number, record in enumerate(csv.DictReader(lines, delimiter="\t"), start=1):
-        where = f"{path}, row {number} ({record.get(key)!r})"
+    for (number, _), record in zip(numbered[1:], reader, strict=True):
+        where = f"{path}, line {number} ({key} {record.get(key)!r})"
         if None in record or None in record.values():
             raise UserError(f"{where}: the number of columns differs from the header; use tabs")
         row = _parse(model, {k: v for k, v in record.items() if v != ""}, where, "column")
         name = getattr(row, key)
         if name in seen:
-            raise UserError(f"{where}: row {seen[name]} has the same name; names must differ")
+            raise UserError(f"{where}: line {seen[name]} has the same name; names must differ")
         seen[name] = number
         rows.append(row)
     return rows
@@ -152,9 +239,5 @@ def _read_objects(path: Path) -> dict[str, ObjectEntry]:
 
 def _absolute(entry: M, folder: Path) -> M:
     """Resolve the entry's relative paths against the folder of its file."""
-    moved = {
-        name: folder / value
-        for name, value in entry
-        if isinstance(value, Path) and not value.is_absolute()
-    }
+    moved = {name: tidy(folder / value) for name, value in entry if isinstance(value, Path)}
     return entry.model_copy(update=moved)
