@@ -1,0 +1,127 @@
+"""Files that say where the cameras of a capture are."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.camera.transforms import invert, is_rigid, rigid
+from intercap_core.errors import UserError
+
+RELEASE_NAME = re.compile(r"Color(?:_(\d+))?\.json")
+
+
+@dataclass(frozen=True)
+class Extrinsics:
+    """Poses of the colour cameras: name -> (4, 4), metres; the master's is the identity."""
+
+    master: str
+    master_from_colour: dict[str, np.ndarray]
+
+
+def read_extrinsics(path: Path) -> Extrinsics:
+    """Read camera poses from a rig file, or from a folder as the InterCap dataset has it.
+
+    A rig file is JSON: ``{"master": "k1", "cameras": {"k1": {"master_from_camera": 4x4}, ...}}``,
+    metres. A folder holds ``Color.json``, ``Color_2.json``, ... with a rotation vector ``R`` and a
+    translation ``T``, x_camera = R x_world + T; the cameras are named k1, k2, ... and k1 is the
+    master. Raises UserError naming file and camera where something is missing or impossible.
+    """
+    path = Path(path)
+    return _read_release_folder(path) if path.is_dir() else _read_rig_file(path)
+
+
+def write_rig_file(path: Path, extrinsics: Extrinsics) -> None:
+    """Write the rig file that :func:`read_extrinsics` reads."""
+    cameras = {
+        name: {"master_from_camera": pose.tolist()}
+        for name, pose in extrinsics.master_from_colour.items()
+    }
+    content = {"master": extrinsics.master, "cameras": cameras}
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _read_rig_file(path: Path) -> Extrinsics:
+    content = _read_json(path)
+    master = content.get("master")
+    cameras = content.get("cameras")
+    if not isinstance(cameras, dict) or not cameras or not isinstance(master, str):
+        raise UserError(
+            f"{path}: expected 'master' (a camera's name) and 'cameras' (names and poses); see "
+            "docs/recordings.md"
+        )
+    if master not in cameras:
+        raise UserError(
+            f"{path}: master {master!r} is none of the cameras ({', '.join(cameras)}); correct "
+            "the name or add the camera"
+        )
+    poses = {}
+    for name, entry in cameras.items():
+        try:
+            pose = np.array(entry["master_from_camera"], np.float64)
+        except (KeyError, TypeError, ValueError):
+            pose = np.zeros(0)
+        if not is_rigid(pose):
+            raise UserError(
+                f"{path}: camera {name!r} has no rigid 4x4 'master_from_camera' (rows of rotation "
+                "and translation in metres, last row 0 0 0 1); correct it"
+            )
+        poses[name] = pose
+    return _relative_to(master, poses)
+
+
+def _read_release_folder(folder: Path) -> Extrinsics:
+    matches = {p: RELEASE_NAME.fullmatch(p.name) for p in folder.iterdir()}
+    files = {int(m.group(1) or 1): p for p, m in matches.items() if m}
+    if 1 not in files:
+        raise UserError(
+            f"{folder}: holds no Color.json (the master camera); give the folder of Color*.json "
+            "files, or a rig file"
+        )
+    poses = {}
+    for number, path in sorted(files.items()):
+        content = _read_json(path)
+        try:
+            turn, shift = (np.array(content[k], np.float64).reshape(3) for k in ("R", "T"))
+        except (KeyError, TypeError, ValueError):
+            raise UserError(
+                f"{path}: expected a rotation vector 'R' and a translation 'T' of three numbers "
+                "each; correct it"
+            ) from None
+        poses[f"k{number}"] = invert(rigid(_rotation_matrix(turn), shift))
+    return _relative_to("k1", poses)
+
+
+def _relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
+    """Express the poses in the master's frame; exactly the identity for the master itself."""
+    master_from_world = invert(world_from_camera[master])
+    poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
+    poses[master] = np.eye(4)
+    return Extrinsics(master, poses)
+
+
+def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula: rotation vector (3,), radians, to matrix (3, 3)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is not valid JSON ({error}); correct it") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected names and values, found {type(content).__name__}")
+    return content

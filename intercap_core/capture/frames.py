@@ -1,0 +1,135 @@
+"""Reader of the frames artefact: images of every camera by frame set."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.errors import UserError
+from intercap_core.schemas import FRAMES
+
+
+class Frames:
+    """An open frames artefact. ``t`` is a set (0 <= t < T), ``c`` a camera's index in the rig."""
+
+    def __init__(self, artefact: artefacts.Artefact) -> None:
+        self._artefact = artefact
+        self._offsets: dict[int, np.ndarray] = {}
+
+    @classmethod
+    @contextlib.contextmanager
+    def open(cls, path: Path) -> Iterator[Frames]:
+        """Open for a ``with`` block; raises UserError as :func:`artefacts.read` does."""
+        with artefacts.read(path, FRAMES) as artefact:
+            yield cls(artefact)
+
+    @cached_property
+    def rig(self) -> Rig:
+        """Lenses and extrinsics as given (unrefined)."""
+        return Rig.from_artefact(self._artefact)
+
+    @property
+    def num_sets(self) -> int:
+        """T."""
+        return len(self.time_s)
+
+    @property
+    def fps(self) -> float:
+        """Nominal sets a second."""
+        return float(self._artefact.attributes["fps"])
+
+    @property
+    def sequence(self) -> str:
+        """The sequence's name."""
+        return str(self._artefact.attributes["sequence"])
+
+    @property
+    def master(self) -> str:
+        """Name of the camera whose frame the extrinsics are in."""
+        return str(self._artefact.attributes["master"])
+
+    @cached_property
+    def time_s(self) -> np.ndarray:
+        """(T,) seconds since the first set."""
+        return self._artefact["times"]
+
+    @cached_property
+    def present(self) -> np.ndarray:
+        """(C,) bool: the camera has a recording and a pose."""
+        return self._artefact["present"]
+
+    @cached_property
+    def _colour_index(self) -> np.ndarray:
+        return self._artefact["colour_index"]
+
+    @cached_property
+    def _depth_index(self) -> np.ndarray:
+        return self._artefact["depth_index"]
+
+    @property
+    def colour_available(self) -> np.ndarray:
+        """(T, C) bool: the set holds a colour image of this camera."""
+        return self._colour_index >= 0
+
+    @property
+    def depth_available(self) -> np.ndarray:
+        """(T, C) bool: the set holds a depth image of this camera."""
+        return self._depth_index >= 0
+
+    @property
+    def available(self) -> np.ndarray:
+        """(T, C) bool: the set holds some image of this camera; False for dropped sets."""
+        return self.colour_available | self.depth_available
+
+    @cached_property
+    def skew_s(self) -> np.ndarray:
+        """(T, C) float32: image's device time minus the set's time, seconds, NaN = none."""
+        return self._artefact["skew"]
+
+    @cached_property
+    def gravity(self) -> np.ndarray:
+        """(C, 3): the direction down, unit, in each colour camera's frame; NaN = not known."""
+        return self._artefact["gravity"]
+
+    def depth(self, t: int, c: int) -> np.ndarray | None:
+        """Return the depth image (H, W) uint16, millimetres, 0 = invalid; None if there is none."""
+        index = int(self._depth_index[t, c])
+        if index < 0:
+            return None
+        return self._artefact.rows(f"cameras/{self.rig.names[c]}/depth", index)
+
+    def colour_jpeg(self, t: int, c: int) -> bytes | None:
+        """Return the JPEG as recorded; None if there is none."""
+        index = int(self._colour_index[t, c])
+        if index < 0:
+            return None
+        group = f"cameras/{self.rig.names[c]}"
+        if c not in self._offsets:
+            self._offsets[c] = self._artefact[f"{group}/colour_offsets"]
+        start, end = self._offsets[c][index : index + 2]
+        return self._artefact.rows(f"{group}/colour", slice(int(start), int(end))).tobytes()
+
+    def colour(self, t: int, c: int) -> np.ndarray | None:
+        """Return the colour image (H, W, 3) uint8, BGR; None if there is none.
+
+        Raises UserError where the recorded JPEG cannot be decoded.
+        """
+        jpeg = self.colour_jpeg(t, c)
+        if jpeg is None:
+            return None
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        lens = self.rig[c].colour
+        if image is None or image.shape != (lens.height, lens.width, 3):
+            raise UserError(
+                f"{self._artefact.path}: sequence {self.sequence}, camera {self.rig.names[c]}, "
+                f"frame {t}: the recorded JPEG does not decode to {lens.width}x{lens.height}; add "
+                f"{t} to drop_frames in the sequence's annotation"
+            )
+        return image

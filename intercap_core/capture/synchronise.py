@@ -1,0 +1,106 @@
+"""Sets of images taken at one moment by several cameras, found by device time alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+NEW_SET_GAP = 0.6  # of a period: an image this far from every set starts one of its own
+
+
+@dataclass(frozen=True)
+class SetTable:
+    """Which image of each camera belongs to each of T sets.
+
+    ``times_us`` (T,) int64 increasing, the master's device time or, where it has no image, that of
+    the others; ``index`` (T, C) int32 into each camera's images, -1 = none; ``skew_us`` (T, C)
+    float64, image time minus set time, NaN = none; ``unmatched`` (C,) images in no set.
+    """
+
+    times_us: np.ndarray
+    index: np.ndarray
+    skew_us: np.ndarray
+    unmatched: np.ndarray
+
+    def gaps(self, period_us: float) -> list[tuple[int, int]]:
+        """Where time runs on without any image: (set before the gap, number of sets missing)."""
+        steps = np.rint(np.diff(self.times_us) / period_us).astype(int)
+        return [(int(at), int(steps[at]) - 1) for at in np.flatnonzero(steps > 1)]
+
+
+def synchronise(
+    times_us: Sequence[np.ndarray], *, period_us: float, max_skew_us: float, master: int
+) -> SetTable:
+    """Group the images of C cameras into sets.
+
+    ``times_us``: for each camera the device times (N_c,) int64 of its images, microseconds of one
+    common clock, in any order, empty for a missing camera. The master's images each make a set;
+    where it has none (more than ``NEW_SET_GAP`` periods to the next set) the other cameras' do.
+    An image joins the nearest set if it is within ``max_skew_us`` and no image of its camera is
+    nearer. Raises ValueError unless 0 <= master < C and max_skew_us < period_us / 2.
+    """
+    if not 0 <= master < len(times_us):
+        raise ValueError(f"master {master} is none of {len(times_us)} cameras")
+    if not 0 < max_skew_us < period_us / 2:
+        raise ValueError(f"max_skew {max_skew_us} us is not below half of {period_us} us")
+    cameras = [np.asarray(t, np.int64) for t in times_us]
+    sets = _distinct(np.sort(cameras[master]), NEW_SET_GAP * period_us)
+    orphans = np.sort(np.concatenate(cameras))
+    orphans = orphans[_distance_to(orphans, sets) > NEW_SET_GAP * period_us]
+    extra: list[int] = []
+    while len(orphans):
+        group = orphans[orphans - orphans[0] <= max_skew_us]
+        extra.append(int(group[(len(group) - 1) // 2]))  # the median, an actual time
+        orphans = orphans[orphans - extra[-1] > NEW_SET_GAP * period_us]
+    sets = np.sort(np.concatenate([sets, np.array(extra, np.int64)]))
+    index = np.stack([nearest_images(sets, t, max_skew_us) for t in cameras], axis=1)
+    skew = np.full(index.shape, np.nan)
+    for camera, times in enumerate(cameras):
+        has = index[:, camera] >= 0
+        skew[has, camera] = times[index[has, camera]] - sets[has]
+    counts = np.array([len(t) for t in cameras])
+    return SetTable(sets, index, skew, counts - (index >= 0).sum(axis=0))
+
+
+def nearest_images(sets_us: np.ndarray, times_us: np.ndarray, max_skew_us: float) -> np.ndarray:
+    """Return for each set (T,) the position of its image among ``times_us`` (N,), -1 = none.
+
+    Image and set are each other's nearest and at most ``max_skew_us`` apart, so that no image is
+    used twice. ``sets_us`` is increasing.
+    """
+    index = np.full(len(sets_us), -1, np.int32)
+    if not len(sets_us) or not len(times_us):
+        return index
+    nearest_set = _nearest(times_us, sets_us)
+    distance = np.abs(times_us - sets_us[nearest_set])
+    order = np.lexsort((np.arange(len(times_us)), distance))[::-1]  # the nearest is written last
+    order = order[distance[order] <= max_skew_us]
+    index[nearest_set[order]] = order
+    return index
+
+
+def _nearest(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
+    """Return the position of the target nearest to each value; of two equally near the first."""
+    right = np.clip(np.searchsorted(sorted_targets, values), 1, max(1, len(sorted_targets) - 1))
+    if len(sorted_targets) == 1:
+        return np.zeros(len(values), np.int64)
+    left = right - 1
+    nearer_right = sorted_targets[right] - values < values - sorted_targets[left]
+    return np.where(nearer_right, right, left)
+
+
+def _distance_to(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
+    if not len(sorted_targets):
+        return np.full(len(values), np.inf)
+    return np.abs(values - sorted_targets[_nearest(values, sorted_targets)])
+
+
+def _distinct(sorted_times: np.ndarray, gap: float) -> np.ndarray:
+    """Drop times that follow a kept one by less than ``gap``: repeats of one image."""
+    kept: list[int] = []
+    for time in sorted_times.tolist():
+        if not kept or time - kept[-1] >= gap:
+            kept.append(time)
+    return np.array(kept, np.int64)

@@ -1,0 +1,306 @@
+"""The frames stage on recordings made for the purpose, and on the real one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.camera.extrinsics_files import Extrinsics, read_extrinsics, write_rig_file
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import rigid
+from intercap_core.capture.frames import Frames
+from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.errors import UserError
+from intercap_core.schemas import FRAMES
+from intercap_core.stages import frames as stage
+from intercap_core.studio.calibration import write_calibration
+from intercap_core.studio.mkv import MkvWriter
+
+PERIOD_US = 66_666
+MODES = dict(colour_mode="720P", depth_mode="NFOV_2X2BINNED")
+DEPTH_DELAY_US = 500
+
+
+def pose_of(index: int) -> np.ndarray:
+    turn = cv2.Rodrigues(np.array([0.0, 1.0 * index, 0.0]))[0]
+    return rigid(turn, np.array([0.5 * index, 0.0, 0.1 * index]))
+
+
+def make_camera(index: int) -> Camera:
+    colour = Intrinsics(*COLOUR_MODES["720P"].size, 610.0 + index, 611.0, 640.0, 360.0)
+    depth = Intrinsics(*DEPTH_MODES["NFOV_2X2BINNED"].size, 252.0, 252.0, 160.0 + index, 150.0)
+    between = rigid(cv2.Rodrigues(np.array([0.1, 0, 0]))[0], np.array([-0.032, 0, 0]))
+    return Camera(f"k{index + 1}", colour, depth, between, pose_of(index))
+
+
+def depth_at(camera: int, tick: int) -> np.ndarray:
+    return np.full((288, 320), 1000 + 100 * camera + tick, np.uint16)
+
+
+def jpeg_at(camera: int, tick: int) -> bytes:
+    image = np.full((720, 1280, 3), (10 * camera, tick, 128), np.uint8)
+    return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def record(folder: Path, camera: int, ticks, *, clock_us: int = 3_000_000, depth: bool = True):
+    device = make_camera(camera)
+    with MkvWriter(
+        folder / f"{device.name}.mkv",
+        calibration_json=write_calibration(device, serial=str(camera), **MODES),
+        colour_mode=MODES["colour_mode"],
+        depth_mode=MODES["depth_mode"] if depth else None,
+        fps=15,
+        serial=str(camera),
+        start_offset_ns=clock_us * 1000,
+        depth_delay_ns=DEPTH_DELAY_US * 1000,
+        wired_sync_mode="SUBORDINATE" if camera else "MASTER",
+        subordinate_delay_ns=160_000 * camera,
+        with_imu=True,
+    ) as writer:
+        for tick in ticks:
+            time_us = clock_us + tick * PERIOD_US + 160 * camera
+            writer.write_imu([0, 0, -9.8], [0, 0, 0], time_us)
+            writer.write_colour(jpeg_at(camera, tick), time_us)
+            if depth:
+                writer.write_depth(depth_at(camera, tick), time_us + DEPTH_DELAY_US)
+
+
+@pytest.fixture
+def capture(tmp_path) -> SequenceEntry:
+    """Three cameras, six ticks; k2 loses tick 3, k3 stops after tick 4."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    record(folder, 0, range(6))
+    record(folder, 1, [0, 1, 2, 4, 5])
+    record(folder, 2, range(5))
+    poses = {f"k{i + 1}": pose_of(i) for i in range(3)}
+    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", poses))
+    return SequenceEntry(
+        sequence="s1", subject="a", object="b", recordings=folder, calibration=tmp_path / "rig.json"
+    )
+
+
+def run(capture: SequenceEntry, drop=()) -> Path:
+    output = capture.calibration.parent / "out" / "frames.h5"
+    stage.run(sequence=capture, output=output, settings=FramesSettings(), frames_to_drop=drop)
+    return output
+
+
+def notes_of(path: Path) -> dict[str, str]:
+    with artefacts.read(path, FRAMES) as frames:
+        return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
+
+
+def test_every_image_is_in_its_set_unchanged(capture):
+    with Frames.open(run(capture)) as frames:
+        assert (frames.num_sets, frames.fps, frames.master) == (6, 15.0, "k1")
+        assert np.allclose(frames.time_s, np.arange(6) * PERIOD_US * 1e-6)
+        expected = np.ones((6, 3), bool)
+        expected[3, 1] = expected[5, 2] = False
+        assert np.array_equal(frames.available, expected)
+        assert np.array_equal(frames.depth_available, expected)
+        for t in range(6):
+            for c in range(3):
+                if not expected[t, c]:
+                    assert frames.depth(t, c) is None and frames.colour(t, c) is None
+                    continue
+                assert np.array_equal(frames.depth(t, c), depth_at(c, t))
+                assert frames.colour_jpeg(t, c) == jpeg_at(c, t)
+                assert frames.colour(t, c).shape == (720, 1280, 3)
+        assert np.allclose(frames.skew_s[:, 2][:5], 320e-6, atol=1e-9)
+        assert np.isnan(frames.skew_s[3, 1])
+
+
+def test_cameras_poses_and_gravity(capture):
+    output = run(capture)
+    rig = Rig.from_frames(output)
+    assert rig.names == ("k1", "k2", "k3") and len(rig) == 3
+    for index, camera in enumerate(rig):
+        made = make_camera(index)
+        assert np.allclose(camera.colour.parameters, made.colour.parameters, atol=1e-9)
+        assert np.allclose(camera.depth.parameters, made.depth.parameters, atol=1e-9)
+        assert np.allclose(camera.colour_from_depth, made.colour_from_depth, atol=1e-12)
+        assert np.allclose(camera.master_from_colour, pose_of(index), atol=1e-12)
+    with Frames.open(output) as frames:
+        down = cv2.Rodrigues(np.array([0.1, 0, 0]))[0] @ [0, 1, 0]
+        assert np.allclose(frames.gravity, down[None], atol=1e-6)
+
+
+def test_what_is_degraded_is_noted(capture):
+    notes = notes_of(run(capture))
+    assert notes["k1"] == ""
+    assert "no image in 1 frame sets" in notes["k2"]
+    assert "ends 1 frame sets early" in notes["k3"]
+
+
+def test_dropped_sets_have_no_image(capture):
+    with Frames.open(run(capture, drop=(1, 4))) as frames:
+        assert not frames.available[[1, 4]].any() and frames.available[[0, 2, 3, 5]].any(1).all()
+        assert frames.num_sets == 6
+
+
+def test_same_recordings_same_bytes(capture):
+    first = run(capture).read_bytes()
+    assert run(capture).read_bytes() == first
+
+
+def test_a_camera_without_file_pose_or_readable_head_is_kept_and_flagged(capture):
+    (capture.recordings / "k2.mkv").unlink()
+    (capture.recordings / "k3.mkv").write_text("not a recording")
+    record(capture.recordings, 3, range(6))
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.present.tolist() == [True, False, False, False]
+        assert frames.rig.names == ("k1", "k2", "k3", "k4")
+        assert frames.rig[1].depth is None
+        assert not frames.available[:, 1:].any()
+    notes = notes_of(output)
+    assert "no recording k2.mkv" in notes["k2"]
+    assert "k3.mkv: is not a Matroska file" in notes["k3"]
+    assert "no pose in rig.json" in notes["k4"]
+    assert str(capture.recordings) not in notes["k3"]  # an artefact holds no path of a machine
+
+
+def test_without_the_masters_recording_its_frame_stays(capture):
+    (capture.recordings / "k1.mkv").unlink()
+    with Frames.open(run(capture)) as frames:
+        assert frames.master == "k1" and frames.num_sets == 6
+        assert np.allclose(frames.rig[1].master_from_colour, pose_of(1))
+        assert not frames.available[:, 0].any()
+
+
+def test_a_cut_recording_gives_what_it_holds(capture):
+    path = capture.recordings / "k2.mkv"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    output = run(capture)
+    assert "cut off: " in notes_of(output)["k2"]
+    with Frames.open(output) as frames, artefacts.read(output, FRAMES) as artefact:
+        assert artefact["truncated"].tolist() == [False, True, True]
+        assert 1 <= frames.available[:, 1].sum() < 5
+        assert np.array_equal(frames.depth(0, 1), depth_at(1, 0))
+
+
+def test_a_camera_without_depth_gives_colour(capture):
+    record(capture.recordings, 2, range(6), depth=False)
+    output = run(capture)
+    assert "no depth track" in notes_of(output)["k3"]
+    with Frames.open(output) as frames:
+        assert frames.rig[2].depth is None and frames.depth(0, 2) is None
+        assert frames.colour_jpeg(0, 2) == jpeg_at(2, 0)
+
+
+def test_a_device_with_a_clock_of_its_own_is_set_aside(capture):
+    record(capture.recordings, 2, range(6), clock_us=90_000_000)
+    output = run(capture)
+    assert "do not overlap those of k1" in notes_of(output)["k3"]
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 6 and not frames.present[2]
+
+
+def drop_too_far(capture):
+    return run(capture, drop=(6,))
+
+
+def nothing_readable(capture):
+    for path in capture.recordings.glob("*.mkv"):
+        path.write_bytes(b"")
+    return run(capture)
+
+
+def no_depth_at_all(capture):
+    for camera in range(3):
+        record(capture.recordings, camera, range(3), depth=False)
+    return run(capture)
+
+
+def no_folder(capture):
+    return run(capture.model_copy(update={"recordings": capture.recordings / "none"}))
+
+
+def master_unknown(capture):
+    capture.calibration.write_text(json.dumps({"master": "k9", "cameras": {"k1": {}}}))
+    return run(capture)
+
+
+def pose_not_rigid(capture):
+    content = json.loads(capture.calibration.read_text())
+    content["cameras"]["k2"]["master_from_camera"][0][0] = 3
+    capture.calibration.write_text(json.dumps(content))
+    return run(capture)
+
+
+def not_json(capture):
+    capture.calibration.write_text("{")
+    return run(capture)
+
+
+def too_wide_a_window(capture):
+    output = capture.calibration.parent / "frames.h5"
+    stage.run(sequence=capture, output=output, settings=FramesSettings(max_skew_ms=40))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (drop_too_far, "drop_frames holds 6, the recording has frame sets 0 to 5"),
+        (nothing_readable, "'s1': no camera in .* can be used .*k2: k2.mkv: is empty"),
+        (no_depth_at_all, "no camera in .* has depth"),
+        (no_folder, "no such folder"),
+        (master_unknown, "master 'k9' is none of the cameras"),
+        (pose_not_rigid, "camera 'k2' has no rigid 4x4"),
+        (not_json, "not valid JSON"),
+        (too_wide_a_window, "max_skew_ms is 40"),
+    ],
+)
+def test_faults_of_the_user_are_told_and_leave_no_file(capture, fault, words):
+    with pytest.raises(UserError, match=words):
+        fault(capture)
+    assert not list(capture.calibration.parent.rglob("*frames.h5*"))
+
+
+def test_release_folder_gives_poses_relative_to_its_first_camera(tmp_path):
+    rng = np.random.default_rng(0)
+    world = {}
+    for number in (1, 2, 3):
+        turn, shift = rng.normal(size=3), rng.normal(size=3)
+        name = "Color.json" if number == 1 else f"Color_{number}.json"
+        (tmp_path / name).write_text(json.dumps({"R": turn.tolist(), "T": [[v] for v in shift]}))
+        world[number] = rigid(cv2.Rodrigues(turn)[0], shift)
+    extrinsics = read_extrinsics(tmp_path)
+    assert extrinsics.master == "k1"
+    assert np.array_equal(extrinsics.master_from_colour["k1"], np.eye(4))
+    point = np.array([0.3, -0.2, 2.0, 1.0])
+    for number in (2, 3):
+        in_camera = world[number] @ point
+        in_master = extrinsics.master_from_colour[f"k{number}"] @ in_camera
+        assert np.allclose(in_master, world[1] @ point)
+
+
+def test_a_rig_file_written_is_read_back(tmp_path):
+    poses = {"k1": pose_of(1), "k2": pose_of(2)}
+    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", poses))
+    again = read_extrinsics(tmp_path / "rig.json").master_from_colour
+    assert np.allclose(poses["k1"] @ again["k2"], poses["k2"])
+
+
+def test_real_recording_goes_through_the_stage(tmp_path, real_recording):
+    (tmp_path / "k1.mkv").symlink_to(real_recording)
+    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", {"k1": np.eye(4)}))
+    entry = SequenceEntry(
+        sequence="real", subject="a", object="b", recordings=tmp_path,
+        calibration=tmp_path / "rig.json",
+    )  # fmt: skip
+    stage.run(sequence=entry, output=tmp_path / "frames.h5", settings=FramesSettings())
+    with Frames.open(tmp_path / "frames.h5") as frames:
+        assert frames.num_sets == 1 and frames.available.all()
+        assert frames.depth(0, 0).shape == (576, 640)
+        assert frames.colour(0, 0).shape == (720, 1280, 3)
+        assert frames.gravity[0, 1] > 0.8
