@@ -1,0 +1,182 @@
+"""COCO's run-length masks: checked, and read at single pixels without decoding the image.
+
+A compressed RLE is the string of pycocotools' ``maskApi``: lengths of runs in column-major order,
+zeros first. It does not know the image's size, so every function takes it. Strings come from
+users' files, and the C decoder writes past its buffer for one that does not fill the image, so
+they are parsed and checked here first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from pycocotools import mask as coco_mask
+
+_ZERO = 48  # first character of the alphabet
+_LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
+
+
+class Window(NamedTuple):
+    """A mask (h, w) bool whose pixel [0, 0] is pixel (x0, y0) of the image."""
+
+    x0: int
+    y0: int
+    mask: np.ndarray
+
+
+class Runs:
+    """A mask of one image, kept as its runs.
+
+    ``ends`` (n,) int64: where each run ends in the column-major image; even runs are background.
+    Raises ValueError, in words that fit after a file's name, where the string is not an RLE of
+    ``height`` x ``width`` pixels.
+    """
+
+    def __init__(self, rle: bytes, height: int, width: int) -> None:
+        self.height, self.width = height, width
+        self.ends = np.cumsum(_parse(rle))
+        filled = int(self.ends[-1]) if len(self.ends) else 0
+        if filled != height * width:
+            raise ValueError(
+                f"its runs hold {filled} pixels, expected {height * width} "
+                f"({width} x {height}, the colour image)"
+            )
+
+    @property
+    def area(self) -> int:
+        """Number of pixels set."""
+        return int(np.diff(self.ends, prepend=0)[1::2].sum())
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """x, y, width, height of the pixels set; all 0 where there are none."""
+        starts, ends = self._set_runs()
+        if not len(starts):
+            return 0, 0, 0, 0
+        left, right = int(starts[0]) // self.height, int(ends[-1] - 1) // self.height
+        top, bottom = starts % self.height, (ends - 1) % self.height
+        wraps = starts // self.height != (ends - 1) // self.height  # runs over a column's end
+        if wraps.any():
+            return left, 0, right - left + 1, self.height
+        y0 = int(top.min())
+        return left, y0, right - left + 1, int(bottom.max()) - y0 + 1
+
+    def _set_runs(self) -> tuple[np.ndarray, np.ndarray]:
+        starts, ends = self.ends[0:-1:2], self.ends[1::2]
+        some = ends > starts
+        return starts[some], ends[some]
+
+    def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Read the mask at integer pixels x, y (...): (...) bool, False outside the image."""
+        inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
+        index = np.where(inside, x * np.int64(self.height) + y, 0)
+        return inside & (np.searchsorted(self.ends, index, side="right") % 2 == 1)
+
+    def sample_flat(self, index: np.ndarray) -> np.ndarray:
+        """Read the mask at flat pixels (N,), row * width + column; False where negative."""
+        row, column = np.divmod(index, self.width)
+        return self.sample(np.where(index >= 0, column, -1), row)
+
+    def decode(self) -> np.ndarray:
+        """The whole mask (height, width) bool."""
+        lengths = np.diff(self.ends, prepend=0)
+        flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+        return np.ascontiguousarray(flat.reshape(self.width, self.height).T)
+
+    def decode_window(self) -> Window:
+        """The mask cropped to its :attr:`box`; an empty window where no pixel is set."""
+        x0, y0, width, height = self.box
+        first, last = x0 * self.height, (x0 + width) * self.height
+        ends = np.clip(self.ends, first, last)
+        lengths = np.diff(ends, prepend=first)
+        flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+        columns = flat.reshape(width, self.height)[:, y0 : y0 + height]
+        return Window(x0, y0, np.ascontiguousarray(columns.T))
+
+
+def encode(mask: np.ndarray) -> bytes:
+    """Encode a mask (H, W), any type, non-zero = set."""
+    return bytes(coco_mask.encode(np.asfortranarray(mask != 0, dtype=np.uint8))["counts"])
+
+
+def decode(rle: bytes, height: int, width: int) -> np.ndarray:
+    """Decode to (height, width) bool. Raises ValueError as :class:`Runs` does."""
+    return Runs(rle, height, width).decode()
+
+
+def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
+    """Compress an uncompressed RLE, a list of run lengths.
+
+    Raises ValueError where a length is not a whole number from 0 or they do not fill the image.
+    """
+    lengths = np.asarray(counts)
+    if lengths.ndim != 1 or (lengths.size and lengths.dtype.kind not in "iu"):
+        raise ValueError("its counts are not a list of whole numbers")
+    if lengths.size and lengths.min() < 0:
+        raise ValueError(f"its counts hold {int(lengths.min())}, expected 0 or more")
+    if int(lengths.sum()) != height * width:
+        raise ValueError(
+            f"its runs hold {int(lengths.sum())} pixels, expected {height * width} "
+            f"({width} x {height}, the colour image)"
+        )
+    return _compress({"size": [height, width], "counts": [int(n) for n in lengths]}, height, width)
+
+
+def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
+    """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
+
+    Raises ValueError where one has fewer than three corners or a value that is not finite.
+    """
+    for polygon in polygons:
+        values = np.asarray(polygon, np.float64)
+        if values.ndim != 1 or len(values) < 6 or len(values) % 2 or not np.isfinite(values).all():
+            raise ValueError("a polygon is not a list of three or more finite x, y corners")
+    if not polygons:
+        return encode(np.zeros((height, width), np.uint8))
+    return _compress([[float(v) for v in p] for p in polygons], height, width)
+
+
+def _compress(segmentation: object, height: int, width: int) -> bytes:
+    made = coco_mask.frPyObjects(segmentation, height, width)
+    return bytes((coco_mask.merge(made) if isinstance(made, list) else made)["counts"])
+
+
+def overlap(first: Sequence[bytes], second: Sequence[bytes], height: int, width: int) -> np.ndarray:
+    """IoU (A, B) float64 of checked masks of one image (A) and (B)."""
+    if not first or not second:
+        return np.zeros((len(first), len(second)))
+    a, b = (
+        [{"size": [height, width], "counts": rle} for rle in masks] for masks in (first, second)
+    )
+    return np.asarray(coco_mask.iou(a, b, [0] * len(b)))
+
+
+def _parse(rle: bytes) -> np.ndarray:
+    """Run lengths (n,) int64 of a compressed RLE.
+
+    Each number is written in groups of 5 bits, lowest first, bit 5 = more follow, bit 4 of the
+    last = sign; from the fourth on it is the difference to the number two before.
+    """
+    if not rle:
+        raise ValueError("its RLE is empty")
+    bits = np.frombuffer(rle, np.uint8).astype(np.int64) - _ZERO
+    if bits.min() < 0 or bits.max() > 63:
+        raise ValueError("its RLE holds characters that COCO's alphabet does not have")
+    last = (bits & 0x20) == 0
+    if not last[-1]:
+        raise ValueError("its RLE is cut within a number")
+    stop = np.flatnonzero(last)
+    start = np.concatenate([[0], stop[:-1] + 1])
+    position = np.arange(len(bits)) - np.repeat(start, stop - start + 1)
+    if position.max() >= _LONGEST_NUMBER:
+        raise ValueError("its RLE holds a number that is too long")
+    values = np.add.reduceat((bits & 0x1F) << (5 * position), start)
+    negative = (bits[stop] & 0x10) != 0
+    values[negative] -= np.int64(1) << (5 * (position[stop[negative]] + 1))
+    values[1::2] = np.cumsum(values[1::2])
+    values[2::2] = np.cumsum(values[2::2])
+    if values.min() < 0:
+        raise ValueError("its RLE holds a run of negative length")
+    return values

@@ -1,0 +1,108 @@
+"""OpenPose's JSON files: body, hands and face of every person in one image.
+
+Body 25, hands 21 each and face 70 points become 135: body, left hand, right hand, the inner face
+(dlib 17 to 67), the jaw line (dlib 0 to 16). OpenPose's two pupils (68, 69) are left out.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.body.keypoints import (
+    BODY,
+    CONTOUR,
+    FACE,
+    LEFT_HAND,
+    NUM_KEYPOINTS,
+    RIGHT_HAND,
+)
+from intercap_core.errors import UserError
+
+_LISTS = {
+    "pose_keypoints_2d": 25,
+    "hand_left_keypoints_2d": 21,
+    "hand_right_keypoints_2d": 21,
+    "face_keypoints_2d": 70,
+}
+_JAW_LINE, _INNER_FACE = slice(0, 17), slice(17, 68)
+_FILE_NAME = re.compile(r"(?:.*?_)?(\d+)_keypoints\.json")
+
+
+class UnreadableJson(Exception):
+    """The file is not JSON: cut or empty, as a detector that was stopped leaves it."""
+
+
+def keypoint_files(folder: Path) -> dict[int, Path]:
+    """Find the files of one camera, by the number of the image, ``[name_]<number>_keypoints.json``.
+
+    Raises UserError where two files have one number.
+    """
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = _FILE_NAME.fullmatch(path.name)
+        if not match:
+            continue
+        number = int(match.group(1))
+        if number in found:
+            raise UserError(
+                f"{folder}: image {number} has two keypoint files, {found[number].name} and "
+                f"{path.name}; keep one"
+            )
+        found[number] = path
+    return found
+
+
+def read_people(path: Path) -> np.ndarray:
+    """Read one file: (P, 135, 3) float32 of x, y (px) and confidence; P may be 0.
+
+    A point that is not finite, or has no confidence, becomes zeros. A hand or face that the
+    detector did not look for (an empty list) has confidence 0. Raises :class:`UnreadableJson` for
+    a file that is not JSON, and UserError where it is JSON of another layout.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise UnreadableJson(f"{path}: not valid JSON ({error})") from None
+    people = content.get("people") if isinstance(content, dict) else None
+    if not isinstance(people, list):
+        raise UserError(f"{path}: has no list 'people'; expected a file as OpenPose writes it")
+    result = np.zeros((len(people), NUM_KEYPOINTS, 3), np.float32)
+    for index, person in enumerate(people):
+        if not isinstance(person, dict):
+            raise UserError(f"{path}: people[{index}] is not an object with keypoint lists")
+        lists = {
+            name: _points(person.get(name, []), count, f"{path}: people[{index}].{name}")
+            for name, count in _LISTS.items()
+        }
+        face = lists["face_keypoints_2d"]
+        result[index, BODY] = lists["pose_keypoints_2d"]
+        result[index, LEFT_HAND] = lists["hand_left_keypoints_2d"]
+        result[index, RIGHT_HAND] = lists["hand_right_keypoints_2d"]
+        result[index, FACE], result[index, CONTOUR] = face[_INNER_FACE], face[_JAW_LINE]
+    return result
+
+
+def _points(values: Any, count: int, where: str) -> np.ndarray:
+    if not isinstance(values, list) or len(values) not in (0, 3 * count):
+        found = len(values) if isinstance(values, list) else type(values).__name__
+        raise UserError(
+            f"{where} has {found} numbers, expected {3 * count} (x, y, confidence of {count} "
+            "points); run OpenPose with its BODY_25 model, hands and face"
+        )
+    if not values:
+        return np.zeros((count, 3), np.float32)
+    try:
+        # None stands for NaN in JSON that was written by careful libraries.
+        points = np.array([np.nan if v is None else v for v in values], np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{where} holds something that is not a number; write it again") from None
+    if points.ndim != 1:
+        raise UserError(f"{where} holds lists, expected one flat list of {3 * count} numbers")
+    points = points.reshape(count, 3)
+    known = np.isfinite(points).all(1) & (points[:, 2] > 0) & (np.abs(points) < 1e6).all(1)
+    return np.where(known[:, None], points, 0).astype(np.float32)

@@ -1,0 +1,126 @@
+"""The detections artefact, opened for reading: people and candidates of any image."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.detection.masks import Runs
+from intercap_core.schemas import DETECTIONS
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One segmented instance of one image.
+
+    ``index`` counts within the image, ``box`` (4,) is x, y, width, height, pixels. The mask is
+    parsed when first asked for.
+    """
+
+    index: int
+    label: str
+    score: float
+    box: np.ndarray
+    rle: bytes
+    image_size: tuple[int, int]  # width, height
+
+    @cached_property
+    def runs(self) -> Runs:
+        """The mask; see :class:`Runs` for reading pixels, windows and the area."""
+        width, height = self.image_size
+        return Runs(self.rle, height, width)
+
+    def mask(self) -> np.ndarray:
+        """The mask decoded to the whole colour image (H, W) bool."""
+        return self.runs.decode()
+
+
+@dataclass(frozen=True)
+class _CameraTable:
+    people_offsets: np.ndarray
+    people: np.ndarray
+    candidate_offsets: np.ndarray
+    labels: list[str]
+    scores: np.ndarray
+    boxes: np.ndarray
+    rle_offsets: np.ndarray
+    rle: bytes
+
+
+class Detections:
+    """Detections of all images; T frame sets, C cameras in the order of ``camera_names``.
+
+    Everything is read at once: keypoints and RLE strings are a few MB a hundred sets.
+    ``keypoints_found`` and ``candidates_found`` are (T, C) bool, ``image_sizes`` (C, 2) width and
+    height. Obtained from :meth:`open` or :meth:`load`.
+    """
+
+    def __init__(self, artefact: artefacts.Artefact) -> None:
+        self.path = artefact.path
+        self.sequence = str(artefact.attributes["sequence"])
+        self.camera_names = tuple(artefact.text("camera_names"))
+        self.image_sizes = artefact["colour_size"]
+        self.keypoints_found = artefact["keypoints_found"]
+        self.candidates_found = artefact["candidates_found"]
+        self.notes = tuple(artefact.text("note"))
+        self._tables = [_read_camera(artefact, name) for name in self.camera_names]
+
+    @classmethod
+    @contextlib.contextmanager
+    def open(cls, path: Path) -> Iterator[Detections]:
+        """Open the artefact; raises UserError as :func:`artefacts.read` does."""
+        with artefacts.read(path, DETECTIONS) as artefact:
+            yield cls(artefact)
+
+    @classmethod
+    def load(cls, path: Path) -> Detections:
+        """Read the artefact and close it; raises UserError as :func:`artefacts.read` does."""
+        with artefacts.read(path, DETECTIONS) as artefact:
+            return cls(artefact)
+
+    @property
+    def num_sets(self) -> int:
+        """T."""
+        return int(self.keypoints_found.shape[0])
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """Keypoints (P, 135, 3) float32 of the image's people: x, y, confidence."""
+        table = self._tables[c]
+        return table.people[table.people_offsets[t] : table.people_offsets[t + 1]]
+
+    def candidates(self, t: int, c: int) -> list[Candidate]:
+        """The image's segmentation candidates, in the order that the artefact holds them."""
+        table = self._tables[c]
+        first, last = table.candidate_offsets[t : t + 2]
+        width, height = (int(n) for n in self.image_sizes[c])
+        return [
+            Candidate(
+                index=int(i - first),
+                label=table.labels[i],
+                score=float(table.scores[i]),
+                box=table.boxes[i],
+                rle=table.rle[table.rle_offsets[i] : table.rle_offsets[i + 1]],
+                image_size=(width, height),
+            )
+            for i in range(first, last)
+        ]
+
+
+def _read_camera(artefact: artefacts.Artefact, name: str) -> _CameraTable:
+    group = f"cameras/{name}"
+    return _CameraTable(
+        people_offsets=artefact[f"{group}/people_offsets"],
+        people=artefact[f"{group}/people"],
+        candidate_offsets=artefact[f"{group}/candidate_offsets"],
+        labels=artefact.text(f"{group}/candidate_labels"),
+        scores=artefact[f"{group}/candidate_scores"],
+        boxes=artefact[f"{group}/candidate_boxes"],
+        rle_offsets=artefact[f"{group}/rle_offsets"],
+        rle=artefact[f"{group}/rle"].tobytes(),
+    )

@@ -1,0 +1,157 @@
+"""A ring of cameras around a room whose surfaces are known in closed form, and frames artefacts.
+
+Nothing of the studio: rays are cast on boxes and planes analytically.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply, invert, rigid
+from intercap_core.schemas import FRAMES
+
+COLOUR = Intrinsics(
+    1920, 1080, 918.0, 917.0, 959.2, 549.4,
+    np.array([0.33, -2.489, -1.6e-4, -1.3e-4, 1.454, 0.209, -2.303, 1.375]),
+)  # fmt: skip
+DEPTH = Intrinsics(
+    640, 576, 504.6, 504.7, 332.8, 348.8,
+    np.array([0.548, -0.021, 2.1e-5, -7.2e-5, -0.0027, 0.89, 0.086, -0.0139]), 1.74,
+).scaled(0.3)  # fmt: skip
+COLOUR_FROM_DEPTH = rigid(
+    np.array([[1, 0, 0], [0, 0.995, 0.0998749], [0, -0.0998749, 0.995]]),
+    np.array([-0.032, -0.002, 0.004]),
+)
+
+
+def looking_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """world_from_camera (4, 4) of a camera whose image is upright in a z-up world."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    return rigid(np.stack([right, np.cross(forward, right), forward], 1), centre)
+
+
+def ring(count: int = 6, radius: float = 2.6, height: float = 1.7) -> tuple[Rig, np.ndarray]:
+    """A rig of ``count`` cameras and zup_from_master (4, 4); the floor is z = 0."""
+    poses = []
+    for index in range(count):
+        angle = 2 * np.pi * index / count
+        centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        poses.append(looking_at(centre, np.array([0, 0, 0.8])))
+    master_from_world = invert(poses[0])
+    cameras = tuple(
+        Camera(f"k{i + 1}", COLOUR, DEPTH, COLOUR_FROM_DEPTH, master_from_world @ pose)
+        for i, pose in enumerate(poses)
+    )
+    return Rig(cameras), poses[0]
+
+
+def room_depth(
+    camera: Camera, zup_from_master: np.ndarray, boxes: np.ndarray, walls: float | None = 3.6
+) -> np.ndarray:
+    """Depth (H, W) float64 metres of a floor, four walls (or none) and ``boxes`` (B, 2, 3)."""
+    assert camera.depth is not None
+    rays = np.dstack([camera.depth.rays.astype(np.float64), np.ones(camera.depth.rays.shape[:2])])
+    pose = zup_from_master @ camera.master_from_depth
+    direction = rays.reshape(-1, 3) @ pose[:3, :3].T
+    origin = pose[:3, 3]
+    depth = np.full(len(direction), np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        faces = [(2, 0.0)]
+        if walls is not None:
+            faces += [(axis, side * walls) for axis in (0, 1) for side in (-1, 1)]
+        for axis, at in faces:
+            t = (at - origin[axis]) / direction[:, axis]
+            depth = np.where((t > 0) & (t < depth), t, depth)
+        for low, high in boxes:
+            a, b = (low - origin) / direction, (high - origin) / direction
+            near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+            depth = np.where((near > 0) & (near < far) & (near < depth), near, depth)
+    depth[~np.isfinite(depth)] = 0
+    return depth.reshape(camera.depth.height, camera.depth.width)
+
+
+FURNITURE = np.array([
+    [[-1.9, -0.4, 0], [-1.2, 0.5, 0.75]],
+    [[0.9, 1.1, 0], [1.5, 1.6, 1.1]],
+    [[0.4, -1.7, 0], [1.2, -1.2, 0.5]],
+])  # fmt: skip
+
+
+def to_millimetres(depth: np.ndarray, rng: np.random.Generator, noise: float = 1.0) -> np.ndarray:
+    """Depth with noise that grows with distance, as the sensor stores it: uint16 mm."""
+    sigma = noise * (0.001 + 0.0005 * depth**2)
+    noisy = depth + sigma * rng.standard_normal(depth.shape)
+    return np.where(depth > 0, np.rint(noisy * 1000), 0).astype(np.uint16)
+
+
+def perturbed(rig: Rig, rng: np.random.Generator, metres: float, degrees: float) -> Rig:
+    """Every camera but the first moved by a random motion of these sizes."""
+    poses = rig.master_from_colour.copy()
+    for index in range(1, len(rig)):
+        axis = rng.standard_normal(3)
+        axis *= np.radians(degrees) / np.linalg.norm(axis)
+        shift = rng.standard_normal(3)
+        poses[index, :3, :3] = poses[index, :3, :3] @ rotation_of(axis)
+        poses[index, :3, 3] += metres * shift / np.linalg.norm(shift)
+    return rig.moved(poses)
+
+
+def rotation_of(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a rotation vector, by Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def extrinsics_error(rig: Rig, truth: Rig, centre: np.ndarray, side: float = 2.0) -> np.ndarray:
+    """RMS displacement (C,) of a cube's points, metres, between two rigs with one master."""
+    steps = np.linspace(-side / 2, side / 2, 5)
+    cube = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3) + centre
+    moved = [
+        apply(a.master_from_colour @ b.colour_from_master, cube) - cube
+        for a, b in zip(rig, truth, strict=True)
+    ]
+    return np.sqrt((np.stack(moved) ** 2).sum(-1).mean(-1))
+
+
+def write_frames(
+    path: Path,
+    rig: Rig,
+    *,
+    num_sets: int,
+    depths: list[np.ndarray] | None = None,
+    colour_index: np.ndarray | None = None,
+    dropped: np.ndarray | None = None,
+    gravity: np.ndarray | None = None,
+) -> Path:
+    """Write a frames artefact without colour; ``depths`` has (T, H, W) uint16 for each camera."""
+    count = len(rig)
+    sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
+    none = np.full((num_sets, count), -1)
+    with artefacts.write(path, FRAMES, sequence="test", master="k1", fps=15.0) as writer:
+        for key, values in rig.datasets().items():
+            writer.put(key, values)
+        writer.put("master_from_colour", rig.master_from_colour)
+        writer.put("gravity", np.full((count, 3), np.nan) if gravity is None else gravity)
+        writer.put("present", np.ones(count, bool))
+        writer.put("truncated", np.zeros(count, bool))
+        writer.put("note", [""] * count)
+        writer.put("times", np.arange(num_sets) / 15.0)
+        writer.put("dropped", np.zeros(num_sets, bool) if dropped is None else dropped)
+        writer.put("colour_index", sets if colour_index is None else colour_index)
+        writer.put("depth_index", none if depths is None else sets)
+        writer.put("skew", np.zeros((num_sets, count)))
+        for index, name in enumerate(rig.names):
+            if depths is not None:
+                writer.put(f"cameras/{name}/depth", depths[index])
+    return path
