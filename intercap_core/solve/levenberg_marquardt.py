@@ -1,0 +1,192 @@
+"""Levenberg-Marquardt on many small problems at once, optionally tied by shared parameters.
+
+Every frame b has its own parameters x_b (n,); all frames may share parameters y (m,). The energy
+is sum_b f_b(x_b, y). With m = 0 the frames are independent: each has its own damping, accepts or
+rejects its own steps and stops on its own. With m > 0 the normal equations are an arrow, solved
+exactly by eliminating the frames:
+
+    | H_1         B_1 |   | dx_1 |     | g_1   |
+    |     ...     ... | . | ...  | = - | ...   |
+    | B_1^T ... sum C |   | dy   |     | sum c |
+
+For frames that are coupled in time see :mod:`.banded`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+_DAMPING_UP = 8.0
+_DAMPING_DOWN = 0.2
+_DAMPING_RANGE = (1e-8, 1e8)
+_SHARED_SLACK = 100  # shared parameters count as settled within this many step tolerances
+
+
+class NormalEquations(NamedTuple):
+    """One linearisation of b frames with n own and m shared parameters.
+
+    cost (b,): f_b. gradient (b, n+m) and hessian (b, n+m, n+m): J^T W r and J^T W J of that frame
+    alone, its own columns first, the shared ones last. A prior on shared parameters is spread over
+    the frames (1/B of it in each).
+    """
+
+    cost: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+class Problem(Protocol):
+    """What a caller provides. ``index`` (b,) says which of the B frames are asked for."""
+
+    def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
+        """Normal equations at own (b, n), shared (m,)."""
+        ...
+
+    def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
+        """f_b (b,) at own (b, n), shared (m,): the same energy as ``linearise`` reports."""
+        ...
+
+
+@dataclass
+class Solution:
+    """own (B, n), shared (m,), cost (B,); converged (B,) by the step's or the cost's size.
+
+    trials: steps tried. normal: the linearisation at the solution, where it was asked for (the
+    Hessian's inverse is the covariance of unit-variance residuals).
+    """
+
+    own: Tensor
+    shared: Tensor
+    cost: Tensor
+    converged: Tensor
+    trials: int
+    normal: NormalEquations | None = None
+
+
+def minimise(
+    problem: Problem,
+    own: Tensor,
+    shared: Tensor | None = None,
+    *,
+    max_trials: int = 20,
+    damping: float = 1e-3,
+    step_tolerance: float = 1e-5,
+    cost_tolerance: float = 1e-6,
+    keep_normal: bool = False,
+) -> Solution:
+    """Minimise sum_b f_b(x_b, y) from own (B, n) and shared (m,), none if absent.
+
+    A step is damped by ``damping`` times the Hessian's diagonal (Marquardt 1963), more in frames
+    whose last step failed. A frame has converged when its accepted step is below
+    ``step_tolerance`` in every parameter, or lowers its cost by less than ``cost_tolerance`` of it;
+    tied frames converge together. The factorisations are in float64 whatever the type of the
+    parameters. A frame whose Hessian cannot be factorised stays where it is under growing damping.
+    """
+    count, device = own.shape[0], own.device
+    own = own.clone()
+    y = own.new_zeros(0) if shared is None else shared.clone()
+    everyone = torch.arange(count, device=device)
+    size = own.shape[1] + len(y)
+    normal = NormalEquations(
+        own.new_zeros(count), own.new_zeros(count, size), own.new_zeros(count, size, size)
+    )
+    lam = torch.full((count,), damping, dtype=torch.float64, device=device)
+    stale = torch.ones(count, dtype=torch.bool, device=device)
+    done = torch.zeros_like(stale)
+    converged = torch.zeros_like(stale)
+    trials = 0
+    while trials < max_trials and not bool(done.all()):
+        _refresh(problem, normal, own, y, torch.nonzero(stale & ~done)[:, 0])
+        stale[:] = False
+        index = torch.nonzero(~done)[:, 0]
+        at = normal if len(index) == count else NormalEquations(*(part[index] for part in normal))
+        step, shared_step, solved = _damped_step(at, lam[index], len(y))
+        trials += 1
+        trial, trial_y = own[index] + step.to(own.dtype), y + shared_step.to(y.dtype)
+        new = problem.cost(trial, trial_y, index)
+        good = solved & (new <= at.cost)
+        if len(y):
+            trial, new, good = _keep_the_better(problem, own, trial, trial_y, new, good)
+            good &= new.double().sum() <= at.cost.double().sum()
+        small = (step.abs() < step_tolerance).all(1)
+        small |= at.cost - new <= cost_tolerance * at.cost.abs()
+        lam[index] *= torch.where(good, _DAMPING_DOWN, _DAMPING_UP)
+        lam.clamp_(*_DAMPING_RANGE)
+        stuck = lam[index] >= _DAMPING_RANGE[1]
+        if len(y):
+            if bool(good.any()):
+                own, y = trial, trial_y
+                stale[:] = True
+                settled = bool((small | ~good).all()) and bool(
+                    (shared_step.abs() < _SHARED_SLACK * step_tolerance).all()
+                )
+                converged[:], done[:] = settled, settled
+            done |= stuck.all()
+        else:
+            accepted = index[good]
+            own[accepted] = trial[good]
+            stale[accepted] = True
+            converged[index[good & small]] = True
+            done[index] = (good & small) | stuck
+    cost = problem.cost(own, y, everyone)
+    result = Solution(own, y, cost, converged, trials)
+    if keep_normal:
+        result.normal = problem.linearise(own, y, everyone)
+    return result
+
+
+def _refresh(
+    problem: Problem, normal: NormalEquations, own: Tensor, y: Tensor, index: Tensor
+) -> None:
+    """Linearise the frames of ``index`` where they stand now."""
+    if len(index):
+        for kept, fresh in zip(normal, problem.linearise(own[index], y, index), strict=True):
+            kept[index] = fresh.to(kept.dtype)
+
+
+def _keep_the_better(
+    problem: Problem, own: Tensor, trial: Tensor, trial_y: Tensor, new: Tensor, good: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Frames whose step failed may stay where they were, under the new shared parameters."""
+    bad = torch.nonzero(~good)[:, 0]
+    if len(bad):
+        stayed = problem.cost(own[bad], trial_y, bad)
+        better = stayed <= new[bad]
+        trial[bad] = torch.where(better[:, None], own[bad], trial[bad])
+        new[bad] = torch.minimum(stayed, new[bad])
+        good = good.clone()
+        good[bad] = ~better
+    return trial, new, good
+
+
+def _damped_step(
+    normal: NormalEquations, lam: Tensor, num_shared: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Steps (b, n) and (m,) of the damped arrow, and which frames could be factorised (b,)."""
+    hessian, gradient = normal.hessian.double(), normal.gradient.double()
+    n = gradient.shape[1] - num_shared
+    a, g = hessian[:, :n, :n].clone(), gradient[:, :n]
+    diagonal = a.diagonal(dim1=1, dim2=2)
+    diagonal += lam[:, None] * diagonal + 1e-9
+    factor, info = torch.linalg.cholesky_ex(a)
+    solved = info == 0
+    if not bool(solved.all()):  # leaves such a frame where it is; its damping grows
+        factor = torch.where(
+            solved[:, None, None], factor, torch.eye(n, dtype=a.dtype, device=a.device)
+        )
+        g = torch.where(solved[:, None], g, torch.zeros_like(g))
+    if num_shared == 0:
+        step = -torch.cholesky_solve(g[..., None], factor)[..., 0]
+        return step, gradient.new_zeros(0), solved
+    border = torch.where(solved[:, None, None], hessian[:, :n, n:], torch.zeros(1).to(hessian))
+    back = torch.cholesky_solve(torch.cat([g[..., None], border], 2), factor)
+    schur = hessian[:, n:, n:].sum(0) - (border.transpose(1, 2) @ back[..., 1:]).sum(0)
+    schur.diagonal().add_(lam.mean() * schur.diagonal().abs() + 1e-9)
+    right = gradient[:, n:].sum(0) - (border.transpose(1, 2) @ back[..., :1])[..., 0].sum(0)
+    shared_step = -torch.linalg.solve(schur, right)
+    step = -back[..., 0] - (back[..., 1:] @ shared_step)
+    return step, shared_step, solved

@@ -1,0 +1,46 @@
+"""Robust penalties of squared residuals, as rho(s) and its slope, the weight of Gauss-Newton.
+
+The convention of every solver here: a residual vector r with s = |r|^2 costs rho(s) / 2, whose
+gradient is w J^T r with w = d rho / d s. Replacing rho by the parabola of weight w keeps the
+gradient and leaves a positive semi-definite Hessian w J^T J (iteratively reweighted least squares).
+All rho have rho(0) = 0 and slope 1 at 0, so a scale alone says where a residual stops counting.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Robust(NamedTuple):
+    """rho (...) of squared residuals, and its slope, the weight (...) in (0, 1]."""
+
+    rho: Tensor
+    weight: Tensor
+
+
+def huber(squared: Tensor, scale: float | Tensor) -> Robust:
+    """Huber 1964: squared residuals (...) count in full up to ``scale``, then linearly.
+
+    ``squared`` and ``scale``^2 are in the same units. rho = s for s <= scale^2, else
+    2 scale sqrt(s) - scale^2.
+    """
+    scale = torch.as_tensor(scale, dtype=squared.dtype, device=squared.device)
+    inside = squared <= scale * scale
+    root = torch.where(inside, scale, squared).sqrt()
+    root = torch.where(inside, scale, root)
+    rho = torch.where(inside, squared, 2 * scale * root - scale * scale)
+    return Robust(rho, scale / root)
+
+
+def geman_mcclure(squared: Tensor, scale: float | Tensor) -> Robust:
+    """Geman and McClure 1987, the paper's rho_J: an outlier's pull fades to nothing.
+
+    rho = scale^2 s / (s + scale^2), which is the field's rho^2 r^2 / (r^2 + rho^2); its slope is
+    (scale^2 / (s + scale^2))^2.
+    """
+    c2 = torch.as_tensor(scale, dtype=squared.dtype, device=squared.device) ** 2
+    share = c2 / (squared + c2)
+    return Robust(share * squared, share * share)
