@@ -22,6 +22,11 @@ import numpy as np
 
 from intercap_core.errors import UserError
 
+
+class Unreadable(UserError):
+    """An artefact that is missing, damaged or of another schema."""
+
+
 CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
 
 
@@ -70,7 +75,7 @@ class Schema:
 
 def _filters(declared: Field, dtype: np.dtype) -> dict[str, Any]:
     if declared.codec == "depth":
-        return dict(hdf5plugin.Blosc2(cname="zstd", clevel=3, filters=hdf5plugin.Blosc2.BITSHUFFLE))
+        return dict(hdf5plugin.Blosc2(cname="zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE))
     if declared.codec == "gzip":
         return {"compression": "gzip", "compression_opts": 1, "shuffle": dtype.itemsize > 1}
     return {}
@@ -265,14 +270,14 @@ class Artefact:
     def rows(self, key: str, selection: Any) -> np.ndarray:
         """Read part of a dataset, e.g. one image: ``rows("cameras/k1/depth", 7)``."""
         if key not in self._file:
-            raise UserError(
+            raise Unreadable(
                 f"{self.path}: dataset {key!r} is missing; re-run stage "
                 f"'{self._schema.stage}' for this sequence"
             )
         try:
             values = self._file[key][selection]
         except OSError as error:
-            raise UserError(
+            raise Unreadable(
                 f"{self.path}: dataset {key!r} is damaged (its checksum does not match); delete "
                 f"the file and re-run stage '{self._schema.stage}' for this sequence"
             ) from error
@@ -291,17 +296,17 @@ class Artefact:
 def read(path: Path, schema: Schema) -> Iterator[Artefact]:
     """Open an artefact for reading after checking that it is what ``schema`` declares.
 
-    Raises :class:`UserError` with one sentence that names the file, what is wrong with it and
+    Raises :class:`Unreadable` with one sentence that names the file, what is wrong with it and
     which stage to re-run.
     """
     path = Path(path)
     again = f"re-run stage '{schema.stage}' for this sequence"
     if not path.is_file():
-        raise UserError(f"{path}: there is no such file; {again}")
+        raise Unreadable(f"{path}: there is no such file; {again}")
     try:
         file = h5py.File(path, "r", locking="best-effort")
     except OSError as error:
-        raise UserError(
+        raise Unreadable(
             f"{path}: not a readable HDF5 file (damaged or half-written); delete it and {again}"
         ) from error
     with file:
@@ -312,18 +317,18 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
 def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> None:
     found = str(file.attrs.get("schema", "none"))
     if found != schema.name:
-        raise UserError(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
+        raise Unreadable(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
     version = int(file.attrs.get("schema_version", 0))
     if version != schema.version:
-        raise UserError(
+        raise Unreadable(
             f"{path}: schema {schema.name!r} has version {version}, this program reads version "
             f"{schema.version}; {again}"
         )
     if not bool(file.attrs.get("complete", False)):
-        raise UserError(f"{path}: was never finished (no 'complete' mark); delete it and {again}")
+        raise Unreadable(f"{path}: was never finished (no 'complete' mark); delete it and {again}")
     for name in schema.attributes:
         if name not in file.attrs:
-            raise UserError(f"{path}: attribute {name!r} is missing; {again}")
+            raise Unreadable(f"{path}: attribute {name!r} is missing; {again}")
     lengths: dict[str, int] = {}
     for key, declared in schema.fields.items():
         if "{camera}" in key:
@@ -331,7 +336,7 @@ def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> None:
         if key not in file:
             if declared.optional:
                 continue
-            raise UserError(f"{path}: dataset {key!r} is missing; {again}")
+            raise Unreadable(f"{path}: dataset {key!r} is missing; {again}")
         _check_dataset(file[key], key, declared, lengths, path, again)
 
 
@@ -347,17 +352,17 @@ def _check_dataset(
     if (text and dataset.dtype.kind != "S") or (
         not text and dataset.dtype != np.dtype(declared.dtype)
     ):
-        raise UserError(
+        raise Unreadable(
             f"{path}: dataset {key!r} has type {dataset.dtype}, expected {declared.dtype}; {again}"
         )
     if len(dataset.shape) != len(declared.dims):
-        raise UserError(
+        raise Unreadable(
             f"{path}: dataset {key!r} has shape {dataset.shape}, expected {declared.dims}; {again}"
         )
     for dim, length in zip(declared.dims, dataset.shape, strict=True):
         expected = int(dim) if dim.isdigit() else lengths.setdefault(dim, length)
         if length != expected:
-            raise UserError(
+            raise Unreadable(
                 f"{path}: dataset {key!r} has {length} entries along {dim}, expected {expected}; "
                 f"{again}"
             )
