@@ -1,0 +1,134 @@
+"""Which body regions touch the object in which frames, from geometry and motion alone.
+
+The paper annotates contact by hand. Here every region has a two-state hidden Markov chain over the
+frames (touching or not). Three things speak for contact: the region is as near as the fits are
+accurate; it moves along with an object that moves; and an object that moves must be held by
+something, so the region that follows it best is believed first. Annotated intervals enter as
+strong evidence whose ends may be some frames off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.config import ContactInterval
+
+# Chance for a region to begin or end touching, per second: an interaction of a few seconds has a
+# handful of changes.
+_CHANGES_PER_SECOND = 0.6
+_PRIOR = 0.15  # share of frames that a region touches, before anything is seen
+_FREE_RANGE = 0.40  # a free hand is anywhere within its reach of the object, metres
+# Fit errors last: the evidence of one frame repeats in its neighbours for about this long.
+_CORRELATION_S = 0.2
+_MOVING = 0.12  # an object moves when its surface does so faster than this, m/s
+_SLIP = 0.12  # speed of skin over a held surface that the fits' jitter explains, m/s
+_ANNOTATION_SLACK = 5  # frames by which an annotated end may be off
+_ANNOTATED_LOGIT = 6.0
+
+
+@dataclass(frozen=True)
+class RegionMotion:
+    """What is known of R regions in T frames.
+
+    ``distance`` (T, R) signed distance of the region's nearest area to the object, metres;
+    ``slip`` (T, R) speed of that area relative to the object's surface beside it, m/s;
+    ``object_speed`` (T, R) speed of that surface, m/s; ``sigma`` (T, R) stated standard deviation
+    of the distance, metres.
+    """
+
+    distance: np.ndarray
+    slip: np.ndarray
+    object_speed: np.ndarray
+    sigma: np.ndarray
+
+
+def contact_probability(motion: RegionMotion, fps: float) -> np.ndarray:
+    """Probability (T, R) that each region touches the object, smoothed over time.
+
+    Forward-backward over each region's two-state chain; see the module's description.
+    """
+    evidence = _distance_evidence(motion) + _motion_evidence(motion)
+    evidence = evidence / max(1.0, _CORRELATION_S * fps)
+    evidence += _holder_evidence(motion, evidence, fps)
+    return smooth(evidence, fps)
+
+
+def _distance_evidence(motion: RegionMotion) -> np.ndarray:
+    """Log odds of the distance: normal around the surface against anywhere within reach."""
+    touching = -0.5 * np.square(motion.distance / motion.sigma) - np.log(
+        motion.sigma * np.sqrt(2 * np.pi)
+    )
+    # An error of some millimetres beyond the stated one must not be impossible.
+    touching = np.logaddexp(touching, np.log(0.01 / _FREE_RANGE))
+    return touching - np.log(1 / _FREE_RANGE)
+
+
+def _motion_evidence(motion: RegionMotion) -> np.ndarray:
+    """Log odds of the slip, in frames where the object moves: half-normal against the spread of
+    velocities that a region unaware of the object would have relative to it."""
+    moving = motion.object_speed > _MOVING
+    spread = np.maximum(motion.object_speed, _MOVING)
+    holding = -0.5 * np.square(motion.slip / _SLIP) - np.log(_SLIP)
+    free = -0.5 * np.square(motion.slip / spread) - np.log(spread)
+    return np.where(moving, np.clip(holding - free, -4.0, 4.0), 0.0)
+
+
+def _holder_evidence(motion: RegionMotion, evidence: np.ndarray, fps: float) -> np.ndarray:
+    """An object that moves is moved by something: raise the best candidate within reach."""
+    out = np.zeros_like(evidence)
+    moving = motion.object_speed.max(axis=1) > 2 * _MOVING
+    reachable = motion.distance < 4 * motion.sigma
+    score = np.where(reachable, evidence, -np.inf)
+    best = score.argmax(axis=1)
+    frames = np.flatnonzero(moving & reachable.any(axis=1))
+    out[frames, best[frames]] = 2.0 / max(1.0, _CORRELATION_S * fps)
+    return out
+
+
+def smooth(evidence: np.ndarray, fps: float) -> np.ndarray:
+    """Posterior (T, R) of two-state Markov chains given log odds ``evidence`` (T, R) by frame."""
+    change = min(0.5, _CHANGES_PER_SECOND / fps)
+    begin, end = 2 * change * _PRIOR, 2 * change * (1 - _PRIOR)
+    transition = np.log(np.array([[1 - begin, begin], [end, 1 - end]]))
+    frames, regions = evidence.shape
+    emission = np.stack([np.zeros_like(evidence), evidence], axis=2)  # (T, R, 2)
+    start = np.log(np.array([1 - _PRIOR, _PRIOR]))
+    forward = np.empty((frames, regions, 2))
+    forward[0] = start + emission[0]
+    for t in range(1, frames):
+        forward[t] = emission[t] + np.logaddexp.reduce(forward[t - 1][:, :, None] + transition, 1)
+    backward = np.zeros((frames, regions, 2))
+    for t in range(frames - 2, -1, -1):
+        following = (emission[t + 1] + backward[t + 1])[:, None, :]
+        backward[t] = np.logaddexp.reduce(transition[None] + following, axis=2)
+    joint = forward + backward
+    return np.exp(joint[:, :, 1] - np.logaddexp(joint[:, :, 0], joint[:, :, 1]))
+
+
+def annotation_evidence(
+    intervals: Sequence[ContactInterval], regions: Sequence[str], frames: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log odds (T, R) that annotated intervals add, and the labels (T, R) int8 they state.
+
+    Regions named by no interval are annotated as free throughout: who annotates a sequence's
+    contact annotates all of it. Towards an interval's ends the evidence fades to nothing over
+    the frames by which people err.
+    """
+    labels = np.zeros((frames, len(regions)), np.int8)
+    for interval in intervals:
+        labels[interval.start : interval.end, regions.index(interval.part)] = 1
+    position = np.arange(frames)
+    evidence = np.empty(labels.shape)
+    for r in range(len(regions)):
+        changes = np.flatnonzero(np.diff(labels[:, r])) + 0.5
+        nearest = (
+            np.abs(position[:, None] - changes).min(axis=1)
+            if len(changes)
+            else np.full(frames, np.inf)
+        )
+        certainty = np.clip(nearest / _ANNOTATION_SLACK, 0.0, 1.0)
+        evidence[:, r] = np.where(labels[:, r] == 1, 1.0, -1.0) * certainty * _ANNOTATED_LOGIT
+    return evidence, labels

@@ -1,0 +1,73 @@
+"""The body's likely-contact vertices, thinned and cut into patches that touch as one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.body.model import BodyModel
+from intercap_core.schemas import CONTACT_REGIONS
+
+# Vertices kept of each region: fingers are thin and wrap around things, the rest is smooth.
+_HAND_VERTICES = 240
+_OTHER_VERTICES = 60
+_FIRST_FINGER_JOINT = 25  # joints 25-39 are the left hand's, 40-54 the right's, three a finger
+_PALM = -1
+
+
+@dataclass(frozen=True)
+class Patches:
+    """``vertices`` (N,) ids on the body; ``region`` (N,) and ``patch`` (N,) of each;
+    ``region_of_patch`` (P,); ``joint`` (N,) the joint that moves the vertex most; ``share`` (N,)
+    how many vertices of its region it stands for."""
+
+    vertices: np.ndarray
+    region: np.ndarray
+    patch: np.ndarray
+    region_of_patch: np.ndarray
+    joint: np.ndarray
+    share: np.ndarray
+
+
+def contact_patches(model: BodyModel) -> Patches:
+    """Cut every region of ``CONTACT_REGIONS``: hands into palm and fingers, others are whole."""
+    template = model.template.cpu().numpy()
+    driver = model.skinning_weights.cpu().numpy().argmax(axis=1)
+    vertices, region, patch, region_of_patch, share = [], [], [], [], []
+    for r, name in enumerate(CONTACT_REGIONS):
+        ids = np.asarray(model.regions[name])
+        hand = name.endswith("_hand")
+        kept = ids[farthest_points(template[ids], _HAND_VERTICES if hand else _OTHER_VERTICES)]
+        part = np.full(len(kept), _PALM)
+        if hand:
+            finger = driver[kept] >= _FIRST_FINGER_JOINT
+            part[finger] = (driver[kept][finger] - _FIRST_FINGER_JOINT) // 3
+        for value in np.unique(part):
+            members = kept[part == value]
+            vertices.append(members)
+            region.append(np.full(len(members), r))
+            patch.append(np.full(len(members), len(region_of_patch)))
+            region_of_patch.append(r)
+            share.append(np.full(len(members), len(ids) / len(kept)))
+    ids = np.concatenate(vertices)
+    return Patches(
+        vertices=ids,
+        region=np.concatenate(region),
+        patch=np.concatenate(patch),
+        region_of_patch=np.array(region_of_patch),
+        joint=driver[ids],
+        share=np.concatenate(share),
+    )
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of ``count`` points spread evenly over points (N, 3); all where there are fewer."""
+    if len(points) <= count:
+        return np.arange(len(points))
+    chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
+    distance = np.full(len(points), np.inf)
+    for _ in range(count - 1):
+        distance = np.minimum(distance, np.square(points - points[chosen[-1]]).sum(axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.sort(np.array(chosen))

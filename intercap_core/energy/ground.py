@@ -1,0 +1,25 @@
+"""Ground support E_G and E_G' of the appendix: nothing sinks into the floor.
+
+|| RL(n . (p - W)) ||^2 over the vertices W of the body and of the object, with p a point of the
+floor, n its upward normal and RL the rectifier.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def residuals(points: np.ndarray, ground_point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Height (..., N) of points (..., N, 3) over the floor where negative, else 0; metres.
+
+    Its derivative by a point is ``normal`` where the residual is negative and 0 elsewhere.
+    """
+    return np.minimum((points - ground_point) @ normal, 0.0)
+
+
+def by_object(points: np.ndarray, translation: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Derivative (T, N, 6) of the heights of object points (T, N, 3) by (w, d), for the motion
+    X' = exp(w)(X - t) + t + d with ``translation`` t (T, 3)."""
+    arm = points - translation[:, None]
+    turn = np.cross(arm, np.broadcast_to(normal, arm.shape))
+    return np.concatenate([turn, np.broadcast_to(normal, arm.shape)], axis=2)

@@ -1,0 +1,53 @@
+"""Signed distances of body points to the moving object, and how they change: shared by the
+contact and penetration terms.
+
+d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
+from q to x. Both terms of the paper are functions of this one distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.rigid.distance import DistanceField
+
+# Nearer than this the direction from the surface to the point is noise: the face's normal is used.
+_ON_SURFACE = 1e-4
+
+
+@dataclass(frozen=True)
+class Proximity:
+    """Distances of N points in T frames to the object's surface, master frame, metres.
+
+    ``distance`` (T, N), negative inside; ``normals`` (T, N, 3) d distance / d point;
+    ``by_object`` (T, N, 6) d distance / d (w, d) for the motion X' = exp(w)(X - t) + t + d.
+    """
+
+    distance: np.ndarray
+    normals: np.ndarray
+    by_object: np.ndarray
+
+
+def proximity(
+    field: DistanceField, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> Proximity:
+    """Distances of ``points`` (T, N, 3) to the object at ``rotation`` (T, 3, 3) and
+    ``translation`` (T, 3), all in the master frame, with exact first derivatives."""
+    frames, count = points.shape[:2]
+    local = np.einsum("tji,tnj->tni", rotation, points - translation[:, None])
+    flat = local.reshape(-1, 3)
+    closest = field.closest(flat)
+    inside = field.inside(flat)
+    offset = flat - closest.points
+    length = np.linalg.norm(offset, axis=1)
+    sign = np.where(inside, -1.0, 1.0)
+    direction = sign[:, None] * offset / np.maximum(length, _ON_SURFACE)[:, None]
+    direction = np.where((length < _ON_SURFACE)[:, None], closest.normals, direction)
+    normals = np.einsum("tij,tnj->tni", rotation, direction.reshape(frames, count, 3))
+    # d/dw of -n . (exp(w) (q - t)) = -((q - t) x n); turning n itself changes nothing to first
+    # order since x - q is parallel to it.
+    arm = np.einsum("tij,tnj->tni", rotation, closest.points.reshape(frames, count, 3))
+    by_object = np.concatenate([-np.cross(arm, normals), -normals], axis=2)
+    return Proximity((sign * length).reshape(frames, count), normals, by_object)

@@ -1,0 +1,52 @@
+"""Motion terms E_S (body) and E_A (object) of equation 6 and the appendix: small accelerations.
+
+E_A is the paper's: squared second differences of all object vertices. For a rigid body that sum
+depends on the vertices only through their mean and covariance, so six points with the same moments
+give the same energy. E_S uses the same differences of the body's joints where the paper uses the
+latent velocities of LEMO's network, whose weights are not free. Both are made robust: a start, a
+stop or an impact is an outlier of smooth motion, and is paid for once instead of smeared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+STENCIL = (1.0, -2.0, 1.0)  # of frames t-1, t, t+1
+
+
+def accelerations(points: np.ndarray, fps: float) -> np.ndarray:
+    """Second differences (T-2, N, 3) of points (T, N, 3), in units per second squared."""
+    return (points[:-2] - 2 * points[1:-1] + points[2:]) * fps**2
+
+
+def robust_weights(acceleration: np.ndarray, scale: float) -> np.ndarray:
+    """Charbonnier (pseudo-Huber) weights (T-2, N) of accelerations (T-2, N, 3): quadratic below
+    ``scale``, linear above."""
+    return 1.0 / np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
+
+
+def moment_points(vertices: np.ndarray) -> np.ndarray:
+    """Six points (6, 3) with the mean and covariance of ``vertices`` (V, 3).
+
+    Mean + and - sqrt(3 lambda_i) e_i along the principal axes: any sum of squares of an affine map
+    over the vertices is V / 6 times the same sum over these points.
+    """
+    mean = vertices.mean(axis=0)
+    covariance = np.cov((vertices - mean).T, bias=True)
+    values, axes = np.linalg.eigh(covariance)
+    arms = (axes * np.sqrt(3 * np.maximum(values, 0.0))).T
+    return np.concatenate([mean + arms, mean - arms])
+
+
+def points_by_object(
+    points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Object points (N, 3) moved to all frames (T, N, 3), and their derivative (T, N, 3, 6) by
+    (w, d) for the motion X' = exp(w)(X - t) + t + d."""
+    arm = np.einsum("tij,nj->tni", rotation, points)
+    jacobian = np.zeros((*arm.shape, 6))
+    jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
+    jacobian[..., 1, 0], jacobian[..., 1, 2] = -arm[..., 2], arm[..., 0]
+    jacobian[..., 2, 0], jacobian[..., 2, 1] = arm[..., 1], -arm[..., 0]
+    jacobian[..., [0, 1, 2], [3, 4, 5]] = 1.0
+    return arm + translation[:, None], jacobian

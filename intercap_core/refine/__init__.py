@@ -1,0 +1,1 @@
+"""Body and object refined together over all frames (equation 6)."""

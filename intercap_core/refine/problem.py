@@ -1,0 +1,192 @@
+"""The energy of equation 6 around one state, as normal equations.
+
+Every residual is divided by the standard deviation that its source leaves unexplained, so that a
+term's weight in the settings is 1 where it is as strong as its evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from intercap_core.body.model import BodyModel
+from intercap_core.config import JointSettings
+from intercap_core.contact.patches import Patches
+from intercap_core.energy import contact, ground, penetration, smoothness
+from intercap_core.energy.proximity import Proximity, proximity
+from intercap_core.refine.equations import NormalEquations
+from intercap_core.refine.state import BODY, OBJECT, SIZE, State
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
+
+# What is left of a true contact after skin, mesh and calibration errors, metres. A patch counts as
+# one measurement.
+CONTACT_SIGMA = 0.002
+PENETRATION_SIGMA = 0.003
+GROUND_SIGMA = 0.005
+# Accelerations of everyday motion, m/s^2: people's joints stay below a few of them outside impacts
+# (hands reach 5-10), carried objects likewise.
+BODY_ACCELERATION = 2.5
+FINGER_ACCELERATION = 5.0
+OBJECT_ACCELERATION = 2.5
+ROBUST_FACTOR = 2.0  # accelerations beyond so many sigmas count as a start, a stop or an impact
+_FIRST_FINGER = 25
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor: ``point`` (3,) and upward unit ``normal`` (3,), master frame, metres."""
+
+    point: np.ndarray
+    normal: np.ndarray
+
+
+BodyData = Callable[[State, NormalEquations], None]
+ObjectData = Callable[[State, NormalEquations], None]
+
+
+@dataclass
+class Problem:
+    """All that equation 6 needs beside the state.
+
+    ``data`` add E_B and E_O to the equations; ``probability`` (T, P) that each patch's region
+    touches (Q); ``floor`` is None where none was seen.
+    """
+
+    model: BodyModel
+    mesh: ObjectMesh
+    field: DistanceField
+    patches: Patches
+    data: Sequence[Callable[[State, NormalEquations], None]]
+    probability: np.ndarray
+    floor: Ground | None
+    fps: float
+    settings: JointSettings
+
+    def __post_init__(self) -> None:
+        self._moments = smoothness.moment_points(self.mesh.vertices)
+        fingers = np.arange(55) >= _FIRST_FINGER
+        self._joint_sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
+
+    def equations(self, state: State) -> NormalEquations:
+        """Linearise every term at ``state``."""
+        out = NormalEquations(len(state))
+        for add in self.data:
+            add(state, out)
+        self._near_object(state, out)
+        self._body_motion(state, out)
+        self._object_motion_and_ground(state, out)
+        return out
+
+    def proximity(self, state: State) -> tuple[np.ndarray, Proximity]:
+        """Patch vertices (T, N, 3) in the master frame, and their distance to the object."""
+        with torch.no_grad():
+            body = self.model(state.parameters(self.model), vertex_ids=self.patches.vertices)
+        points = body.vertices.double().cpu().numpy()
+        return points, proximity(self.field, points, state.rotation, state.translation)
+
+    def _near_object(self, state: State, out: NormalEquations) -> None:
+        """E_C and E_P, and E_G of the same vertices."""
+        lin = self.model.linearise(state.parameters(self.model), vertex_ids=self.patches.vertices)
+        points = lin.vertices.double().cpu().numpy()
+        near = proximity(self.field, points, state.rotation, state.translation)
+        touch, touch_weight = contact.weights(near.distance, self.patches.patch, self.probability)
+        deep, deep_weight = penetration.weights(near.distance, self.patches.share)
+        touch_weight *= self.settings.contact_weight / CONTACT_SIGMA**2
+        deep_weight *= self.settings.penetration_weight / PENETRATION_SIGMA**2
+        for term, residual, weight in (
+            ("contact", touch, touch_weight),
+            ("penetration", deep, deep_weight),
+        ):
+            self._add_coupled(term, lin, near, residual, weight, out)
+        if self.floor is not None:
+            height = ground.residuals(points, self.floor.point, self.floor.normal)
+            weight = np.where(height < 0, self.patches.share, 0.0)
+            weight *= self.settings.ground_weight / GROUND_SIGMA**2
+            normal = np.broadcast_to(self.floor.normal, points.shape)
+            rows = self._body_rows(lin, normal, weight.any(axis=0))
+            active = np.flatnonzero(weight.any(axis=0))
+            out.add_rows("ground", slice(0, BODY), rows, weight[:, active], height[:, active])
+
+    def _body_rows(self, lin, normals: np.ndarray, active: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
+        """Rows (T, A, 168) of n^T d point / d body for the active points."""
+        directions = torch.as_tensor(
+            np.ascontiguousarray(normals), dtype=lin.points.dtype, device=lin.points.device
+        )
+        rows = lin.along(directions[:, :, None])[:, :, 0, :BODY]
+        return rows[:, torch.as_tensor(np.flatnonzero(active))].double().cpu().numpy()
+
+    def _add_coupled(
+        self,
+        term: str,
+        lin,  # type: ignore[no-untyped-def]
+        near: Proximity,
+        residual: np.ndarray,
+        weight: np.ndarray,
+        out: NormalEquations,
+    ) -> None:
+        """Rows that move with both the body and the object."""
+        active = weight.any(axis=0)
+        index = np.flatnonzero(active)
+        if not len(index):
+            out.energy.setdefault(term, 0.0)
+            return
+        rows = np.concatenate(
+            [self._body_rows(lin, near.normals, active), near.by_object[:, index]], axis=2
+        )
+        out.add_rows(term, slice(0, SIZE), rows, weight[:, index], residual[:, index])
+
+    def _body_motion(self, state: State, out: NormalEquations) -> None:
+        """E_S on the 55 joints."""
+        lin = self.model.linearise(
+            state.parameters(self.model), vertex_ids=np.zeros(0, np.int64), joints=True
+        )
+        joints = lin.joints.double().cpu().numpy()
+        frames = len(joints)
+        if frames < 3:
+            return
+        acceleration = smoothness.accelerations(joints, self.fps) / self._joint_sigma[:, None]
+        weight = smoothness.robust_weights(acceleration, ROBUST_FACTOR)
+        weight = np.repeat(weight * self.settings.body_smoothness, 3, axis=1)
+        jacobian = lin.full()[..., :BODY].double().cpu().numpy()
+        jacobian = jacobian / self._joint_sigma[:, None, None]
+        out.add_accelerations(
+            "body_motion",
+            slice(0, BODY),
+            jacobian.reshape(frames, -1, BODY),
+            weight,
+            acceleration.reshape(frames - 2, -1),
+            self.fps**2,
+        )
+
+    def _object_motion_and_ground(self, state: State, out: NormalEquations) -> None:
+        """E_A and E_G'."""
+        points, jacobian = smoothness.points_by_object(
+            self._moments, state.rotation, state.translation
+        )
+        frames = len(points)
+        if frames >= 3:
+            acceleration = smoothness.accelerations(points, self.fps) / OBJECT_ACCELERATION
+            weight = smoothness.robust_weights(acceleration, ROBUST_FACTOR)
+            weight = np.repeat(weight * self.settings.object_smoothness, 3, axis=1)
+            out.add_accelerations(
+                "object_motion",
+                OBJECT,
+                jacobian.reshape(frames, -1, 6) / OBJECT_ACCELERATION,
+                weight,
+                acceleration.reshape(frames - 2, -1),
+                self.fps**2,
+            )
+        if self.floor is not None:
+            moved = state.translation[:, None] + np.einsum(
+                "tij,nj->tni", state.rotation, self.mesh.vertices
+            )
+            height = ground.residuals(moved, self.floor.point, self.floor.normal)
+            # the object stands on few vertices: its lowest ones count as one measurement
+            weight = (height < 0) / np.maximum((height < 0).sum(axis=1, keepdims=True), 1)
+            weight = weight * self.settings.ground_weight / GROUND_SIGMA**2
+            rows = ground.by_object(moved, state.translation, self.floor.normal)
+            out.add_rows("ground", OBJECT, rows, weight, height)

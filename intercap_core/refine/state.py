@@ -1,0 +1,50 @@
+"""The unknowns of the joint fit: the body's pose and the object's pose in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL, BodyParameters
+
+BODY = TRANSL.stop  # 55 rotation vectors and the translation
+OBJECT = slice(BODY, BODY + 6)  # turn about the object's origin (left), then shift
+SIZE = BODY + 6  # unknowns of one frame
+
+
+@dataclass(frozen=True)
+class State:
+    """``body`` (T, 168) pose and translation in ``BodyParameters``' order; ``betas`` (S,) and
+    ``expression`` (T, X), which stay as they are; ``rotation`` (T, 3, 3) and ``translation``
+    (T, 3), master_from_object."""
+
+    body: np.ndarray
+    betas: np.ndarray
+    expression: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+    def parameters(self, model: BodyModel) -> BodyParameters:
+        """The body as the model takes it."""
+        vector = np.concatenate(
+            [self.body, np.tile(self.betas, (len(self), 1)), self.expression], axis=1
+        )
+        return model.parameters(torch.as_tensor(vector, dtype=model.dtype, device=model.device))
+
+    def moved(self, step: np.ndarray) -> State:
+        """The state after ``step`` (T, 174)."""
+        turn = Rotation.from_rotvec(step[:, OBJECT][:, :3]).as_matrix()
+        return State(
+            self.body + step[:, :BODY],
+            self.betas,
+            self.expression,
+            turn @ self.rotation,
+            self.translation + step[:, OBJECT][:, 3:],
+        )

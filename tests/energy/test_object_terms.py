@@ -1,0 +1,121 @@
+"""Terms that tie the body to the object and both to the floor."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from intercap_core.energy import contact, ground, penetration, smoothness
+from intercap_core.energy.proximity import proximity
+from intercap_core.rigid.distance import DistanceField
+
+RNG = np.random.default_rng(3)
+
+
+@pytest.fixture(scope="module")
+def sphere() -> DistanceField:
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+    return DistanceField(mesh.vertices, mesh.faces)
+
+
+def _poses(frames: int) -> tuple[np.ndarray, np.ndarray]:
+    return Rotation.random(frames, rng=RNG).as_matrix(), RNG.normal(size=(frames, 3))
+
+
+def test_distance_to_a_moved_sphere_is_its_closed_form(sphere):
+    rotation, translation = _poses(4)
+    points = translation[:, None] + RNG.normal(scale=0.1, size=(4, 50, 3))
+    near = proximity(sphere, points, rotation, translation)
+    expected = np.linalg.norm(points - translation[:, None], axis=2) - 0.1
+    np.testing.assert_allclose(near.distance, expected, atol=5e-4)  # facets of the icosphere
+
+
+def test_distance_derivatives_match_finite_differences():
+    box = trimesh.creation.box((0.2, 0.3, 0.1))
+    field = DistanceField(box.vertices, box.faces)
+    rotation, translation = _poses(3)
+    points = translation[:, None] + RNG.normal(scale=0.15, size=(3, 40, 3))
+    near = proximity(field, points, rotation, translation)
+    step = 2e-3
+
+    def moved(twist: np.ndarray) -> np.ndarray:
+        turn = Rotation.from_rotvec(twist[:3]).as_matrix()
+        return proximity(field, points, turn @ rotation, translation + twist[3:]).distance
+
+    for axis in range(6):
+        twist = np.eye(6)[axis] * step
+        numeric = (moved(twist) - moved(-twist)) / (2 * step)
+        # points that change their nearest face within the step have no derivative
+        agree = np.abs(numeric - near.by_object[..., axis]) < 2e-3
+        assert agree.mean() > 0.9
+    for axis in range(3):
+        offset = np.eye(3)[axis] * step
+        numeric = (
+            proximity(field, points + offset, rotation, translation).distance
+            - proximity(field, points - offset, rotation, translation).distance
+        ) / (2 * step)
+        assert (np.abs(numeric - near.normals[..., axis]) < 2e-3).mean() > 0.9
+
+
+def test_contact_weights_of_a_patch_sum_to_its_probability_when_it_touches():
+    distance = np.array([[0.0, 0.001, 0.2, 0.0]])
+    _, weight = contact.weights(distance, np.array([0, 0, 0, 1]), np.array([[0.8, 0.3]]))
+    assert weight[0, :3].sum() == pytest.approx(0.8)
+    assert weight[0, 3] == pytest.approx(0.3)
+    assert weight[0, 2] < 1e-6
+
+
+def test_a_far_patch_gives_up():
+    _, near = contact.weights(np.array([[0.005]]), np.array([0]), np.array([[1.0]]))
+    _, far = contact.weights(np.array([[0.2]]), np.array([0]), np.array([[1.0]]))
+    assert near.sum() > 0.9 and far.sum() < 0.01
+
+
+def test_only_depth_beyond_the_tolerance_is_paid_for():
+    distance = np.array([[0.01, -0.5 * penetration.TOLERANCE, -0.006]])
+    residual, weight = penetration.weights(distance, np.full(3, 2.0))
+    np.testing.assert_allclose(residual[0], [0, 0, -0.006 + penetration.TOLERANCE])
+    np.testing.assert_allclose(weight[0], [0, 0, 2])
+
+
+def test_ground_counts_what_is_below_alone():
+    points = np.array([[[0, 0, 0.1], [0, 0, -0.02]]])
+    height = ground.residuals(points, np.zeros(3), np.array([0, 0, 1.0]))
+    np.testing.assert_allclose(height, [[0, -0.02]])
+
+
+def test_ground_derivative_matches_finite_differences():
+    points, translation = RNG.normal(size=(2, 5, 3)), RNG.normal(size=(2, 3))
+    normal = np.array([0.6, 0.0, 0.8])
+    rows = ground.by_object(points, translation, normal)
+    step = 1e-6
+    for axis in range(6):
+        twist = np.eye(6)[axis] * step
+        turn = Rotation.from_rotvec(twist[:3]).as_matrix()
+        moved = (points - translation[:, None]) @ turn.T + translation[:, None] + twist[3:]
+        np.testing.assert_allclose(((moved - points) @ normal) / step, rows[..., axis], atol=1e-5)
+
+
+def test_six_points_carry_the_energy_of_all_vertices():
+    vertices = RNG.normal(size=(200, 3)) * (0.1, 0.2, 0.4) + (0.3, 0.0, -0.1)
+    matrix, shift = RNG.normal(size=(3, 3)), RNG.normal(size=3)
+    six = smoothness.moment_points(vertices)
+    energy = np.square(vertices @ matrix.T + shift).sum() / len(vertices)
+    assert np.square(six @ matrix.T + shift).sum() / 6 == pytest.approx(energy)
+
+
+def test_object_points_derivative_matches_finite_differences():
+    rotation, translation = _poses(2)
+    points = RNG.normal(size=(4, 3))
+    moved, jacobian = smoothness.points_by_object(points, rotation, translation)
+    step = 1e-6
+    for axis in range(6):
+        twist = np.eye(6)[axis] * step
+        turn = Rotation.from_rotvec(twist[:3]).as_matrix()
+        there, _ = smoothness.points_by_object(points, turn @ rotation, translation + twist[3:])
+        np.testing.assert_allclose((there - moved) / step, jacobian[..., axis], atol=1e-5)
+
+
+def test_constant_velocity_has_no_acceleration():
+    points = np.arange(6)[:, None, None] * np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(smoothness.accelerations(points, 30.0), 0, atol=1e-10)
