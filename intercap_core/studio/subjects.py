@@ -1,0 +1,200 @@
+"""The studio's true bodies: people whose shape, mesh, skinning and clothes the fit does not know.
+
+Joint names, axes and the rest pose are SMPL-X's, so that a pose means the same for both; all else
+differs from the fitted body: identities lie 3 to 8 mm outside its shape space, on another mesh with
+other skinning weights, half dual-quaternion skinned (Kavan et al. 2008, "Geometric skinning with
+approximate dual quaternion blending"), with muscles that bulge and 5 to 20 mm of clothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
+
+from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS, PARENTS
+
+SUBJECTS_FILE = Path(__file__).parent / "data" / "subjects.npz"
+# Each driver's angle thickens and creases what hangs on it (the file's `bulges`, at 90 degrees)
+_DRIVERS = tuple(
+    JOINT_INDEX[f"{side}_{joint}"]
+    for joint in ("elbow", "knee", "hip", "shoulder")
+    for side in ("left", "right")
+)
+_TIP_JOINTS = [*range(27, 40, 3), *range(42, 55, 3)]
+_DUAL_QUATERNION_SHARE = 0.5
+_LARGEST_BULGE = 1.6  # times the displacement at 90 degrees
+
+
+@dataclass(frozen=True)
+class PosedSubject:
+    """B poses, metres: body skin (B,V,3), clothed surface (B,V,3), joints (B,55,3), tips (B,10,3).
+
+    Tips: left index, middle, pinky, ring, thumb, then right.
+    """
+
+    vertices: np.ndarray
+    clothed: np.ndarray
+    joints: np.ndarray
+    tips: np.ndarray
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One person in the T-pose.
+
+    rest (V,3), faces (F,3), rest_joints (55,3), rest_tips (10,3) in metres, weights (V,55), bulges
+    (8,V,3) metres at a right angle, clothing (V,) metres, height_m; fitted_face (N,) and
+    fitted_bary (N,3): where on this mesh the vertices of the open body are.
+    """
+
+    name: str
+    gender: str
+    height_m: float
+    rest: np.ndarray
+    faces: np.ndarray
+    rest_joints: np.ndarray
+    rest_tips: np.ndarray
+    weights: csr_matrix
+    bulges: np.ndarray
+    clothing: np.ndarray
+    fitted_face: np.ndarray
+    fitted_bary: np.ndarray
+
+    @classmethod
+    def load(cls, name: str) -> Subject:
+        """One of `subject_names()`; another name raises KeyError."""
+        data = _file()
+        names = data["names"].tolist()
+        if name not in names:
+            raise KeyError(f"no subject {name!r}; there are {', '.join(names)}")
+        i = names.index(name)
+        weights = data["weights"].astype(np.float64)
+        return cls(
+            name=name,
+            gender=str(data["gender"][i]),
+            height_m=float(data["height_m"][i]),
+            rest=data["template"] + data["offsets"][i].astype(np.float64),
+            faces=data["faces"].astype(np.int64),
+            rest_joints=data["joints"][i].astype(np.float64),
+            rest_tips=data["tips"][i].astype(np.float64),
+            weights=csr_matrix(weights / weights.sum(1, keepdims=True)),
+            bulges=data["bulges"].astype(np.float64) * float(data["bulge_scale"][i]),
+            clothing=data["clothing"][i].astype(np.float64),
+            fitted_face=data["fitted_face"].astype(np.int64),
+            fitted_bary=_normalised(data["fitted_bary"].astype(np.float64)),
+        )
+
+    def skin(self, pose: np.ndarray, transl: np.ndarray) -> PosedSubject:
+        """Pose the person.
+
+        pose: local rotations (B,55,3,3), or axis-angle (B,165) or (B,55,3) in SMPL-X's order;
+        transl (B,3) metres, added to the rest position as in SMPL-X.
+        """
+        local = _matrices(pose)
+        world, joints = self._chain(local, np.asarray(transl, np.float64))
+        offsets = joints - np.einsum("bkij,kj->bki", world, self.rest_joints)
+        rest = self._flexed(local)
+        vertices = self._blend(world, offsets, rest)
+        clothed = vertices + self.normals(vertices) * self.clothing[:, None]
+        tips = offsets[:, _TIP_JOINTS] + np.einsum(
+            "bkij,kj->bki", world[:, _TIP_JOINTS], self.rest_tips
+        )
+        return PosedSubject(vertices, clothed, joints, tips)
+
+    def on_fitted_topology(self, vertices: np.ndarray) -> np.ndarray:
+        """(B,V,3) on this mesh -> (B,N,3): the surface's points at the open body's vertices."""
+        corners = vertices[:, self.faces[self.fitted_face]]
+        return np.einsum("nk,bnkc->bnc", self.fitted_bary, corners)
+
+    def normals(self, vertices: np.ndarray) -> np.ndarray:
+        """(B,V,3) -> unit normals (B,V,3), each face counted by its area."""
+        a, b, c = (vertices[:, self.faces[:, k]] for k in range(3))
+        cross = np.cross(b - a, c - a)
+        spread = _corner_matrix(self.faces.tobytes(), len(self.faces), vertices.shape[1])
+        summed = np.stack([spread @ x for x in cross])
+        return summed / np.maximum(np.linalg.norm(summed, axis=-1, keepdims=True), 1e-12)
+
+    def _chain(self, local: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        world = np.empty_like(local)
+        joints = np.empty((len(local), NUM_JOINTS, 3))
+        world[:, 0], joints[:, 0] = local[:, 0], self.rest_joints[0] + transl
+        for k in range(1, NUM_JOINTS):
+            p = PARENTS[k]
+            bone = self.rest_joints[k] - self.rest_joints[p]
+            joints[:, k] = joints[:, p] + world[:, p] @ bone
+            world[:, k] = world[:, p] @ local[:, k]
+        return world, joints
+
+    def _flexed(self, local: np.ndarray) -> np.ndarray:
+        """(B,V,3) rest vertices with the bulges of the bent joints."""
+        trace = np.trace(local[:, _DRIVERS], axis1=-2, axis2=-1)
+        bend = np.clip(1 - (trace - 1) / 2, 0, _LARGEST_BULGE)  # 1 - cos of the joint's angle
+        return self.rest + np.einsum("bd,dvc->bvc", bend, self.bulges)
+
+    def _blend(self, world: np.ndarray, offsets: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Half linear, half dual-quaternion blend skinning, (B,V,3)."""
+        batch = len(world)
+        real = Rotation.from_matrix(world.reshape(-1, 3, 3)).as_quat().reshape(batch, -1, 4)
+        for k in range(1, NUM_JOINTS):  # q and -q are one rotation: stay on the parent's side
+            flip = (real[:, k] * real[:, PARENTS[k]]).sum(-1, keepdims=True) < 0
+            real[:, k] = np.where(flip, -real[:, k], real[:, k])
+        dual = 0.5 * _quaternion_product(offsets, real)
+        out = np.empty_like(rest)
+        for b in range(batch):
+            rows = np.concatenate([world[b].reshape(-1, 9), offsets[b], real[b], dual[b]], 1)
+            mixed = self.weights @ rows
+            linear = np.einsum("vij,vj->vi", mixed[:, :9].reshape(-1, 3, 3), rest[b])
+            linear += mixed[:, 9:12]
+            length = np.linalg.norm(mixed[:, 12:16], axis=1, keepdims=True)
+            q, e = mixed[:, 12:16] / length, mixed[:, 16:20] / length
+            xyz, w = q[:, :3], q[:, 3:]
+            turned = rest[b] + 2 * np.cross(xyz, np.cross(xyz, rest[b]) + w * rest[b])
+            shift = 2 * (w * e[:, :3] - e[:, 3:] * xyz + np.cross(xyz, e[:, :3]))
+            share = _DUAL_QUATERNION_SHARE
+            out[b] = (1 - share) * linear + share * (turned + shift)
+        return out
+
+
+def subject_names() -> tuple[str, ...]:
+    """The people there are, in a fixed order."""
+    return tuple(_file()["names"].tolist())
+
+
+@cache
+def _file() -> dict[str, np.ndarray]:
+    with np.load(SUBJECTS_FILE, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+@cache
+def _corner_matrix(faces: bytes, count: int, num_vertices: int) -> csr_matrix:
+    """(V,F) matrix that adds each face's vector to its three vertices."""
+    corners = np.frombuffer(faces, np.int64).reshape(count, 3)
+    columns = np.repeat(np.arange(count), 3)
+    return csr_matrix(
+        (np.ones(3 * count), (corners.ravel(), columns)), shape=(num_vertices, count)
+    )
+
+
+def _normalised(barycentric: np.ndarray) -> np.ndarray:
+    return barycentric / barycentric.sum(1, keepdims=True)
+
+
+def _matrices(pose: np.ndarray) -> np.ndarray:
+    pose = np.asarray(pose, np.float64)
+    if pose.shape[1:] == (NUM_JOINTS, 3, 3):
+        return pose
+    vectors = pose.reshape(-1, 3)
+    return Rotation.from_rotvec(vectors).as_matrix().reshape(len(pose), NUM_JOINTS, 3, 3)
+
+
+def _quaternion_product(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """(vector, 0) * quaternion, both x y z w, (...,3) and (...,4)."""
+    v, w = quaternion[..., :3], quaternion[..., 3:]
+    imaginary = w * vector + np.cross(vector, v)
+    return np.concatenate([imaginary, -(vector * v).sum(-1, keepdims=True)], -1)

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from intercap_core.body.model import BodyModel
+from intercap_core.studio.subjects import Subject, subject_names
+
+
+@pytest.fixture(scope="module")
+def body() -> BodyModel:
+    return BodyModel.load()
+
+
+@pytest.fixture(scope="module")
+def person() -> Subject:
+    return Subject.load("s04")
+
+
+def _random_pose(batch: int) -> np.ndarray:
+    return np.random.default_rng(5).normal(0, 0.35, (batch, 165))
+
+
+def test_a_dozen_people_of_both_genders() -> None:
+    people = [Subject.load(n) for n in subject_names()]
+    assert len(people) == 12
+    assert sum(p.gender == "female" for p in people) == 6
+    heights = [p.height_m for p in people]
+    assert 1.45 < min(heights) < 1.6 and 1.8 < max(heights) < 2.0
+    with pytest.raises(KeyError, match="s99"):
+        Subject.load("s99")
+
+
+def test_the_rest_pose_leaves_the_body_where_it_is(person: Subject) -> None:
+    shift = np.array([0.1, 0.2, 0.3])
+    out = person.skin(np.zeros((1, 165)), shift[None])
+    assert np.allclose(out.vertices[0], person.rest + shift, atol=1e-9)
+    assert np.allclose(out.joints[0], person.rest_joints + shift)
+    assert np.allclose(out.tips[0], person.rest_tips + shift)
+
+
+def test_turning_the_whole_body_is_rigid(person: Subject) -> None:
+    pose = _random_pose(2)
+    pose[1, 3:] = pose[0, 3:]
+    pose[1, :3] = [0.5, 2.9, -0.3]
+    out = person.skin(pose, np.zeros((2, 3)))
+    v = out.clothed[:, ::200]
+    gaps = np.linalg.norm(v[:, :, None] - v[:, None], axis=-1)
+    assert np.allclose(gaps[0], gaps[1], atol=1e-9)
+
+
+def test_a_pose_means_the_same_as_on_the_fitted_body(person: Subject, body: BodyModel) -> None:
+    """Limb directions of the posed skeleton agree, although the bones' lengths do not."""
+    pose = np.zeros((1, 165))
+    pose[0, [48, 51, 55, 12, 1]] = [0.3, -0.2, -1.2, 1.1, 0.7]
+    truth = person.skin(pose, np.zeros((1, 3))).joints[0]
+    ours = body.forward(
+        body.parameters(torch.as_tensor(np.c_[pose, np.zeros((1, 23))], dtype=torch.float32))
+    ).joints[0].numpy()
+    for a, b in ((16, 18), (18, 20), (17, 19), (1, 4), (4, 7), (28, 29)):
+        u, w = truth[b] - truth[a], ours[b] - ours[a]
+        assert u @ w / np.linalg.norm(u) / np.linalg.norm(w) > np.cos(np.radians(3))
+
+
+def test_rotations_and_axis_angle_are_the_same_pose(person: Subject) -> None:
+    from scipy.spatial.transform import Rotation
+
+    pose = _random_pose(2)
+    matrices = Rotation.from_rotvec(pose.reshape(-1, 3)).as_matrix().reshape(2, 55, 3, 3)
+    a, b = (person.skin(p, np.zeros((2, 3))).vertices for p in (pose, matrices))
+    assert np.allclose(a, b, atol=1e-12)
+
+
+def test_the_fitted_model_cannot_reproduce_the_people(body: BodyModel) -> None:
+    template = body.template.numpy().astype(float)
+    params = body.zeros(10)
+    params.betas = torch.eye(10)
+    basis = (body.forward(params).vertices.numpy() - template).reshape(10, -1).T
+    for name in subject_names():
+        subject = Subject.load(name)
+        mapped = subject.on_fitted_topology(subject.rest[None])[0]
+        offset = (mapped - template).reshape(-1)
+        betas, *_ = np.linalg.lstsq(basis, offset, rcond=None)
+        rest = (offset - basis @ betas).reshape(-1, 3)
+        rms = 1e3 * np.sqrt((rest**2).sum(1).mean())
+        assert 1.5 < rms < 9, name
+        assert np.abs(betas).max() < 5
+
+
+def test_mapped_points_are_on_the_surface_and_on_the_same_limb(
+    person: Subject, body: BodyModel
+) -> None:
+    mapped = person.on_fitted_topology(person.rest[None])[0]
+    own = body.skinning_weights.numpy().argmax(1)
+    theirs = np.asarray(person.weights.argmax(1)).ravel()[person.faces[person.fitted_face]]
+    hands = np.flatnonzero(own >= 25)
+    assert (np.abs(theirs[hands] - own[hands, None]).min(1) <= 2).mean() > 0.97
+    assert mapped.shape == (body.num_vertices, 3)
+    assert person.fitted_bary.min() >= 0
+
+
+def test_clothes_are_where_clothes_are(person: Subject) -> None:
+    out = person.skin(_random_pose(1), np.zeros((1, 3)))
+    gap = np.linalg.norm(out.clothed - out.vertices, axis=-1)[0]
+    assert np.allclose(gap, person.clothing, atol=1e-9)
+    dominant = np.asarray(person.weights.argmax(1)).ravel()
+    for joints, low, high in (([3, 6, 9], 0.004, 0.021), ([1, 2], 0.004, 0.021)):
+        worn = person.clothing[np.isin(dominant, joints)]
+        assert low < np.median(worn) and worn.max() < high
+    bare = np.isin(dominant, [15, 22, 10, 11, *range(25, 55)])
+    assert person.clothing[bare].max() < 1e-3
+
+
+def test_a_bent_elbow_bulges_by_millimetres(person: Subject) -> None:
+    pose = np.zeros((1, 165))
+    pose[0, 55] = -1.6
+    bent = person.skin(pose, np.zeros((1, 3))).vertices[0]
+    flat = Subject(**{**person.__dict__, "bulges": np.zeros_like(person.bulges)})
+    change = np.linalg.norm(bent - flat.skin(pose, np.zeros((1, 3))).vertices[0], axis=1)
+    assert 0.003 < change.max() < 0.02
+    assert (change > 1e-3).mean() < 0.1
