@@ -26,8 +26,7 @@ def body_path(body_models: BodyModels, gender: str) -> Path | None:
 def read_parameters(artefact: Artefact) -> BodyParameters:
     """All T frames of a body_fit or joint artefact; one shape has betas (1, S)."""
     values = {
-        name: torch.as_tensor(np.atleast_2d(artefact[name]), dtype=torch.float32)
-        for name in _NAMES
+        name: torch.as_tensor(np.atleast_2d(artefact[name]), dtype=torch.float32) for name in _NAMES
     }
     return BodyParameters(**values)
 

@@ -59,7 +59,7 @@ def corresponding_vertices(
     return sum(
         true_vertices[..., corners[:, k], :] * weights[:, k, None].astype(true_vertices.dtype)
         for k in range(3)
-    )  # type: ignore[return-value]
+    )
 
 
 def normalised_joint_error(

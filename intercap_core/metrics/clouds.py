@@ -24,7 +24,7 @@ class SurfaceSamples:
         """Interpolate values (V, ...) at the vertices of ``triangles`` (F, 3): (N, ...)."""
         corners = triangles[self.faces]
         weights = self.barycentric.reshape(len(self.faces), 3, *([1] * (values.ndim - 1)))
-        return sum(values[corners[:, k]] * weights[:, k] for k in range(3))  # type: ignore[return-value]
+        return sum(values[corners[:, k]] * weights[:, k] for k in range(3))
 
     def __len__(self) -> int:
         return len(self.faces)
@@ -40,9 +40,7 @@ def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> S
     u, v = (number * _STEP_U) % 1, (number * _STEP_V) % 1
     outside = u + v > 1
     u[outside], v[outside] = 1 - u[outside], 1 - v[outside]
-    return SurfaceSamples(
-        np.minimum(faces, len(triangles) - 1), np.column_stack([1 - u - v, u, v])
-    )
+    return SurfaceSamples(np.minimum(faces, len(triangles) - 1), np.column_stack([1 - u - v, u, v]))
 
 
 class Cloud:

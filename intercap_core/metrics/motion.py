@@ -80,9 +80,7 @@ def motion_onset_lags(
             over = end
             while over < total and is_moving[over]:
                 over += 1
-            found, true = (
-                _leaves(path[start:over], end - start) for path in (centre, true_centre)
-            )
+            found, true = (_leaves(path[start:over], end - start) for path in (centre, true_centre))
             if true is not None:
                 lags.append(float((over - start if found is None else found) - true))
         start = end

@@ -18,20 +18,12 @@ def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray
     return rotation @ point + translation
 
 
-def translation_error(
-    rotation: np.ndarray,
-    translation: np.ndarray,
-    true_rotation: np.ndarray,
-    true_translation: np.ndarray,
-    centre: np.ndarray,
-) -> np.ndarray:
-    """Distance (...) of the object's centre of mass from where it truly is, metres.
+def centre_error(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
+    """Distance (...) of the object's centre of mass (..., 3) from where it truly is, metres.
 
     Symmetries leave the centre of mass in place, so no element of the group makes it smaller.
     """
-    fitted = posed_point(rotation, translation, centre)
-    true = posed_point(true_rotation, true_translation, centre)
-    return np.linalg.norm(fitted - true, axis=-1)
+    return np.linalg.norm(centre - true_centre, axis=-1)
 
 
 def rotation_error_deg(
@@ -43,9 +35,7 @@ def rotation_error_deg(
 
 def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
     """Which poses are truly lost (...): off by more than 50 mm or 20 degrees."""
-    return (translation_error_m > LOST_TRANSLATION_M) | (
-        rotation_error_degrees > LOST_ROTATION_DEG
-    )
+    return (translation_error_m > LOST_TRANSLATION_M) | (rotation_error_degrees > LOST_ROTATION_DEG)
 
 
 def first_seen_found(

@@ -1,4 +1,4 @@
-"""The depth cameras' points of one frame that the segmentation gives to the person or the object."""
+"""Depth points of one frame that the segmentation gives to the person or the object."""
 
 from __future__ import annotations
 

@@ -1,0 +1,98 @@
+"""Signed distances between a posed body and a posed object, and what cameras see of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import open3d as o3d
+
+from intercap_core.camera.rig import Camera
+from intercap_core.camera.transforms import apply
+from intercap_core.rigid.distance import DistanceField
+
+REACH_M = 0.25  # distances are capped here: nothing that is reported looks further
+_LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own triangle
+
+
+class PosedObject:
+    """A rigid mesh (V, 3), (F, 3) in its own frame; its search tree is built once."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
+        self._field = DistanceField(vertices, faces, watertight=watertight)
+        self._low, self._high = vertices.min(0) - REACH_M, vertices.max(0) + REACH_M
+
+    def signed_distance(
+        self, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+    ) -> np.ndarray:
+        """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
+
+        Negative inside, at most ``REACH_M``.
+        """
+        return _within_reach(self._field, (points - translation) @ rotation, self._low, self._high)
+
+
+def distance_to_body(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Signed distance (N,) of points (N, 3) to a posed body (V, 3), (F, 3), as above."""
+    low, high = vertices.min(0) - REACH_M, vertices.max(0) + REACH_M
+    near = ((points > low) & (points < high)).all(1)
+    if not near.any():
+        return np.full(len(points), REACH_M)
+    return _within_reach(DistanceField(vertices, faces), points, low, high)
+
+
+def _within_reach(
+    field: DistanceField, points: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    result = np.full(len(points), REACH_M)
+    near = np.flatnonzero(((points > low) & (points < high)).all(1))
+    if len(near):
+        result[near] = np.clip(field.signed_distance(points[near]), -REACH_M, REACH_M)
+    return result
+
+
+class Sight:
+    """What the rig's cameras see of meshes that hide each other, in one frame."""
+
+    def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene()
+        for vertices, faces in meshes:
+            self._scene.add_triangles(
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(faces, np.uint32)),
+            )
+
+    def seen(
+        self, points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camera]
+    ) -> np.ndarray:
+        """Whether some depth camera (colour where it has none) sees each surface point (N,).
+
+        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the meshes.
+        """
+        seen = np.zeros(len(points), bool)
+        for camera in cameras:
+            lens, camera_from_master = (
+                (camera.depth, camera.depth_from_master)
+                if camera.depth
+                else (camera.colour, camera.colour_from_master)
+            )
+            eye = -camera_from_master[:3, :3].T @ camera_from_master[:3, 3]
+            facing = ((eye - points) * normals).sum(1) > 0
+            ids = np.flatnonzero(facing & ~seen)
+            ids = ids[lens.sees(apply(camera_from_master, points[ids]))]
+            if len(ids) == 0:
+                continue
+            start = points[ids] + _LIFT_M * normals[ids]
+            rays = np.concatenate([start, eye - start], 1).astype(np.float32)
+            hidden = self._scene.test_occlusions(
+                o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0
+            )
+            seen[ids[~hidden.numpy()]] = True
+        return seen
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Outward unit normals (F, 3)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

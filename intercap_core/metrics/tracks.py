@@ -1,0 +1,72 @@
+"""The fitted bodies and objects of a sequence, as the artefacts hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from intercap_core import artefacts
+from intercap_core.body.artefact import load_model, read_parameters
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.config import BodyModels
+from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK
+
+_CHUNK = 16  # frames posed at once: 16 bodies of 13 k vertices take some 20 MB
+_TIPS = [
+    KEYPOINT_NAMES.index(f"{side}_{finger}_tip")
+    for side in ("left", "right")
+    for finger in ("thumb", "index", "middle", "ring", "pinky")
+]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTrack:
+    """T bodies. ``sigma`` (T, 55) stated deviation of the joints or None, ``joints`` (T, 55, 3)."""
+
+    model: BodyModel
+    parameters: BodyParameters
+    joints: np.ndarray
+    tips: np.ndarray
+    sigma: np.ndarray | None = None
+
+    def vertices(self) -> Iterator[np.ndarray]:
+        """Posed vertices (V, 3) float32 of one frame after another."""
+        for start in range(0, len(self.joints), _CHUNK):
+            chunk = self.parameters.frames(slice(start, start + _CHUNK))
+            with torch.no_grad():
+                yield from self.model.forward(chunk).vertices.numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTrack:
+    """T poses master_from_object; ``covariance`` (T, 6, 6) or None."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    covariance: np.ndarray | None = None
+
+
+def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> BodyTrack:
+    """Bodies of the ``"body_fit"`` or ``"joint"`` artefact; raises UserError as reading does."""
+    with artefacts.read(path, BODY_FIT if stage == "body_fit" else JOINT) as artefact:
+        parameters = read_parameters(artefact)
+        sigma = artefact["joint_sigma"] if stage == "body_fit" else None
+    model = load_model(body_models, gender, parameters)
+    with torch.no_grad():
+        ids = model.keypoint_map.vertex_ids
+        posed = model.forward(parameters, vertex_ids=ids)
+        tips = model.keypoints(posed)[:, _TIPS].numpy()
+    return BodyTrack(model, parameters, posed.joints.numpy(), tips, sigma)
+
+
+def read_object(path: Path, stage: str) -> ObjectTrack:
+    """Poses of the ``"object_track"`` or ``"joint"`` artefact; raises UserError as reading does."""
+    with artefacts.read(path, OBJECT_TRACK if stage == "object_track" else JOINT) as artefact:
+        covariance = artefact["covariance"] if stage == "object_track" else None
+        return ObjectTrack(artefact["rotation"], artefact["translation"], covariance)

@@ -1,0 +1,159 @@
+"""The truth of a virtual recording, brought onto the fitted meshes. Only the metrics read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.metrics import body, contact, motion, object_pose
+from intercap_core.metrics.clouds import SurfaceSamples
+from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import METRIC_REGIONS, TRUTH
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True body and object in the recording's T frame sets, master frame, metres.
+
+    ``vertices`` (T, V, 3) of the true skin that correspond to the fitted mesh's, or None where the
+    fitted body has another topology than the one the truth was matched to; ``visible`` (T, V) of
+    them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
+    (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
+    ``translation`` (T, 3); ``contact_region`` (T, 12) in the order of METRIC_REGIONS;
+    ``master_from_colour`` (C, 4, 4) and ``camera_names``.
+    """
+
+    vertices: np.ndarray | None
+    visible: np.ndarray | None
+    joints: np.ndarray
+    tips: np.ndarray
+    object_vertices: np.ndarray
+    object_faces: np.ndarray
+    object_visible: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    object_views: np.ndarray
+    contact_region: np.ndarray
+    camera_names: tuple[str, ...]
+    master_from_colour: np.ndarray
+
+    @classmethod
+    def load(cls, path: Path, times: np.ndarray, fps: float, num_vertices: int) -> Truth:
+        """Read the truth at the frame sets' ``times`` (T,), seconds.
+
+        Raises UserError where the file is broken or does not cover those moments.
+        """
+        with artefacts.read(path, TRUTH) as file:
+            at = _match(path, file["times"], times, fps)
+            vertices = visible = None
+            face, weights = file["correspondence_face"], file["correspondence_weights"]
+            if len(face) == num_vertices:
+                faces = file["body_faces"]
+                vertices = body.corresponding_vertices(
+                    file["body_vertices"][at], faces, face, weights
+                )
+                seen = file["body_visible"][at].astype(np.float32)[..., None]
+                visible = body.corresponding_vertices(seen, faces, face, weights)[..., 0] > 0.5
+            names = file.text("region_names")
+            columns = [names.index(name) for name in METRIC_REGIONS]
+            return cls(
+                vertices=vertices,
+                visible=visible,
+                joints=file["joints"][at],
+                tips=file["fingertips"][at],
+                object_vertices=file["object_vertices"].astype(np.float64),
+                object_faces=file["object_faces"],
+                object_visible=file["object_visible"][at],
+                rotation=file["rotation"][at],
+                translation=file["translation"][at],
+                object_views=file["object_views"][at],
+                contact_region=file["region_contact"][at][:, columns],
+                camera_names=tuple(file.text("camera_names")),
+                master_from_colour=file["master_from_colour"],
+            )
+
+    def object_samples_visible(
+        self, samples: SurfaceSamples, mesh: ObjectMesh
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """True object points nearest to the tracked mesh's samples, and which cameras truly see.
+
+        Returns the points (N, 3), object frame, and (T, N) bool.
+        """
+        points = samples.of(mesh.vertices, mesh.faces)
+        nearest = cKDTree(self.object_vertices).query(points)[1]
+        return self.object_vertices[nearest], self.object_visible[:, nearest]
+
+
+def _match(path: Path, true_times: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
+    """The truth's set (T,) nearest to each recorded set."""
+    if len(true_times) == len(times):
+        return np.arange(len(times))
+    after = np.clip(np.searchsorted(true_times, times), 1, len(true_times) - 1)
+    nearest = after - (times - true_times[after - 1] < true_times[after] - times)
+    worst = float(np.abs(true_times[nearest] - times).max())
+    if worst > 0.5 / fps:
+        raise UserError(
+            f"{path}: holds {len(true_times)} frames and the recording {len(times)}, the nearest "
+            f"up to {worst:.3f} s apart; make the truth of this recording again or leave it out"
+        )
+    return nearest
+
+
+def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
+    """Errors of T fitted bodies' joints by key of the metrics artefact."""
+    joints, tips = track.joints, track.tips
+    true = truth.joints
+    hands = np.r_[body.FINGER_JOINTS[0], body.FINGER_JOINTS[1]]
+    result = {
+        "body_mpjpe": body.joint_error(joints, true),
+        "hand_mpjpe": body.hand_error(joints, tips, true, truth.tips),
+        "hand_mpjpe_wrist": body.hand_error(joints, tips, true, truth.tips, align_wrists=True),
+        "acceleration_body": motion.acceleration_error(
+            joints[:, body.BODY_JOINTS], true[:, body.BODY_JOINTS], fps
+        ),
+        "acceleration_hands": motion.acceleration_error(joints[:, hands], true[:, hands], fps),
+    }
+    if track.sigma is not None:
+        result["joint_normalised"] = body.normalised_joint_error(joints, true, track.sigma)
+    return result
+
+
+def object_errors(
+    truth: Truth, track: ObjectTrack, mesh: ObjectMesh, fps: float
+) -> dict[str, np.ndarray]:
+    """Errors of T object poses by key of the metrics artefact."""
+    centre = mesh.centre_of_mass
+    fitted = object_pose.posed_point(track.rotation, track.translation, centre)
+    true = object_pose.posed_point(truth.rotation, truth.translation, centre)
+    result = {
+        "object_translation": object_pose.centre_error(fitted, true),
+        "object_rotation": object_pose.rotation_error_deg(
+            track.rotation, truth.rotation, mesh.symmetry
+        ),
+        "object_centre": fitted,
+        "acceleration_object": motion.acceleration_error(fitted[:, None], true[:, None], fps),
+    }
+    if track.covariance is not None:
+        result["object_normalised"] = object_pose.normalised_translation_error(
+            track.translation, truth.translation, track.covariance
+        )
+    return result
+
+
+def contact_counts(distance: np.ndarray, true_distance: np.ndarray) -> np.ndarray:
+    """Counts (W, 4) of one frame's body vertices by threshold, from signed distances (V,)."""
+    return np.stack(
+        [
+            contact.confusion(
+                contact.vertex_contact(distance, limit),
+                contact.vertex_contact(true_distance, limit),
+            )
+            for limit in contact.SWEEP_M
+        ]
+    )

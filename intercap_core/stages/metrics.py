@@ -1,0 +1,233 @@
+"""Distances between body, object and measurements, and errors where the truth is known."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.capture.frames import Frames
+from intercap_core.config import BodyModels, MetricsSettings, ObjectEntry, SubjectEntry
+from intercap_core.detection.read import Detections
+from intercap_core.metrics import body, contact, motion, object_pose
+from intercap_core.metrics import truth as truths
+from intercap_core.metrics.extrinsics import displacement
+from intercap_core.metrics.flags import merge_reasons
+from intercap_core.metrics.measurement import Measurement, Values
+from intercap_core.metrics.proximity import PosedObject
+from intercap_core.metrics.segmented import SegmentedClouds
+from intercap_core.metrics.tracks import BodyTrack, ObjectTrack, read_body, read_object
+from intercap_core.project import digest
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import (
+    BODY_FIT,
+    JOINT,
+    METRIC_REGIONS,
+    METRICS,
+    OBJECT_TRACK,
+    PERSON,
+    SCENE,
+)
+
+
+def run(
+    *,
+    frames: Path,
+    scene: Path,
+    detections: Path,
+    person: Path,
+    object_track: Path,
+    body_fit: Path,
+    joint: Path,
+    output: Path,
+    object_: ObjectEntry,
+    subject: SubjectEntry,
+    body_models: BodyModels,
+    settings: MetricsSettings,
+    truth: Path | None = None,
+) -> None:
+    """Measure the joint result of one sequence, and every stage against ``truth`` where given.
+
+    Raises UserError where an input artefact is missing, broken or does not fit the others.
+    """
+    mesh = ObjectMesh.load(object_)
+    fitted_body = read_body(joint, "joint", body_models, subject.gender)
+    fitted_object = read_object(joint, "joint")
+    with contextlib.ExitStack() as stack:
+        images = stack.enter_context(Frames.open(frames))
+        setting = stack.enter_context(artefacts.read(scene, SCENE))
+        clouds = _clouds(images, setting, detections, person, object_track)
+        known = None
+        if truth is not None:
+            vertices = fitted_body.model.num_vertices
+            known = truths.Truth.load(truth, images.time_s, images.fps, vertices)
+        measured = Measurement(
+            mesh,
+            fitted_body,
+            fitted_object,
+            clouds,
+            Rig.from_artefact(setting),
+            settings.contact_mm * 1e-3,
+        )
+        values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
+        true_distance = values.pop("true_distance", None)
+        values |= _motion(fitted_body, fitted_object, mesh, images.fps)
+        values |= _flags(images, person, object_track, body_fit, joint)
+        if known is not None:
+            tracked = read_object(object_track, "object_track")
+            first_body = read_body(body_fit, "body_fit", body_models, subject.gender)
+            errors = _Errors(known, true_distance, mesh, measured.threshold, images.fps)
+            values |= errors.of_object("object_track", tracked)
+            values |= errors.of_body("body_fit", first_body, tracked)
+            values |= errors.of_object("joint", fitted_object)
+            values |= errors.of_body("joint", fitted_body, fitted_object)
+            values |= errors.about_truth() | _extrinsics_errors(setting, known)
+        attributes = {
+            "sequence": images.sequence,
+            "subject": subject.subject,
+            "object": object_.name,
+            "fps": images.fps,
+            "has_truth": known is not None,
+        }
+    with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
+        for key in sorted(values):
+            writer.put(key, values[key])
+
+
+def _clouds(
+    images: Frames, scene: artefacts.Artefact, detections: Path, person: Path, object_track: Path
+) -> SegmentedClouds:
+    found = Detections.load(detections)
+    with artefacts.read(object_track, OBJECT_TRACK) as track:
+        kept = track["candidate"]
+    with artefacts.read(person, PERSON) as people:
+        masks = artefacts.unpack_ragged(people["mask_offsets"], people["mask_rle"])
+    total, cameras = kept.shape
+    person_masks = [masks[t * cameras : (t + 1) * cameras] for t in range(total)]
+    candidates = [
+        [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
+        for t in range(total)
+    ]
+    return SegmentedClouds(
+        images,
+        Rig.from_artefact(scene),
+        person_masks,
+        candidates,
+        scene["slip"],
+        scene["depth_bias"],
+    )
+
+
+def _motion(body_track: BodyTrack, track: ObjectTrack, mesh: ObjectMesh, fps: float) -> Values:
+    centre = object_pose.posed_point(track.rotation, track.translation, mesh.centre_of_mass)
+    return {
+        "acceleration_body": motion.acceleration(body_track.joints[:, body.BODY_JOINTS], fps),
+        "acceleration_object": motion.acceleration(centre[:, None], fps),
+    }
+
+
+def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joint: Path) -> Values:
+    """Frames that some stage does not trust, with every reason."""
+    with artefacts.read(person, PERSON) as artefact:
+        missing = artefact["missing"]
+    with artefacts.read(object_track, OBJECT_TRACK) as artefact:
+        lost, disagree = artefact["lost"], artefact["disagree"]
+    with artefacts.read(body_fit, BODY_FIT) as artefact:
+        failed, bridged = artefact["failed"], artefact["bridged"]
+    with artefacts.read(joint, JOINT) as artefact:
+        joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
+    unseen = ~images.available.any(1)
+    reasons = merge_reasons(
+        [
+            (np.asarray(unseen), "no images"),
+            (missing & ~unseen, "person seen in fewer than two views"),
+            (lost, "object lost"),
+            (disagree & ~lost, "forward and backward object tracks disagree"),
+            (failed, "body fit failed"),
+            (bridged & ~failed, "body filled in from neighbouring frames"),
+        ]
+    )
+    for t, flagged in enumerate(joint_flags):
+        said = joint_reasons[t] or "joint fit not trusted"
+        if flagged and said not in reasons[t]:
+            reasons[t] = f"{reasons[t]}; {said}" if reasons[t] else said
+    return {"flagged": np.array([bool(r) for r in reasons]), "flag_reason": reasons}
+
+
+def _extrinsics_errors(scene: artefacts.Artefact, truth: truths.Truth) -> Values:
+    names = scene.text("camera_names")
+    if not set(names) <= set(truth.camera_names):
+        return {}
+    order = [truth.camera_names.index(name) for name in names]
+    true = truth.master_from_colour[order]
+    master = names.index(str(scene.attributes["master"]))
+    return {
+        "truth/extrinsics_before": displacement(scene["master_from_colour_start"], true, master),
+        "truth/extrinsics_after": displacement(scene["master_from_colour"], true, master),
+    }
+
+
+class _Errors:
+    """Errors of each stage by dataset name; what a stage does not estimate is left out."""
+
+    def __init__(
+        self,
+        truth: truths.Truth,
+        true_distance: np.ndarray | None,
+        mesh: ObjectMesh,
+        threshold_m: float,
+        fps: float,
+    ) -> None:
+        self._truth = truth
+        self._true_distance = true_distance
+        self._mesh = mesh
+        self._threshold = threshold_m
+        self._fps = fps
+        self._surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+
+    def of_object(self, stage: str, track: ObjectTrack) -> Values:
+        errors = truths.object_errors(self._truth, track, self._mesh, self._fps)
+        return {f"truth/{stage}/{key}": value for key, value in errors.items()}
+
+    def of_body(self, stage: str, body_track: BodyTrack, track: ObjectTrack) -> Values:
+        """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets."""
+        errors = truths.body_errors(self._truth, body_track, self._fps)
+        if self._truth.vertices is not None and self._true_distance is not None:
+            errors |= self._vertices(body_track, track)
+        return {f"truth/{stage}/{key}": value for key, value in errors.items()}
+
+    def _vertices(self, body_track: BodyTrack, track: ObjectTrack) -> Values:
+        """Vertex errors and contact, frame by frame."""
+        pve, counts, touching = [], [], []
+        assert self._truth.vertices is not None and self._true_distance is not None
+        for t, vertices in enumerate(body_track.vertices()):
+            pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
+            distance = self._surface.signed_distance(
+                vertices.astype(np.float64), track.rotation[t], track.translation[t]
+            )
+            counts.append(truths.contact_counts(distance, self._true_distance[t]))
+            touching.append(contact.vertex_contact(distance, self._threshold))
+        touched = np.stack(touching)
+        regions = body_track.model.regions
+        return {
+            "body_pve": pve,
+            "vertex_contact_counts": np.stack(counts),
+            "contact_frame": touched.any(1),
+            "region_contact": contact.region_contact(touched, regions, METRIC_REGIONS),
+        }
+
+    def about_truth(self) -> Values:
+        truth = self._truth
+        centre = object_pose.posed_point(
+            truth.rotation, truth.translation, self._mesh.centre_of_mass
+        )
+        return {
+            "truth/sweep": contact.SWEEP_M,
+            "truth/contact_region": truth.contact_region,
+            "truth/object_views": truth.object_views,
+            "truth/object_moving": motion.moving(truth.rotation, centre, self._fps),
+            "truth/object_centre": centre,
+        }

@@ -1,0 +1,141 @@
+"""The metrics stage on a capture whose errors are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fitted_capture as fitted
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.config import MetricsSettings
+from intercap_core.schemas import METRIC_REGIONS, METRICS
+from intercap_core.stages import metrics
+
+STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+    return fitted.make_capture(tmp_path_factory.mktemp("capture"))
+
+
+def _run(capture: fitted.Capture, output: Path, truth: bool) -> Path:
+    metrics.run(
+        **capture.inputs(*STAGES),
+        output=output,
+        object_=capture.object_,
+        subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS,
+        settings=MetricsSettings(),
+        truth=capture.paths["truth"] if truth else None,
+    )
+    return output
+
+
+@pytest.fixture(scope="module")
+def measured(capture: fitted.Capture) -> dict[str, np.ndarray]:
+    with artefacts.read(_run(capture, capture.paths["metrics"], truth=True), METRICS) as artefact:
+        assert artefact.attributes["has_truth"]
+        return {key: artefact[key] for key in artefact.keys()}  # noqa: SIM118
+
+
+def test_errors_are_the_offsets_that_were_put_in(measured: dict[str, np.ndarray]) -> None:
+    for stage in ("body_fit", "joint"):
+        for key in ("body_pve", "body_mpjpe", "hand_mpjpe"):
+            found = measured[f"truth/{stage}/{key}"]
+            assert found == pytest.approx(fitted.BODY_OFFSET_M, abs=1e-6)
+        assert measured[f"truth/{stage}/hand_mpjpe_wrist"] == pytest.approx(0, abs=1e-6)
+    offsets = {"object_track": fitted.OBJECT_OFFSET_M, "joint": fitted.OBJECT_OFFSET_M / 2}
+    for stage, offset in offsets.items():
+        assert measured[f"truth/{stage}/object_translation"] == pytest.approx(offset, abs=1e-6)
+        assert measured[f"truth/{stage}/object_rotation"] == pytest.approx(0, abs=1e-4)
+        assert measured[f"truth/{stage}/acceleration_object"][1:-1] == pytest.approx(0, abs=1e-6)
+
+
+def test_stages_have_only_what_they_estimate(measured: dict[str, np.ndarray]) -> None:
+    assert "truth/object_track/body_pve" not in measured
+    assert "truth/object_track/region_contact" not in measured
+    assert "truth/body_fit/object_translation" not in measured
+    assert "truth/body_fit/joint_normalised" in measured
+
+
+def test_extrinsics_errors_before_and_after(measured: dict[str, np.ndarray]) -> None:
+    assert measured["truth/extrinsics_before"] == pytest.approx([0, 0.012, 0], abs=1e-6)
+    assert measured["truth/extrinsics_after"] == pytest.approx(0, abs=1e-6)
+
+
+def test_contact_is_the_right_hand(measured: dict[str, np.ndarray]) -> None:
+    hand = METRIC_REGIONS.index("right_hand")
+    assert measured["region_contact"][:, hand].all()
+    assert measured["truth/joint/region_contact"][:, hand].all()
+    assert measured["contact_frame"].all() and measured["truth/contact_frame"].all()
+    assert measured["object_sample_contact"].max() == len(measured["contact_frame"])
+    near = measured["object_sample_contact"] > 0
+    assert 0.001 < near.mean() < 0.2
+
+
+def test_distances_agree_with_an_independent_search(
+    capture: fitted.Capture, measured: dict[str, np.ndarray]
+) -> None:
+    import trimesh
+
+    t = 2
+    vertices = capture.vertices[t] + np.array([0, fitted.BODY_OFFSET_M, 0])
+    translation = capture.translation[t] + np.array([0, fitted.OBJECT_OFFSET_M / 2, 0])
+    ball = trimesh.Trimesh(capture.mesh.vertices, capture.mesh.faces, process=False)
+    chosen = np.argsort(np.linalg.norm(vertices - translation, axis=1))[:300]
+    query = trimesh.proximity.ProximityQuery(ball)
+    expected = -query.signed_distance(vertices[chosen] - translation)
+    assert measured["body_to_object"][t, chosen] == pytest.approx(expected, abs=2e-6)
+    person = trimesh.Trimesh(vertices, capture.model.faces.numpy(), process=False)
+    nearest = np.argsort(measured["object_to_body"][t])[:40]
+    distance = trimesh.proximity.closest_point(person, ball.vertices[nearest] + translation)[1]
+    assert np.abs(measured["object_to_body"][t, nearest]) == pytest.approx(distance, abs=2e-6)
+
+
+def test_penetration_is_that_of_the_distances(measured: dict[str, np.ndarray]) -> None:
+    distance = measured["body_to_object"][1]
+    inside = -distance[distance < 0]
+    assert measured["penetration_mean"][1] == pytest.approx(inside.mean(), rel=1e-5)
+    assert measured["penetration_median"][1] == pytest.approx(np.median(inside), rel=1e-5)
+    assert measured["penetration_max"][1] == pytest.approx(inside.max(), rel=1e-5)
+    assert measured["ground_penetration"] == pytest.approx(fitted.BODY_OFFSET_M, abs=1e-5)
+
+
+def test_the_floor_of_cloud_distances_is_below_the_fit(measured: dict[str, np.ndarray]) -> None:
+    # pixels of the depth images are 12 mm apart on the body: no point is nearer than some 5 mm
+    for key in ("body", "object"):
+        for visible in ("", "_visible"):
+            fit = measured[f"{key}{visible}_to_cloud"].mean()
+            floor = measured[f"truth/{key}{visible}_floor"].mean()
+            assert 0.003 < floor < 0.010
+            assert floor - 1e-4 < fit < floor + 0.010
+    assert (measured["truth/body_visible_floor"] < measured["truth/body_floor"]).all()
+
+
+def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
+    assert measured["flag_reason"].tolist() == [
+        "object lost", "", "", "", "person seen in fewer than two views",
+    ]  # fmt: skip
+    assert measured["flagged"].tolist() == [True, False, False, False, True]
+
+
+def test_without_truth_nothing_of_it_appears_and_the_rest_is_the_same(
+    capture: fitted.Capture, measured: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    with artefacts.read(_run(capture, tmp_path / "metrics.h5", truth=False), METRICS) as artefact:
+        assert not artefact.keys("truth/")
+        for key in artefact.keys():  # noqa: SIM118
+            if key.endswith("visible_to_cloud"):  # seen by the fit instead of by the truth
+                assert artefact[key] == pytest.approx(measured[key], abs=2e-3)
+            elif measured[key].dtype == object:
+                assert artefact[key].tolist() == measured[key].tolist()
+            else:
+                assert np.array_equal(artefact[key], measured[key], equal_nan=True)
+
+
+def test_same_input_same_bytes(capture: fitted.Capture, tmp_path: Path) -> None:
+    again = _run(capture, tmp_path / "metrics.h5", truth=True)
+    assert again.read_bytes() == capture.paths["metrics"].read_bytes()
