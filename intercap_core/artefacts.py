@@ -10,6 +10,7 @@ same bytes.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,12 +23,11 @@ import numpy as np
 
 from intercap_core.errors import UserError
 
+CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
+
 
 class Unreadable(UserError):
     """An artefact that is missing, damaged or of another schema."""
-
-
-CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ class Artefact:
             )
         try:
             values = self._file[key][selection]
-        except OSError as error:
+        except (OSError, RuntimeError) as error:
             raise Unreadable(
                 f"{self.path}: dataset {key!r} is damaged (its checksum does not match); delete "
                 f"the file and re-run stage '{self._schema.stage}' for this sequence"
@@ -310,7 +310,10 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
             f"{path}: not a readable HDF5 file (damaged or half-written); delete it and {again}"
         ) from error
     with file:
-        _validate(file, path, schema, again)
+        try:
+            _validate(file, path, schema, again)
+        except (OSError, RuntimeError, KeyError) as error:
+            raise Unreadable(f"{path}: its contents are damaged; delete it and {again}") from error
         yield Artefact(file, path, schema)
 
 
@@ -378,4 +381,4 @@ def pack_ragged(items: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
 def unpack_ragged(offsets: np.ndarray, values: np.ndarray) -> list[bytes]:
     """Invert :func:`pack_ragged`."""
     data = values.tobytes()
-    return [data[a:b] for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+    return [data[a:b] for a, b in itertools.pairwise(offsets)]

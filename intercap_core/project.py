@@ -6,7 +6,7 @@ import csv
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,6 +37,8 @@ class Project:
 
     def annotation_path(self, sequence: str) -> Path:
         """Where this sequence's annotation file is, or would be."""
+        if self.annotation_made(sequence):
+            return self.results / "recordings" / sequence / "annotation.yaml"
         return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
     def annotation(self, sequence: str) -> Annotation:
@@ -46,6 +48,23 @@ class Project:
         """
         path = self.annotation_path(sequence)
         return read_annotation(path) if path.exists() else Annotation()
+
+    def annotation_made(self, sequence: str) -> bool:
+        """Whether the studio writes this sequence's annotation, beside the recordings."""
+        captures = self.config.studio.captures if self.config.studio else {}
+        return sequence in captures and captures[sequence].annotate
+
+    def annotation_digest(self, sequence: str, sections: Sequence[str]) -> str:
+        """Digest of these sections of the sequence's annotation file, which may be broken."""
+        path = self.annotation_path(sequence)
+        if self.annotation_made(sequence) and self.config.studio:
+            return digest(self.config.studio.captures[sequence])
+        try:
+            values = read_yaml(path) if path.exists() else {}
+        except UserError as error:
+            return digest(str(error))
+        values = values if isinstance(values, dict) else {"": values}
+        return digest([values.get(section) for section in sections])
 
     def recordings_made(self, sequence: str) -> Path | None:
         """Folder into which the studio writes this sequence; None for a real recording."""

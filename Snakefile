@@ -1,0 +1,25 @@
+from snakemake.utils import min_version
+
+min_version("9.20")
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/studio.smk"
+include: "workflow/rules/capture.smk"
+include: "workflow/rules/detection.smk"
+include: "workflow/rules/scene.smk"
+include: "workflow/rules/object.smk"
+include: "workflow/rules/body.smk"
+include: "workflow/rules/joint.smk"
+include: "workflow/rules/metrics.smk"
+include: "workflow/rules/export.smk"
+include: "workflow/rules/dataset.smk"
+
+
+rule all:
+    """Artefacts, exports and the report of every sequence."""
+    default_target: True
+    input:
+        rules.dataset.output,
+        expand(f"{RESULTS}/{{sequence}}/export", sequence=SEQUENCES),
+    localrule: True

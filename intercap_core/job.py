@@ -1,0 +1,68 @@
+"""One job of the workflow: its threads, its log, and how its faults are told.
+
+Imports nothing heavy, so that the thread counts are set before any library reads them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from intercap_core.errors import UserError
+
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+# Last line of a job's log; `intercap run` shows these.
+FINISHED = "finished in"
+FAILED = "failed:"
+
+
+def set_threads(threads: int) -> None:
+    """Let the numerical libraries use ``threads`` threads; only before they are imported."""
+    for variable in THREAD_VARIABLES:
+        os.environ[variable] = str(threads)
+
+
+@contextmanager
+def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
+    """Run the block as one job that writes to ``log``.
+
+    A fault of the input is told in one line, in the log and on standard error; any other error
+    leaves its traceback in the log. Both end the process with status 1.
+    """
+    set_threads(threads)
+    log = Path(log)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    handler = logging.FileHandler(log, mode="w", encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
+    logger = logging.getLogger("intercap_core")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    start = time.monotonic()
+    logger.info("%s started with %d thread(s)", name, threads)
+    try:
+        yield
+        logger.info("%s %.1f s", FINISHED, time.monotonic() - start)
+    except UserError as error:
+        logger.error("%s %s", FAILED, error)
+        print(f"{name} failed: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except Exception as error:
+        logger.exception("unexpected error")
+        told = f"unexpected {type(error).__name__}: {str(error).strip() or 'no message'}"
+        logger.error("%s %s", FAILED, told.splitlines()[0])
+        print(f"{name} failed: {told}; the traceback is in {log}", file=sys.stderr)
+        raise SystemExit(1) from None
+    finally:
+        logger.removeHandler(handler)
+        handler.close()

@@ -1,0 +1,29 @@
+rule body_fit:
+    """The body in every frame."""
+    input:
+        body=body_file,
+        frames=rules.frames.output.frames,
+        scene=rules.scene.output.scene,
+        person=rules.person.output.person,
+        annotation=ancient(rules.annotation.output.annotation),
+    output:
+        body_fit=f"{RESULTS}/{{sequence}}/body_fit.h5",
+    params:
+        settings=settings_of("body_fit"),
+        subject=tracked_subject,
+        device=SETTINGS.device,
+        code=code_of("body_fit"),
+    log:
+        f"{LOGS}/{{sequence}}/body_fit.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/body_fit.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(4000),
+        runtime=120,
+    message:
+        "{wildcards.sequence}: fitting the body"
+    script:
+        "../scripts/stage.py"

@@ -1,0 +1,117 @@
+import re
+from pathlib import Path
+
+from snakemake.exceptions import WorkflowError
+
+from intercap_core.code_digest import code_digest
+from intercap_core.config import Annotation
+from intercap_core.errors import UserError
+from intercap_core.project import digest, load_project
+
+
+def _load():
+    """Check all settings and tables before any job; one sentence says what is wrong."""
+    given = workflow.config_settings.configfiles
+    path = given[0] if given else Path("config/config.yaml")
+    overrides = {key: value for key, value in config.items() if key != "project"}
+    config["project"] = {"path": str(path), "overrides": overrides}
+    try:
+        return load_project(path, overrides)
+    except UserError as error:
+        raise WorkflowError(str(error)) from None
+
+
+PROJECT = _load()
+SETTINGS = PROJECT.config
+SEQUENCES = list(PROJECT.sequences)
+RESULTS = PROJECT.results.as_posix()
+LOGS = f"logs/{SETTINGS.dataset}"
+BENCHMARKS = f"benchmarks/{SETTINGS.dataset}"
+ENVIRONMENT = "../../envs/intercap.yaml"
+
+
+wildcard_constraints:
+    sequence="|".join(map(re.escape, SEQUENCES)),
+
+
+def existing(*paths):
+    """The paths that are there: what is missing is the fault of one sequence, told by its job."""
+    return [path for path in paths if path is not None and Path(path).exists()]
+
+
+def of_sequence(wildcards):
+    """The sequence's row, its object and its subject."""
+    row = PROJECT.sequences[wildcards.sequence]
+    return row, PROJECT.objects[row.object], PROJECT.subjects[row.subject]
+
+
+def made_by_studio(wildcards, name):
+    """Named output of the studio for this sequence; None for a real recording."""
+    if PROJECT.recordings_made(wildcards.sequence) is None:
+        return None
+    return expand(getattr(rules.studio.output, name), sequence=wildcards.sequence)
+
+
+def recorded(column):
+    """Input function: what the sequence's row says under ``column``, or the studio made for it."""
+
+    def files(wildcards):
+        made = made_by_studio(wildcards, column)
+        if made is not None:
+            return made
+        value = getattr(PROJECT.sequences[wildcards.sequence], column)
+        if column == "recordings" and value.is_dir():
+            return sorted(value.glob("*.mkv"))
+        return existing(value)
+
+    return files
+
+
+def annotation_file(wildcards):
+    """Input function: the sequence's annotation, where it has one."""
+    if PROJECT.annotation_made(wildcards.sequence):
+        return PROJECT.annotation_path(wildcards.sequence)
+    return existing(PROJECT.annotation_path(wildcards.sequence))
+
+
+def object_files(wildcards):
+    """Input function: the object's mesh and contact vertices."""
+    _, tracked, _ = of_sequence(wildcards)
+    return existing(tracked.mesh, tracked.contact_vertices)
+
+
+def body_file(wildcards):
+    """Input function: the licensed body file of the subject's gender, where one is set."""
+    _, _, subject = of_sequence(wildcards)
+    return existing(getattr(SETTINGS.body_models, subject.gender))
+
+
+def settings_of(stage):
+    """Param: digest of one stage's settings."""
+    return digest(getattr(SETTINGS, stage))
+
+
+def code_of(stage):
+    """Param: digest of the core modules that the stage reaches."""
+    return lambda wildcards: code_digest(f"stages.{stage}")
+
+
+def annotation_of(*sections):
+    """Param: digest of the annotation's own sections; editing another one changes nothing here."""
+    return lambda wildcards: PROJECT.annotation_digest(wildcards.sequence, sections)
+
+
+def tracked_object(wildcards):
+    """Param: digest of the object's entry; its files are inputs."""
+    entry = of_sequence(wildcards)[1]
+    return digest(entry.model_dump(mode="json", exclude={"mesh", "contact_vertices"}))
+
+
+def tracked_subject(wildcards):
+    """Param: digest of the subject's row; its body file is an input."""
+    return digest(of_sequence(wildcards)[2])
+
+
+def memory(megabytes):
+    """Resource: grows with every attempt after a job that was killed for its memory."""
+    return lambda wildcards, attempt: megabytes * attempt

@@ -1,0 +1,29 @@
+rule export:
+    """Files for other tools: InterCap, AMASS, BOP, glb."""
+    input:
+        object=object_files,
+        body=body_file,
+        frames=rules.frames.output.frames,
+        scene=rules.scene.output.scene,
+        joint=rules.joint.output.joint,
+    output:
+        folder=directory(f"{RESULTS}/{{sequence}}/export"),
+    params:
+        settings=settings_of("export"),
+        object=tracked_object,
+        subject=tracked_subject,
+        code=code_of("export"),
+    log:
+        f"{LOGS}/{{sequence}}/export.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/export.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(3000),
+        runtime=30,
+    message:
+        "{wildcards.sequence}: exporting"
+    script:
+        "../scripts/export.py"

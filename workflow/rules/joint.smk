@@ -1,0 +1,35 @@
+rule joint:
+    """Body and object together, over all frames."""
+    input:
+        object=object_files,
+        body=body_file,
+        frames=rules.frames.output.frames,
+        scene=rules.scene.output.scene,
+        detections=rules.detections.output.detections,
+        person=rules.person.output.person,
+        object_track=rules.object_track.output.object_track,
+        body_fit=rules.body_fit.output.body_fit,
+        annotation=ancient(rules.annotation.output.annotation),
+    output:
+        joint=f"{RESULTS}/{{sequence}}/joint.h5",
+    params:
+        settings=settings_of("joint"),
+        annotation=annotation_of("contact"),
+        object=tracked_object,
+        subject=tracked_subject,
+        device=SETTINGS.device,
+        code=code_of("joint"),
+    log:
+        f"{LOGS}/{{sequence}}/joint.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/joint.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(4000),
+        runtime=120,
+    message:
+        "{wildcards.sequence}: refining body and object together"
+    script:
+        "../scripts/stage.py"

@@ -1,0 +1,30 @@
+rule object_track:
+    """The object's pose in every frame."""
+    input:
+        object=object_files,
+        frames=rules.frames.output.frames,
+        scene=rules.scene.output.scene,
+        detections=rules.detections.output.detections,
+        person=rules.person.output.person,
+        annotation=ancient(rules.annotation.output.annotation),
+    output:
+        object_track=f"{RESULTS}/{{sequence}}/object_track.h5",
+    params:
+        settings=settings_of("object_track"),
+        annotation=annotation_of("object_pose"),
+        object=tracked_object,
+        code=code_of("object_track"),
+    log:
+        f"{LOGS}/{{sequence}}/object_track.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/object_track.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(4000),
+        runtime=120,
+    message:
+        "{wildcards.sequence}: tracking the object"
+    script:
+        "../scripts/stage.py"

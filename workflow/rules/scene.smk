@@ -1,0 +1,53 @@
+rule scene:
+    """Refined extrinsics, ground plane and background."""
+    input:
+        frames=rules.frames.output.frames,
+        detections=rules.detections.output.detections,
+        annotation=ancient(rules.annotation.output.annotation),
+    output:
+        scene=f"{RESULTS}/{{sequence}}/scene.h5",
+    params:
+        settings=settings_of("scene"),
+        annotation=annotation_of("floor"),
+        code=code_of("scene"),
+    log:
+        f"{LOGS}/{{sequence}}/scene.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/scene.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(3000),
+        runtime=60,
+    message:
+        "{wildcards.sequence}: refining the cameras, finding the floor"
+    script:
+        "../scripts/stage.py"
+
+
+rule person:
+    """The subject over views, and the triangulated keypoints."""
+    input:
+        detections=rules.detections.output.detections,
+        scene=rules.scene.output.scene,
+        annotation=ancient(rules.annotation.output.annotation),
+    output:
+        person=f"{RESULTS}/{{sequence}}/person.h5",
+    params:
+        settings=settings_of("person"),
+        code=code_of("person"),
+    log:
+        f"{LOGS}/{{sequence}}/person.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/person.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(2000),
+        runtime=30,
+    message:
+        "{wildcards.sequence}: finding the subject in all views"
+    script:
+        "../scripts/stage.py"

@@ -1,0 +1,42 @@
+_studio = SETTINGS.studio
+_recordings = f"{RESULTS}/recordings/{{sequence}}"
+
+
+def capture_of(wildcards):
+    """Param: everything that decides what the studio makes of one sequence."""
+    shared = _studio.model_dump(mode="json", exclude={"captures"})
+    return digest([shared, _studio.captures[wildcards.sequence]])
+
+
+rule studio:
+    """Make one virtual recording whose truth is known."""
+    input:
+        object=object_files,
+    output:
+        recordings=[
+            f"{_recordings}/k{number}.mkv"
+            for number in range(1, (_studio.cameras if _studio else 1) + 1)
+        ],
+        calibration=f"{_recordings}/calibration.json",
+        keypoints=directory(f"{_recordings}/keypoints"),
+        candidates=directory(f"{_recordings}/candidates"),
+        truth=f"{_recordings}/truth.h5",
+        manifest=f"{_recordings}/capture.json",
+    params:
+        settings=capture_of,
+        object=tracked_object,
+        code=lambda wildcards: code_digest("studio.capture"),
+    log:
+        f"{LOGS}/{{sequence}}/studio.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/studio.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(3000),
+        runtime=60,
+    message:
+        "{wildcards.sequence}: making a virtual recording"
+    script:
+        "../scripts/studio.py"

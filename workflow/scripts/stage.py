@@ -1,0 +1,25 @@
+"""One stage of one sequence; the rule's name says which."""
+
+from pathlib import Path
+
+from intercap_core.job import job
+
+with job(
+    f"{snakemake.wildcards.sequence}: {snakemake.rule}",
+    snakemake.log[0],
+    threads=snakemake.threads,
+):
+    from intercap_core.project import load_project
+    from intercap_core.stages.annotation import read_checked
+    from intercap_core.step import SEQUENCE_STAGES, run_step
+
+    run_step(
+        snakemake.rule,
+        load_project(**snakemake.config["project"]),
+        snakemake.wildcards.sequence,
+        inputs={
+            name: Path(path) for name, path in snakemake.input.items() if name in SEQUENCE_STAGES
+        },
+        annotation=read_checked(Path(snakemake.input.annotation)),
+        output=Path(snakemake.output[0]),
+    )
