@@ -45,15 +45,18 @@ class RegionMotion:
     sigma: np.ndarray
 
 
-def contact_probability(motion: RegionMotion, fps: float) -> np.ndarray:
+def contact_probability(
+    motion: RegionMotion, fps: float, *, given: np.ndarray | float = 0.0
+) -> np.ndarray:
     """Probability (T, R) that each region touches the object, smoothed over time.
 
-    Forward-backward over each region's two-state chain; see the module's description.
+    Forward-backward over each region's two-state chain; see the module's description. ``given``
+    (T, R) are further log odds, from :func:`annotation_evidence`.
     """
     evidence = _distance_evidence(motion) + _motion_evidence(motion)
     evidence = evidence / max(1.0, _CORRELATION_S * fps)
     evidence += _holder_evidence(motion, evidence, fps)
-    return smooth(evidence, fps)
+    return smooth(evidence + given, fps)
 
 
 def _distance_evidence(motion: RegionMotion) -> np.ndarray:

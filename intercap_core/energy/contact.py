@@ -21,24 +21,30 @@ REACH = 0.03
 INDENTATION = 0.001
 
 
-def weights(
+def term(
     distance: np.ndarray, patch_of: np.ndarray, probability: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (T, N) in metres and weights (T, N) of all contact vertices.
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Residuals (T, N) in metres, weights (T, N) and energy (m^2) of all contact vertices.
 
     ``distance`` (T, N) signed distances to the object, metres; ``patch_of`` (N,) patch of each
-    vertex; ``probability`` (T, P) that the patch's region touches. The weights of one patch in one
-    frame sum to probability times the square of Geman-McClure's factor.
+    vertex; ``probability`` (T, P) that the patch's region touches. One patch in one frame has the
+    energy q rho(s) / 2, with s the mean square residual over its nearest area and Geman-McClure's
+    rho(s) = R^2 s / (R^2 + s), R = ``REACH``; its weights are q rho'(s) spread over that area.
     """
     residual = distance + INDENTATION
-    out = np.zeros_like(distance)
+    weight = np.zeros_like(distance)
+    energy = 0.0
     for patch in range(probability.shape[1]):
         members = np.flatnonzero(patch_of == patch)
-        if not len(members):
+        gate = probability[:, [patch]]
+        if not len(members) or not gate.any():
             continue
         d = distance[:, members]
         nearest = np.maximum(d.min(axis=1, keepdims=True), 0.0)
-        near = np.exp(-np.square(np.maximum(d - nearest, 0.0) / SOFTNESS) / 2)
-        robust = np.square(REACH**2 / (REACH**2 + nearest**2))
-        out[:, members] = near / near.sum(axis=1, keepdims=True) * robust * probability[:, [patch]]
-    return residual, out
+        area = np.exp(-np.square(np.maximum(d - nearest, 0.0) / SOFTNESS) / 2)
+        area /= area.sum(axis=1, keepdims=True)
+        square = (area * np.square(residual[:, members])).sum(axis=1, keepdims=True)
+        robust = REACH**2 / (REACH**2 + square)
+        weight[:, members] = gate * area * robust**2
+        energy += 0.5 * float((gate * square * robust).sum())
+    return residual, weight, energy

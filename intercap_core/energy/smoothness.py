@@ -19,10 +19,11 @@ def accelerations(points: np.ndarray, fps: float) -> np.ndarray:
     return (points[:-2] - 2 * points[1:-1] + points[2:]) * fps**2
 
 
-def robust_weights(acceleration: np.ndarray, scale: float) -> np.ndarray:
-    """Charbonnier (pseudo-Huber) weights (T-2, N) of accelerations (T-2, N, 3): quadratic below
+def robust(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+    """Pseudo-Huber weights (T-2, N) and energy of accelerations (T-2, N, 3): quadratic below
     ``scale``, linear above."""
-    return 1.0 / np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
+    root = np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
+    return 1.0 / root, float(scale**2 * (root - 1.0).sum())
 
 
 def moment_points(vertices: np.ndarray) -> np.ndarray:

