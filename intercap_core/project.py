@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,8 +15,10 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from intercap_core import artefacts
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
 from intercap_core.errors import UserError
+from intercap_core.schemas import FRAMES
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -41,30 +44,41 @@ class Project:
             return self.results / "recordings" / sequence / "annotation.yaml"
         return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
+    def artefact(self, sequence: str, stage: str) -> Path:
+        """Where a stage of this sequence writes."""
+        return self.results / sequence / f"{stage}.h5"
+
     def annotation(self, sequence: str) -> Annotation:
         """Load this sequence's annotation; empty where there is no file.
 
-        Raises UserError naming file and field where the file is broken.
+        Raises UserError naming file and field where the file is broken, or where an entry lies
+        past the end of the recording (as soon as its frames have been read).
         """
         path = self.annotation_path(sequence)
-        return read_annotation(path) if path.exists() else Annotation()
+        if not path.exists():
+            return Annotation()
+        annotation = _parse(Annotation, read_yaml(path) or {}, str(path), "annotation")
+        with contextlib.suppress(artefacts.Unreadable):
+            with artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source:
+                count = len(source["times"])
+            problem = annotation.check_frames(count)
+            if problem:
+                raise UserError(f"{path}: {problem} (numbered from 0); correct the entry")
+        return annotation
+
+    def annotation_sections(self, sequence: str) -> dict[str, Any]:
+        """The filled sections of the sequence's annotation file as written, unchecked.
+
+        Raises UserError where the file is not YAML.
+        """
+        path = self.annotation_path(sequence)
+        values = (read_yaml(path) or {}) if path.exists() else {}
+        return {k: v for k, v in values.items() if v} if isinstance(values, dict) else {}
 
     def annotation_made(self, sequence: str) -> bool:
         """Whether the studio writes this sequence's annotation, beside the recordings."""
         captures = self.config.studio.captures if self.config.studio else {}
         return sequence in captures and captures[sequence].annotate
-
-    def annotation_digest(self, sequence: str, sections: Sequence[str]) -> str:
-        """Digest of these sections of the sequence's annotation file, which may be broken."""
-        path = self.annotation_path(sequence)
-        if self.annotation_made(sequence) and self.config.studio:
-            return digest(self.config.studio.captures[sequence])
-        try:
-            values = read_yaml(path) if path.exists() else {}
-        except UserError as error:
-            return digest(str(error))
-        values = values if isinstance(values, dict) else {"": values}
-        return digest([values.get(section) for section in sections])
 
     def recordings_made(self, sequence: str) -> Path | None:
         """Folder into which the studio writes this sequence; None for a real recording."""
@@ -161,11 +175,6 @@ def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path)
                 f"{table}: sequence {sequence!r} has recordings {given}, but the studio writes "
                 f"them to {made}; correct the path"
             )
-
-
-def read_annotation(path: Path) -> Annotation:
-    """Read one annotation file; raises UserError naming file and field where it is broken."""
-    return _parse(Annotation, read_yaml(path) or {}, str(path), "annotation")
 
 
 def tidy(path: Path) -> Path:

@@ -8,9 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from intercap_core.config import Annotation
 from intercap_core.project import Project
-from intercap_core.stages.annotation import check_length
 
 SEQUENCE_STAGES = (
     "frames",
@@ -30,7 +28,6 @@ def run_step(
     sequence: str,
     *,
     inputs: Mapping[str, Path],
-    annotation: Annotation,
     output: Path,
 ) -> None:
     """Call ``intercap_core.stages.<stage>.run`` with what its signature asks for.
@@ -38,8 +35,7 @@ def run_step(
     ``inputs`` are the artefacts by the name of the stage that wrote them. Raises UserError where
     the stage finds a fault in the input.
     """
-    if "frames" in inputs and annotation != Annotation():
-        check_length(annotation, inputs["frames"], project.annotation_path(sequence))
+    annotation = project.annotation(sequence)
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
     row = project.sequences[sequence]
     known: dict[str, Any] = {

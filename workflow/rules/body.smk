@@ -5,7 +5,6 @@ rule body_fit:
         frames=rules.frames.output.frames,
         scene=rules.scene.output.scene,
         person=rules.person.output.person,
-        annotation=ancient(rules.annotation.output.annotation),
     output:
         body_fit=f"{RESULTS}/{{sequence}}/body_fit.h5",
     params:

@@ -1,12 +1,7 @@
-rule annotation:
-    """Check the sequence's annotation file; where it is broken, only this job fails."""
-    input:
-        annotation=ancient(annotation_file),
+rule broken_annotation:
+    """Fails with what is wrong; a job only where the sequence's annotation file is broken."""
     output:
-        annotation=f"{RESULTS}/{{sequence}}/annotation.json",
-    params:
-        annotation=annotation_of(*Annotation.model_fields),
-        code=code_of("annotation"),
+        checked=f"{RESULTS}/{{sequence}}/annotation.checked",
     log:
         f"{LOGS}/{{sequence}}/annotation.log",
     benchmark:
@@ -28,7 +23,7 @@ rule frames:
     input:
         recordings=recorded("recordings"),
         calibration=recorded("calibration"),
-        annotation=ancient(rules.annotation.output.annotation),
+        annotation=ancient(annotation_input("drop_frames")),
     output:
         frames=f"{RESULTS}/{{sequence}}/frames.h5",
     params:

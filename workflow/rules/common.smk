@@ -1,3 +1,4 @@
+import functools
 import re
 from pathlib import Path
 
@@ -67,11 +68,35 @@ def recorded(column):
     return files
 
 
-def annotation_file(wildcards):
-    """Input function: the sequence's annotation, where it has one."""
-    if PROJECT.annotation_made(wildcards.sequence):
-        return PROJECT.annotation_path(wildcards.sequence)
-    return existing(PROJECT.annotation_path(wildcards.sequence))
+@functools.cache
+def annotation_sections(sequence):
+    """The filled sections of a sequence's annotation; None where the file is broken."""
+    if PROJECT.annotation_made(sequence):
+        made = digest(SETTINGS.studio.captures[sequence])
+        return {section: made for section in Annotation.model_fields}
+    try:
+        PROJECT.annotation(sequence)
+        return PROJECT.annotation_sections(sequence)
+    except UserError:
+        return None
+
+
+def annotation_input(*sections):
+    """Input function: the annotation file where it fills one of the stage's own sections.
+
+    A broken file is replaced by the output of a job that fails and says why: what was computed
+    before stays, and no other sequence is touched.
+    """
+
+    def files(wildcards):
+        filled = annotation_sections(wildcards.sequence)
+        if filled is None:
+            return [rules.broken_annotation.output.checked.format(sequence=wildcards.sequence)]
+        if not any(section in filled for section in sections):
+            return []
+        return [PROJECT.annotation_path(wildcards.sequence)]
+
+    return files
 
 
 def object_files(wildcards):
@@ -98,7 +123,12 @@ def code_of(stage):
 
 def annotation_of(*sections):
     """Param: digest of the annotation's own sections; editing another one changes nothing here."""
-    return lambda wildcards: PROJECT.annotation_digest(wildcards.sequence, sections)
+
+    def own(wildcards):
+        filled = annotation_sections(wildcards.sequence) or {}
+        return digest([filled.get(section) for section in sections])
+
+    return own
 
 
 def tracked_object(wildcards):

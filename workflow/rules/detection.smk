@@ -4,7 +4,6 @@ rule detections:
         keypoints=recorded("keypoints"),
         candidates=recorded("candidates"),
         frames=rules.frames.output.frames,
-        annotation=ancient(rules.annotation.output.annotation),
     output:
         detections=f"{RESULTS}/{{sequence}}/detections.h5",
     params:

@@ -9,7 +9,7 @@ rule joint:
         person=rules.person.output.person,
         object_track=rules.object_track.output.object_track,
         body_fit=rules.body_fit.output.body_fit,
-        annotation=ancient(rules.annotation.output.annotation),
+        annotation=ancient(annotation_input("contact")),
     output:
         joint=f"{RESULTS}/{{sequence}}/joint.h5",
     params:

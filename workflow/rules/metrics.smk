@@ -11,7 +11,6 @@ rule metrics:
         object_track=rules.object_track.output.object_track,
         body_fit=rules.body_fit.output.body_fit,
         joint=rules.joint.output.joint,
-        annotation=ancient(rules.annotation.output.annotation),
     output:
         metrics=f"{RESULTS}/{{sequence}}/metrics.h5",
     params:

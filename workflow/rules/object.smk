@@ -6,7 +6,7 @@ rule object_track:
         scene=rules.scene.output.scene,
         detections=rules.detections.output.detections,
         person=rules.person.output.person,
-        annotation=ancient(rules.annotation.output.annotation),
+        annotation=ancient(annotation_input("object_pose")),
     output:
         object_track=f"{RESULTS}/{{sequence}}/object_track.h5",
     params:

@@ -3,7 +3,7 @@ rule scene:
     input:
         frames=rules.frames.output.frames,
         detections=rules.detections.output.detections,
-        annotation=ancient(rules.annotation.output.annotation),
+        annotation=ancient(annotation_input("floor")),
     output:
         scene=f"{RESULTS}/{{sequence}}/scene.h5",
     params:
@@ -31,7 +31,6 @@ rule person:
     input:
         detections=rules.detections.output.detections,
         scene=rules.scene.output.scene,
-        annotation=ancient(rules.annotation.output.annotation),
     output:
         person=f"{RESULTS}/{{sequence}}/person.h5",
     params:

@@ -5,11 +5,7 @@ from pathlib import Path
 from intercap_core.job import job
 
 with job(f"{snakemake.wildcards.sequence}: annotation", snakemake.log[0]):
-    from intercap_core.stages import annotation
+    from intercap_core.project import load_project
 
-    output = Path(snakemake.output[0])
-    annotation.run(
-        annotation=Path(snakemake.input.annotation) if snakemake.input.annotation else None,
-        frames=output.with_name("frames.h5"),
-        output=output,
-    )
+    load_project(**snakemake.config["project"]).annotation(snakemake.wildcards.sequence)
+    Path(snakemake.output.checked).touch()

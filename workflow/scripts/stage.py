@@ -10,7 +10,6 @@ with job(
     threads=snakemake.threads,
 ):
     from intercap_core.project import load_project
-    from intercap_core.stages.annotation import read_checked
     from intercap_core.step import SEQUENCE_STAGES, run_step
 
     run_step(
@@ -20,6 +19,5 @@ with job(
         inputs={
             name: Path(path) for name, path in snakemake.input.items() if name in SEQUENCE_STAGES
         },
-        annotation=read_checked(Path(snakemake.input.annotation)),
         output=Path(snakemake.output[0]),
     )
