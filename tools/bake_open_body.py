@@ -29,7 +29,11 @@ def main() -> None:
     from open_body import body_file, source
 
     rig = source.load()
-    body_file.bake(rig, ROOT / "intercap_core" / "body" / "data")
+    body_file.bake(
+        rig,
+        ROOT / "intercap_core" / "body" / "data",
+        ROOT / "tests" / "body" / "data" / "unseen_adults.npz",
+    )
     if options.subjects:
         from open_body import subjects
 

@@ -30,7 +30,20 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
                              zipfile.ZIP_DEFLATED, 9)  # fmt: skip
 
 
-def bake(source: Source, folder: Path) -> None:
+def _held_out(source: Source) -> dict[str, np.ndarray]:
+    """Ten adults that the bake has not seen: some skin vertices and the rig's own joints."""
+    others = shape_space.sample_adults(10, np.random.default_rng(SEED + 2))
+    vertices, joints, _ = shape_space.t_posed(source, source.coefficients(others))
+    ids = np.arange(0, len(source.template), 31)
+    return {
+        "vertex_ids": ids.astype(np.int32),
+        "vertices": vertices[:, ids].astype(np.float32),
+        "joints": joints.astype(np.float32),
+    }
+
+
+def bake(source: Source, folder: Path, held_out: Path) -> None:
+    """Write open_body.npz and its maps to `folder`, and a few unseen adults for the tests."""
     space = shape_space.build(source, SAMPLES, SEED)
     directions = space.directions.astype(np.float16)
     template = space.template.astype(np.float32)
@@ -66,6 +79,7 @@ def bake(source: Source, folder: Path) -> None:
     points.write_maps(folder / "open_body_maps.json", stored.template, source.faces,
                       source.weights, space.joints, tips, mouth)  # fmt: skip
     report(source, stored, regressor)
+    write_npz(held_out, _held_out(source))
 
 
 def report(source: Source, space: shape_space.ShapeSpace, regressor: np.ndarray) -> None:

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from intercap_core.body import priors
+from intercap_core.body.joint_limits import LIMITS_DEG, REST_SPREAD_DEG
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel
+
+from .conftest import random_vector
+
+Rows = priors.DiagonalRows | priors.LinearRows
+
+
+def _hand(model: BodyModel, side: int, count: int) -> Callable[[Tensor], Rows]:
+    return lambda v: priors.hand_pose(
+        v, model.hand_mean, model.hand_components, model.hand_deviation, side=side, count=count
+    )
+
+
+@pytest.mark.parametrize("name", ["limits", "bending", "rest", "shape", "left", "right"])
+def test_rows_differentiate_their_energy(name: str, body64: BodyModel) -> None:
+    """Gradient against autograd of the energy; Gauss-Newton Hessian against the residuals'."""
+    terms = {
+        "limits": priors.joint_limits,
+        "bending": priors.bending,
+        "rest": priors.rest_pose,
+        "shape": priors.shape,
+        "left": _hand(body64, 0, 45),
+        "right": _hand(body64, 1, 12),
+    }
+    term, size = terms[name], body64.num_parameters
+    vector = random_vector(2, size, 11, torch.float64) * 3
+    rows = term(vector)
+    hessian = torch.zeros(2, size, size, dtype=torch.float64)
+    gradient = torch.zeros(2, size, dtype=torch.float64)
+    rows.add_to(hessian, gradient, 1.7)
+    for b in range(2):
+        jacobian = torch.autograd.functional.jacobian(
+            lambda v: term(v[None]).residuals[0], vector[b]
+        )
+        assert torch.allclose(hessian[b], 1.7**2 * jacobian.T @ jacobian, atol=1e-9)
+        slope = torch.autograd.functional.jacobian(
+            lambda v: term(v[None]).energy(1.7)[0], vector[b]
+        )
+        assert torch.allclose(gradient[b], slope, atol=1e-9)
+
+
+def test_limits_are_mirrored_and_hold_the_rest_poses() -> None:
+    limits = np.array(LIMITS_DEG)
+    rest = np.array(REST_SPREAD_DEG)
+    assert (limits[..., 0] <= 0).all() and (limits[..., 1] >= 0).all()
+    assert (rest[:25, :, 0] > limits[:25, :, 0]).all()
+    assert (rest[:25, :, 0] < limits[:25, :, 1]).all()
+    for name, left in JOINT_INDEX.items():
+        if name.startswith("left_"):
+            right = JOINT_INDEX["right_" + name[5:]]
+            assert (limits[left, 1:] == -limits[right, 1:, ::-1]).all()
+            assert (limits[left, 0] == limits[right, 0]).all()
+
+
+def test_limits_cost_everyday_poses_nothing_and_wrong_ones_something() -> None:
+    vector = torch.zeros(5, 188)
+    vector[1, [3 * 18 + 1, 3 * 19 + 1]] = torch.tensor([-2.3, 2.3])  # both elbows closed
+    vector[2, [3, 6, 12, 15]] = torch.tensor([-1.6, -1.6, 1.7, 1.7])  # sitting
+    vector[3, [3 * 16 + 2, 3 * 17 + 2]] = torch.tensor([-1.3, 1.3])  # arms hang
+    vector[4, 12] = -0.5  # the knee bends forward
+    cost = priors.joint_limits(vector).energy(1.0)
+    assert (cost[:4] == 0).all()
+    assert cost[4] > 0.05
+    bend = priors.bending(vector).energy(1.0)
+    assert bend[1] < bend[0] < bend[4]
+
+
+def test_named_grasps_of_the_hand_space_are_likely_and_within_limits(body64: BodyModel) -> None:
+    vector = torch.zeros(200, body64.num_parameters, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    for side, at in ((0, slice(75, 120)), (1, slice(120, 165))):
+        code = torch.randn(200, 45, generator=generator, dtype=torch.float64)
+        code = code.clamp(-1.5, 1.5) * body64.hand_deviation[side]
+        vector[:, at] = body64.hand_pose(code, side)
+    rows = _hand(body64, 0, 45)(vector)
+    assert rows.residuals.abs().max() < 1.5 + 1e-5
+    assert priors.joint_limits(vector).residuals.abs().median() == 0
+    assert torch.deg2rad(torch.tensor(12.0)) > priors.joint_limits(vector).residuals.abs().mean()

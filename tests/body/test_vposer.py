@@ -1,0 +1,96 @@
+"""The weights are licensed, so the tests make files of the right keys with random numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from intercap_core.body.kinematics import rotation_from_axis_angle
+from intercap_core.body.vposer import VPoser, axis_angle_from_rotation
+from intercap_core.errors import UserError
+
+_NAMES = {
+    1: ["bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"],
+    2: ["vp_model.decoder_net.0", "vp_model.decoder_net.3", "vp_model.decoder_net.5"],
+}
+
+
+def _state(version: int) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(version)
+    shapes = [(512, 32), (512, 512), (126, 512)]
+    state = {}
+    for name, shape in zip(_NAMES[version], shapes, strict=True):
+        scale = shape[1] ** -0.5
+        state[f"{name}.weight"] = torch.randn(shape, generator=generator) * scale
+        state[f"{name}.bias"] = torch.randn(shape[0], generator=generator) * 0.1
+    return state
+
+
+def _save(folder: Path, version: int) -> Path:
+    path = folder / ("TR00_E096.pt" if version == 1 else "V02_05.ckpt")
+    torch.save(_state(1) if version == 1 else {"state_dict": _state(2), "epoch": 8}, path)
+    return path
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_decodes_as_the_layers_say(version: int, tmp_path: Path) -> None:
+    prior = VPoser.load(_save(tmp_path, version))
+    assert prior.version == version
+    code = torch.randn(4, 32, generator=torch.Generator().manual_seed(5))
+    slope = 0.2 if version == 1 else 0.01
+    state, x = _state(version), code
+    for name in _NAMES[version][:2]:
+        x = x @ state[f"{name}.weight"].T + state[f"{name}.bias"]
+        x = torch.where(x > 0, x, slope * x)
+    name = _NAMES[version][2]
+    six = (x @ state[f"{name}.weight"].T + state[f"{name}.bias"]).reshape(4, 21, 3, 2)
+    rotations = prior.rotations(code)
+    eye = torch.eye(3).expand(4, 21, 3, 3)
+    assert torch.allclose(rotations @ rotations.transpose(-1, -2), eye, atol=1e-5)
+    assert torch.allclose(torch.linalg.det(rotations), torch.ones(4, 21), atol=1e-5)
+    first = six[..., 0] / six[..., 0].norm(dim=-1, keepdim=True)
+    assert torch.allclose(rotations[..., 0], first, atol=1e-5)
+    assert ((rotations[..., 1] * six[..., 1]).sum(-1) > 0).all()
+    again = rotation_from_axis_angle(prior.decode(code).reshape(4, 21, 3))
+    assert torch.allclose(again, rotations, atol=1e-4)
+
+
+def test_jacobian_equals_finite_differences(tmp_path: Path) -> None:
+    prior = VPoser.load(_save(tmp_path, 2), dtype=torch.float64)
+    code = torch.randn(2, 32, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    _, jacobian = prior.decode_with_jacobian(code)
+    step = 1e-6
+    for k in (0, 13, 31):
+        move = torch.zeros(32, dtype=torch.float64)
+        move[k] = step
+        numeric = (prior.decode(code + move) - prior.decode(code - move)) / (2 * step)
+        assert torch.allclose(jacobian[:, :, k], numeric, atol=1e-6)
+
+
+def test_matrix_logarithm_inverts_rodrigues() -> None:
+    axis = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
+    angles = torch.tensor([0.0, 1e-6, 1e-3, 0.5, 2.0, 3.1], dtype=torch.float64)
+    vectors = angles[:, None] * axis
+    assert torch.allclose(
+        axis_angle_from_rotation(rotation_from_axis_angle(vectors)), vectors, atol=1e-8
+    )
+
+
+def test_files_that_are_no_vposer_are_named(tmp_path: Path) -> None:
+    other, short, text = (tmp_path / n for n in ("other.pt", "short.pt", "text.pt"))
+    torch.save({"a.weight": torch.zeros(2)}, other)
+    state = _state(1)
+    state["bodyprior_dec_out.weight"] = torch.zeros(10, 512)
+    torch.save(state, short)
+    text.write_text("no weights")
+    for path, words in (
+        (tmp_path / "none.pt", "does not exist"),
+        (other, "no decoder"),
+        (short, "shapes"),
+        (text, "damaged"),
+    ):
+        with pytest.raises(UserError, match=words) as caught:
+            VPoser.load(path)
+        assert str(path) in str(caught.value)
