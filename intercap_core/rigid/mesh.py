@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,36 @@ class ObjectMesh:
         middle = self.vertices.mean(0)  # tetrahedra from a near point keep the sum well scaled
         volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
         return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
+
+    def simplified(self, max_faces: int, tolerance_m: float = 0.0005) -> ObjectMesh:
+        """The same object with about ``max_faces`` faces, for rendering and searching.
+
+        Contact vertices are left out (the vertices are others). Returns the mesh itself where it
+        is small enough, and as many faces as it takes to keep every vertex within
+        ``tolerance_m`` of the simplified surface.
+        """
+        import open3d as o3d
+
+        from intercap_core.rigid.distance import DistanceField
+
+        full = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.faces)
+        )
+        count = max_faces
+        while count < 0.8 * len(self.faces):
+            simple = full.simplify_quadric_decimation(count)
+            vertices = np.asarray(simple.vertices)
+            faces = np.asarray(simple.triangles).astype(np.int32)
+            if DistanceField(vertices, faces).distance(self.vertices).max() < tolerance_m:
+                return replace(
+                    self,
+                    vertices=vertices,
+                    faces=faces,
+                    contact_vertices=np.zeros(0, np.int64),
+                    colours=np.full((len(vertices), 3), 128, np.uint8),
+                )
+            count = count * 3 // 2
+        return self
 
     @cached_property
     def radius(self) -> float:

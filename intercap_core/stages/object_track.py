@@ -1,0 +1,193 @@
+"""Stage ``object_track``: the object's pose in every frame (equation 1)."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import rigid
+from intercap_core.capture.frames import Frames
+from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings
+from intercap_core.detection.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.project import digest
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
+from intercap_core.tracking.evidence import View, ViewGeometry
+from intercap_core.tracking.passes import NotFound, Track, Tracker
+
+log = logging.getLogger(__name__)
+
+TRACKING_FACES = 600  # of the mesh that is rendered; kept within 0.5 mm of the full one
+
+
+class _Recording:
+    """The views of every frame set, read from the artefacts when asked for."""
+
+    def __init__(
+        self,
+        frames: Frames,
+        detections: Detections,
+        scene: Path,
+        person: Path,
+        diameter_m: float,
+    ) -> None:
+        self._frames = frames
+        self._detections = detections
+        rig = Rig.from_scene(scene)
+        with artefacts.read(scene, SCENE) as artefact:
+            present = artefact["present"]
+            bias = artefact["depth_bias"]
+            self._slip = artefact["slip"]
+            self.up = artefact["zup_from_master"][2, :3].copy()
+        with artefacts.read(person, PERSON) as artefact:
+            masks = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
+        self._masks = [masks[t * len(rig) : (t + 1) * len(rig)] for t in range(frames.num_sets)]
+        usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
+        self.cameras = [int(c) for c in np.flatnonzero(usable)]
+        self._geometry = [
+            ViewGeometry.for_object(rig[c], diameter_m, float(np.nan_to_num(bias[c])))
+            for c in self.cameras
+        ]
+
+    def image_of(self, t: int, c: int) -> int:
+        """The set whose image of camera c shows the moment of set t, -1 where there is none."""
+        source = t - int(self._slip[t, c])
+        if not 0 <= source < self._frames.num_sets or not self._frames.available[source, c]:
+            return -1
+        return source
+
+    def views(self, t: int) -> list[View]:
+        """What each usable camera shows of set t."""
+        found = []
+        for c, geometry in zip(self.cameras, self._geometry, strict=True):
+            source = self.image_of(t, c)
+            if source < 0:
+                found.append(View.build(geometry, None, b"", []))
+                continue
+            candidates = [
+                (candidate.index, candidate.label, candidate.score, candidate.rle)
+                for candidate in self._detections.candidates(source, c)
+            ]
+            found.append(
+                View.build(
+                    geometry, self._frames.depth(source, c), self._masks[source][c], candidates
+                )
+            )
+        return found
+
+    def labels(self) -> list[list[list[str]]]:
+        """Labels [T][usable cameras][candidates] of what was detected."""
+        result = []
+        for t in range(self._frames.num_sets):
+            row = []
+            for c in self.cameras:
+                source = self.image_of(t, c)
+                found = self._detections.candidates(source, c) if source >= 0 else []
+                row.append([candidate.label for candidate in found])
+            result.append(row)
+        return result
+
+
+def run(
+    *,
+    frames: Path,
+    scene: Path,
+    detections: Path,
+    person: Path,
+    output: Path,
+    object_: ObjectEntry,
+    settings: ObjectTrackSettings,
+    initial: InitialObjectPose | None = None,
+) -> None:
+    """Track the object through the recording and write the object_track artefact.
+
+    The start is ``initial`` where annotated, else searched for. Raises UserError where the mesh
+    or an input artefact is unusable, or no frame shows anything that could be the object.
+    """
+    mesh = ObjectMesh.load(object_)
+    simple = mesh.simplified(TRACKING_FACES)
+    with Frames.open(frames) as recording:
+        source = _Recording(recording, Detections.load(detections), scene, person, mesh.diameter)
+        sequence = recording.sequence
+        if not source.cameras:
+            raise UserError(
+                f"sequence {sequence}: no camera has images and a pose; check the recordings and "
+                "the calibration"
+            )
+        tracker = Tracker(
+            simple,
+            source.views,
+            source.labels(),
+            settings,
+            labels=object_.labels,
+            up=source.up if np.isfinite(source.up).all() else None,
+        )
+        try:
+            track = tracker.run(_start(initial, recording.num_sets, sequence))
+        except NotFound:
+            raise UserError(
+                f"sequence {sequence}: object {object_.name!r} was found in no frame (no "
+                f"segmentation candidate with measured depth fits its size; labels expected: "
+                f"{', '.join(object_.labels) or 'any'}); check the candidates, or annotate "
+                "'object_pose'"
+            ) from None
+        names = list(recording.rig.names)
+    with artefacts.write(
+        output,
+        OBJECT_TRACK,
+        settings_digest=digest(settings),
+        sequence=sequence,
+        object=object_.name,
+        seed_frame=track.seed_frame,
+        seed_source="annotated" if track.annotated else "search",
+    ) as writer:
+        for key, values in _datasets(track, source.cameras, len(names)).items():
+            writer.put(key, values)
+        writer.put("camera_names", names)
+
+
+def _start(
+    initial: InitialObjectPose | None, count: int, sequence: str
+) -> tuple[int, np.ndarray] | None:
+    if initial is None:
+        return None
+    if initial.frame >= count:
+        raise UserError(
+            f"sequence {sequence}: the annotated object_pose is in frame {initial.frame}, the "
+            f"recording has {count} frame sets; correct 'frame' in the annotation"
+        )
+    rotation = Rotation.from_rotvec(initial.rotation_vector).as_matrix()
+    return initial.frame, rigid(rotation, np.array(initial.translation))
+
+
+def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndarray]:
+    """The artefact's datasets by name; cameras without a view keep -1 and NaN."""
+    shape = (len(track.frames), count)
+    candidate = np.full(shape, -1, np.int32)
+    overlap, depth, contour = (np.full(shape, np.nan, np.float32) for _ in range(3))
+    for t, frame in enumerate(track.frames):
+        for c, view in zip(cameras, frame.fit.views, strict=True):
+            candidate[t, c] = view.candidate
+            overlap[t, c] = view.overlap
+            depth[t, c] = view.depth_residual_m
+            contour[t, c] = view.contour_residual_px
+    poses = np.array([frame.fit.pose for frame in track.frames])
+    return {
+        "rotation": poses[:, :3, :3],
+        "translation": poses[:, :3, 3],
+        "candidate": candidate,
+        "overlap": overlap,
+        "depth_residual": depth,
+        "silhouette_residual": contour,
+        "views": np.array([frame.fit.support for frame in track.frames], np.int8),
+        "covariance": np.array([frame.fit.covariance for frame in track.frames]),
+        "lost": np.array([frame.lost for frame in track.frames]),
+        "recovered": np.array([frame.recovered for frame in track.frames]),
+        "disagree": np.array([frame.disagree for frame in track.frames]),
+    }
