@@ -1,0 +1,67 @@
+"""The text that goes with an export: frame, units and direction of every number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from intercap_core.export.motion import Motion
+from intercap_core.rigid.mesh import ObjectMesh
+
+_HEAD = """\
+{sequence}: subject {subject} ({gender} body file), object {object}, {frames} frames at {fps:g} fps
+Frame numbers count from 0 and are the frame sets of the recording.
+Bodies are SMPL-X parameters for the file they were fitted with: {body}.
+An object pose maps the mesh as it is stored: x = R v + t, R 3x3 applied on the left.
+Object mesh: {mesh_vertices} vertices, metres.
+"""
+
+_INTERCAP = """
+intercap/res.pkl    pickle of numpy arrays and lists, keys and shapes as the InterCap release
+  frame: {master}
+  global_orient, transl (T,3), body_pose (1,63T), betas and expression (T,10), jaw/leye/reye (T,3)
+  left_hand_pose, right_hand_pose (T,12): PCA coefficients over the mean hand
+    (flat_hand_mean=False), the nearest to the fitted pose
+  *_hand_pose_axis_angle (T,45): the fitted poses themselves, mean included
+  ob_pose, ob_trans: lists of T (3,) rotation vectors (radians) and translations (metres),
+    master camera from object
+  pose_embedding is left out: it is VPoser's, which was not used
+"""
+
+_AMASS = """
+amass/body.npz      AMASS keys (SMPL-X): poses (T,165) = root, body, jaw, eyes, hands; trans; betas
+amass/object.npz    rotation (T,3,3), translation (T,3): frame from object, metres
+  frame: {viewed}
+  SMPL-X turns the body about its pelvis joint, not the origin; trans allows for that
+"""
+
+_BOP = """
+bop/                one scene folder a camera, in the order of lenses.json; lengths in millimetres
+  scene_gt.json: cam_R_m2c, cam_t_m2c = colour camera from model, row by row
+  scene_camera.json: world = {master}
+  cam_K is a pinhole; the images are distorted, see lenses.json (OpenCV's rational model)
+  models/: the mesh in millimetres, with its symmetries
+"""
+
+_GLB = """
+glb/*.glb           skinned body (55 joints) and object, animated; metres, y up as glTF wants
+  under the node "world": {viewed}
+  four weights a vertex, first frame's expression, no pose correctives
+"""
+
+
+def readme(motion: Motion, viewed: Motion, mesh: ObjectMesh, formats: Sequence[str]) -> str:
+    """README.txt for these formats; ``viewed`` is the motion in the frame of amass and glb."""
+    parts = {"intercap": _INTERCAP, "amass": _AMASS, "bop": _BOP, "glb": _GLB}
+    text = _HEAD + "".join(parts[name] for name in formats)
+    return text.format(
+        sequence=motion.sequence,
+        subject=motion.subject,
+        gender=motion.gender,
+        object=motion.object_,
+        frames=len(motion),
+        fps=motion.fps,
+        body=motion.model.path.name,
+        mesh_vertices=len(mesh.vertices),
+        master=motion.frame,
+        viewed=viewed.frame,
+    )
