@@ -287,9 +287,31 @@ class Artefact:
             )
         return values
 
+    def describe(self, key: str) -> tuple[tuple[int, ...], str, str, str]:
+        """Shape, type, units and frame of a dataset."""
+        dataset = self._file[key]
+        return (
+            dataset.shape,
+            "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
+            str(dataset.attrs["units"]),
+            str(dataset.attrs.get("frame", "")),
+        )
+
     def text(self, key: str) -> list[str]:
         """Read a dataset of text as a list."""
         return [str(v) for v in self[key]]
+
+
+def schema_name(path: Path) -> str:
+    """Which schema a file says it holds; raises Unreadable where it is no artefact."""
+    path = Path(path)
+    if not path.is_file():
+        raise Unreadable(f"{path}: there is no such file; check the path")
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            return str(file.attrs["schema"])
+    except (OSError, RuntimeError, KeyError):
+        raise Unreadable(f"{path}: not an artefact of this program, or damaged") from None
 
 
 @contextlib.contextmanager

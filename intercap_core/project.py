@@ -46,7 +46,7 @@ class Project:
 
     def artefact(self, sequence: str, stage: str) -> Path:
         """Where a stage of this sequence writes."""
-        return self.results / sequence / f"{stage}.h5"
+        return self.results / sequence / ("export" if stage == "export" else f"{stage}.h5")
 
     def annotation(self, sequence: str) -> Annotation:
         """Load this sequence's annotation; empty where there is no file.

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from intercap_core.errors import UserError
 from intercap_core.project import Project
 
 SEQUENCE_STAGES = (
@@ -32,8 +33,8 @@ def run_step(
 ) -> None:
     """Call ``intercap_core.stages.<stage>.run`` with what its signature asks for.
 
-    ``inputs`` are the artefacts by the name of the stage that wrote them. Raises UserError where
-    the stage finds a fault in the input.
+    ``inputs`` are the artefacts by the name of the stage that wrote them; ``output`` is an artefact
+    or, for the export, a folder. Raises UserError where the stage finds a fault in the input.
     """
     annotation = project.annotation(sequence)
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
@@ -54,3 +55,26 @@ def run_step(
         "contact": annotation.contact,
     }
     run(**{name: known[name] for name in inspect.signature(run).parameters})
+
+
+def run_studio(project: Project, sequence: str) -> Path:
+    """Make one virtual recording; returns its folder.
+
+    Raises UserError where the project's studio does not make this sequence.
+    """
+    folder = project.recordings_made(sequence)
+    if project.config.studio is None or folder is None:
+        raise UserError(
+            f"{project.path}: studio.captures does not name {sequence!r}; its recordings are real"
+        )
+    from intercap_core.studio.capture import make_capture
+
+    row = project.sequences[sequence]
+    make_capture(
+        project.config.studio.captures[sequence],
+        project.config.studio,
+        sequence=row,
+        object_=project.objects[row.object],
+        output=folder,
+    )
+    return folder

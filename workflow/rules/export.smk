@@ -3,7 +3,6 @@ rule export:
     input:
         object=object_files,
         body=body_file,
-        frames=rules.frames.output.frames,
         scene=rules.scene.output.scene,
         joint=rules.joint.output.joint,
     output:
@@ -26,4 +25,4 @@ rule export:
     message:
         "{wildcards.sequence}: exporting"
     script:
-        "../scripts/export.py"
+        "../scripts/stage.py"

@@ -5,7 +5,6 @@ rule joint:
         body=body_file,
         frames=rules.frames.output.frames,
         scene=rules.scene.output.scene,
-        detections=rules.detections.output.detections,
         person=rules.person.output.person,
         object_track=rules.object_track.output.object_track,
         body_fit=rules.body_fit.output.body_fit,

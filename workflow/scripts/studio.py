@@ -1,21 +1,9 @@
 """Make one virtual recording."""
 
-from pathlib import Path
-
 from intercap_core.job import job
 
-with job(
-    f"{snakemake.wildcards.sequence}: studio", snakemake.log[0], threads=snakemake.threads
-):
+with job(f"{snakemake.wildcards.sequence}: studio", snakemake.log[0], threads=snakemake.threads):
     from intercap_core.project import load_project
-    from intercap_core.studio import capture
+    from intercap_core.step import run_studio
 
-    project = load_project(**snakemake.config["project"])
-    row = project.sequences[snakemake.wildcards.sequence]
-    capture.make_capture(
-        project.config.studio.captures[row.sequence],
-        project.config.studio,
-        sequence=row,
-        object_=project.objects[row.object],
-        output=Path(snakemake.output.manifest).parent,
-    )
+    run_studio(load_project(**snakemake.config["project"]), snakemake.wildcards.sequence)

@@ -1,0 +1,42 @@
+"""What an artefact holds, printed for a person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core import artefacts, schemas
+from intercap_core.errors import UserError
+
+
+def print_summary(path: Path, *, verify: bool = False) -> None:
+    """Print attributes, datasets and the count of set flags; with ``verify``, read everything.
+
+    Raises UserError where the file is not a whole artefact, or (verifying) a checksum is wrong.
+    """
+    known = {s.name: s for s in vars(schemas).values() if isinstance(s, artefacts.Schema)}
+    name = artefacts.schema_name(path)
+    if name not in known:
+        raise UserError(f"{path}: schema {name!r} is not known; known are {', '.join(known)}")
+    schema = known[name]
+    console = Console()
+    with artefacts.read(path, schema) as source:
+        for key, value in sorted(source.attributes.items()):
+            console.print(f"[bold]{key}[/bold]  {value}", highlight=False)
+        table = Table("dataset", "shape", "type", "units", "frame", "set", "what", box=None)
+        for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
+            shape, dtype, units, frame = source.describe(key)
+            count = ""
+            if dtype == "bool":
+                count = str(int(np.count_nonzero(source[key])))
+            elif verify:
+                source[key]
+            doc = schema.field_of(key).doc
+            shown = " x ".join(map(str, shape))
+            table.add_row(key, shown, dtype, "" if units == "1" else units, frame, count, doc)
+        console.print(table)
+        if verify:
+            console.print("every dataset was read and its checksum is right")

@@ -1,0 +1,230 @@
+"""The `intercap` command: check a project, run it, run one step of it, look at an artefact.
+
+Nothing heavy is imported before a command needs it, so that help answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from intercap_core.errors import UserError
+
+STAGES = {
+    "frames": "Recordings to synchronised frame sets.",
+    "detections": "Keypoints and segmentation candidates, from files.",
+    "scene": "Refined extrinsics, ground plane and background.",
+    "person": "The subject over views, and the triangulated keypoints.",
+    "object_track": "The object's pose in every frame.",
+    "body_fit": "SMPL-X parameters in every frame.",
+    "joint": "Body and object together, over all frames, with contact.",
+    "metrics": "Distances, penetration, and errors against truth where it is known.",
+    "export": "Files for other tools: InterCap, AMASS, BOP, glb.",
+}
+WHOLE, SINGLE, LOOK = "A whole dataset", "One step of one sequence", "Look and maintain"
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help=(
+        "Multi-camera RGB-D recordings of people handling objects, turned into a finished 4D "
+        "dataset.\n\n"
+        "[bold]A first look:[/bold] [cyan]intercap run config/demo/config.yaml[/cyan] makes three "
+        "virtual recordings and everything up to the report.\n\n"
+        "[bold]Own recordings:[/bold] fill in config/config.yaml, config/sequences.tsv and "
+        "config/subjects.tsv (config/README.md explains every entry), then\n\n"
+        "[cyan]intercap check[/cyan] says what is wrong with them, and\n\n"
+        "[cyan]intercap run[/cyan] computes what is missing or out of date.\n\n"
+        "[bold]One step:[/bold] [cyan]intercap joint config/demo/config.yaml cup_drink_s02[/cyan] "
+        "runs one stage on artefacts that are there; "
+        "[cyan]intercap inspect results/demo/cup_drink_s02/joint.h5[/cyan] says what a file holds."
+    ),
+)
+
+DEFAULT_SETTINGS = Path("config/config.yaml")
+Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
+SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
+Cores = Annotated[int, typer.Option(help="Processor cores to use; 0 = all.")]
+
+
+@app.command(rich_help_panel=WHOLE)
+def check(settings: Settings = DEFAULT_SETTINGS) -> None:
+    """Check settings, tables, annotations and recordings, and say all that is wrong.
+
+    Example: intercap check config/demo/config.yaml
+    """
+    from intercap_core.project import load_project
+    from intercap_core.project_check import faults_of_sequences
+
+    project = load_project(settings)
+    faults = faults_of_sequences(project)
+    for fault in faults:
+        typer.echo(f"problem: {fault}", err=True)
+    good = len(project.sequences) - len({fault.sequence for fault in faults})
+    typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
+    if faults:
+        raise typer.Exit(1)
+
+
+@app.command(
+    rich_help_panel=WHOLE,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+)
+def run(context: typer.Context, settings: Settings = DEFAULT_SETTINGS, cores: Cores = 0) -> None:
+    """Compute everything that is missing or out of date, and show how it goes.
+
+    Wraps Snakemake: what else you write is handed to it. A sequence that fails leaves the others
+    running, and the report is made of those that succeed.
+
+    Examples: intercap run config/demo/config.yaml;
+    intercap run config/demo/config.yaml --cores 2 -- --until joint
+    """
+    from intercap_core.run import run_workflow
+
+    raise typer.Exit(run_workflow(settings, cores=cores, arguments=context.args))
+
+
+@app.command(rich_help_panel=WHOLE)
+def evaluate(
+    settings: Settings = Path("config/evaluation/config.yaml"),
+    output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
+        "results/evaluation.json"
+    ),
+    cores: Cores = 0,
+) -> None:
+    """Run the evaluation captures and print the tables against truth.
+
+    Example: intercap evaluate
+    """
+    from intercap_core.evaluation import evaluate as run_evaluation
+
+    raise typer.Exit(run_evaluation(settings, output, cores=cores))
+
+
+@app.command(rich_help_panel=WHOLE)
+def bench(
+    settings: Settings = Path("config/bench/config.yaml"),
+    output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
+        "results/bench.json"
+    ),
+    cores: Cores = 0,
+) -> None:
+    """Measure seconds a frame and peak memory, by stage and end to end, on one recording.
+
+    Example: intercap bench
+    """
+    from intercap_core.benchmark import measure
+
+    measure(settings, output, cores=cores)
+
+
+@app.command(rich_help_panel=SINGLE)
+def studio(settings: Settings, sequence: SequenceName) -> None:
+    """Make one virtual recording whose truth is known.
+
+    Example: intercap studio config/demo/config.yaml cup_drink_s02
+    """
+    _prepare()
+    from intercap_core.project import load_project
+    from intercap_core.step import run_studio
+
+    project = load_project(settings)
+    typer.echo(run_studio(project, _known(project.sequences, sequence)))
+
+
+def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
+    def command(
+        settings: Settings,
+        sequence: SequenceName,
+        output: Annotated[
+            Path | None, typer.Option(help="Where to write; else the project's own place.")
+        ] = None,
+        threads: Annotated[int, typer.Option(help="Threads of the numerical libraries.")] = 1,
+    ) -> None:
+        _prepare(threads)
+        from intercap_core.project import load_project
+        from intercap_core.step import SEQUENCE_STAGES, run_step
+
+        project = load_project(settings)
+        name = _known(project.sequences, sequence)
+        written = output or project.artefact(name, stage)
+        inputs = {other: project.artefact(name, other) for other in SEQUENCE_STAGES}
+        run_step(stage, project, name, inputs=inputs, output=written)
+        typer.echo(written)
+
+    command.__doc__ = (
+        f"{purpose}\n\nReads what the earlier stages wrote for this sequence.\n\n"
+        f"Example: intercap {stage.replace('_', '-')} config/demo/config.yaml cup_drink_s02"
+    )
+    return command
+
+
+for _stage, _purpose in STAGES.items():
+    app.command(_stage.replace("_", "-"), rich_help_panel=SINGLE)(_stage_command(_stage, _purpose))
+
+
+@app.command(rich_help_panel=LOOK)
+def inspect(
+    artefact: Annotated[Path, typer.Argument(help="An .h5 file that a stage wrote.")],
+    verify: Annotated[bool, typer.Option(help="Read all data and check its checksums.")] = False,
+) -> None:
+    """Say what an artefact holds: attributes, datasets with shapes and units, what is flagged.
+
+    Example: intercap inspect results/demo/cup_drink_s02/joint.h5
+    """
+    from intercap_core.artefact_summary import print_summary
+
+    print_summary(artefact, verify=verify)
+
+
+@app.command(rich_help_panel=LOOK)
+def docs(
+    root: Annotated[Path, typer.Argument(help="The project's root.")] = Path("."),
+    check_only: Annotated[bool, typer.Option("--check", help="Only say what is stale.")] = False,
+) -> None:
+    """Write what is generated from the code: config/README.md, JSON schemas, docs/artefacts.md."""
+    from intercap_core.generated_docs import generate
+
+    stale = generate(root, write=not check_only)
+    for path in stale:
+        typer.echo(f"{'stale' if check_only else 'written'}: {path}")
+    if check_only and stale:
+        raise typer.Exit(1)
+
+
+def _prepare(threads: int = 1) -> None:
+    """Threads before any numerical library is imported; progress to standard error."""
+    import logging
+
+    from intercap_core.job import set_threads
+
+    set_threads(threads)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.getLogger("intercap_core").setLevel(logging.INFO)
+
+
+def _known(sequences: dict, name: str) -> str:
+    if name not in sequences:
+        raise UserError(
+            f"there is no sequence {name!r} in the table; it lists {', '.join(sequences)}"
+        )
+    return name
+
+
+def main() -> None:
+    """Entry point: a fault of the input is one line and exit status 1."""
+    try:
+        app()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    main()
