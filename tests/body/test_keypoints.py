@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES, maps_path, smplx_
 from intercap_core.body.model import BodyModel
 from intercap_core.body.regions import REGION_NAMES
 
-from .conftest import random_vector
+from .conftest import open_arrays, random_vector
 
 
 def _mirror(name: str) -> str:
@@ -110,3 +111,25 @@ def test_maps_name_every_point_and_marker(body64: BodyModel) -> None:
     assert at["C7"][2] < at["CLAV"][2] and at["LHEE"][2] < at["LTOE"][2]
     assert at["LKNE"][0] > at["LKNI"][0] and at["LSHO"][1] > at["LELB"][1]
     assert at["LFHD"][1] > at["LSHO"][1] > at["LFWT"][1] > at["LKNE"][1] > at["LANK"][1]
+
+
+def test_a_mesh_of_smplx_size_uses_the_published_vertex_ids(tmp_path: Path) -> None:
+    """The open body cut to 10,475 vertices stands in for the licensed file: only ids are tested."""
+    arrays = open_arrays()
+    keep = 10_475
+    faces = arrays["f"].astype(np.int64)
+    for name in ("v_template", "shapedirs", "weights"):
+        arrays[name] = arrays[name][:keep]
+    arrays["posedirs"] = np.zeros((keep, 3, 486), np.float32)
+    arrays["J_regressor"] = arrays["J_regressor"][:, :keep]
+    arrays["f"] = faces[(faces < keep).all(1)]
+    for name in ("lmk_faces_idx", "dynamic_lmk_faces_idx"):
+        arrays[name] = np.zeros_like(arrays[name])
+    path = tmp_path / "SMPLX_FEMALE.npz"
+    np.savez(path, **arrays)
+    model = BodyModel.load(path)
+    points = model.keypoints_of(model.zeros())[0]
+    assert torch.allclose(points[0], model.template[9120])
+    assert torch.allclose(points[25 + 4], model.template[5361])
+    assert model.markers[0] == 3832
+    assert tuple(model.regions) == REGION_NAMES

@@ -9,6 +9,7 @@ import torch
 
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.studio.subjects import Subject
 
 from .hands import mirrored, named_grasp
 from .pictures import save, shade
@@ -126,3 +127,14 @@ def render(folder: Path) -> None:
         shade(v, faces, colours=colours, pitch_deg=-50, centre=np.array([0, -1.3, 0]),
               width_m=0.6, size=(300, 400)),
     ])  # fmt: skip
+    pose = posed(model, **REACH).full_pose().numpy()
+    tiles = []
+    for name in ("s01", "s04", "s07", "s12"):
+        subject = Subject.load(name)
+        out = subject.skin(pose, np.zeros((1, 3)))
+        tiles += [
+            shade(surface[0], subject.faces, yaw_deg=25, centre=middle, width_m=1.1,
+                  size=(180, 330))
+            for surface in (out.vertices, out.clothed)
+        ]  # fmt: skip
+    save(folder / "body_subjects.png", tiles)
