@@ -1,0 +1,166 @@
+"""Curves that a script is made of: ramps, holds, footsteps, small involuntary motion.
+
+Everything is a function of time in seconds, smooth, and vectorised over moments (N,).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+
+from intercap_core.studio.skeleton import blend
+
+GRID_STEP_S = 0.005
+GRID_MARGIN_S = 1.0
+BODY_LAG_S = 0.11  # the trunk follows the feet as if smoothed by this much
+SWAY_TO_STANCE = 0.35  # share of the way to the standing foot that the pelvis shifts in a step
+STEP_LIFT_M = 0.075
+SOLE_FRONT_M = 0.12  # the ball of the foot, ahead of the ankle
+
+
+def ramp(times: np.ndarray, start: float, end: float) -> np.ndarray:
+    """0 before ``start``, 1 after ``end``, least jerk between (Flash and Hogan 1985)."""
+    u = np.clip((np.asarray(times, float) - start) / max(end - start, 1e-9), 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u * u)
+
+
+def bump(times: np.ndarray, start: float, end: float) -> np.ndarray:
+    """0 outside, 1 in the middle, smooth: sin^2 of the share of time that has passed."""
+    u = np.clip((np.asarray(times, float) - start) / max(end - start, 1e-9), 0, 1)
+    return np.sin(np.pi * u) ** 2
+
+
+def plateau(times: np.ndarray, start: float, full: float, wane: float, end: float) -> np.ndarray:
+    """Rises from ``start`` to ``full``, holds, falls from ``wane`` to ``end``."""
+    return ramp(times, start, full) - ramp(times, wane, end)
+
+
+@dataclass(frozen=True)
+class Wander:
+    """Involuntary motion: a sum of slow sines with random phases, ``channels`` of them.
+
+    ``size`` is the RMS of each channel, its unit the caller's. Frequencies in Hz.
+    """
+
+    channels: int
+    size: float
+    rng: np.random.Generator
+    frequencies: tuple[float, ...] = (0.23, 0.41, 0.67, 1.13)
+    _phase: np.ndarray = field(init=False, repr=False)
+    _weight: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        shape = (self.channels, len(self.frequencies))
+        object.__setattr__(self, "_phase", self.rng.uniform(0, 2 * np.pi, shape))
+        weight = self.rng.uniform(0.5, 1.5, shape) / np.array(self.frequencies)
+        weight /= np.linalg.norm(weight, axis=1, keepdims=True)
+        object.__setattr__(self, "_weight", weight * np.sqrt(2) * self.size)
+
+    def __call__(self, times: np.ndarray) -> np.ndarray:
+        """(N,) -> (N, channels)."""
+        angle = 2 * np.pi * np.asarray(times)[:, None, None] * np.array(self.frequencies)
+        return (np.sin(angle + self._phase) * self._weight).sum(-1)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a wrist is wanted: positions (N, 3) and rotations stage_from_rest (N, 3, 3)."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+
+    @classmethod
+    def still(cls, transform: np.ndarray, count: int) -> Pose:
+        """One transform (4, 4) at all of ``count`` moments."""
+        return cls(
+            np.broadcast_to(transform[:3, 3], (count, 3)),
+            np.broadcast_to(transform[:3, :3], (count, 3, 3)),
+        )
+
+    def towards(self, other: Pose, share: np.ndarray, arc: np.ndarray | None = None) -> Pose:
+        """Go to ``other`` by ``share`` (N,), over a detour of ``arc`` (3,) metres in the middle."""
+        s = share[:, None]
+        position = (1 - s) * self.position + s * other.position
+        if arc is not None:
+            position = position + 4 * s * (1 - s) * arc
+        return Pose(position, blend(self.rotation, other.rotation, share))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One foot's step: ``foot`` 0 left, 1 right; times in s; to ``place`` (2,), heading rad."""
+
+    foot: int
+    start: float
+    end: float
+    place: tuple[float, float]
+    heading: float = 0.0
+
+
+@dataclass(frozen=True)
+class Footwork:
+    """Feet that stand without sliding, step, and carry a pelvis along.
+
+    ``start`` (2, 2): where the ankles stand first, left and right; ``heading`` rad.
+    """
+
+    start: np.ndarray
+    heading: float
+    steps: Sequence[Step]
+    ankle_height: float
+    end_s: float
+
+    def feet(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ankles (N, 2, 3), headings (N, 2), pitch (N, 2; positive toes down) at ``times``."""
+        count = len(times)
+        ankle = np.empty((count, 2, 3))
+        ankle[:, :, :2] = self.start
+        ankle[:, :, 2] = self.ankle_height
+        heading = np.full((count, 2), self.heading)
+        pitch = np.zeros((count, 2))
+        placed, turned = self.start.copy(), [self.heading, self.heading]
+        for step in self.steps:
+            share = ramp(times, step.start, step.end)
+            u = np.clip((times - step.start) / (step.end - step.start), 0, 1)
+            ankle[:, step.foot, :2] += share[:, None] * (np.array(step.place) - placed[step.foot])
+            heading[:, step.foot] += share * (step.heading - turned[step.foot])
+            length = np.linalg.norm(np.array(step.place) - placed[step.foot])
+            roll = np.sin(np.pi * u) ** 2 * np.cos(np.pi * u) * min(1.0, length / 0.4)
+            pitch[:, step.foot] += 0.9 * roll * (u < 0.5) + 0.5 * roll * (u >= 0.5)
+            lift = STEP_LIFT_M * min(1.0, 0.4 + length / 0.5) * np.sin(np.pi * u) ** 2
+            raised = SOLE_FRONT_M * np.sin(np.abs(pitch[:, step.foot])) * (np.abs(roll) > 0)
+            ankle[:, step.foot, 2] += lift + raised
+            placed[step.foot] = step.place
+            turned[step.foot] = step.heading
+        return ankle, heading, pitch
+
+    def pelvis(self, leg: float, hip_width: float, hip_drop: float, stand: float) -> CubicSpline:
+        """Pelvis position and heading (4 channels) over time, low enough for both legs to reach.
+
+        ``leg`` usable length hip to ankle, ``hip_width`` from the midline, ``hip_drop`` the hips
+        below the pelvis, ``stand`` the highest pelvis, all metres.
+        """
+        grid = np.arange(-GRID_MARGIN_S, self.end_s + GRID_MARGIN_S, GRID_STEP_S)
+        ankle, heading, _ = self.feet(grid)
+        middle = ankle[:, :, :2].mean(1)
+        for step in self.steps:
+            stance = ankle[:, 1 - step.foot, :2] - middle
+            middle = middle + SWAY_TO_STANCE * bump(grid, step.start, step.end)[:, None] * stance
+        lag = BODY_LAG_S / GRID_STEP_S
+        middle = gaussian_filter1d(middle, lag, axis=0, mode="nearest")
+        facing = gaussian_filter1d(heading.mean(1), lag, mode="nearest")
+        across = np.stack([-np.sin(facing), np.cos(facing)], 1)
+        top = np.full(len(grid), stand)
+        for foot, sign in ((0, 1.0), (1, -1.0)):
+            hip = middle + sign * hip_width * across
+            far = np.linalg.norm(ankle[:, foot, :2] - hip, axis=1)
+            reach = np.sqrt(np.maximum(leg**2 - far**2, 0.01)) + ankle[:, foot, 2] + hip_drop
+            top = np.minimum(top, reach)
+        window = int(6 * 0.05 / GRID_STEP_S) | 1
+        top = gaussian_filter1d(minimum_filter1d(top, window, mode="nearest"), 0.05 / GRID_STEP_S,
+                                mode="nearest", truncate=3.0)  # fmt: skip
+        return CubicSpline(grid, np.column_stack([middle, top, facing]))

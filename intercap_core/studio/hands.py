@@ -1,0 +1,192 @@
+"""A puppet's hands: finger flexion and grasps closed against the true object's surface.
+
+A grasp is found without the contact term and regions of the fit: joint after joint flexes until
+the skin of that finger meets the object, as a robot hand closes (Miller and Allen 2004, "GraspIt!",
+auto-grasp). The hand stands in its rest frame and the object comes to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.studio.skeleton import Skeleton, turn, unit
+from intercap_core.studio.subjects import Subject
+
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of the joints
+TISSUE_M = 0.0012  # a finger closes until its skin is pressed in by this much
+SCAN_DEG = 4.0
+BISECTIONS = 8
+# Largest flexion of MCP, PIP, DIP, and of the thumb's CMC, MCP, IP, degrees (AAOS tables)
+LIMITS = {"finger": (85.0, 100.0, 65.0), "thumb": (35.0, 50.0, 65.0)}
+
+
+@dataclass(frozen=True)
+class HandShape:
+    """Angles in degrees. ``flexion`` (5, 3): FINGERS by joint from the knuckle; ``spread`` (5,)
+    away from the middle finger; ``opposition``: the thumb's base turned towards the palm."""
+
+    flexion: np.ndarray
+    spread: np.ndarray
+    opposition: float
+
+    def towards(self, other: HandShape, share: float) -> HandShape:
+        """Between this shape and another."""
+        return HandShape(
+            (1 - share) * self.flexion + share * other.flexion,
+            (1 - share) * self.spread + share * other.spread,
+            (1 - share) * self.opposition + share * other.opposition,
+        )
+
+
+def shape(fingers: tuple[float, float, float], thumb: tuple[float, float, float],
+          opposition: float, spread: float = 3.0) -> HandShape:  # fmt: skip
+    """A shape with the same flexion in all four fingers."""
+    flexion = np.array([fingers] * 4 + [thumb], float)
+    flexion[1:4] += np.array([[2.0, 2, 1], [6, 4, 2], [4, 3, 2]])  # towards the little finger
+    return HandShape(flexion, np.array([1.0, 0, -1.4, -0.7, 0]) * spread, opposition)
+
+
+RELAXED = shape((18, 26, 12), (8, 12, 15), 18)
+OPEN = shape((6, 10, 5), (0, 4, 6), 35, 5)
+FLAT = shape((-3, 3, 2), (0, 2, 4), 5, 4)
+
+
+class Hand:
+    """One hand of a subject: ``side`` 0 left, 1 right."""
+
+    def __init__(self, subject: Subject, side: int) -> None:
+        self.side = side
+        self.name = ("left", "right")[side]
+        self.first = 25 + 15 * side
+        self.wrist = JOINT_INDEX[f"{self.name}_wrist"]
+        self.rest = Skeleton(subject.rest_joints)
+        self.out = np.array([1.0 if side == 0 else -1.0, 0, 0])  # where the fingers point at rest
+        self.palm = np.array([0.0, -1, 0])  # where the palm faces at rest
+        self.radial = np.array([0.0, 0, 1])  # where the thumb is at rest
+        bones = [self.wrist, *range(self.first, self.first + 15)]
+        share = np.asarray(subject.weights[:, bones].todense())
+        self.vertex_ids = np.flatnonzero(share.sum(1) > 0.5)
+        self._part = part_of(subject, self.vertex_ids)
+        finger = share[self.vertex_ids, 1:].reshape(-1, 5, 3)
+        distal = finger[..., ::-1].cumsum(-1)[..., ::-1]  # moved by this joint or a further one
+        self.moved = [[np.flatnonzero(distal[:, f, j] > 0.5) for j in range(3)] for f in range(5)]
+        self.palm_ids = np.flatnonzero(share[self.vertex_ids, 0] > 0.6)
+        self._tips = subject.rest_tips[5 * side : 5 * side + 5]
+
+    @cached_property
+    def knuckles(self) -> np.ndarray:
+        """Knuckles (4, 3) of index, middle, pinky, ring relative to the wrist, rest frame."""
+        return self.rest.rest[self.first : self.first + 12 : 3] - self.rest.rest[self.wrist]
+
+    def local(self, hand: HandShape) -> np.ndarray:
+        """Rotation vectors (15, 3) of a shape, in the order of the joints."""
+        vectors = np.zeros((15, 3))
+        rest = self.rest.rest
+        for f in range(5):
+            chain = np.vstack([rest[self.first + 3 * f : self.first + 3 * f + 3], self._tips[f]])
+            bones = np.diff(chain, axis=0)
+            bend_to = self.palm if f < 4 else unit(0.55 * self.palm - self.radial)
+            for j in range(3):
+                axis = unit(np.cross(bones[j], bend_to))
+                vectors[3 * f + j] = axis * np.radians(hand.flexion[f, j])
+            if f < 4:
+                sideways = np.cross(self.out, self.radial) * np.radians(hand.spread[f])
+                first = turn(sideways) @ turn(vectors[3 * f])
+            else:
+                lift = unit(np.cross(bones[0], self.palm)) * np.radians(hand.opposition)
+                roll = unit(bones[0]) * np.radians(0.5 * hand.opposition) * self.out[0]
+                first = turn(vectors[3 * f]) @ turn(lift) @ turn(roll)
+            vectors[3 * f] = _vector(first)
+        return vectors
+
+    def skin(self, vectors: np.ndarray) -> np.ndarray:
+        """Vertices (B, n, 3) relative to the wrist, rest frame, of finger poses (B, 15, 3)."""
+        local = np.broadcast_to(np.eye(3), (len(vectors), 55, 3, 3)).copy()
+        local[:, self.first : self.first + 15] = turn(vectors)
+        posed = self._part.skin(local, np.zeros((len(vectors), 3)))
+        return posed.vertices - self.rest.rest[self.wrist]
+
+    def close(self, start: HandShape, limits: dict[str, tuple[float, float, float]],
+              surface: DistanceField, object_from_wrist: np.ndarray,
+              tissue: float = TISSUE_M) -> tuple[HandShape, np.ndarray]:  # fmt: skip
+        """Flex joint after joint until the skin meets the object or the limit is reached.
+
+        ``object_from_wrist`` (4, 4) takes the hand's rest frame at the wrist to the object's.
+        Returns the shape and the least signed distance (5,) of each finger.
+        """
+        flexion = start.flexion.copy()
+        for f in (1, 3, 0, 2, 4):
+            largest = limits["finger" if f < 4 else "thumb"]
+            for j in range(3):
+                moved = self.moved[f][j]
+
+                def least(angles: np.ndarray, f: int = f, j: int = j,
+                          moved: np.ndarray = moved) -> np.ndarray:  # fmt: skip
+                    poses = []
+                    for angle in angles:
+                        trial = flexion.copy()
+                        trial[f, j] = angle
+                        poses.append(self.local(replace(start, flexion=trial)))
+                    points = self.skin(np.stack(poses))[:, moved]
+                    return self._distance(points, surface, object_from_wrist)
+
+                angles = np.arange(flexion[f, j], largest[j] + SCAN_DEG, SCAN_DEG)
+                if len(angles) < 2:
+                    continue
+                hits = np.flatnonzero(least(angles) < -tissue)
+                if len(hits) == 0:
+                    flexion[f, j] = max(largest[j], flexion[f, j])
+                    continue
+                low = angles[max(hits[0] - 1, 0)]
+                high = angles[hits[0]] if hits[0] else low
+                for _ in range(BISECTIONS):
+                    middle = (low + high) / 2
+                    if least(np.array([middle]))[0] < -tissue:
+                        high = middle
+                    else:
+                        low = middle
+                flexion[f, j] = low
+        closed = replace(start, flexion=flexion)
+        skin = self.skin(self.local(closed)[None])
+        gaps = [
+            self._distance(skin[:, self.moved[f][0]], surface, object_from_wrist)[0]
+            for f in range(5)
+        ]
+        return closed, np.array(gaps)
+
+    def gap(self, hand: HandShape, surface: DistanceField, object_from_wrist: np.ndarray) -> float:
+        """Least signed distance of the whole hand to the object, metres."""
+        skin = self.skin(self.local(hand)[None])
+        return float(self._distance(skin, surface, object_from_wrist)[0])
+
+    @staticmethod
+    def _distance(points: np.ndarray, surface: DistanceField, pose: np.ndarray) -> np.ndarray:
+        """(B, n, 3) -> least signed distance (B,)."""
+        at = points @ pose[:3, :3].T + pose[:3, 3]
+        return surface.signed_distance(at.reshape(-1, 3)).reshape(at.shape[:2]).min(1)
+
+
+def part_of(subject: Subject, ids: np.ndarray) -> Subject:
+    """The same person with a part (n,) of the vertices and the faces between them."""
+    place = np.full(len(subject.rest), -1)
+    place[ids] = np.arange(len(ids))
+    faces = place[subject.faces]
+    return replace(
+        subject,
+        rest=subject.rest[ids],
+        faces=np.ascontiguousarray(faces[(faces >= 0).all(1)]),
+        weights=subject.weights[ids],
+        bulges=subject.bulges[:, ids],
+        clothing=subject.clothing[ids],
+    )
+
+
+def _vector(rotation: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()

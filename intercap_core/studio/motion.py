@@ -1,0 +1,217 @@
+"""A puppet plays controls: trunk first, then legs to the planted feet, then arms to the wrists.
+
+Headings turn about the stage's z axis; a person with heading 0 faces +x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.studio.controls import Pose
+from intercap_core.studio.hands import Hand, HandShape
+from intercap_core.studio.skeleton import (
+    Skeleton,
+    blend,
+    carry,
+    local_rotations,
+    turn,
+    twist_angle,
+    unit,
+)
+from intercap_core.studio.subjects import PosedSubject, Subject
+
+SIDES = ("left", "right")
+# How a bend of the trunk is shared along it, from the pelvis up
+TRUNK = {"pelvis": 0.30, "spine1": 0.20, "spine2": 0.20, "spine3": 0.30}
+ARM_REACH = 0.965  # of the arm's length; the trunk helps beyond
+ASSIST_STEPS = 8
+FOREARM_TWIST = 0.6  # share of the wrist's roll that the forearm takes
+LEG_REACH = 0.985
+STAND = 0.990  # of the leg's length when standing
+_J = JOINT_INDEX
+
+
+def facing(heading: np.ndarray) -> np.ndarray:
+    """stage_from_rest rotations (N, 3, 3) of upright people with headings (N,)."""
+    cos, sin, zero = np.cos(heading), np.sin(heading), np.zeros_like(heading)
+    left = np.stack([-sin, cos, zero], -1)
+    up = np.stack([zero, zero, zero + 1], -1)
+    forward = np.stack([cos, sin, zero], -1)
+    return np.stack([left, up, forward], -1)
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """Pelvis position (N, 3), heading (N,), and bends as rotation vectors (N, 3) in the person's
+    axes (x left, y up, z forward: positive x bends forward, positive z to the right, positive y
+    turns left) of the trunk and, against the heading, of the head."""
+
+    pelvis: np.ndarray
+    heading: np.ndarray
+    bend: np.ndarray
+    head: np.ndarray
+
+
+class Puppet:
+    """One subject that can be posed."""
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self.skeleton = Skeleton(subject.rest_joints)
+        self.hands = (Hand(subject, 0), Hand(subject, 1))
+        rest = subject.rest_joints
+        self.leg = self.skeleton.length("left_hip", "left_knee", "left_ankle")
+        self.arm = self.skeleton.length("left_shoulder", "left_elbow", "left_wrist")
+        self.hip_width = float(rest[_J["left_hip"], 0] - rest[_J["right_hip"], 0]) / 2
+        self.hip_drop = float(rest[0, 1] - rest[[1, 2], 1].mean())
+        share = np.asarray(subject.weights[:, [7, 8, 10, 11]].sum(1)).ravel()
+        sole = subject.rest[share > 0.5, 1].min()
+        self.ankle_height = float(rest[[7, 8], 1].mean() - sole)
+        self.stand = STAND * self.leg + self.ankle_height + self.hip_drop
+
+    # --- the parts of a pose ---------------------------------------------------------------
+
+    def trunk(self, trunk: Trunk) -> np.ndarray:
+        """World rotations (N, 55, 3, 3) with the trunk and head set, limbs hanging on them."""
+        count = len(trunk.pelvis)
+        world = np.empty((count, 55, 3, 3))
+        base = facing(trunk.heading)
+        rotation = base
+        for name, share in TRUNK.items():
+            rotation = rotation @ turn(share * trunk.bend)
+            world[:, _J[name]] = rotation
+        head = base @ turn(trunk.head)
+        neck = blend(rotation, head, np.full(count, 0.45))
+        world[:, _J["neck"]] = neck
+        for name in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf"):
+            world[:, _J[name]] = head
+        for side in SIDES:
+            chest = ("collar", "shoulder", "elbow", "wrist")
+            for name in chest:
+                world[:, _J[f"{side}_{name}"]] = rotation
+            for name in ("hip", "knee", "ankle", "foot"):
+                world[:, _J[f"{side}_{name}"]] = world[:, 0]
+        world[:, 25:40] = world[:, 20:21]
+        world[:, 40:55] = world[:, 21:22]
+        return world
+
+    def legs(self, world: np.ndarray, pelvis: np.ndarray, ankle: np.ndarray, heading: np.ndarray,
+             pitch: np.ndarray, splay: float = 0.12) -> None:  # fmt: skip
+        """Set the legs for ankles (N, 2, 3), foot headings and pitch (N, 2), in place.
+
+        The knees point between the pelvis's and the foot's heading, ``splay`` rad outward.
+        """
+        for side, (name, sign) in enumerate(zip(SIDES, (1.0, -1.0), strict=True)):
+            hip = pelvis + world[:, 0] @ self.skeleton.bone("pelvis", f"{name}_hip")
+            foot = facing(heading[:, side] + sign * splay)
+            names = (f"{name}_hip", f"{name}_knee", f"{name}_ankle")
+            pole = unit(world[:, 0, :, 2] * np.array([1, 1, 0.2])) + 1.5 * foot[:, :, 2]
+            upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, np.array([1.0, 0, 0]))
+            world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
+            tilt = np.zeros((len(pelvis), 3))
+            tilt[:, 0] = pitch[:, side]
+            world[:, _J[names[2]]] = foot @ turn(tilt)
+            tilt[:, 0] = np.minimum(pitch[:, side], 0) + 0.35 * np.maximum(pitch[:, side], 0)
+            world[:, _J[f"{name}_foot"]] = foot @ turn(tilt)
+
+    def arm_root(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> np.ndarray:
+        """Shoulder joint (N, 3)."""
+        chain = ("pelvis", "spine1", "spine2", "spine3", f"{SIDES[side]}_collar",
+                 f"{SIDES[side]}_shoulder")  # fmt: skip
+        at = pelvis
+        for a, b in zip(chain[:-1], chain[1:], strict=True):
+            at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
+        return at
+
+    def joint_on_trunk(self, world: np.ndarray, pelvis: np.ndarray, name: str) -> np.ndarray:
+        """A joint of spine, neck or head (N, 3)."""
+        chain = ["pelvis", "spine1", "spine2", "spine3", "neck", "head"]
+        chain = chain[: chain.index(name) + 1]
+        at = pelvis
+        for a, b in zip(chain[:-1], chain[1:], strict=True):
+            at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
+        return at
+
+    def idle_wrist(self, world: np.ndarray, pelvis: np.ndarray, side: int,
+                   swing: np.ndarray) -> Pose:  # fmt: skip
+        """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
+        sign = (1.0, -1.0)[side]
+        base = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
+        left, up, forward = base[..., 0], base[..., 1], base[..., 2]
+        shoulder = self.arm_root(world, pelvis, side)
+        reach = 0.955 * self.arm
+        offset = (sign * 0.085 * left + (0.05 + swing)[:, None] * forward) - reach * 0.965 * up
+        position = shoulder + offset
+        fingers = unit(-up + (0.10 + swing)[:, None] * forward - 0.02 * sign * left)
+        palm = unit(-sign * left - 0.25 * forward)
+        return Pose(position, self.wrist_rotation(side, fingers, palm))
+
+    def wrist_rotation(self, side: int, fingers: np.ndarray, palm: np.ndarray) -> np.ndarray:
+        """Rotation(s) that point the fingers and face the palm along directions (..., 3)."""
+        hand = self.hands[side]
+        return carry(hand.out, hand.palm, fingers, palm)
+
+    def assist(self, trunk: Trunk, targets: dict[int, tuple[Pose, np.ndarray]]) -> Trunk:
+        """Bend the trunk a little more where an arm could not reach.
+
+        ``targets``: side to (wrist target, weight (N,) in [0, 1]).
+        """
+        bend = trunk.bend.copy()
+        for _ in range(ASSIST_STEPS):
+            current = Trunk(trunk.pelvis, trunk.heading, bend, trunk.head)
+            world = self.trunk(current)
+            base = facing(trunk.heading)
+            for side, (target, weight) in targets.items():
+                shoulder = self.arm_root(world, trunk.pelvis, side)
+                way = target.position - shoulder
+                excess = np.linalg.norm(way, axis=1) - ARM_REACH * self.arm
+                excess = weight * 0.5 * (excess + np.sqrt(excess**2 + 0.01**2))
+                lever = shoulder - trunk.pelvis
+                axis = np.cross(lever, unit(way)) / (lever**2).sum(1, keepdims=True)
+                change = np.einsum("nji,nj->ni", base, axis * excess[:, None])
+                bend = bend + 0.9 * change
+        return Trunk(trunk.pelvis, trunk.heading, bend, trunk.head)
+
+    def arm_to(self, world: np.ndarray, pelvis: np.ndarray, side: int, wrist: Pose,
+               raised: np.ndarray | float = 0.0) -> None:  # fmt: skip
+        """Set one arm for a wrist pose, in place; ``raised`` (N,) lifts the elbow outward."""
+        name, sign = SIDES[side], (1.0, -1.0)[side]
+        shoulder = self.arm_root(world, pelvis, side)
+        chest = world[:, _J["spine3"]]
+        raised = np.broadcast_to(raised, len(pelvis))[:, None]
+        pole = -0.75 * chest[..., 2] + sign * (0.45 + raised) * chest[..., 0] - 0.5 * chest[..., 1]
+        hand = self.hands[side]
+        hinge = np.array([0.0, -sign, 0])
+        names = (f"{name}_shoulder", f"{name}_elbow", f"{name}_wrist")
+        upper, lower = self.skeleton.limb(names, shoulder, wrist.position, pole, hinge)
+        forearm = unit(self.skeleton.bone(names[1], names[2]))
+        roll = twist_angle(np.swapaxes(lower, -1, -2) @ wrist.rotation, forearm)
+        lower = lower @ turn(FOREARM_TWIST * roll[:, None] * forearm)
+        world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
+        world[:, _J[names[2]]] = wrist.rotation
+        world[:, hand.first : hand.first + 15] = wrist.rotation[:, None]
+
+    def fingers(self, world: np.ndarray, side: int, vectors: np.ndarray) -> None:
+        """Set the fingers' rotation vectors (N, 15, 3) relative to their parents, in place."""
+        hand = self.hands[side]
+        local = turn(vectors)
+        for joint in range(15):
+            parent = hand.wrist if joint % 3 == 0 else hand.first + joint - 1
+            world[:, hand.first + joint] = world[:, parent] @ local[:, joint]
+
+    def finger_track(self, side: int, start: HandShape,
+                     keys: list[tuple[np.ndarray, HandShape]]) -> np.ndarray:  # fmt: skip
+        """Rotation vectors (N, 15, 3): from ``start`` to each shape in turn by its share (N,)."""
+        hand = self.hands[side]
+        vectors = hand.local(start)[None]
+        for share, goal in keys:
+            s = share[:, None, None]
+            vectors = (1 - s) * vectors + s * hand.local(goal)[None]
+        return vectors
+
+    def skin(self, world: np.ndarray, pelvis: np.ndarray) -> PosedSubject:
+        """The subject posed: world rotations (N, 55, 3, 3), pelvis (N, 3)."""
+        return self.subject.skin(local_rotations(world), pelvis - self.subject.rest_joints[0])

@@ -1,0 +1,75 @@
+"""Random processes over time, in two families of shape.
+
+Family "a" is Gaussian with a smooth kernel; family "b" has heavier tails (Laplace) and jagged
+paths (first-order, Ornstein-Uhlenbeck) at another correlation time.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+FAMILY_B_SLOWER = 1.7  # correlation times of family "b" against those of family "a"
+OVERSAMPLING = 4
+
+
+@dataclass(frozen=True)
+class NoiseSource:
+    """Makes processes from a seed, a scale and a family; each name its own stream."""
+
+    seed: int
+    scale: float
+    family: str
+    fps: float
+
+    def rng(self, *name: object) -> np.random.Generator:
+        """A generator of its own for what ``name`` says."""
+        return np.random.default_rng([self.seed, zlib.crc32(repr(name).encode())])
+
+    def process(self, rng: np.random.Generator, frames: int, channels: int,
+                correlation_s: float) -> np.ndarray:  # fmt: skip
+        """(frames, channels): zero mean, unit variance, correlated over ``correlation_s``."""
+        if self.family == "b":
+            correlation_s *= FAMILY_B_SLOWER
+            return self.tails(self._first_order(rng, frames, channels, correlation_s))
+        lag = max(correlation_s * self.fps, 1e-3)
+        margin = int(np.ceil(3 * lag))
+        white = rng.normal(size=(frames + 2 * margin, channels))
+        reach = np.arange(-margin, margin + 1)
+        kernel = np.exp(-((reach / lag) ** 2))
+        kernel /= np.linalg.norm(kernel)
+        return np.stack(
+            [np.convolve(white[:, k], kernel, "valid") for k in range(channels)], 1
+        ).reshape(frames, channels)
+
+    def _first_order(self, rng: np.random.Generator, frames: int, channels: int,
+                     correlation_s: float) -> np.ndarray:  # fmt: skip
+        keep = np.exp(-1 / max(correlation_s * self.fps, 1e-3))
+        steps = rng.normal(size=(frames, channels))
+        path = np.empty_like(steps)
+        path[0] = steps[0]
+        for t in range(1, frames):
+            path[t] = keep * path[t - 1] + np.sqrt(1 - keep**2) * steps[t]
+        return path
+
+    def tails(self, gaussian: np.ndarray) -> np.ndarray:
+        """Family "b": the same ranks, Laplace-distributed with unit variance."""
+        if self.family != "b":
+            return gaussian
+        rank = np.clip(ndtr(gaussian), 1e-6, 1 - 1e-6) - 0.5
+        return -np.sign(rank) * np.log1p(-2 * np.abs(rank)) / np.sqrt(2)
+
+    def episodes(self, rng: np.random.Generator, frames: int, probability: np.ndarray,
+                 shared: np.ndarray, correlation_s: float, agreement: float) -> np.ndarray:  # fmt: skip
+        """(frames, n) on/off episodes that last about ``correlation_s`` and are partly shared.
+
+        ``probability`` (frames, n) of being on; ``shared`` (frames,) a process that all views have
+        in common, ``agreement`` its share of the variance.
+        """
+        own = self.process(rng, frames, probability.shape[1], correlation_s)
+        mixed = np.sqrt(agreement) * shared[:, None] + np.sqrt(1 - agreement) * own
+        scaled = np.clip(probability * self.scale, 0, 0.95)
+        return ndtr(mixed) < scaled

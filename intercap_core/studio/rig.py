@@ -1,0 +1,193 @@
+"""Six Azure Kinects in a ring: true lenses and poses, what they claim, and when they expose.
+
+Lens values are typical of devices' own calibrations; no two devices are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import invert, rigid
+from intercap_core.studio.skeleton import turn, unit
+
+RADIUS_M, RADIUS_SPREAD_M = 2.55, 0.2
+HEIGHTS_M, HEIGHT_SPREAD_M = (1.05, 2.05), 0.08
+AIM_HEIGHT_M = 0.85
+STAGGER_S = 160e-6  # the designed delay of each subordinate
+DEPTH_MODE = "NFOV_UNBINNED"
+EXTRINSIC_ERROR_M, EXTRINSIC_ERROR_DEG = 0.010, 0.5  # of the rig file, at noise 1
+FOCAL_ERROR, CENTRE_ERROR_PX = 3e-4, 0.25  # of the devices' own calibration
+MAX_OFFSET_S = 0.008
+MISSING_FRAMES = (1, 4)
+COLOUR_FROM_DEPTH_M = (-0.0320, -0.0021, 0.0039)
+DEPTH_TILT_DEG = 5.6  # the depth camera looks down against the colour camera
+
+
+@dataclass(frozen=True)
+class StudioRig:
+    """Cameras as they are and as they claim to be, in the master's colour frame.
+
+    ``true`` and ``claimed`` share names and order; ``claimed`` holds the erring lenses of the
+    recordings and the erring poses of the rig file. ``master_from_stage`` (4, 4). ``offset_s``
+    (C,): how much later than its device time (without the stagger) each camera exposes.
+    ``missing``: for each camera the set indices that it did not record. ``slip`` (T, C): whole
+    frames by which an image is older than its device time says.
+    """
+
+    true: Rig
+    claimed: Rig
+    master_from_stage: np.ndarray
+    offset_s: np.ndarray
+    missing: tuple[frozenset[int], ...]
+    slip: np.ndarray
+
+
+def build_rig(
+    rng: np.random.Generator,
+    *,
+    cameras: int,
+    frames: int,
+    colour_mode: str,
+    noise: float,
+    slips: str = "missing",
+) -> StudioRig:
+    """Make a rig around the stage's origin; ``noise`` scales every error.
+
+    ``slips``: "missing" frames in up to two cameras, or "silent": their images are one to four
+    frames late for a while and the device times do not tell.
+    """
+    stage_from_camera = _ring(rng, cameras)
+    true, claimed = [], []
+    master_from_stage = invert(stage_from_camera[0])
+    for index in range(cameras):
+        camera = Camera(
+            f"k{index + 1}",
+            _colour_lens(rng, colour_mode),
+            _depth_lens(rng),
+            _colour_from_depth(rng),
+            master_from_stage @ stage_from_camera[index],
+        )
+        true.append(camera)
+        error = np.eye(4)
+        if index:
+            error = rigid(
+                turn(unit(rng.normal(size=3)) * np.radians(EXTRINSIC_ERROR_DEG) * noise),
+                unit(rng.normal(size=3)) * EXTRINSIC_ERROR_M * noise,
+            )
+        assert camera.depth is not None
+        claimed.append(
+            replace(
+                camera,
+                colour=_recalibrated(camera.colour, rng, noise),
+                depth=_recalibrated(camera.depth, rng, noise),
+                master_from_colour=_about_centre(camera.master_from_colour, error),
+            )
+        )
+    offset = rng.uniform(-MAX_OFFSET_S, MAX_OFFSET_S, cameras) * noise
+    offset = np.clip(offset, -2 * MAX_OFFSET_S, 2 * MAX_OFFSET_S)
+    offset -= offset[0]  # the sets' times are the master's
+    offset = np.clip(offset, -MAX_OFFSET_S * noise, MAX_OFFSET_S * noise)
+    missing, slip = _slips(rng, cameras, frames, slips, noise)
+    return StudioRig(
+        Rig(tuple(true)), Rig(tuple(claimed)), master_from_stage, offset, missing, slip
+    )
+
+
+def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
+    """stage_from_colour (4, 4) of each camera: x right, y down, z towards the middle."""
+    poses = []
+    first = rng.uniform(0, 2 * np.pi)
+    for index in range(cameras):
+        azimuth = first + 2 * np.pi * index / cameras + np.radians(rng.uniform(-5, 5))
+        radius = RADIUS_M + rng.uniform(-RADIUS_SPREAD_M, RADIUS_SPREAD_M)
+        height = HEIGHTS_M[index % 2] + rng.uniform(-HEIGHT_SPREAD_M, HEIGHT_SPREAD_M)
+        eye = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
+        aim = np.array([0, 0, AIM_HEIGHT_M]) + rng.normal(0, 0.05, 3)
+        forward = unit(aim - eye)
+        right = unit(np.cross(forward, [0, 0, 1.0]))
+        rotation = np.stack([right, np.cross(forward, right), forward], 1)
+        roll = turn(np.array([0, 0, np.radians(rng.uniform(-1.5, 1.5))]))
+        poses.append(rigid(rotation @ roll, eye))
+    return poses
+
+
+def _about_centre(master_from_colour: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Turn a camera about its own place and move it: the error of an ill-measured mount."""
+    moved = master_from_colour.copy()
+    moved[:3, :3] = error[:3, :3] @ moved[:3, :3]
+    moved[:3, 3] += error[:3, 3]
+    return moved
+
+
+def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
+    width, height = COLOUR_MODES[mode].size
+    scale = width / 1920
+    focal = (913 + rng.normal(0, 4)) * scale
+    distortion = np.array([0.42, -2.55, 3e-4, -2e-4, 1.50, 0.30, -2.37, 1.42])
+    distortion[:2] += rng.normal(0, (0.03, 0.05))
+    distortion[2:4] += rng.normal(0, 2e-4, 2)
+    distortion[5:7] += distortion[:2] - (0.42, -2.55)  # lenses differ by far less than numbers
+    distortion[5] += rng.normal(0, 0.004)
+    return Intrinsics(
+        width, height, focal, focal * (1 + rng.normal(0, 3e-4)),
+        (width - 1) / 2 + rng.normal(0, 5) * scale, (height - 1) / 2 + rng.normal(7, 5) * scale,
+        distortion,
+    )  # fmt: skip
+
+
+def _depth_lens(rng: np.random.Generator) -> Intrinsics:
+    width, height = DEPTH_MODES[DEPTH_MODE].size
+    focal = 504.5 + rng.normal(0, 1.0)
+    distortion = np.array([0.55, -0.02, -7e-5, 2e-5, -0.0027, 0.89, 0.086, -0.0139])
+    shift = rng.normal(0, 0.05)
+    distortion[0] += shift
+    distortion[5] += shift + rng.normal(0, 0.002)
+    distortion[2:4] += rng.normal(0, 5e-5, 2)
+    return Intrinsics(
+        width, height, focal, focal * (1 + rng.normal(0, 2e-4)),
+        (width - 1) / 2 + rng.normal(8, 3), (height - 1) / 2 + rng.normal(14, 3),
+        distortion, 1.74,
+    )  # fmt: skip
+
+
+def _colour_from_depth(rng: np.random.Generator) -> np.ndarray:
+    tilt = np.array([np.radians(-DEPTH_TILT_DEG), 0, 0]) + np.radians(rng.normal(0, 0.25, 3))
+    return rigid(turn(tilt), np.array(COLOUR_FROM_DEPTH_M) + rng.normal(0, 2e-4, 3))
+
+
+def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> Intrinsics:
+    """What the device's own calibration says of a lens."""
+    focal = 1 + rng.normal(0, FOCAL_ERROR) * noise
+    centre = rng.normal(0, CENTRE_ERROR_PX, 2) * noise * lens.width / 1920
+    return replace(
+        lens, fx=lens.fx * focal, fy=lens.fy * focal, cx=lens.cx + centre[0], cy=lens.cy + centre[1]
+    )
+
+
+def _slips(
+    rng: np.random.Generator, cameras: int, frames: int, kind: str, noise: float
+) -> tuple[tuple[frozenset[int], ...], np.ndarray]:
+    """Frames that are missing, and silent slips (T, C), in up to two subordinate cameras; one
+    more camera starts late and one ends early."""
+    missing: list[set[int]] = [set() for _ in range(cameras)]
+    slip = np.zeros((frames, cameras), np.int32)
+    others = np.arange(1, cameras)
+    if len(others) == 0 or frames < 8 or noise == 0:
+        return tuple(frozenset(m) for m in missing), slip
+    for camera in rng.permutation(others)[: rng.integers(1, 3)]:
+        length = int(rng.integers(MISSING_FRAMES[0], MISSING_FRAMES[1] + 1))
+        start = int(rng.integers(2, max(3, frames - length - 2)))
+        if kind == "silent":
+            end = min(frames, start + int(rng.integers(5, 20)))
+            slip[start:end, camera] = min(length, start)
+        else:
+            missing[camera].update(range(start, min(frames, start + length)))
+    late, early = rng.permutation(others)[[0, -1]]
+    missing[late].update(range(int(rng.integers(0, 3))))
+    missing[early].update(range(frames - int(rng.integers(0, 3)), frames))
+    return tuple(frozenset(m) for m in missing), slip

@@ -1,0 +1,179 @@
+"""The room: floor, walls and furniture with procedural looks; all of it static.
+
+Materials give the colour of a surface point from its place alone, so the same wall looks the same
+in every camera. Colours are RGB in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.studio.interactions.base import Box
+
+FLOOR_HALF_M = 6.0
+WALL_HEIGHT_M = 2.7
+WALL_DISTANCE_M = (3.0, 3.7)
+
+
+@dataclass(frozen=True)
+class Room:
+    """Static surfaces in the stage frame: vertices (V, 3), faces (F, 3), material (F,) as an index
+    of ``materials``: functions of points (N, 3) and normals (N, 3) to colours (N, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    material: np.ndarray
+    materials: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...]
+    distractor: int  # index of the material of a thing that detectors take for the object
+
+
+def build_room(rng: np.random.Generator, furniture: Sequence[Box], *, bare: bool) -> Room:
+    """Make a room around the stage; ``bare`` leaves only the floor and the scripts' furniture."""
+    names = ["floor", *sorted({box.material for box in furniture})]
+    boxes = list(furniture)
+    if not bare:
+        boxes += _walls(rng) + _pieces(rng)
+    names = list(dict.fromkeys(["floor", *(box.material for box in boxes)]))
+    vertices = [np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M]
+    faces, material = [np.array([[0, 2, 1], [1, 2, 3]])], [np.zeros(2, int)]
+    count = 4
+    for box in boxes:
+        corners, triangles = _box_mesh(box)
+        vertices.append(corners)
+        faces.append(triangles + count)
+        material.append(np.full(len(triangles), names.index(box.material)))
+        count += len(corners)
+    looks = tuple(_look(name, rng) for name in names)
+    distractor = names.index("distractor") if "distractor" in names else -1
+    return Room(np.vstack(vertices), np.vstack(faces), np.concatenate(material), looks, distractor)
+
+
+def _walls(rng: np.random.Generator) -> list[Box]:
+    walls = []
+    heading = rng.uniform(0, 2 * np.pi)
+    for turn_by in (0, np.pi / 2, np.pi)[: int(rng.integers(2, 4))]:
+        far = rng.uniform(*WALL_DISTANCE_M)
+        angle = heading + turn_by
+        x, y = far * np.cos(angle), far * np.sin(angle)
+        walls.append(
+            Box((x - 0.05, y - 4.0, 0.0), (x + 0.05, y + 4.0, WALL_HEIGHT_M), angle, "wall")
+        )
+        px, py = (far - 0.06) * np.cos(angle), (far - 0.06) * np.sin(angle)
+        side = rng.uniform(-1.2, 1.2)
+        px, py = px - side * np.sin(angle), py + side * np.cos(angle)
+        walls.append(Box((px - 0.015, py - 0.45, 1.0), (px + 0.015, py + 0.45, 1.7), angle, "poster"))
+    return walls
+
+
+def _pieces(rng: np.random.Generator) -> list[Box]:
+    """Shelves, boxes, a table and one thing that could be taken for the object, outside the ring
+    of action."""
+    pieces = []
+    start = rng.uniform(0, 2 * np.pi)
+    kinds = ["shelf", "cardboard", "wood", "distractor", "cardboard", "wood"]
+    for index, kind in enumerate(kinds):
+        angle = start + 2 * np.pi * index / len(kinds) + rng.uniform(-0.25, 0.25)
+        far = rng.uniform(1.75, 2.15)
+        x, y = far * np.cos(angle), far * np.sin(angle)
+        size = {
+            "shelf": (0.15, 0.40, rng.uniform(1.0, 1.5)),
+            "cardboard": (rng.uniform(0.15, 0.25), rng.uniform(0.15, 0.3), rng.uniform(0.25, 0.6)),
+            "wood": (rng.uniform(0.25, 0.35), rng.uniform(0.3, 0.45), rng.uniform(0.4, 0.75)),
+            "distractor": (0.10, 0.17, rng.uniform(0.3, 0.45)),
+        }[kind]
+        pieces.append(
+            Box((x - size[0], y - size[1], 0), (x + size[0], y + size[1], size[2]), angle, kind)
+        )
+    return pieces
+
+
+def _box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.array(box.low), np.array(box.high)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    corners = low + corners * (high - low)
+    middle = (low + high)[:2] / 2
+    cos, sin = np.cos(box.heading), np.sin(box.heading)
+    turned = (corners[:, :2] - middle) @ np.array([[cos, sin], [-sin, cos]])
+    corners[:, :2] = middle + turned
+    faces = [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]  # fmt: skip
+    return corners, np.array(faces)
+
+
+def value_noise(points: np.ndarray, scale: float, seed: int) -> np.ndarray:
+    """Smooth pseudo-random values in [0, 1] of points (N, 3), features of ``scale`` metres."""
+    p = points / scale
+    cell = np.floor(p).astype(np.int64)
+    part = p - cell
+    part = part * part * (3 - 2 * part)
+    total = np.zeros(len(points))
+    for corner in range(8):
+        offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
+        weight = np.prod(np.where(offset, part, 1 - part), axis=1)
+        total += weight * _hash(cell + offset, seed)
+    return total
+
+
+def _hash(cell: np.ndarray, seed: int) -> np.ndarray:
+    h = (cell * np.array([73856093, 19349663, 83492791])).sum(1) + seed * 2654435761
+    h = (h ^ (h >> 13)) * 1274126177
+    return ((h ^ (h >> 16)) & 0xFFFF) / 65535.0
+
+
+def _look(name: str, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    seed = int(rng.integers(1 << 30))
+    tint = rng.uniform(-0.06, 0.06, 3)
+
+    def grain(points: np.ndarray, *scales: float) -> np.ndarray:
+        layers = [value_noise(points, s, seed + i) - 0.5 for i, s in enumerate(scales)]
+        return np.sum(layers, 0)
+
+    def floor(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        plank = np.floor(p[:, 0] / 0.14)
+        along = p[:, 1] + 0.7 * np.sin(plank * 12.9898)
+        board = np.stack([plank, np.floor(along / 1.1), 0 * plank], 1).astype(np.int64)
+        shade = 0.80 + 0.25 * (_hash(board, seed) - 0.5)
+        shade = shade + 0.10 * grain(p * (1, 0.12, 1), 0.02, 0.006)
+        edge = np.minimum(p[:, 0] / 0.14 % 1, 1 - p[:, 0] / 0.14 % 1) * 0.14
+        shade = shade * np.where(edge < 0.002, 0.55, 1.0)
+        return np.clip(shade[:, None] * (np.array([0.60, 0.45, 0.32]) + tint), 0, 1)
+
+    def wall(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        shade = 0.86 + 0.05 * grain(p, 0.5, 0.05) + 0.03 * grain(p, 0.008)
+        skirting = np.where(p[:, 2] < 0.09, 0.5, 1.0)
+        return np.clip((shade * skirting)[:, None] * (np.array([0.86, 0.86, 0.82]) + tint), 0, 1)
+
+    def poster(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        channels = [value_noise(p, 0.16, seed + i) > 0.5 for i in range(3)]
+        return 0.2 + 0.6 * np.stack(channels, 1) + 0.1 * grain(p, 0.02)[:, None]
+
+    def wood(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        rings = np.sin(60 * (p[:, 0] + 0.5 * p[:, 2]) + 6 * grain(p, 0.15))
+        shade = 0.75 + 0.08 * rings + 0.08 * grain(p, 0.01)
+        return np.clip(shade[:, None] * (np.array([0.66, 0.50, 0.34]) + tint), 0, 1)
+
+    def shelf(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        board = p[:, 2] % 0.32 < 0.025
+        book = np.floor((p[:, 0] + p[:, 1]) / 0.035).astype(np.int64)
+        row = np.floor(p[:, 2] / 0.32).astype(np.int64)
+        colour = np.stack(
+            [_hash(np.stack([book, row, 0 * book + k], 1), seed) for k in range(3)], 1
+        )
+        return np.where(board[:, None], (0.45, 0.35, 0.27), 0.15 + 0.6 * colour)
+
+    def cardboard(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        shade = 0.8 + 0.06 * np.sin(p[:, 2] * 900) + 0.15 * grain(p, 0.08, 0.01)
+        return np.clip(shade[:, None] * (np.array([0.70, 0.55, 0.38]) + tint), 0, 1)
+
+    def distractor(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+        stripes = (p[:, 2] % 0.08 < 0.012)[:, None]
+        return np.where(stripes, 0.10, np.clip(np.array([0.50, 0.14, 0.16]) + 2 * tint, 0, 1))
+
+    looks = {"floor": floor, "wall": wall, "poster": poster, "wood": wood, "shelf": shelf,
+             "cardboard": cardboard, "distractor": distractor}  # fmt: skip
+    return looks[name]
