@@ -1,0 +1,222 @@
+"""Files that are generated from the code, so that they cannot disagree with it.
+
+The settings with their defaults, the explanation of every setting and column, JSON schemas for
+editors, and the contents of every artefact.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+
+from intercap_core import schemas
+from intercap_core.artefacts import Schema
+from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
+
+ENTRIES: dict[str, tuple[type[BaseModel], str, str]] = {
+    "config": (Config, "config.yaml", "Settings"),
+    "sequences": (SequenceEntry, "sequences.tsv", "Recordings, one a row, columns split by tabs"),
+    "subjects": (SubjectEntry, "subjects.tsv", "People, one a row, columns split by tabs"),
+    "objects": (ObjectEntry, "objects.yaml", "Objects, one an entry under its name"),
+    "annotation": (Annotation, "annotations/<sequence>.yaml", "What a person adds by hand"),
+}
+# The default settings name a dataset; the studio's section belongs to virtual recordings alone.
+STARTING_DATASET = "my_dataset"
+LEFT_OUT_OF_DEFAULTS = ("studio",)
+
+
+def generate(root: Path, *, write: bool) -> list[Path]:
+    """Bring the generated files under ``root`` up to date; returns those that were not."""
+    stale = []
+    for relative, text in contents().items():
+        path = root / relative
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            stale.append(path)
+            if write:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, encoding="utf-8")
+    return stale
+
+
+def contents() -> dict[str, str]:
+    """Every generated file's text, by its path below the project's root."""
+    files = {
+        "config/config.yaml": default_settings(),
+        "config/README.md": settings_page(),
+        "docs/artefacts.md": artefacts_page(),
+    }
+    for name, (model, _, _) in ENTRIES.items():
+        text = json.dumps(model.model_json_schema(), indent=2) + "\n"
+        files[f"config/schemas/{name}.json"] = text
+    return files
+
+
+def default_settings() -> str:
+    """config.yaml with every default, each under what it means."""
+    lines = [
+        "# Settings of a dataset. Every line but the dataset's name is a default and may go.",
+        "# config/README.md lists allowed values; paths are relative to this file.",
+        "# yaml-language-server: $schema=schemas/config.json",
+    ]
+    values = Config(dataset=STARTING_DATASET).model_dump(mode="json")
+    _settings(Config.model_json_schema(), Config.model_json_schema(), values, "", lines)
+    return "\n".join(lines) + "\n"
+
+
+def _settings(
+    top: dict[str, Any], schema: dict[str, Any], values: dict[str, Any], pad: str, lines: list[str]
+) -> None:
+    for name, entry in schema["properties"].items():
+        if name in LEFT_OUT_OF_DEFAULTS and not pad:
+            continue
+        lines += [""] if not pad else []
+        lines += [f"{pad}# {_meaning(entry, top)}"]
+        if isinstance(values[name], dict):
+            lines.append(f"{pad}{name}:")
+            _settings(top, _resolved(entry, top), values[name], pad + "  ", lines)
+        else:
+            lines.append(f"{pad}{name}: {_inline(values[name])}")
+
+
+def _inline(value: Any) -> str:
+    return (
+        yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+    )
+
+
+def settings_page() -> str:
+    """config/README.md: every entry of every file that a user writes."""
+    lines = [
+        "# What goes into this folder",
+        "",
+        "This page and the schemas in `schemas/` are generated from `intercap_core/config.py` by",
+        "`intercap docs`. Relative paths are relative to the file that holds them; an entry that",
+        "is not listed here is refused. `intercap check` says what is wrong before a run.",
+        "",
+        "`demo/` holds the settings of `make demo`, `evaluation/` those of `make evaluate`,",
+        "`bench/` those of `make bench`, `test/` a tiny capture for the tests.",
+    ]
+    for model, file, purpose in ENTRIES.values():
+        schema = model.model_json_schema()
+        lines += ["", f"## {file}", "", f"{purpose}.", ""]
+        _table(schema, schema, lines)
+    return "\n".join(lines) + "\n"
+
+
+def _table(top: dict[str, Any], schema: dict[str, Any], lines: list[str]) -> None:
+    lines += ["| entry | value | default | meaning |", "|---|---|---|---|"]
+    inner: list[tuple[str, dict[str, Any]]] = []
+    for name, entry in schema["properties"].items():
+        resolved = _resolved(entry, top)
+        if "properties" in resolved:
+            inner.append((name, resolved))
+        default = _default(name, entry, schema)
+        meaning = _cell(_meaning(entry, top))
+        lines.append(f"| `{name}` | {_kind(entry, top)} | {default} | {meaning} |")
+    for name, resolved in inner:
+        lines += ["", f"### {name}", "", _cell(resolved.get("description", "")), ""]
+        _table(top, resolved, lines)
+
+
+def _default(name: str, entry: dict[str, Any], schema: dict[str, Any]) -> str:
+    if name in schema.get("required", ()):
+        return "*required*"
+    value = entry.get("default")
+    if value is None or isinstance(value, dict):
+        return ""
+    return f"`{_cell(_inline(value))}`"
+
+
+def _meaning(entry: dict[str, Any], top: dict[str, Any]) -> str:
+    text = entry.get("description") or _resolved(entry, top).get("description", "")
+    return " ".join(text.split())
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _resolved(entry: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
+    """Follow references, also those of optional and repeated entries, to an inner model."""
+    options = [option for option in entry.get("anyOf", ()) if option.get("type") != "null"]
+    for candidate in (*options, entry.get("items", {}), entry.get("additionalProperties", {})):
+        if isinstance(candidate, dict) and candidate:
+            found = _resolved(candidate, top)
+            if "properties" in found:
+                return found
+    if "$ref" in entry:
+        return top["$defs"][entry["$ref"].rsplit("/", 1)[1]]
+    return entry
+
+
+def _kind(entry: dict[str, Any], top: dict[str, Any]) -> str:
+    """What a value may be, in words."""
+    options = [option for option in entry.get("anyOf", ()) if option.get("type") != "null"]
+    if options:
+        return " or ".join(_kind(option, top) for option in options)
+    if "enum" in entry or "const" in entry:
+        return ", ".join(f"`{value}`" for value in entry.get("enum", [entry.get("const")]))
+    if "$ref" in entry:
+        return "entries, see below"
+    kind = entry.get("type", "")
+    if kind == "array":
+        if "prefixItems" in entry:
+            return f"list of {len(entry['prefixItems'])} numbers"
+        return f"list of: {_kind(entry.get('items', {}), top)}"
+    if kind == "object":
+        return "names, each with entries as below"
+    if entry.get("format") == "path":
+        return "path"
+    words = {"integer": "whole number", "string": "text", "boolean": "`true`, `false`"}
+    text = words.get(kind, kind)
+    if "pattern" in entry:
+        text = "name (letters, digits, `_`, `-`)"
+    bounds = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+    limits = [f"{sign} {entry[key]:g}" for key, sign in bounds.items() if key in entry]
+    return " ".join([text, ", ".join(limits)]).strip()
+
+
+def artefacts_page() -> str:
+    """docs/artefacts.md: what every stage writes."""
+    lines = [
+        "# What every artefact holds",
+        "",
+        "Generated from `intercap_core/schemas.py` by `intercap docs`. Artefacts are HDF5",
+        "files, one a stage and sequence: `results/<dataset>/<sequence>/<stage>.h5`. All carry",
+        "the root attributes `schema`, `schema_version`, `frame`, `units`, `settings_digest` and",
+        "`complete`; every dataset has a checksum and units. `intercap inspect FILE` prints one.",
+        "",
+        *(schemas.__doc__ or "").split("\n\n", 1)[1].strip().splitlines(),
+    ]
+    for schema in vars(schemas).values():
+        if isinstance(schema, Schema):
+            lines += _artefact(schema)
+    return "\n".join(lines) + "\n"
+
+
+def _artefact(schema: Schema) -> list[str]:
+    lines = [
+        "",
+        f"## {schema.name}",
+        "",
+        f"Version {schema.version}, written by stage `{schema.stage}`. Frame: {schema.frame}.",
+        "",
+    ]
+    lines += [f"- attribute `{name}`: {meaning}" for name, meaning in schema.attributes.items()]
+    lines += [
+        "",
+        "| dataset | shape | type | units | frame | meaning |",
+        "|---|---|---|---|---|---|",
+    ]
+    for key, declared in schema.fields.items():
+        optional = " (optional)" if declared.optional else ""
+        shape = " x ".join(declared.dims)
+        lines.append(
+            f"| `{key}` | {shape} | {declared.dtype} | {declared.units} | {declared.frame} "
+            f"| {_cell(declared.doc)}{optional} |"
+        )
+    return lines
