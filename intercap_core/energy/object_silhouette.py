@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from intercap_core.camera.intrinsics import Intrinsics
 
@@ -27,23 +28,19 @@ def rim(mask: np.ndarray) -> np.ndarray:
 
 
 class NearestRim:
-    """For every pixel of a window, the nearest of a set of rim pixels."""
+    """Rim pixels (R, 2) int64 as x, y, at least one, and which of them is nearest to a pixel."""
 
-    def __init__(self, rim_mask: np.ndarray) -> None:
-        """``rim_mask`` (h, w) bool, at least one pixel set."""
-        self.pixels = np.argwhere(rim_mask)[:, ::-1]  # (R, 2) x, y in row-major order
-        source = np.where(rim_mask, 0, 255).astype(np.uint8)
-        distance, labels = cv2.distanceTransformWithLabels(
-            source, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        self.distance = distance
-        self._labels = labels
-        self._of_label = np.zeros(int(labels.max()) + 1, np.int64)
-        self._of_label[labels[rim_mask]] = np.arange(len(self.pixels))
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels = pixels
+        self._tree = cKDTree(pixels, balanced_tree=False)
 
-    def index(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Index (N,) into :attr:`pixels` of the rim pixel nearest to window pixels (N,), (N,)."""
-        return self._of_label[self._labels[y, x]]
+    def query(self, pixels: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (N,) of pixels (N, 2) and index (N,) of the nearest rim pixel.
+
+        Beyond ``limit`` pixels the distance is infinite and the index is the number of pixels.
+        """
+        distance, index = self._tree.query(pixels, distance_upper_bound=limit)
+        return distance, index
 
 
 def residuals(

@@ -94,7 +94,7 @@ def _counts(text: np.ndarray) -> np.ndarray:
     number = 0
     position = 0
     while position < len(text):
-        value, shift, more = 0, 0, True
+        value, shift, more = np.int64(0), 0, True
         while more and position < len(text):
             bits = np.int64(text[position]) - 48
             value |= (bits & 0x1F) << shift
@@ -102,9 +102,9 @@ def _counts(text: np.ndarray) -> np.ndarray:
             position += 1
             shift += 5
             if not more and bits & 0x10:
-                value |= -1 << shift
+                value |= np.int64(-1) << shift
         if number > 2:
-            value += int(counts[number - 2])
+            value += counts[number - 2]
         counts[number] = value
         number += 1
     return counts[:number]
