@@ -1,0 +1,63 @@
+# make demo      three virtual recordings, everything computed, the report's path at the end
+# make test      the whole test suite
+# make lint      ruff, snakefmt, mypy, snakemake --lint
+# make evaluate  the evaluation captures against truth, tables and results/evaluation.json
+# make bench     seconds a frame and peak memory, results/bench.json
+# make docs      the generated pages and schemas, and the rule graph
+PYTHON ?= python3
+VENV ?= .venv
+CORES ?= 0
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+TORCH := torch==2.13.0
+EXTRAS := workflow,test,dev
+
+.PHONY: demo test lint ruff-check ruff-format snakefmt mypy snakemake-lint evaluate bench docs \
+    environment clean
+
+demo: $(STAMP)
+	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+lint: ruff-check ruff-format snakefmt mypy snakemake-lint
+
+ruff-check: $(STAMP)
+	$(BIN)/ruff check .
+
+ruff-format: $(STAMP)
+	$(BIN)/ruff format --check .
+
+snakefmt: $(STAMP)
+	$(BIN)/snakefmt --check Snakefile workflow
+
+mypy: $(STAMP)
+	$(BIN)/mypy
+
+snakemake-lint: $(STAMP)
+	$(BIN)/snakemake --lint --configfile config/demo/config.yaml
+
+evaluate: $(STAMP)
+	$(BIN)/intercap evaluate --cores $(CORES)
+
+bench: $(STAMP)
+	$(BIN)/intercap bench --cores $(CORES)
+
+docs: $(STAMP)
+	$(BIN)/intercap docs
+	$(BIN)/python tools/write_rule_graph.py
+
+environment: $(STAMP)
+
+# A stamp, so that the environment is made once, and again only when what it needs has changed. Torch
+# comes first and by its exact version, so that pip does not fetch several of its large builds to
+# choose from. For a build without CUDA: PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu.
+$(STAMP): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[$(EXTRAS)]"
+	touch $@
+
+clean:
+	rm -rf results logs benchmarks .snakemake
