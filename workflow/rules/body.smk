@@ -7,11 +7,6 @@ rule body_fit:
         person=rules.person.output.person,
     output:
         body_fit=f"{RESULTS}/{{sequence}}/body_fit.h5",
-    params:
-        settings=settings_of("body_fit"),
-        subject=tracked_subject,
-        device=SETTINGS.device,
-        code=code_of("body_fit"),
     log:
         f"{LOGS}/{{sequence}}/body_fit.log",
     benchmark:
@@ -22,6 +17,11 @@ rule body_fit:
     resources:
         mem_mb=memory(4000),
         runtime=120,
+    params:
+        settings=settings_of("body_fit"),
+        subject=tracked_subject,
+        device=SETTINGS.device,
+        code=code_of("body_fit"),
     message:
         "{wildcards.sequence}: fitting the body"
     script:

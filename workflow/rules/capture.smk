@@ -26,10 +26,6 @@ rule frames:
         annotation=ancient(annotation_input("drop_frames")),
     output:
         frames=f"{RESULTS}/{{sequence}}/frames.h5",
-    params:
-        settings=settings_of("frames"),
-        annotation=annotation_of("drop_frames"),
-        code=code_of("frames"),
     log:
         f"{LOGS}/{{sequence}}/frames.log",
     benchmark:
@@ -40,6 +36,10 @@ rule frames:
     resources:
         mem_mb=memory(2000),
         runtime=60,
+    params:
+        settings=settings_of("frames"),
+        annotation=annotation_of("drop_frames"),
+        code=code_of("frames"),
     message:
         "{wildcards.sequence}: reading and synchronising the recordings"
     script:

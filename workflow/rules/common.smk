@@ -91,7 +91,11 @@ def annotation_input(*sections):
     def files(wildcards):
         filled = annotation_sections(wildcards.sequence)
         if filled is None:
-            return [rules.broken_annotation.output.checked.format(sequence=wildcards.sequence)]
+            return [
+                rules.broken_annotation.output.checked.format(
+                    sequence=wildcards.sequence
+                )
+            ]
         if not any(section in filled for section in sections):
             return []
         return [PROJECT.annotation_path(wildcards.sequence)]

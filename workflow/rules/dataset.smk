@@ -11,10 +11,6 @@ rule dataset:
         summary=f"{RESULTS}/summary.json",
         heatmaps=f"{RESULTS}/heatmaps.h5",
         tables=directory(f"{RESULTS}/tables"),
-    params:
-        settings=settings_of("report"),
-        sequences=SEQUENCES,
-        code=code_of("dataset"),
     log:
         f"{LOGS}/dataset.log",
     benchmark:
@@ -25,6 +21,10 @@ rule dataset:
     resources:
         mem_mb=memory(4000),
         runtime=60,
+    params:
+        settings=settings_of("report"),
+        sequences=SEQUENCES,
+        code=code_of("dataset"),
     message:
         "the report over all sequences"
     script:

@@ -6,9 +6,6 @@ rule detections:
         frames=rules.frames.output.frames,
     output:
         detections=f"{RESULTS}/{{sequence}}/detections.h5",
-    params:
-        settings=settings_of("detections"),
-        code=code_of("detections"),
     log:
         f"{LOGS}/{{sequence}}/detections.log",
     benchmark:
@@ -19,6 +16,9 @@ rule detections:
     resources:
         mem_mb=memory(1500),
         runtime=30,
+    params:
+        settings=settings_of("detections"),
+        code=code_of("detections"),
     message:
         "{wildcards.sequence}: reading keypoints and candidates"
     script:

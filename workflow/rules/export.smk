@@ -7,11 +7,6 @@ rule export:
         joint=rules.joint.output.joint,
     output:
         folder=directory(f"{RESULTS}/{{sequence}}/export"),
-    params:
-        settings=settings_of("export"),
-        object=tracked_object,
-        subject=tracked_subject,
-        code=code_of("export"),
     log:
         f"{LOGS}/{{sequence}}/export.log",
     benchmark:
@@ -22,6 +17,11 @@ rule export:
     resources:
         mem_mb=memory(3000),
         runtime=30,
+    params:
+        settings=settings_of("export"),
+        object=tracked_object,
+        subject=tracked_subject,
+        code=code_of("export"),
     message:
         "{wildcards.sequence}: exporting"
     script:

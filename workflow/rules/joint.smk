@@ -11,13 +11,6 @@ rule joint:
         annotation=ancient(annotation_input("contact")),
     output:
         joint=f"{RESULTS}/{{sequence}}/joint.h5",
-    params:
-        settings=settings_of("joint"),
-        annotation=annotation_of("contact"),
-        object=tracked_object,
-        subject=tracked_subject,
-        device=SETTINGS.device,
-        code=code_of("joint"),
     log:
         f"{LOGS}/{{sequence}}/joint.log",
     benchmark:
@@ -28,6 +21,13 @@ rule joint:
     resources:
         mem_mb=memory(4000),
         runtime=120,
+    params:
+        settings=settings_of("joint"),
+        annotation=annotation_of("contact"),
+        object=tracked_object,
+        subject=tracked_subject,
+        device=SETTINGS.device,
+        code=code_of("joint"),
     message:
         "{wildcards.sequence}: refining body and object together"
     script:

@@ -13,11 +13,6 @@ rule metrics:
         joint=rules.joint.output.joint,
     output:
         metrics=f"{RESULTS}/{{sequence}}/metrics.h5",
-    params:
-        settings=settings_of("metrics"),
-        object=tracked_object,
-        subject=tracked_subject,
-        code=code_of("metrics"),
     log:
         f"{LOGS}/{{sequence}}/metrics.log",
     benchmark:
@@ -28,6 +23,11 @@ rule metrics:
     resources:
         mem_mb=memory(4000),
         runtime=60,
+    params:
+        settings=settings_of("metrics"),
+        object=tracked_object,
+        subject=tracked_subject,
+        code=code_of("metrics"),
     message:
         "{wildcards.sequence}: measuring"
     script:

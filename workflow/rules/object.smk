@@ -9,11 +9,6 @@ rule object_track:
         annotation=ancient(annotation_input("object_pose")),
     output:
         object_track=f"{RESULTS}/{{sequence}}/object_track.h5",
-    params:
-        settings=settings_of("object_track"),
-        annotation=annotation_of("object_pose"),
-        object=tracked_object,
-        code=code_of("object_track"),
     log:
         f"{LOGS}/{{sequence}}/object_track.log",
     benchmark:
@@ -24,6 +19,11 @@ rule object_track:
     resources:
         mem_mb=memory(4000),
         runtime=120,
+    params:
+        settings=settings_of("object_track"),
+        annotation=annotation_of("object_pose"),
+        object=tracked_object,
+        code=code_of("object_track"),
     message:
         "{wildcards.sequence}: tracking the object"
     script:

@@ -6,10 +6,6 @@ rule scene:
         annotation=ancient(annotation_input("floor")),
     output:
         scene=f"{RESULTS}/{{sequence}}/scene.h5",
-    params:
-        settings=settings_of("scene"),
-        annotation=annotation_of("floor"),
-        code=code_of("scene"),
     log:
         f"{LOGS}/{{sequence}}/scene.log",
     benchmark:
@@ -20,6 +16,10 @@ rule scene:
     resources:
         mem_mb=memory(3000),
         runtime=60,
+    params:
+        settings=settings_of("scene"),
+        annotation=annotation_of("floor"),
+        code=code_of("scene"),
     message:
         "{wildcards.sequence}: refining the cameras, finding the floor"
     script:
@@ -33,9 +33,6 @@ rule person:
         scene=rules.scene.output.scene,
     output:
         person=f"{RESULTS}/{{sequence}}/person.h5",
-    params:
-        settings=settings_of("person"),
-        code=code_of("person"),
     log:
         f"{LOGS}/{{sequence}}/person.log",
     benchmark:
@@ -46,6 +43,9 @@ rule person:
     resources:
         mem_mb=memory(2000),
         runtime=30,
+    params:
+        settings=settings_of("person"),
+        code=code_of("person"),
     message:
         "{wildcards.sequence}: finding the subject in all views"
     script:

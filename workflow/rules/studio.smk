@@ -22,10 +22,6 @@ rule studio:
         candidates=directory(f"{_recordings}/candidates"),
         truth=f"{_recordings}/truth.h5",
         manifest=f"{_recordings}/capture.json",
-    params:
-        settings=capture_of,
-        object=tracked_object,
-        code=lambda wildcards: code_digest("studio.capture"),
     log:
         f"{LOGS}/{{sequence}}/studio.log",
     benchmark:
@@ -36,6 +32,10 @@ rule studio:
     resources:
         mem_mb=memory(3000),
         runtime=60,
+    params:
+        settings=capture_of,
+        object=tracked_object,
+        code=lambda wildcards: code_digest("studio.capture"),
     message:
         "{wildcards.sequence}: making a virtual recording"
     script:
