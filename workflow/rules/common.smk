@@ -146,6 +146,12 @@ def tracked_subject(wildcards):
     return digest(of_sequence(wildcards)[2])
 
 
+def capture_of(wildcards):
+    """Param: everything that decides what the studio makes of one sequence."""
+    shared = SETTINGS.studio.model_dump(mode="json", exclude={"captures"})
+    return digest([shared, SETTINGS.studio.captures[wildcards.sequence]])
+
+
 def memory(megabytes):
     """Resource: grows with every attempt after a job that was killed for its memory."""
     return lambda wildcards, attempt: megabytes * attempt

@@ -1,11 +1,4 @@
-_studio = SETTINGS.studio
 _recordings = f"{RESULTS}/recordings/{{sequence}}"
-
-
-def capture_of(wildcards):
-    """Param: everything that decides what the studio makes of one sequence."""
-    shared = _studio.model_dump(mode="json", exclude={"captures"})
-    return digest([shared, _studio.captures[wildcards.sequence]])
 
 
 rule studio:
@@ -15,7 +8,9 @@ rule studio:
     output:
         recordings=[
             f"{_recordings}/k{number}.mkv"
-            for number in range(1, (_studio.cameras if _studio else 1) + 1)
+            for number in range(
+                1, (SETTINGS.studio.cameras if SETTINGS.studio else 1) + 1
+            )
         ],
         calibration=f"{_recordings}/calibration.json",
         keypoints=directory(f"{_recordings}/keypoints"),
