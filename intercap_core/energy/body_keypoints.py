@@ -1,0 +1,220 @@
+"""Keypoint term of the body's energy, E_J of equation 2.
+
+    E_J = sum over views v, keypoints i of k_i w_i^v rho_J( Pi^v(X_i(theta, beta, gamma)) - J_i^v )
+
+with Geman and McClure's rho_J, the detector's confidence w and a fixed trust k = 1 / sigma^2 by
+keypoint. X_i is the model's keypoint plus an offset o_i that is fixed in the frame of the bone that
+carries it: detectors and body models mean different points by the same name ("hip"), and that
+difference is the same in every frame. o_i is estimated with a Gaussian prior, see
+:mod:`.body_priors`.
+
+Everything a view says about a keypoint acts through the 3D point, so the views are summed into one
+3 x 3 matrix and one 3-vector for each keypoint before the body's derivatives come in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
+from intercap_core.body.kinematics import pose_joints, rotation_from_axis_angle, skew
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.camera import projection
+from intercap_core.solve.robust import geman_mcclure
+
+
+class Keypoints(NamedTuple):
+    """points (B,K,3) with offsets applied, derivatives (B,K,3,P), bone rotations (B,K,3,3)."""
+
+    points: Tensor
+    derivatives: Tensor | None
+    rotations: Tensor
+
+
+class PointTerm(NamedTuple):
+    """A term that acts through points: cost (B,), and by point gradient (B,K,3), matrix (B,K,3,3).
+
+    The gradient is that of the cost by the points; the matrix is Gauss-Newton's.
+    """
+
+    cost: Tensor
+    gradient: Tensor
+    matrix: Tensor
+
+
+@dataclass(frozen=True)
+class Carriers:
+    """Which bone carries each keypoint: joint (K,) ids, and (K,55) the joints that turn it."""
+
+    joint: Tensor
+    turned_by: Tensor
+
+
+def carriers(model: BodyModel) -> Carriers:
+    """A joint is carried by its parent's bone, a vertex by the bone with the largest weight."""
+    keypoints = model.keypoint_map
+    heaviest = model.skinning_weights.argmax(1).cpu().numpy()
+    joint = [
+        max(PARENTS[j], 0) if j >= 0 else int(heaviest[ids[weights.argmax()]])
+        for j, ids, weights in zip(keypoints.joint, keypoints.ids, keypoints.weights, strict=True)
+    ]
+    turned = torch.zeros(len(joint), NUM_JOINTS, dtype=model.dtype, device=model.device)
+    for row, carrier in enumerate(joint):
+        turned[row, list(ancestors(carrier))] = 1
+    return Carriers(torch.tensor(joint, device=model.device), turned)
+
+
+def evaluate(
+    model: BodyModel,
+    params: BodyParameters,
+    carried: Carriers,
+    offsets: Tensor,
+    *,
+    derivatives: bool,
+) -> Keypoints:
+    """Keypoints of B bodies, displaced by offsets (K,3), metres, in the frames of their bones."""
+    local = rotation_from_axis_angle(params.full_pose())
+    still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
+    world = pose_joints(still, local, still[:, 0]).rotations
+    rotations = world[:, carried.joint]
+    arms = (rotations @ offsets[..., None])[..., 0]
+    matrix = torch.as_tensor(model.keypoint_map.matrix, dtype=local.dtype, device=local.device)
+    ids = model.keypoint_map.vertex_ids
+    if not derivatives:
+        output = model.forward(params, vertex_ids=ids)
+        points = matrix @ torch.cat([output.vertices, output.joints], 1)
+        return Keypoints(points + arms, None, rotations)
+    linear = model.linearise(params, vertex_ids=ids, joints=True)
+    full = linear.full()
+    batch, _, _, size = full.shape
+    by = (matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
+    # a turn w of joint l moves the arm R o by w x R o, for every l the carrier hangs on
+    turned = -skew(arms)[:, :, None] @ linear.frames[:, None]
+    turned = turned * carried.turned_by[None, :, :, None, None]
+    by[..., : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(batch, -1, 3, 3 * NUM_JOINTS)
+    return Keypoints(matrix @ linear.points + arms, by, rotations)
+
+
+def reprojection(
+    points: Tensor,
+    observed: Tensor,
+    confidence: Tensor,
+    sigma: Tensor,
+    lenses: Tensor,
+    colour_from_master: Tensor,
+    *,
+    scale: float,
+    shift: Tensor | None = None,
+) -> PointTerm:
+    """E_J of points (B,K,3), master frame, seen in C views.
+
+    observed (B,C,K,2) px; confidence (B,C,K), 0 = not seen; sigma (B,C,K) px, the trust; lenses
+    (C,13) as :mod:`projection` takes them; colour_from_master (C,4,4). ``scale``: residuals beyond
+    so many sigma stop counting. shift (B,C,K,3), metres: how much farther each point has moved when
+    that camera exposes. cost = sum w rho(|r / sigma|^2) / 2.
+    """
+    rotation, translation = colour_from_master[:, :3, :3], colour_from_master[:, :3, 3]
+    seen = points[:, None] if shift is None else points[:, None] + shift
+    in_camera = seen @ rotation.transpose(1, 2) + translation[:, None]
+    pixels, by_point = projection.project_with_jacobian(in_camera, lenses[:, None])
+    known = confidence > 0
+    residual = torch.where(known[..., None], (pixels - observed) / sigma[..., None], 0)
+    robust = geman_mcclure((residual**2).sum(-1), scale)
+    by_point = by_point @ rotation[:, None] / sigma[..., None, None]
+    weight = confidence * robust.weight
+    weighted = by_point.transpose(-1, -2) * weight[..., None, None]
+    gradient = (weighted @ residual[..., None])[..., 0].sum(1)
+    cost = 0.5 * (confidence * robust.rho).sum((1, 2))
+    return PointTerm(cost, gradient, (weighted @ by_point).sum(1))
+
+
+def reprojection_cost(
+    points: Tensor,
+    observed: Tensor,
+    confidence: Tensor,
+    sigma: Tensor,
+    lenses: Tensor,
+    colour_from_master: Tensor,
+    *,
+    scale: float,
+    shift: Tensor | None = None,
+) -> Tensor:
+    """The cost (B,) of :func:`reprojection` alone."""
+    residual = pixel_residuals(points, observed, lenses, colour_from_master, shift=shift)
+    residual = torch.where(confidence[..., None] > 0, residual / sigma[..., None], 0)
+    rho = geman_mcclure((residual**2).sum(-1), scale).rho
+    return 0.5 * (confidence * rho).sum((1, 2))
+
+
+def pixel_residuals(
+    points: Tensor,
+    observed: Tensor,
+    lenses: Tensor,
+    colour_from_master: Tensor,
+    *,
+    shift: Tensor | None = None,
+) -> Tensor:
+    """Projection minus observation (B,C,K,2), px."""
+    rotation, translation = colour_from_master[:, :3, :3], colour_from_master[:, :3, 3]
+    seen = points[:, None] if shift is None else points[:, None] + shift
+    in_camera = seen @ rotation.transpose(1, 2) + translation[:, None]
+    return projection.project(in_camera, lenses[:, None]) - observed
+
+
+def triangulated(
+    points: Tensor, targets: Tensor, confidence: Tensor, *, sigma: float, scale: float
+) -> PointTerm:
+    """The same term on triangulated keypoints: where the fit starts.
+
+    points, targets (B,K,3), master frame, metres; confidence (B,K), 0 = no target; ``sigma`` in
+    metres, ``scale`` in sigmas. cost = sum w rho(|(X - target) / sigma|^2) / 2.
+    """
+    known = confidence > 0
+    residual = torch.where(known[..., None], (points - targets) / sigma, 0)
+    robust = geman_mcclure((residual**2).sum(-1), scale)
+    weight = confidence * robust.weight / sigma
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    return PointTerm(
+        0.5 * (confidence * robust.rho).sum(1),
+        weight[..., None] * residual,
+        (weight / sigma)[..., None, None] * eye,
+    )
+
+
+def assemble(term: PointTerm, keypoints: Keypoints, columns: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradient (B,n) and Hessian (B,n,n) by the chosen columns (n,) of the body's parameters."""
+    if keypoints.derivatives is None:
+        raise ValueError("keypoints were evaluated without derivatives")
+    by = keypoints.derivatives[..., columns]
+    batch, _, _, size = by.shape
+    pulled = (term.matrix @ by).reshape(batch, -1, size)
+    flat = by.reshape(batch, -1, size)
+    gradient = (flat.transpose(1, 2) @ term.gradient.reshape(batch, -1, 1))[..., 0]
+    return gradient, flat.transpose(1, 2) @ pulled
+
+
+def assemble_offsets(
+    term: PointTerm, keypoints: Keypoints, columns: Tensor, count: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of the offsets of the first ``count`` keypoints.
+
+    Returns gradient (B,3 count), cross block (B,n,3 count) with the body's columns (n,), and the
+    offsets' own block (B,3 count,3 count), block diagonal.
+    """
+    if keypoints.derivatives is None:
+        raise ValueError("keypoints were evaluated without derivatives")
+    rotation = keypoints.rotations[:, :count]
+    batch = rotation.shape[0]
+    gradient = (rotation.transpose(2, 3) @ term.gradient[:, :count, :, None])[..., 0]
+    turned = term.matrix[:, :count] @ rotation
+    by = keypoints.derivatives[:, :count][..., columns]
+    cross = (by.transpose(2, 3) @ turned).permute(0, 2, 1, 3).reshape(batch, len(columns), -1)
+    own = rotation.new_zeros(batch, count, 3, count, 3)
+    each = torch.arange(count, device=rotation.device)
+    own[:, each, :, each, :] = (rotation.transpose(2, 3) @ turned).transpose(0, 1)
+    return gradient.reshape(batch, -1), cross, own.reshape(batch, 3 * count, 3 * count)

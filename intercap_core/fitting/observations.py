@@ -1,0 +1,253 @@
+"""What the cameras say about the person: keypoints of all frames, and each frame's fused cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core import artefacts
+from intercap_core.artefacts import unpack_ragged
+from intercap_core.camera.clouds import colour_lookup
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply
+from intercap_core.capture.frames import Frames
+from intercap_core.detection.masks import Runs
+from intercap_core.errors import UserError
+from intercap_core.schemas import PERSON, SCENE
+
+_OUTLIER_TRUST = 0.2  # of a view that disagrees with the triangulated point
+_BEFORE_BACKGROUND_M = 0.04  # nearer than the background by less is background
+_NORMAL_BASE_PX = 3  # half the base over which a normal is measured
+_EDGE_M = 0.04  # a larger step between those pixels is an edge of the person
+_EDGE_TRUST = 0.3  # such points may float between the person and what is behind
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """T frames, C cameras, K = 135 keypoints.
+
+    keypoints (T,C,K,2) px and confidence (T,C,K), 0 = not seen; joints (T,K,3) triangulated, master
+    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none;
+    delay (T,C) s, exposure later than the set; times (T,) s.
+    """
+
+    sequence: str
+    rig: Rig
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    joints: np.ndarray
+    joint_views: np.ndarray
+    masks: list[bytes]
+    background: list[np.ndarray | None]
+    depth_bias: np.ndarray
+    delay: np.ndarray
+    times: np.ndarray
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.times)
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(T,) bool: enough of the trunk is triangulated to place a body."""
+        trunk = self.joints[:, list(TRUNK_KEYPOINTS)]
+        return np.isfinite(trunk).all(2).sum(1) >= 3
+
+
+# neck, shoulders, mid hip, hips, knees: keypoints that a pose can be started from
+TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
+
+
+def read_observations(scene: Path, person: Path) -> Observations:
+    """Read scene and person; raises UserError for artefacts that do not belong together."""
+    with artefacts.read(scene, SCENE) as read:
+        rig = Rig.from_artefact(read)
+        sequence = str(read.attributes["sequence"])
+        times = read["times"]
+        delay = read["time_offset"] + read["slip"] / float(read.attributes["fps"])
+        depth_bias = read["depth_bias"]
+        keys = set(read.keys("cameras/"))
+        background = [
+            read[f"cameras/{name}/background"] if f"cameras/{name}/background" in keys else None
+            for name in rig.names
+        ]
+    with artefacts.read(person, PERSON) as read:
+        names = tuple(read.text("camera_names"))
+        if names != rig.names or len(read["missing"]) != len(times):
+            raise UserError(
+                f"{person}: has {len(read['missing'])} frames of cameras {', '.join(names)}, "
+                f"expected {len(times)} of {', '.join(rig.names)} as in {scene}; re-run stage "
+                "'person' for this sequence"
+            )
+        keypoints = read["keypoints"].astype(np.float64)
+        joints, views = read["joints"].astype(np.float64), read["joint_views"]
+        inlier = read["inlier"]
+        masks = unpack_ragged(read["mask_offsets"], read["mask_rle"])
+    confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
+    disputed = (views >= 2)[:, None] & ~inlier
+    confidence = np.where(disputed, _OUTLIER_TRUST * confidence, confidence)
+    confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
+    return Observations(
+        sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks,
+        background, depth_bias, delay, times,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class PersonCloud:
+    """One frame's person points of all views, master frame.
+
+    points, normals (M,3) float32, metres, normals towards the camera; trust (M,) in (0,1]; view
+    (M,) index of the camera.
+    """
+
+    points: Tensor
+    normals: Tensor
+    trust: Tensor
+    view: Tensor
+
+
+def person_clouds(
+    frames: Path, seen: Observations, count: int, device: torch.device
+) -> Iterator[PersonCloud | None]:
+    """The cloud of every frame in order, about ``count`` points each; None = no depth, no mask."""
+    with Frames.open(frames) as reader:
+        if reader.num_sets != seen.num_frames:
+            raise UserError(
+                f"{frames}: has {reader.num_sets} frame sets, expected {seen.num_frames} as in the "
+                "scene artefact; re-run stage 'scene' for this sequence"
+            )
+        for t in range(seen.num_frames):
+            yield _fused(reader, seen, t, count, device)
+
+
+def _fused(
+    reader: Frames, seen: Observations, t: int, count: int, device: torch.device
+) -> PersonCloud | None:
+    parts = []
+    for c, camera in enumerate(seen.rig):
+        rle = seen.masks[t * len(seen.rig) + c]
+        if not rle or camera.depth is None:
+            continue
+        depth = reader.depth(t, c)
+        if depth is None:
+            continue
+        runs = Runs(rle, camera.colour.height, camera.colour.width)
+        part = view_points(depth, camera, runs, seen.background[c], seen.depth_bias[c])
+        if part is not None:
+            parts.append((*part, np.full(len(part[0]), c)))
+    if not parts:
+        return None
+    points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
+    # every n-th point: pixels are in scan order, so this spreads over the surface
+    pick = np.unique(np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.int64))
+    return PersonCloud(
+        torch.as_tensor(points[pick], dtype=torch.float32, device=device),
+        torch.as_tensor(normals[pick], dtype=torch.float32, device=device),
+        torch.as_tensor(trust[pick], dtype=torch.float32, device=device),
+        torch.as_tensor(view[pick], device=device),
+    )
+
+
+def view_points(
+    depth: np.ndarray,
+    camera: Camera,
+    mask: Runs,
+    background: np.ndarray | None,
+    depth_bias: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Person points of one depth image: points, normals (M,3), master frame, and trust (M,).
+
+    A depth pixel counts when the colour pixel that shows the same surface lies in the person's
+    mask and the depth is clearly nearer than the background. Every second pixel of every second
+    row is used. None where no pixel counts.
+    """
+    window = _window(camera, mask, depth)
+    if window is None:
+        return None
+    rows, columns = window
+    near = depth[rows, columns].astype(np.int32)
+    counts = near > 0
+    if background is not None:
+        behind = background[rows, columns].astype(np.int32)
+        counts &= (behind == 0) | (near < behind - int(1000 * _BEFORE_BACKGROUND_M))
+    counts[1::2] = False
+    counts[:, 1::2] = False
+    row, column = np.nonzero(counts)
+    width = depth.shape[1]
+    index = (row + rows.start) * width + column + columns.start
+    if not len(index):
+        return None
+    lookup = colour_lookup(depth, camera, index)
+    inside = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
+    index = lookup.depth_index[inside]
+    if not len(index):
+        return None
+    points, normals, edge = _points_and_normals(depth, camera, index)
+    if depth_bias:
+        points = points - depth_bias * points / points[:, 2:]
+    master = camera.master_from_depth
+    rotation = master[:3, :3].astype(np.float32)
+    return apply(master, points), normals @ rotation.T, np.where(edge, _EDGE_TRUST, 1.0)
+
+
+def _window(camera: Camera, mask: Runs, depth: np.ndarray) -> tuple[slice, slice] | None:
+    """The part of the depth image that can show the mask: its box, through both lenses."""
+    x, y, w, h = mask.box
+    if w == 0 or camera.depth is None or camera.colour_from_depth is None:
+        return None
+    corners = np.array([[x + i * w / 4, y + j * h / 4] for i in range(5) for j in range(5)])
+    rays = camera.colour.unproject(corners)
+    rays = rays[np.isfinite(rays).all(1)]
+    depth_from_colour = np.linalg.inv(camera.colour_from_depth)
+    placed = np.concatenate([apply(depth_from_colour, z * rays) for z in (0.7, 2.0, 6.0)])
+    pixels = camera.depth.project(placed)
+    height, width = depth.shape
+    margin = 6
+    x0, y0 = np.floor(pixels.min(0)).astype(int) - margin
+    x1, y1 = np.ceil(pixels.max(0)).astype(int) + margin
+    rows = slice(max(int(y0), 0), min(int(y1), height))
+    columns = slice(max(int(x0), 0), min(int(x1), width))
+    return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
+
+
+def _points_and_normals(
+    depth: np.ndarray, camera: Camera, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points and unit normals (M,3), depth camera's frame, and whether a pixel is at an edge."""
+    assert camera.depth is not None
+    height, width = depth.shape
+    rays = camera.depth.rays
+    row, column = np.divmod(index, width)
+    z = depth[row, column].astype(np.float32) * np.float32(1e-3)
+
+    def at(r: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
+        there = depth[r, c].astype(np.float32) * np.float32(1e-3)
+        ray = rays[r, c]
+        good = (there > 0) & (np.abs(there - z) < _EDGE_M) & np.isfinite(ray[:, 0])
+        ray = np.where(good[:, None], ray, 0)
+        return np.concatenate([ray * there[:, None], there[:, None]], 1), good
+
+    ray = np.nan_to_num(rays[row, column])
+    here = np.concatenate([ray * z[:, None], z[:, None]], 1)
+    spans, smooth = [], np.ones(len(index), bool)
+    for dr, dc in ((0, _NORMAL_BASE_PX), (_NORMAL_BASE_PX, 0)):
+        ahead, a = at(row + dr, column + dc)
+        back, b = at(row - dr, column - dc)
+        # one-sided where the other side is another surface
+        span = np.where(a[:, None], ahead, here) - np.where(b[:, None], back, here)
+        spans.append(span)
+        smooth &= a & b
+    normals = np.cross(spans[1], spans[0])
+    length = np.linalg.norm(normals, axis=1)
+    flat = length < 1e-9
+    facing = -here / np.maximum(np.linalg.norm(here, axis=1, keepdims=True), 1e-9)
+    normals = np.where(flat[:, None], facing, normals / np.maximum(length, 1e-9)[:, None])
+    normals *= np.where((normals * here).sum(1) > 0, -1.0, 1.0)[:, None]
+    return here, normals.astype(np.float32), ~smooth

@@ -1,0 +1,115 @@
+"""Stage ``body_fit``: SMPL-X parameters in every frame (equation 2).
+
+All frames are fitted at once by second-order steps. There is no term between frames: each stands
+on what its own views show, apart from one shape, the clothing's thickness and the detector's fixed
+offsets, which all frames share. Self-penetration (E_P_self of equation 3) is not penalised.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from intercap_core import artefacts
+from intercap_core.body.artefact import body_path
+from intercap_core.body.loading import OPEN_BODY
+from intercap_core.body.model import BodyModel
+from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
+from intercap_core.errors import UserError
+from intercap_core.fitting.bridge import bridge, continuous, seconds_to_known
+from intercap_core.fitting.observations import person_clouds, read_observations
+from intercap_core.fitting.schedule import Fitter
+from intercap_core.fitting.uncertainty import joint_sigma
+from intercap_core.project import digest
+from intercap_core.schemas import BODY_FIT
+
+NUM_BETAS, NUM_EXPRESSION = 10, 10
+# A body whose keypoints are this far off, in the median, is not the person's.
+_BAD_RESIDUAL_M = 0.06
+# A bridged joint is off by what people move meanwhile: at walking pace, at most an arm's length.
+_BRIDGED_SPEED = 0.5
+_BRIDGED_SIGMA_RANGE = (0.03, 0.5)
+
+
+def run(
+    *,
+    frames: Path,
+    scene: Path,
+    person: Path,
+    output: Path,
+    subject: SubjectEntry,
+    body_models: BodyModels,
+    settings: BodyFitSettings,
+    device: str = "cpu",
+) -> None:
+    """Fit the subject's body in all frames and write body_fit.h5.
+
+    Frames in which too little of the person is triangulated, or whose fit ends far from the
+    keypoints, are ``failed`` and ``bridged``: filled in between their neighbours. Raises UserError
+    where no frame at all can be fitted, the body file cannot be used, or the artefacts do not
+    belong together.
+    """
+    path = body_path(body_models, subject.gender) or OPEN_BODY
+    model = BodyModel.load(path, num_betas=NUM_BETAS, num_expression=NUM_EXPRESSION, device=device)
+    seen = read_observations(scene, person)
+    if not seen.usable.any():
+        raise UserError(
+            f"{person}: sequence {seen.sequence}: in none of its {seen.num_frames} frames do two "
+            "views agree on three keypoints of the subject's trunk; check the keypoints and the "
+            "camera poses of this sequence"
+        )
+    clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
+    fit = Fitter(model, seen, clouds, settings).run()
+
+    fitted = np.zeros(seen.num_frames, bool)
+    fitted[fit.frames[(fit.keypoint_error < _BAD_RESIDUAL_M).cpu().numpy()]] = True
+    if not fitted.any():
+        raise UserError(
+            f"{person}: sequence {seen.sequence}: the fitted body is more than "
+            f"{1000 * _BAD_RESIDUAL_M:.0f} mm from the keypoints in every frame; check the camera "
+            "poses and that the keypoints belong to this recording"
+        )
+    vectors = np.zeros((seen.num_frames, model.num_parameters))
+    vectors[fit.frames] = fit.vectors.double().cpu().numpy()
+    vectors = bridge(vectors, fitted, seen.times)
+    vectors[:, :3] = continuous(vectors[:, :3])
+
+    sigma = np.zeros((seen.num_frames, 55))
+    sigma[fit.frames] = (
+        joint_sigma(model, fit.vectors, fit.columns, fit.hessian, fit.excess).cpu().numpy()
+    )
+    away = _BRIDGED_SPEED * seconds_to_known(fitted, seen.times)
+    sigma[~fitted] = np.clip(away[~fitted], *_BRIDGED_SIGMA_RANGE)[:, None]
+
+    keypoint_residual = np.full((seen.num_frames, len(seen.rig)), np.nan)
+    keypoint_residual[fit.frames] = fit.pixel_residual.cpu().numpy()
+    cloud_residual = np.full(seen.num_frames, np.nan)
+    cloud_residual[fit.frames] = fit.cloud_residual.cpu().numpy()
+    with artefacts.write(
+        output,
+        BODY_FIT,
+        settings_digest=digest(settings),
+        sequence=seen.sequence,
+        subject=subject.subject,
+        gender=subject.gender,
+        body_model=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+    ) as writer:
+        _put_bodies(writer, model, vectors)
+        writer.put("keypoint_residual", keypoint_residual)
+        writer.put("cloud_residual", cloud_residual)
+        writer.put("joint_sigma", sigma)
+        writer.put("failed", ~fitted)
+        writer.put("bridged", ~fitted)
+
+
+def _put_bodies(writer: artefacts.Writer, model: BodyModel, vectors: np.ndarray) -> None:
+    params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
+    for name in (
+        "betas", "expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose",
+        "reye_pose", "left_hand_pose", "right_hand_pose",
+    ):  # fmt: skip
+        writer.put(name, getattr(params, name).cpu().numpy())
+    writer.put("joints", model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy())

@@ -1,0 +1,40 @@
+"""Priors of the body, weighed and summed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from intercap_core.body.model import BodyModel
+from intercap_core.energy import body_priors
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return BodyModel.load(dtype=torch.float64)
+
+
+@pytest.mark.parametrize("shape", [True, False])
+def test_gradient_matches_differences(model: BodyModel, shape: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = 0.4 * torch.randn(3, model.num_parameters, dtype=torch.float64, generator=generator)
+    direction = torch.randn(*x.shape, dtype=torch.float64, generator=generator)
+    cost, gradient, hessian = body_priors.assemble(model, x, shape=shape)
+    torch.testing.assert_close(cost, body_priors.cost(model, x, shape=shape))
+    step = 1e-6
+    slope = (
+        body_priors.cost(model, x + step * direction, shape=shape)
+        - body_priors.cost(model, x - step * direction, shape=shape)
+    ) / (2 * step)
+    torch.testing.assert_close((gradient * direction).sum(1), slope, rtol=1e-6, atol=1e-6)
+    assert bool((torch.linalg.eigvalsh(hessian) > -1e-8).all())
+
+
+def test_betas_are_left_to_the_caller(model: BodyModel) -> None:
+    x = torch.zeros(1, model.num_parameters, dtype=torch.float64)
+    x[:, 168:178] = 2.0
+    at_zero = torch.zeros_like(x)
+    alone = body_priors.cost(model, x, shape=False) - body_priors.cost(model, at_zero, shape=False)
+    both = body_priors.cost(model, x, shape=True) - body_priors.cost(model, at_zero, shape=True)
+    assert alone.item() == pytest.approx(0.0)
+    assert both.item() == pytest.approx(0.5 * 10 * 4.0)
