@@ -120,6 +120,8 @@ class ReportSettings(Model):
     """Cameras shown with overlays, for each sequence."""
     frames: Annotated[int, Field(ge=1, le=50)] = 4
     """Frames shown with overlays, for each camera."""
+    max_sequences: Annotated[int, Field(ge=1, le=1000)] = 12
+    """Sequences shown with overlays; where there are more, the worst ones."""
 
 
 class ExportSettings(Model):
@@ -167,6 +169,8 @@ class StudioSettings(Model):
     """Resolution of the colour cameras."""
     cameras: Annotated[int, Field(ge=1, le=16)] = 6
     """Kinects in the ring."""
+    slips: Literal["missing", "silent"] = "missing"
+    """Up to two cameras lose frames, or deliver old frames whose device times do not tell."""
 
 
 class BodyModels(Model):
