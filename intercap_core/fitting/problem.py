@@ -125,7 +125,11 @@ class BodyProblem:
 
     def thickness(self) -> Tensor:
         """(N,) of the covering at each sample, metres."""
-        return (self._rest * self.u.exp())[self._group]
+        return self.thickness_of_group()[self._group]
+
+    def thickness_of_group(self) -> Tensor:
+        """(G,) of each covering, metres."""
+        return self._rest * self.u.exp()
 
     def _vector(self, own: Tensor, betas: Tensor | None, index: Tensor) -> Tensor:
         x = self.base[index].clone()

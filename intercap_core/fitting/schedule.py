@@ -30,6 +30,8 @@ _KEYPOINT_SIGMA = (
 )
 _START_SIGMA = 0.04
 _SMALLEST_SIGMA_PX = 1.0
+_PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit do not show
+_NOISE_RANGE = (0.1, 1.5)
 _SIGMA_RANGE = (0.1, 2.0)  # how far the refined sigma may go from the start
 # Neighbouring samples stand on the same fold: about four of them make one measurement.
 _SAMPLE_SHARE = 0.25
@@ -41,14 +43,28 @@ _VERTEX_CHUNK = 16
 
 
 @dataclass(frozen=True)
+class Settled:
+    """What a fit found to be the same in all frames, beside the shape.
+
+    offsets (25,3) m of the body keypoints in the frames of their bones; covering (G,) logarithm of
+    each covering's thickness over the usual one; keypoint_sigma (K,) m; cloud_noise (G,) m.
+    """
+
+    offsets: Tensor
+    covering: Tensor
+    keypoint_sigma: Tensor
+    cloud_noise: Tensor
+
+
+@dataclass(frozen=True)
 class Fit:
     """The fitted frames (N,), ids among the sequence's T.
 
     vectors (N,P) parameters; hessian (N,n,n) of the energy by the parameters ``columns`` (n,);
     excess (N,) >= 1: mean square of the keypoints' residuals over their variance.
     keypoint_error (N,): median distance of the body's keypoints, metres. pixel_residual (N,C) px,
-    cloud_residual (N,) m: medians, NaN = nothing seen. offsets (25,3) m and covering thickness
-    (G,) m: what all frames share beside the shape.
+    cloud_residual (N,) m: medians, NaN = nothing seen. settled: what all frames share beside the
+    shape.
     """
 
     frames: np.ndarray
@@ -59,8 +75,7 @@ class Fit:
     keypoint_error: Tensor
     pixel_residual: Tensor
     cloud_residual: Tensor
-    offsets: Tensor
-    thickness: Tensor
+    settled: Settled
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
@@ -96,6 +111,7 @@ class Fitter:
         self.samples = body_cloud.choose_samples(model)
         self.patch = torch.as_tensor(self.samples.patch, device=model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
+        self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan)
         self.one_shape = settings.shape == "shared"
         sigma = torch.zeros(NUM_KEYPOINTS)
@@ -115,14 +131,18 @@ class Fitter:
             self.one_shape,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
         )  # fmt: skip
-        self._body_views(problem, hands=False, face=False)
-        self._minimise(problem, 6)
+        for _ in range(2):
+            self._body_views(problem, hands=False, face=False)
+            self._minimise(problem, 6)
+            self._refine_sigma(problem)
         has_cloud = any(cloud is not None for cloud in self.clouds)
         problem.fit_shared = True
         for reach in _REACH_M[:2] if has_cloud else ():
             problem.rows = self._match(problem, reach)
             self._body_views(problem, hands=False, face=False)
             self._minimise(problem, 5)
+            self._refine_sigma(problem)
+            self._refine_cloud_noise(problem)
         # Faces and hands of a shape outside the model's space would bend the whole body to fit:
         # what is shared is settled by now, and stays.
         problem.fit_shared, problem.one_shape = False, False
@@ -138,6 +158,36 @@ class Fitter:
             solution = self._minimise(problem, 5, keep_normal=last)
         assert solution.normal is not None
         return self._report(problem, solution.normal.hessian)
+
+    def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
+        """The last round's problem at other bodies (N,P), with what a fit found to be constant."""
+        self.keypoint_sigma = settled.keypoint_sigma.to(base)
+        self.cloud_noise = settled.cloud_noise.to(base)
+        return BodyProblem(
+            self.model, self.carried, self.samples, base,
+            columns_of(
+                self.model, hands=self.settings.hands, face=self.settings.face, betas=False
+            ),
+            False,
+            offsets=settled.offsets.to(base), u=settled.covering.to(base),
+        )  # fmt: skip
+
+    def observe(self, problem: BodyProblem) -> None:
+        """Take correspondences, visibility and pixel sigmas anew at the problem's bodies."""
+        if any(cloud is not None for cloud in self.clouds):
+            problem.rows = self._match(problem, _REACH_M[-1])
+        self._body_views(problem, hands=self.settings.hands, face=self.settings.face)
+
+    def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
+        """Median pixel error (N,C) and cloud distance (N,), metres; NaN = nothing seen."""
+        views = problem.views
+        assert views is not None
+        pixels = body_keypoints.pixel_residuals(
+            self.points(problem), views.observed, views.lenses, views.colour_from_master,
+            shift=views.shift,
+        )[:, :, BODY].norm(dim=-1)  # fmt: skip
+        known = views.confidence[:, :, BODY] > 0
+        return torch.where(known, pixels, torch.nan).nanmedian(2).values, self.cloud_residual
 
     def _report(self, problem: BodyProblem, hessian: Tensor) -> Fit:
         """Residuals of the solution."""
@@ -161,8 +211,7 @@ class Fitter:
             keypoint_error=metres.flatten(1).nanmedian(1).values,
             pixel_residual=pixels.nanmedian(2).values,
             cloud_residual=self.cloud_residual,
-            offsets=problem.offsets,
-            thickness=problem.thickness(),
+            settled=Settled(problem.offsets, problem.u, self.keypoint_sigma, self.cloud_noise),
         )
 
     def _minimise(self, problem: BodyProblem, trials: int, keep_normal: bool = False) -> Solution:
@@ -287,9 +336,26 @@ class Fitter:
         for part, start in _KEYPOINT_SIGMA:
             known = views.confidence[:, :, part] > 0
             if bool(known.any()):
-                found = 1.4826 * float(scaled[:, :, part][known].median())
+                found = 1.4826 * _PERSISTENCE * float(scaled[:, :, part][known].median())
                 low, high = (start * factor for factor in _SIGMA_RANGE)
                 self.keypoint_sigma[part] = min(max(found, low), high)
+
+    def _refine_cloud_noise(self, problem: BodyProblem) -> None:
+        """The same for each covering's samples, from what is left of their distances."""
+        rows = problem.rows
+        assert rows is not None
+        points = self.model.forward(
+            self.model.parameters(problem.base), vertex_ids=self.sample_ids
+        ).vertices
+        group = torch.as_tensor(self.samples.group, device=points.device)
+        away = body_cloud.residuals(points, rows, problem.thickness_of_group(), group).abs()
+        for g, covering in enumerate(COVERINGS):
+            part = group == g
+            known = rows.weight[:, part] > 0
+            if bool(known.any()):
+                found = 1.4826 * float(away[:, part][known].median())
+                low, high = (covering.noise * factor for factor in _NOISE_RANGE)
+                self.cloud_noise[g] = min(max(found, low), high)
 
     # --- the cloud ---------------------------------------------------------------------------
 
@@ -326,8 +392,7 @@ class Fitter:
                 mean[t], total[t] = body_cloud.gather(
                     found, cloud.trust, expected, size, huber=_HUBER_M
                 )
-        noise = torch.tensor([c.noise for c in COVERINGS]).to(mean)
-        noise = noise[torch.as_tensor(self.samples.group, device=mean.device)]
+        noise = self.cloud_noise[torch.as_tensor(self.samples.group, device=mean.device)]
         share = self.settings.cloud_weight * _SAMPLE_SHARE
         weight = share * total / (total + _FULL_SAMPLE) / noise**2
         target = mean + (normal * where).sum(2)

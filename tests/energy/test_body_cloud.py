@@ -54,9 +54,7 @@ def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: term.Sam
     torch.testing.assert_close(found.gradient_u @ turn, slope, rtol=1e-6, atol=1e-5)
 
 
-def test_cross_block_is_the_gauss_newton_product(
-    model: BodyModel, samples: term.Samples
-) -> None:
+def test_cross_block_is_the_gauss_newton_product(model: BodyModel, samples: term.Samples) -> None:
     group = torch.as_tensor(samples.group)
     count = len(group)
     thickness = torch.linspace(0.001, 0.01, len(term.COVERINGS), dtype=torch.float64)

@@ -71,13 +71,15 @@ def write_capture(
     *,
     depth: bool = True,
     missing: tuple[int, ...] = (),
+    seen_by: tuple[int, ...] | None = None,
     pixel_noise: np.ndarray | float = 0.0,
     depth_noise_mm: float = 0.0,
     seed: int = 0,
 ) -> Inputs:
     """Write what the cameras see of a surface (T,V,3) and of keypoints (T,135,3), master frame.
 
-    In ``missing`` frames nobody is there. ``pixel_noise``: standard deviation or (T,C,135,2) shifts.
+    In ``missing`` frames nobody is there; cameras not in ``seen_by`` detect nobody.
+    ``pixel_noise``: standard deviation or (T,C,135,2) shifts.
     """
     random = np.random.default_rng(seed)
     count, cameras = len(surface), len(rig)
@@ -96,7 +98,9 @@ def write_capture(
     observed[..., :2] += noise
     observed[present, ..., 2] = 0.9
     observed[~present] = 0
-    joints = _triangulate(rig, observed)
+    seeing = range(cameras) if seen_by is None else seen_by
+    observed[:, [c for c in range(cameras) if c not in seeing]] = 0
+    joints = _triangulate(Rig(tuple(rig[c] for c in seeing)), observed[:, list(seeing)])
     joints[~present] = np.nan
     views = np.where(np.isfinite(joints[..., 0]), cameras, 0)
     masks = [

@@ -1,0 +1,271 @@
+"""The body's fit on people whose parameters are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from body_capture import Inputs, master_from_room, ring, write_capture
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel
+from intercap_core.camera.transforms import apply
+from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
+from intercap_core.energy import body_cloud, body_keypoints
+from intercap_core.energy.body_cloud import COVERINGS
+from intercap_core.errors import UserError
+from intercap_core.fitting.problem import BodyProblem, Views
+from intercap_core.fitting.schedule import columns_of
+from intercap_core.schemas import BODY_FIT
+from intercap_core.solve.levenberg_marquardt import minimise
+from intercap_core.stages import body_fit
+
+SUBJECT = SubjectEntry(subject="s01", gender="neutral")
+SETTINGS = BodyFitSettings(points_per_frame=800)
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return BodyModel.load()
+
+
+def motion(model: BodyModel, frames: int, seed: int = 0) -> torch.Tensor:
+    """Parameter vectors (T,P): somebody turns and waves in the middle of the ring."""
+    random = np.random.default_rng(seed)
+    x = model.zeros(frames).vector().double().numpy()
+    phase = np.linspace(0, np.pi / 2, frames)
+    x[:, 75:120], x[:, 120:165] = model.hand_mean.numpy()
+    for side in (0, 1):
+        size = 0.6 * model.hand_deviation[side, :6].numpy()
+        bent = (random.standard_normal(6) * size) @ model.hand_components[side, :6].numpy()
+        x[:, 75 + 45 * side : 120 + 45 * side] += bent
+    for joint in range(1, 22):
+        swing = 0.06 * random.standard_normal(3) * np.sin(phase + joint)[:, None]
+        x[:, 3 * joint : 3 * joint + 3] += 0.06 * random.standard_normal(3) + swing
+    x[:, 3 * JOINT_INDEX["left_shoulder"] + 2] -= 1.0
+    x[:, 3 * JOINT_INDEX["right_shoulder"] + 2] += 0.7
+    x[:, 3 * JOINT_INDEX["left_elbow"] + 1] -= 0.5 + 0.3 * np.sin(phase)
+    x[:, 3 * JOINT_INDEX["right_elbow"] + 1] += 0.6
+    x[:, 168:178] = 0.7 * random.standard_normal(10)
+    x[:, 178:188] = 0.5 * random.standard_normal(10)
+    room = master_from_room()
+    room_from_body = Rotation.from_matrix([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    turning = Rotation.from_rotvec(np.outer(0.5 + phase, [0, 0, 1.0]))
+    x[:, :3] = (Rotation.from_matrix(room[:3, :3]) * turning * room_from_body).as_rotvec()
+    still = model.forward(model.zeros(), vertex_ids=np.array([0])).joints[0, 0].double().numpy()
+    x[:, 165:168] = apply(room, np.array([[0.0, 0.1, 0.95]])) - still
+    return torch.as_tensor(x, dtype=torch.float32)
+
+
+class Capture:
+    """True vectors, vertices and joints, and the artefacts of what the cameras saw."""
+
+    def __init__(self, model: BodyModel, folder: Path, frames: int, **options) -> None:
+        cameras = options.pop("cameras", 5)
+        self.vectors = motion(model, frames)
+        output = model.forward(model.parameters(self.vectors))
+        self.vertices, self.joints = output.vertices.numpy(), output.joints.numpy()
+        keypoints = model.keypoints(output).double().numpy()
+        clothing = options.pop("clothing", 0.0)
+        surface = self.vertices.astype(float)
+        if clothing:
+            covered = ~np.isin(
+                model.skinning_weights.argmax(1).numpy(), [12, 15, 20, 21, 22, *range(25, 55)]
+            )
+            surface += clothing * covered[:, None] * _normals(model, output.vertices)
+        self.inputs: Inputs = write_capture(
+            folder, ring(cameras), surface, model.faces.numpy(), keypoints, **options
+        )
+
+    def fit(self, output: Path, **options):
+        given = {
+            "subject": SUBJECT, "body_models": BodyModels(), "settings": SETTINGS, **options
+        }  # fmt: skip
+        body_fit.run(
+            frames=self.inputs.frames, scene=self.inputs.scene, person=self.inputs.person,
+            output=output, **given,
+        )  # fmt: skip
+        with artefacts.read(output, BODY_FIT) as read:
+            return dict(read.attributes) | {key: read[key] for key in read.keys("")}
+
+    def errors_mm(self, model: BodyModel, found) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Per frame: vertices, 22 joints, finger joints."""
+        vector = model.zeros(len(self.vectors))
+        for name in vars(vector):
+            setattr(vector, name, torch.as_tensor(found[name]))
+        output = model.forward(vector)
+        vertices = np.linalg.norm(output.vertices.numpy() - self.vertices, axis=2).mean(1)
+        joints = np.linalg.norm(found["joints"] - self.joints, axis=2)
+        return tuple(1000 * e for e in (vertices, joints[:, :22].mean(1), joints[:, 25:].mean(1)))
+
+
+def _normals(model: BodyModel, vertices: torch.Tensor) -> np.ndarray:
+    from intercap_core.fitting.schedule import vertex_normals
+
+    return vertex_normals(vertices, model.faces).double().numpy()
+
+
+def test_exact_keypoints_alone_give_the_parameters_back() -> None:
+    """With next to no noise assumed, E_J alone returns body, hands and face to under 1 mm."""
+    model = BodyModel.load(dtype=torch.float64)
+    truth = motion(BodyModel.load(), 3).double()
+    points = model.keypoints_of(model.parameters(truth))
+    rig = ring(4)
+    pose, lenses = torch.tensor(rig.colour_from_master), torch.tensor(rig.colour_parameters)
+    observed = body_keypoints.pixel_residuals(
+        points, torch.zeros(3, 4, 135, 2).double(), lenses, pose
+    )
+    shape = (3, 4, 135)
+    start = truth + 0.03 * torch.randn(
+        truth.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    start[:, 168:178] = 0
+    start[:, 69:75] = truth[:, 69:75] = 0
+    problem = BodyProblem(
+        model, body_keypoints.carriers(model), body_cloud.choose_samples(model), start,
+        columns_of(model, hands=True, face=True, betas=False), True,
+        offsets=start.new_zeros(25, 3), u=start.new_zeros(len(COVERINGS)),
+        views=Views(observed, torch.ones(shape).double(), torch.full(shape, 0.003).double(),
+                    lenses, pose),
+    )  # fmt: skip
+    # far from the minimum every residual would count as an outlier: widen, then narrow
+    for sigma in (30.0, 3.0, 0.3, 0.003):
+        problem.views.sigma = torch.full(shape, sigma).double()
+        found = minimise(problem, problem.own_start(), problem.shared_start(), max_trials=20)
+        problem.accept(found.own, found.shared)
+    ours = model.forward(model.parameters(problem.base))
+    true = model.forward(model.parameters(truth))
+    # no keypoint tells how a bend of the back is shared out over the three joints of the spine
+    spine = [JOINT_INDEX[name] for name in ("spine1", "spine2", "spine3")]
+    rest = [joint for joint in range(55) if joint not in spine]
+    assert (ours.joints - true.joints)[:, rest].norm(dim=2).max() < 1e-3
+    assert (ours.vertices - true.vertices).norm(dim=2).mean() < 1e-3
+
+
+def test_normal_equations_of_the_whole_energy_match_differences() -> None:
+    """Own and shared parameters, all terms together."""
+    model = BodyModel.load(dtype=torch.float64)
+    samples = body_cloud.choose_samples(model)
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+    base = motion(BodyModel.load(), 2).double()
+    rig = ring(3)
+    count = len(samples.vertex)
+    problem = BodyProblem(
+        model, body_keypoints.carriers(model), samples, base,
+        columns_of(model, hands=True, face=True, betas=False), True,
+        offsets=0.01 * random(25, 3), u=0.2 * random(len(COVERINGS)),
+        views=Views(300 + 50 * random(2, 3, 135, 2), torch.ones(2, 3, 135).double(),
+                    torch.full((2, 3, 135), 30.0).double(), torch.tensor(rig.colour_parameters),
+                    torch.tensor(rig.colour_from_master)),
+        rows=body_cloud.CloudRows(
+            random(2, count), torch.nn.functional.normalize(random(2, count, 3), dim=2),
+            random(2, count).abs(), torch.zeros(2, count).double()),
+        fit_shared=True,
+    )  # fmt: skip
+    own, shared, index = problem.own_start(), problem.shared_start(), torch.arange(2)
+    normal = problem.linearise(own, shared, index)
+    torch.testing.assert_close(normal.cost, problem.cost(own, shared, index))
+    step, by_own, by_shared = 1e-6, random(*own.shape), random(len(shared))
+    up = problem.cost(own + step * by_own, shared + step * by_shared, index)
+    down = problem.cost(own - step * by_own, shared - step * by_shared, index)
+    expected = (normal.gradient * torch.cat([by_own, by_shared.expand(2, -1)], 1)).sum(1)
+    torch.testing.assert_close((up - down) / (2 * step), expected, rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(normal.hessian, normal.hessian.transpose(1, 2))
+
+
+@pytest.fixture(scope="module")
+def clothed(model: BodyModel, tmp_path_factory) -> tuple[Capture, dict, Path]:
+    """Six frames in 10 mm of clothing, nobody there in frame 3; noise of 1.5 px and 3 mm."""
+    folder = tmp_path_factory.mktemp("clothed")
+    capture = Capture(
+        model, folder, 6, missing=(3,), clothing=0.010, pixel_noise=1.5, depth_noise_mm=3.0
+    )
+    return capture, capture.fit(folder / "body_fit.h5"), folder
+
+
+def test_a_clothed_person_is_found(model: BodyModel, clothed) -> None:
+    capture, found, _ = clothed
+    vertices, joints, hands = capture.errors_mm(model, found)
+    seen = ~found["failed"]
+    assert vertices[seen].mean() < 7 and joints[seen].mean() < 7 and hands[seen].mean() < 7
+    assert np.ptp(found["betas"], axis=0).max() < 1e-6  # one shape
+    assert found["gender"] == "neutral"
+    assert np.nanmedian(found["keypoint_residual"]) < 4
+    assert 0.002 < np.nanmedian(found["cloud_residual"]) < 0.015
+
+
+def test_a_frame_without_anybody_is_bridged_and_flagged(model: BodyModel, clothed) -> None:
+    capture, found, _ = clothed
+    assert found["failed"].tolist() == found["bridged"].tolist() == [t == 3 for t in range(6)]
+    assert np.isnan(found["keypoint_residual"][3]).all() and np.isnan(found["cloud_residual"][3])
+    _, joints, _ = capture.errors_mm(model, found)
+    assert joints[3] < 40
+    assert found["joint_sigma"][3].min() > 2 * np.median(found["joint_sigma"][2])
+    steps = np.linalg.norm(np.diff(found["global_orient"], axis=0), axis=1)
+    assert steps.max() < 1.0  # no jump by a full turn
+
+
+def test_the_stated_uncertainty_is_of_the_error_s_size(clothed) -> None:
+    capture, found, _ = clothed
+    seen = ~found["failed"]
+    error = np.linalg.norm(found["joints"] - capture.joints, axis=2)[seen][:, :22]
+    normalised = error / (1.538 * found["joint_sigma"][seen][:, :22])
+    assert 0.2 < np.median(normalised) < 2.5
+
+
+def test_the_same_input_gives_the_same_bytes(clothed) -> None:
+    capture, _, folder = clothed
+    capture.fit(folder / "again.h5")
+    assert (folder / "again.h5").read_bytes() == (folder / "body_fit.h5").read_bytes()
+
+
+def test_two_cameras_without_depth_are_enough(model: BodyModel, tmp_path: Path) -> None:
+    capture = Capture(model, tmp_path, 3, cameras=5, depth=False, seen_by=(0, 1))
+    found = capture.fit(tmp_path / "body_fit.h5")
+    vertices, joints, hands = capture.errors_mm(model, found)
+    assert not found["failed"].any()
+    assert np.isnan(found["cloud_residual"]).all()
+    assert vertices.max() < 25 and joints.max() < 25 and hands.max() < 30
+
+
+def test_free_shape_in_every_frame(model: BodyModel, tmp_path: Path) -> None:
+    capture = Capture(model, tmp_path, 2)
+    settings = BodyFitSettings(shape="per_frame", hands=False, face=False, points_per_frame=800)
+    found = capture.fit(tmp_path / "body_fit.h5", settings=settings)
+    _, joints, _ = capture.errors_mm(model, found)
+    assert joints.max() < 20
+    assert np.ptp(found["betas"], axis=0).max() > 1e-6
+    np.testing.assert_allclose(found["left_hand_pose"][0], model.hand_mean[0], atol=1e-6)
+
+
+def test_nobody_at_all_is_said(model: BodyModel, tmp_path: Path) -> None:
+    capture = Capture(model, tmp_path, 2, missing=(0, 1), cameras=2)
+    with pytest.raises(UserError, match="in none of its 2 frames"):
+        capture.fit(tmp_path / "body_fit.h5")
+
+
+def test_a_missing_body_file_is_named(clothed, tmp_path: Path) -> None:
+    capture, _, _ = clothed
+    male = SubjectEntry(subject="s01", gender="male")
+    models = BodyModels(male=tmp_path / "SMPLX_MALE.npz")
+    with pytest.raises(UserError, match=r"SMPLX_MALE\.npz"):
+        capture.fit(tmp_path / "out.h5", subject=male, body_models=models)
+
+
+def test_artefacts_of_another_recording_are_refused(model, clothed, tmp_path: Path) -> None:
+    capture, _, _ = clothed
+    other = Capture(model, tmp_path, 2, cameras=2, depth=False)
+    with pytest.raises(UserError, match="re-run stage"):
+        body_fit.run(
+            frames=other.inputs.frames, scene=other.inputs.scene, person=capture.inputs.person,
+            output=tmp_path / "out.h5", subject=SUBJECT, body_models=BodyModels(),
+            settings=SETTINGS,
+        )  # fmt: skip
