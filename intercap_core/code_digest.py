@@ -49,7 +49,7 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
     if not _path(start, root).is_file():
         raise FileNotFoundError(f"there is no module {start} in {root}")
     reached: dict[str, frozenset[str]] = {}
-    waiting = [(start, WHOLE)]
+    waiting = [(name, WHOLE) for name in (start, *_parents(start))]
     while waiting:
         name, used = waiting.pop()
         if name not in DECLARATIONS:
@@ -67,6 +67,12 @@ def _path(module: str, root: Path) -> Path:
     relative = Path(*module.split(".")[1:])
     package = root / relative / "__init__.py"
     return package if package.is_file() else (root / relative).with_suffix(".py")
+
+
+def _parents(module: str) -> list[str]:
+    """The packages that importing ``module`` imports first."""
+    parts = module.split(".")
+    return [".".join(parts[:count]) for count in range(1, len(parts))]
 
 
 def _exists(module: str, root: Path) -> bool:
@@ -148,9 +154,8 @@ def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
             continue
         for name, used in targets:
             if _exists(name, root):
-                parts = name.split(".")
                 found.append((name, used))
-                found += [(".".join(parts[:count]), WHOLE) for count in range(1, len(parts))]
+                found += [(parent, WHOLE) for parent in _parents(name)]
     return found
 
 

@@ -98,6 +98,8 @@ def annotation_input(*sections):
             ]
         if not any(section in filled for section in sections):
             return []
+        if PROJECT.annotation_made(wildcards.sequence):
+            return made_by_studio(wildcards, "manifest")
         return [PROJECT.annotation_path(wildcards.sequence)]
 
     return files

@@ -1,0 +1,215 @@
+"""Artefacts: what is written comes back, what is broken is refused in one sentence."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from intercap_core import artefacts, schemas
+from intercap_core.artefacts import Field, Schema, Unreadable, pack_ragged, unpack_ragged
+
+SCHEMA = Schema(
+    name="trial",
+    version=3,
+    stage="trial_stage",
+    attributes={"sequence": "name"},
+    fields={
+        "points": Field(("T", "K", "3"), "float64", "points", "m", "master"),
+        "good": Field(("T",), "bool", "flags"),
+        "names": Field(("K",), "str", "names"),
+        "extra": Field(("T",), "float32", "optional", optional=True),
+        "cameras/{camera}/depth": Field(("D", "H", "W"), "uint16", "depth", "mm", codec="depth"),
+        "cameras/{camera}/count": Field(("T",), "int32", "per camera"),
+    },
+)
+
+
+def write_trial(path: Path, frames: int = 4, seed: int = 0, **changes: object) -> None:
+    random = np.random.default_rng(seed)
+    with artefacts.write(path, SCHEMA, settings_digest="abc", sequence="s1") as writer:
+        values = {
+            "points": random.normal(size=(frames, 2, 3)),
+            "good": random.random(frames) > 0.5,
+            "names": ["left", "röhts"],
+            "cameras/k1/depth": random.integers(0, 5000, (3, 6, 8), dtype=np.uint16),
+            "cameras/k2/depth": random.integers(0, 5000, (2, 4, 5), dtype=np.uint16),
+            "cameras/k1/count": np.arange(frames),
+            **changes,
+        }
+        for key, value in values.items():
+            if value is not None:
+                writer.put(key, value)
+
+
+def test_what_is_written_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / "trial.h5"
+    write_trial(path)
+    with artefacts.read(path, SCHEMA) as source:
+        random = np.random.default_rng(0)
+        np.testing.assert_array_equal(source["points"], random.normal(size=(4, 2, 3)))
+        assert source.text("names") == ["left", "röhts"]
+        assert source["cameras/k2/depth"].shape == (2, 4, 5)
+        assert source.rows("cameras/k1/depth", 1).shape == (6, 8)
+        assert source.attributes["sequence"] == "s1"
+        assert source.attributes["settings_digest"] == "abc"
+        assert source.attributes["complete"]
+        assert "extra" not in source
+
+
+def test_same_input_gives_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_trial(tmp_path / name / "trial.h5")
+    write_trial(tmp_path / "c.h5", seed=1)
+    first = (tmp_path / "a" / "trial.h5").read_bytes()
+    assert first == (tmp_path / "b" / "trial.h5").read_bytes()
+    assert first != (tmp_path / "c.h5").read_bytes()
+
+
+def test_every_dataset_has_checksum_and_units(tmp_path: Path) -> None:
+    path = tmp_path / "trial.h5"
+    write_trial(path)
+    with h5py.File(path) as file:
+        found = []
+        file.visititems(lambda name, item: found.append(item) if hasattr(item, "dtype") else None)
+        assert len(found) == 6
+        assert all(dataset.fletcher32 for dataset in found)
+        assert all(dataset.attrs["units"] for dataset in found)
+        assert file["points"].attrs["frame"] == "master"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"points": np.zeros((4, 2))}, "does not fit dims"),
+        ({"points": np.zeros((4, 2, 4))}, "axis 3 has 4 entries"),
+        ({"good": np.zeros(5, bool)}, "axis T has 5 entries, 4 elsewhere"),
+        ({"cameras/k1/count": np.arange(5)}, "axis T has 5 entries"),
+        ({"cameras/k1/count": np.zeros(4)}, "float values for an integer"),
+        ({"names": None}, "missing ['names']"),
+    ],
+)
+def test_what_contradicts_the_schema_is_not_written(
+    tmp_path: Path, changes: dict, says: str
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(says)):
+        write_trial(tmp_path / "trial.h5", **changes)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_dataset_and_missing_attribute_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(KeyError, match="declares no dataset"):
+        write_trial(tmp_path / "trial.h5", wrong=np.zeros(1))
+    with (
+        pytest.raises(ValueError, match="attributes off"),
+        artefacts.write(tmp_path / "trial.h5", SCHEMA) as writer,
+    ):
+        writer.put("names", ["a"])
+
+
+def test_an_error_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "trial.h5"
+    write_trial(path)
+    before = path.read_bytes()
+    with (
+        pytest.raises(RuntimeError),
+        artefacts.write(path, SCHEMA, sequence="s1") as writer,
+    ):
+        writer.put("good", [True])
+        raise RuntimeError("killed")
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["trial.h5"]
+
+
+def break_payload(path: Path) -> None:
+    """Flip a byte inside the points' chunk."""
+    with h5py.File(path) as file:
+        offset = file["points"].id.get_chunk_info(0).byte_offset
+    data = bytearray(path.read_bytes())
+    data[offset + 5] ^= 0xFF
+    path.write_bytes(bytes(data))
+
+
+def edit(change):
+    def apply(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            change(file)
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda path: path.unlink(), "there is no such file"),
+        (lambda path: path.write_bytes(path.read_bytes()[:900]), "damaged or half-written"),
+        (lambda path: path.write_bytes(b"not hdf5"), "damaged or half-written"),
+        (lambda path: path.write_bytes(b""), "damaged or half-written"),
+        (break_payload, "its checksum does not match"),
+        (edit(lambda file: file.attrs.__delitem__("complete")), "never finished"),
+        (edit(lambda file: file.attrs.__setitem__("schema", "joint")), "holds schema 'joint'"),
+        (edit(lambda file: file.attrs.__setitem__("schema_version", 2)), "version 2"),
+        (edit(lambda file: file.attrs.__delitem__("sequence")), "attribute 'sequence' is missing"),
+        (edit(lambda file: file.__delitem__("names")), "dataset 'names' is missing"),
+    ],
+)
+def test_a_broken_artefact_is_told_in_one_sentence(tmp_path: Path, damage, says: str) -> None:
+    path = tmp_path / "trial.h5"
+    write_trial(path)
+    damage(path)
+    with pytest.raises(Unreadable) as raised, artefacts.read(path, SCHEMA) as source:
+        for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
+            source[key]
+    message = str(raised.value)
+    assert says in message
+    assert str(path) in message
+    assert "re-run stage 'trial_stage'" in message
+    assert "\n" not in message
+
+
+def test_rows_are_streamed(tmp_path: Path) -> None:
+    path = tmp_path / "trial.h5"
+    depth = np.random.default_rng(0).integers(0, 9, (5, 6, 8), dtype=np.uint16)
+    with artefacts.write(path, SCHEMA, sequence="s1") as writer:
+        writer.put("points", np.zeros((1, 1, 3)))
+        writer.put("good", [True])
+        writer.put("names", ["a"])
+        stream = writer.stream("cameras/k1/depth", (6, 8))
+        stream.append(depth[:2])
+        stream.append(depth[2:])
+        assert len(stream) == 5
+    with artefacts.read(path, SCHEMA) as source:
+        np.testing.assert_array_equal(source["cameras/k1/depth"], depth)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.binary(max_size=40), max_size=12))
+def test_ragged_bytes_round_trip(items: list[bytes]) -> None:
+    assert unpack_ragged(*pack_ragged(items)) == items
+
+
+@settings(max_examples=25, deadline=None)
+@given(hnp.arrays(np.float64, hnp.array_shapes(min_dims=1, max_dims=1, max_side=20)))
+def test_float_bits_survive(tmp_path_factory: pytest.TempPathFactory, values: np.ndarray) -> None:
+    schema = Schema("bits", 1, "bits", {"x": Field(("N",), "float64", "x")})
+    path = tmp_path_factory.mktemp("bits") / "x.h5"
+    with artefacts.write(path, schema) as writer:
+        writer.put("x", values)
+    with artefacts.read(path, schema) as source:
+        assert source["x"].tobytes() == values.tobytes()
+
+
+def test_every_declared_schema_is_sound() -> None:
+    found = [value for value in vars(schemas).values() if isinstance(value, Schema)]
+    assert len({schema.name for schema in found}) == len(found) >= 9
+    for schema in found:
+        for key, declared in schema.fields.items():
+            assert schema.field_of(key.replace("{camera}", "k1")) is declared
+            assert declared.doc
+            assert declared.dtype == "str" or np.dtype(declared.dtype)

@@ -1,0 +1,232 @@
+"""Settings and tables: mistakes are named by file, row and field before anything runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from intercap_core.config import Annotation, Config
+from intercap_core.errors import UserError
+from intercap_core.generated_docs import contents
+from intercap_core.project import Project, digest, load_project
+
+ROOT = Path(__file__).resolve().parents[1]
+HEADER = "sequence\tsubject\tobject\trecordings\tcalibration\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small valid project; the working directory is its folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cup.ply").write_text("a mesh")
+    (tmp_path / "config.yaml").write_text("dataset: trial\n")
+    (tmp_path / "sequences.tsv").write_text(
+        f"# comment\n{HEADER}one\ts01\tcup\trec/one\tcal\n\ntwo\ts02\tcup\trec/two\tcal\n"
+    )
+    (tmp_path / "subjects.tsv").write_text("subject\tgender\ns01\tfemale\ns02\tmale\n")
+    (tmp_path / "objects.yaml").write_text("cup:\n  mesh: cup.ply\n")
+    (tmp_path / "annotations").mkdir()
+    return tmp_path
+
+
+def test_a_valid_project_loads(folder: Path) -> None:
+    project = load_project(Path("config.yaml"))
+    assert list(project.sequences) == ["one", "two"]
+    assert project.sequences["two"].recordings == Path("rec/two")
+    assert project.subjects["s02"].gender == "male"
+    assert project.annotation("one") == Annotation()
+    assert project.artefact("one", "joint") == Path("results/trial/one/joint.h5")
+
+
+def test_paths_are_relative_to_their_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder.parent)
+    project = load_project(folder / "config.yaml")
+    assert project.objects["cup"].mesh == Path(folder.name) / "cup.ply"
+
+
+def test_overrides_win_and_nest(folder: Path) -> None:
+    (folder / "config.yaml").write_text("dataset: trial\njoint: {ground_weight: 2}\n")
+    project = load_project(
+        Path("config.yaml"), {"joint": {"contact_weight": 3}, "exclude": ["one"]}
+    )
+    assert project.config.joint.ground_weight == 2
+    assert project.config.joint.contact_weight == 3
+    assert list(project.sequences) == ["two"]
+
+
+Edit = Callable[[Path], object]
+
+
+def settings(text: str) -> Edit:
+    return lambda folder: (folder / "config.yaml").write_text(text)
+
+
+def rows(text: str, header: str = HEADER) -> Edit:
+    return lambda folder: (folder / "sequences.tsv").write_text(header + text)
+
+
+def remove(name: str) -> Edit:
+    return lambda folder: (folder / name).unlink()
+
+
+def objects(text: str) -> Edit:
+    return lambda folder: (folder / "objects.yaml").write_text(text)
+
+
+MISTAKES: list[tuple[Edit, list[str]]] = [
+    (remove("config.yaml"), ["config.yaml", "no such file"]),
+    (settings("dataset: [\n"), ["config.yaml", "not valid YAML", "line"]),
+    (settings("- a\n"), ["config.yaml", "expected names and values"]),
+    (settings("joint: {}\n"), ["config.yaml", "dataset", "required"]),
+    (settings("dataset: a b\n"), ["config.yaml", "dataset", "'a b'"]),
+    (settings("dataset: x\njiont: {}\n"), ["config.yaml", "jiont", "not permitted"]),
+    (
+        settings("dataset: x\njoint: {contact_weight: -1}\n"),
+        ["config.yaml", "joint.contact_weight", "greater than or equal to 0", "-1"],
+    ),
+    (settings("dataset: x\nexclude: [three]\n"), ["exclude", "'three'"]),
+    (
+        settings("dataset: x\nbody_models: {female: SMPLX_FEMALE.npz}\n"),
+        ["config.yaml", "body_models.female", "SMPLX_FEMALE.npz", "no such file"],
+    ),
+    (
+        settings(
+            "dataset: x\nstudio:\n  captures:\n"
+            "    other: {interaction: cup_drink, subject: s01, seed: 1}\n"
+        ),
+        ["studio.captures", "'other'", "sequences.tsv"],
+    ),
+    (
+        settings(
+            "dataset: x\nstudio:\n  captures:\n"
+            "    one: {interaction: cup_drink, subject: s01, seed: 1}\n"
+        ),
+        ["sequences.tsv", "'one'", "results/x/recordings/one"],
+    ),
+    (remove("sequences.tsv"), ["sequences.tsv", "not a readable text file"]),
+    (rows(""), ["sequences.tsv", "holds no sequence"]),
+    (rows("one\ts09\tcup\tr\tc\n"), ["sequences.tsv", "'one'", "subject 's09'", "s01, s02"]),
+    (rows("one\ts01\tmug\tr\tc\n"), ["sequences.tsv", "'one'", "object 'mug'", "cup"]),
+    (rows("../x\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "column sequence", "'../x'"]),
+    (rows("a/b\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "column sequence", "'a/b'"]),
+    (rows("..\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "column sequence", "'..'"]),
+    (rows("one\ts01\tcup\tr\n"), ["sequences.tsv", "line 2", "number of columns", "tabs"]),
+    (rows("one\ts01\tcup\tr\tc\td\n"), ["sequences.tsv", "line 2", "number of columns"]),
+    (rows("one\ts01\tcup\t\tc\n"), ["sequences.tsv", "line 2", "column recordings", "required"]),
+    (
+        rows("one\ts01\tcup\tr\tc\n# x\none\ts01\tcup\tr\tc\n"),
+        ["sequences.tsv", "line 4", "'one'", "line 2"],
+    ),
+    (
+        rows("one\tx\n", header="sequence\tpeople\n"),
+        ["sequences.tsv", "line 2", "column"],
+    ),
+    (
+        lambda folder: (folder / "subjects.tsv").write_text("subject\tgender\ns01\tF\n"),
+        ["subjects.tsv", "line 2", "'s01'", "gender", "'F'"],
+    ),
+    (objects("cup: {}\n"), ["objects.yaml", "object 'cup'", "mesh", "required"]),
+    (objects("cup: {mesh: mug.ply}\n"), ["objects.yaml", "object 'cup'", "mug.ply", "no such"]),
+    (
+        objects("cup: {mesh: cup.ply, contact_vertices: no.json}\n"),
+        ["objects.yaml", "contact_vertices", "no.json"],
+    ),
+    (
+        objects("cup: {mesh: cup.ply, symmetry: {discrete: [[1, 2]]}}\n"),
+        ["objects.yaml", "symmetry", "16"],
+    ),
+    (objects("[1, 2]\n"), ["objects.yaml", "expected object names"]),
+]
+
+
+@pytest.mark.parametrize(("edit", "says"), MISTAKES)
+def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[str]) -> None:
+    edit(folder)
+    with pytest.raises(UserError) as raised:
+        load_project(Path("config.yaml"))
+    message = str(raised.value)
+    for part in says:
+        assert part in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("contact:\n- {part: left_hand, start: 9, end: 3}\n", ["contact.0", "reversed", "9", "3"]),
+        ("contact:\n- {part: elbow, start: 1, end: 3}\n", ["contact.0.part", "'elbow'"]),
+        ("contact:\n- {part: seat, start: -1, end: 3}\n", ["contact.0.start", "-1"]),
+        ("floor: [[0, 0, 1], [1, 0, 1]]\n", ["floor", "2 points"]),
+        ("object_pose: {frame: 0, translation: [0, 0, 1]}\n", ["rotation_vector", "required"]),
+        ("drop_frames: [x]\n", ["drop_frames.0", "'x'"]),
+        ("flor: []\n", ["flor", "not permitted"]),
+        ("contact: [\n", ["not valid YAML"]),
+        ("- 1\n", ["expected names and values"]),
+    ],
+)
+def test_a_broken_annotation_is_told_and_stops_nobody_else(
+    folder: Path, text: str, says: list[str]
+) -> None:
+    (folder / "annotations" / "one.yaml").write_text(text)
+    project = load_project(Path("config.yaml"))
+    assert project.annotation("two") == Annotation()
+    with pytest.raises(UserError) as raised:
+        project.annotation("one")
+    for part in ["annotations/one.yaml", *says]:
+        assert part in str(raised.value)
+
+
+def test_annotation_past_the_end(folder: Path) -> None:
+    annotation = Annotation.model_validate(
+        {
+            "contact": [{"part": "seat", "start": 0, "end": 20}],
+            "object_pose": {"frame": 11, "rotation_vector": [0, 0, 0], "translation": [0, 0, 1]},
+            "drop_frames": [3, 30],
+        }
+    )
+    assert annotation.check_frames(31) is None
+    assert "drop_frames holds 30" in str(annotation.check_frames(30))
+    assert "contact[0].end is 20" in str(annotation.check_frames(19))
+    pose = annotation.model_copy(update={"contact": None, "drop_frames": ()})
+    assert "object_pose.frame is 11" in str(pose.check_frames(11))
+
+
+def test_digest_follows_content_alone() -> None:
+    a = Config.model_validate({"dataset": "x", "joint": {"ground_weight": 1, "contact_weight": 2}})
+    b = Config.model_validate({"joint": {"contact_weight": 2.0}, "dataset": "x"})
+    assert digest(a) == digest(b)
+    assert digest(a.joint) != digest(Config(dataset="x").joint)
+
+
+@pytest.mark.parametrize("name", ["demo", "evaluation", "bench", "test", ""])
+def test_the_committed_settings_are_valid(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    project = load_project(Path("config") / name / "config.yaml")
+    assert isinstance(project, Project)
+
+
+def test_the_default_settings_are_the_defaults() -> None:
+    values = yaml.safe_load((ROOT / "config" / "config.yaml").read_text())
+    assert Config.model_validate(values) == Config(dataset=values["dataset"])
+
+
+def test_the_example_annotation_is_valid() -> None:
+    values = yaml.safe_load((ROOT / "config" / "annotations.example.yaml").read_text())
+    assert set(values) == set(Annotation.model_fields)
+    Annotation.model_validate(values)
+
+
+@pytest.mark.parametrize("relative", sorted(contents()))
+def test_generated_files_are_in_step(relative: str) -> None:
+    written = (ROOT / relative).read_text(encoding="utf-8")
+    assert written == contents()[relative], f"run `intercap docs`: {relative} is stale"
+
+
+def test_every_setting_is_described() -> None:
+    page = contents()["config/README.md"]
+    empty = [line for line in page.splitlines() if re.match(r"\| `.*\|\s*\|$", line)]
+    assert not empty
