@@ -43,6 +43,7 @@ def run_step(
         **inputs,
         "output": output,
         "settings": getattr(project.config, stage),
+        "body_settings": project.config.body_fit,
         "sequence": row,
         "object_": project.objects[row.object],
         "subject": project.subjects[row.subject],

@@ -34,7 +34,8 @@ def contact_patches(model: BodyModel) -> Patches:
     """Cut every region of ``CONTACT_REGIONS``: hands into palm and fingers, others are whole."""
     template = model.template.cpu().numpy()
     driver = model.skinning_weights.cpu().numpy().argmax(axis=1)
-    vertices, region, patch, region_of_patch, share = [], [], [], [], []
+    region_of_patch: list[int] = []
+    vertices, region, patch, share = [], [], [], []
     for r, name in enumerate(CONTACT_REGIONS):
         ids = np.asarray(model.regions[name])
         hand = name.endswith("_hand")

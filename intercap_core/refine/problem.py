@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
 from intercap_core.contact.patches import Patches
@@ -42,10 +43,6 @@ class Ground:
 
     point: np.ndarray
     normal: np.ndarray
-
-
-BodyData = Callable[[State, NormalEquations], None]
-ObjectData = Callable[[State, NormalEquations], None]
 
 
 @dataclass
@@ -108,22 +105,22 @@ class Problem:
             weight = np.where(height < 0, self.patches.share, 0.0)
             weight *= self.settings.ground_weight / GROUND_SIGMA**2
             normal = np.broadcast_to(self.floor.normal, points.shape)
-            rows = self._body_rows(lin, normal, weight.any(axis=0))
             active = np.flatnonzero(weight.any(axis=0))
+            rows = self._body_rows(lin, normal, active)
             out.add_rows("ground", slice(0, BODY), rows, weight[:, active], height[:, active])
 
-    def _body_rows(self, lin, normals: np.ndarray, active: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
-        """Rows (T, A, 168) of n^T d point / d body for the active points."""
+    def _body_rows(self, lin: Linearisation, normals: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Rows (T, A, 168) of n^T d point / d body for the points ``index`` (A,)."""
         directions = torch.as_tensor(
             np.ascontiguousarray(normals), dtype=lin.points.dtype, device=lin.points.device
         )
         rows = lin.along(directions[:, :, None])[:, :, 0, :BODY]
-        return rows[:, torch.as_tensor(np.flatnonzero(active))].double().cpu().numpy()
+        return rows[:, torch.as_tensor(index)].double().cpu().numpy()
 
     def _add_coupled(
         self,
         term: str,
-        lin,  # type: ignore[no-untyped-def]
+        lin: Linearisation,
         near: Proximity,
         residual: np.ndarray,
         weight: np.ndarray,
@@ -131,13 +128,12 @@ class Problem:
         out: NormalEquations,
     ) -> None:
         """Rows that move with both the body and the object."""
-        active = weight.any(axis=0)
-        index = np.flatnonzero(active)
+        index = np.flatnonzero(weight.any(axis=0))
         if not len(index):
             out.energy.setdefault(term, 0.0)
             return
         rows = np.concatenate(
-            [self._body_rows(lin, near.normals, active), near.by_object[:, index]], axis=2
+            [self._body_rows(lin, near.normals, index), near.by_object[:, index]], axis=2
         )
         out.add_rows(term, slice(0, SIZE), rows, weight[:, index], residual[:, index], energy)
 

@@ -101,6 +101,10 @@ def run(
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", sigma)
+        writer.put("keypoint_offsets", fit.settled.offsets.cpu().numpy())
+        writer.put("keypoint_sigma", fit.settled.keypoint_sigma.cpu().numpy())
+        writer.put("covering", fit.settled.covering.cpu().numpy())
+        writer.put("covering_noise", fit.settled.cloud_noise.cpu().numpy())
         writer.put("failed", ~fitted)
         writer.put("bridged", ~fitted)
 

@@ -20,6 +20,7 @@ from intercap_core.body.artefact import body_path
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.config import (
+    BodyFitSettings,
     BodyModels,
     ContactInterval,
     JointSettings,
@@ -67,13 +68,15 @@ def run(
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: JointSettings,
+    body_settings: BodyFitSettings,
     contact: Sequence[ContactInterval] | None = None,
     device: str = "cpu",
 ) -> None:
     """Write joint.h5 from the sequential fits.
 
-    ``contact`` are the annotated intervals, None where contact is to be found from the geometry.
-    Raises UserError where an artefact or the mesh cannot be used.
+    ``body_settings`` say what the body fit had fitted. ``contact`` are the annotated intervals,
+    None where contact is to be found from the geometry. Raises UserError where an artefact or the
+    mesh cannot be used.
     """
     mesh = ObjectMesh.load(object_)
     with (
@@ -90,6 +93,15 @@ def run(
         object_sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
         object_sigma = np.where(lost | ~np.isfinite(object_sigma), _UNTRACKED_SIGMA, object_sigma)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
+        data = BodyData.load(
+            frames=frames,
+            scene=scene,
+            person=person,
+            body_fit=body,
+            model=model,
+            state=start,
+            settings=body_settings,
+        )
     with artefacts.read(scene, SCENE) as source:
         floor = (
             Ground(source["ground_point"], source["ground_normal"])
@@ -98,9 +110,6 @@ def run(
         )
         fps = float(source.attributes["fps"])
         time_offset = source["time_offset"]
-    data = BodyData.load(
-        frames=frames, scene=scene, person=person, model=model, state=start, trusted=~failed
-    )
     patches = contact_patches(model)
     problem = Problem(
         model=model,
@@ -119,6 +128,7 @@ def run(
     found = _contact(problem, state, contact, joint_sigma, object_sigma)
     for rounds in _ROUNDS:
         problem.probability = found.probability[:, patches.region_of_patch]
+        data.refresh(state)
         if not before:
             before = problem.equations(state).energy
         minimum = minimise(problem.equations, state, max_steps=rounds)
