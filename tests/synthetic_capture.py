@@ -88,7 +88,7 @@ def to_millimetres(depth: np.ndarray, rng: np.random.Generator, noise: float = 1
     """Depth with noise that grows with distance, as the sensor stores it: uint16 mm."""
     sigma = noise * (0.001 + 0.0005 * depth**2)
     noisy = depth + sigma * rng.standard_normal(depth.shape)
-    return np.where(depth > 0, np.rint(noisy * 1000), 0).astype(np.uint16)
+    return np.where(depth > 0, np.rint(np.maximum(noisy, 0) * 1000), 0).astype(np.uint16)
 
 
 def perturbed(rig: Rig, rng: np.random.Generator, metres: float, degrees: float) -> Rig:

@@ -1,0 +1,95 @@
+"""Limbs whose left and right a detector exchanged, found by the views that disagree.
+
+A view's limb counts as exchanged when the point that other views agree on fits much better with
+the sides exchanged. Where the views that exchange are the majority, time tells: a limb that jumps
+to the other side and back was exchanged in all of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.camera.rig import Rig
+from intercap_core.detection.sides import LIMBS, PARTNER
+from intercap_core.detection.triangulation import (
+    Triangulation,
+    pixel_scale,
+    reproject,
+    triangulate,
+)
+
+ROUNDS = 2
+MUCH_BETTER = 0.5  # exchanged cost over cost as detected
+MIN_POINTS = 2
+
+
+def triangulate_people(
+    keypoints: np.ndarray, rig: Rig, *, min_confidence: float, max_error_px: float
+) -> tuple[np.ndarray, Triangulation]:
+    """Triangulate the subject, exchanging sides where views say so.
+
+    ``keypoints`` (T, C, 135, 3) x, y, confidence. Returns them with limbs exchanged back, and the
+    triangulation of T * 135 points, set by set.
+    """
+    keypoints = keypoints.copy()
+    found = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    for _ in range(ROUNDS):
+        exchanged = exchange(keypoints, found.points.reshape(len(keypoints), -1, 3), rig,
+                             min_confidence=min_confidence, max_error_px=max_error_px)  # fmt: skip
+        if not exchanged:
+            break
+        found = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    return keypoints, found
+
+
+def exchange(
+    keypoints: np.ndarray,
+    points: np.ndarray,
+    rig: Rig,
+    *,
+    min_confidence: float,
+    max_error_px: float,
+) -> int:
+    """Exchange in place the limbs of ``keypoints`` (T, C, 135, 3) that fit ``points`` (T, 135, 3)
+    much better the other way; return how many."""
+    sets, views = keypoints.shape[:2]
+    known = np.isfinite(points[..., 0])
+    pixels = reproject(np.nan_to_num(points.reshape(-1, 3), nan=1.0), rig)
+    pixels = np.swapaxes(pixels.reshape(sets, -1, views, 2), 1, 2)  # (T, C, 135, 2)
+    limit = max_error_px * pixel_scale(rig)[:, None]
+    seen = keypoints[..., 2] >= min_confidence
+    count = 0
+    for limb in LIMBS:
+        partner = PARTNER[limb]
+        own = known[:, None, limb]
+        as_found = _cost(
+            pixels[:, :, limb], keypoints[:, :, limb, :2], own & seen[:, :, limb], limit
+        )
+        other = _cost(
+            pixels[:, :, limb], keypoints[:, :, partner, :2], own & seen[:, :, partner], limit
+        )
+        # A mean truncated cost of a quarter: half of the points are off by the limit or more.
+        wrong = (as_found > 0.25) & (other < MUCH_BETTER * as_found)
+        t, c = np.nonzero(wrong)
+        keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], partner]
+        count += len(t)
+    return count
+
+
+def _cost(
+    expected: np.ndarray, found: np.ndarray, valid: np.ndarray, limit: np.ndarray
+) -> np.ndarray:
+    """Mean truncated squared error (T, C) in units of the limit; NaN with too few points."""
+    # Truncated well beyond the limit, so that an exchange is told from another mistake.
+    error = np.linalg.norm(expected - found, axis=-1) / limit
+    square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
+    count = valid.sum(-1)
+    return np.where(count >= MIN_POINTS, square / np.maximum(count, 1), np.nan)
+
+
+def _triangulate(
+    keypoints: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
+) -> Triangulation:
+    by_point = np.swapaxes(keypoints, 1, 2).reshape(-1, len(rig), 3).astype(np.float64)
+    weights = np.where(by_point[..., 2] >= min_confidence, by_point[..., 2], 0)
+    return triangulate(by_point[..., :2], weights, rig, max_error_px=max_error_px)

@@ -1,0 +1,90 @@
+"""Depth images to thinned surfaces: points with normals, one for each cell of a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.camera.intrinsics import Intrinsics
+
+NORMAL_STEP_PX = 4  # half the base line of a normal, at the full depth resolution
+REFERENCE_WIDTH = 640
+MAX_KINK_M_PER_M = 0.008  # a pixel this far off its neighbours' middle, per depth, is an edge
+MIN_COSINE = 0.26  # surfaces seen at a grazing angle of more than 75 degrees are left out
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """``points`` (N, 3) metres, ``normals`` (N, 3) unit, towards the camera, ``rays`` (N, 3) what a
+    point moves by for one metre of depth: all in one camera's depth frame, float64."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    rays: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def subset(self, rows: np.ndarray) -> Surface:
+        """The rows chosen."""
+        return Surface(self.points[rows], self.normals[rows], self.rays[rows])
+
+
+def surface_of(
+    depth: np.ndarray,
+    lens: Intrinsics,
+    *,
+    keep: np.ndarray | None = None,
+    cell_m: float,
+    max_depth_m: float,
+) -> Surface:
+    """Thin a depth image (H, W) uint16 mm to one mean point and normal a cell of ``cell_m``.
+
+    ``keep`` (H, W) bool says which pixels take part. Edges, grazing views and what is farther than
+    ``max_depth_m`` are left out.
+    """
+    usable = (depth > 0) & (depth <= max_depth_m * 1000)
+    if keep is not None:
+        usable &= keep
+    z = depth.astype(np.float32) * np.float32(1e-3)
+    grid = np.dstack([lens.rays * z[..., None], z])
+    step = max(1, round(NORMAL_STEP_PX * lens.width / REFERENCE_WIDTH))
+    middle = np.s_[step:-step, step:-step]
+    left, right = np.s_[step:-step, : -2 * step], np.s_[step:-step, 2 * step :]
+    up, down = np.s_[: -2 * step, step:-step], np.s_[2 * step :, step:-step]
+    flat = usable[middle].copy()
+    for one, other in ((left, right), (up, down)):
+        flat &= usable[one] & usable[other]
+        kink = np.abs((z[one] + z[other]) / 2 - z[middle])
+        flat &= kink <= MAX_KINK_M_PER_M * z[middle]
+    row, column = np.nonzero(flat)
+    row, column = row + step, column + step
+    points = grid[row, column].astype(np.float64)
+    across = grid[row, column + step] - grid[row, column - step]
+    along = grid[row + step, column] - grid[row - step, column]
+    normals = np.cross(along, across).astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
+    good = np.isfinite(points).all(1) & (facing >= MIN_COSINE)
+    rays = np.column_stack([lens.rays[row, column], np.ones(len(row))])
+    return thinned(Surface(points[good], normals[good], rays[good]), cell_m)
+
+
+def thinned(surface: Surface, cell_m: float) -> Surface:
+    """One mean point, normal and ray for each cell of ``cell_m``, in a fixed order."""
+    if not len(surface):
+        return surface
+    cell = np.floor(surface.points / cell_m).astype(np.int64) + (1 << 19)
+    key = (cell[:, 0] << 40) + (cell[:, 1] << 20) + cell[:, 2]
+    _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = [np.bincount(inverse, values[:, i], len(counts)) for i in range(3)]
+        return np.stack(sums, 1) / counts[:, None]
+
+    normals = mean(surface.normals)
+    length = np.linalg.norm(normals, axis=1)
+    whole = length > 0.8  # a cell over an edge has no one normal
+    normals = normals[whole] / length[whole, None]
+    return Surface(mean(surface.points)[whole], normals, mean(surface.rays)[whole])
