@@ -142,7 +142,8 @@ def test_exact_keypoints_alone_give_the_parameters_back() -> None:
     # no keypoint tells how a bend of the back is shared out over the spine and the collars
     seen = np.unique(model.keypoint_map.joint[model.keypoint_map.joint >= 0])
     assert (ours.joints - true.joints)[:, seen].norm(dim=2).max() < 1e-3
-    assert (ours.vertices - true.vertices).norm(dim=2).mean() < 1e-3
+    on_seen = np.isin(model.skinning_weights.argmax(1).numpy(), seen)
+    assert (ours.vertices - true.vertices)[:, on_seen].norm(dim=2).mean() < 1e-3
 
 
 def test_normal_equations_of_the_whole_energy_match_differences() -> None:
