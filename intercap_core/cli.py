@@ -91,6 +91,19 @@ def run(context: typer.Context, settings: Settings = DEFAULT_SETTINGS, cores: Co
 
 
 @app.command(rich_help_panel=WHOLE)
+def report(settings: Settings = DEFAULT_SETTINGS) -> None:
+    """Aggregate the sequences' metrics into tables, heatmaps, summary and the HTML page.
+
+    Example: intercap report config/demo/config.yaml
+    """
+    _prepare()
+    from intercap_core.project import load_project
+    from intercap_core.step import run_dataset
+
+    typer.echo(run_dataset(load_project(settings)))
+
+
+@app.command(rich_help_panel=WHOLE)
 def evaluate(
     settings: Settings = Path("config/evaluation/config.yaml"),
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(

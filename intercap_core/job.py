@@ -66,3 +66,23 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
+
+
+def last_failure(folder: Path) -> str | None:
+    """Why the newest job that logged into ``folder`` failed; None where it did not."""
+    logs = sorted(folder.glob("*.log"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+    for log in logs[:1]:
+        state, words = read_state(log)
+        return words if state == "failed" else None
+    return None
+
+
+def read_state(log: Path) -> tuple[str, str]:
+    """Whether the job that wrote ``log`` runs, finished or failed; and how long, or why."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    # After the time of day, which every line starts with
+    last = lines[-1].partition(" ")[2] if lines else ""
+    for state, mark in (("finished", FINISHED), ("failed", FAILED)):
+        if last.startswith(mark):
+            return state, last.removeprefix(mark).strip()
+    return "running", ""

@@ -38,6 +38,11 @@ class Project:
         """Folder of this dataset's artefacts."""
         return self.config.results / self.config.dataset
 
+    @property
+    def logs(self) -> Path:
+        """Folder of this dataset's logs."""
+        return Path("logs") / self.config.dataset
+
     def annotation_path(self, sequence: str) -> Path:
         """Where this sequence's annotation file is, or would be."""
         if self.annotation_made(sequence):
@@ -45,7 +50,7 @@ class Project:
         return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
     def artefact(self, sequence: str, stage: str) -> Path:
-        """Where a stage of this sequence writes."""
+        """Where a stage of this sequence writes: a file, or the folder of the export."""
         return self.results / sequence / ("export" if stage == "export" else f"{stage}.h5")
 
     def annotation(self, sequence: str) -> Annotation:

@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.table import Table
 
 from intercap_core.errors import UserError
-from intercap_core.job import FAILED, FINISHED
+from intercap_core.job import read_state
 from intercap_core.project import Project, load_project
 from intercap_core.step import SEQUENCE_STAGES
 
@@ -95,7 +95,7 @@ class Watcher:
         self._console = console
         self._start = time.time() - 1.0  # file systems keep whole seconds at worst
         self._told: set[str] = set()
-        self._logs = Path("logs") / project.config.dataset
+        self._logs = project.logs
         self.transcript = self._logs / "snakemake.log"
 
     def jobs(self) -> dict[str, JobState]:
@@ -105,7 +105,9 @@ class Watcher:
             if path == self.transcript or path.stat().st_mtime < self._start:
                 continue
             sequence = path.parent.name if path.parent != self._logs else ""
-            found[f"{sequence}: {path.stem}" if sequence else path.stem] = _read_log(path)
+            found[f"{sequence}: {path.stem}" if sequence else path.stem] = JobState(
+                *read_state(path)
+            )
         return found
 
     def failures(self) -> dict[str, str]:
@@ -143,17 +145,6 @@ class Watcher:
             if job.state != "running" and name not in self._told:
                 self._told.add(name)
                 self._console.print(f"{name}: {job.state} {job.words}", highlight=False)
-
-
-def _read_log(path: Path) -> JobState:
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    # After the time of day, which every line starts with
-    last = lines[-1].partition(" ")[2] if lines else ""
-    if last.startswith(FINISHED):
-        return JobState("finished", last.removeprefix(FINISHED).strip())
-    if last.startswith(FAILED):
-        return JobState("failed", last.removeprefix(FAILED).strip())
-    return JobState("running", "")
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:

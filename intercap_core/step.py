@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from intercap_core.errors import UserError
+from intercap_core.job import last_failure
 from intercap_core.project import Project
 
 SEQUENCE_STAGES = (
@@ -70,12 +71,45 @@ def run_studio(project: Project, sequence: str) -> Path:
         )
     from intercap_core.studio.capture import make_capture
 
-    row = project.sequences[sequence]
     make_capture(
         project.config.studio.captures[sequence],
         project.config.studio,
-        sequence=row,
-        object_=project.objects[row.object],
+        sequence=sequence,
+        objects=project.objects[project.sequences[sequence].object],
         output=folder,
     )
     return folder
+
+
+def run_dataset(project: Project) -> Path:
+    """Aggregate the project's sequences and write the report; returns the page's path.
+
+    Sequences that the project excludes because they failed are named in it. Raises UserError
+    where an artefact is missing or broken.
+    """
+    from intercap_core.stages import dataset
+
+    folder = project.results
+    reasons = {name: last_failure(project.logs / name) for name in project.config.exclude}
+    dataset.run(
+        dataset=project.config.dataset,
+        sequences={
+            name: dataset.SequenceArtefacts(
+                **{
+                    stage: project.artefact(name, stage)
+                    for stage in ("frames", "scene", "object_track", "joint", "metrics")
+                }
+            )
+            for name in project.sequences
+        },
+        objects=project.objects,
+        subjects=project.subjects,
+        body_models=project.config.body_models,
+        settings=project.config.report,
+        report=folder / "report.html",
+        summary=folder / "summary.json",
+        heatmaps=folder / "heatmaps.h5",
+        tables_folder=folder / "tables",
+        failed={name: reason for name, reason in reasons.items() if reason},
+    )
+    return folder / "report.html"

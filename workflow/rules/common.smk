@@ -26,7 +26,7 @@ PROJECT = _load()
 SETTINGS = PROJECT.config
 SEQUENCES = list(PROJECT.sequences)
 RESULTS = PROJECT.results.as_posix()
-LOGS = f"logs/{SETTINGS.dataset}"
+LOGS = PROJECT.logs.as_posix()
 BENCHMARKS = f"benchmarks/{SETTINGS.dataset}"
 ENVIRONMENT = "../../envs/intercap.yaml"
 
@@ -137,10 +137,24 @@ def annotation_of(*sections):
     return own
 
 
+def entry_of_object(name):
+    """An object's entry without its files, which are inputs."""
+    entry = PROJECT.objects[name]
+    return entry.model_dump(mode="json", exclude={"mesh", "contact_vertices"})
+
+
 def tracked_object(wildcards):
-    """Param: digest of the object's entry; its files are inputs."""
-    entry = of_sequence(wildcards)[1]
-    return digest(entry.model_dump(mode="json", exclude={"mesh", "contact_vertices"}))
+    """Param: digest of the object's entry."""
+    return digest(entry_of_object(PROJECT.sequences[wildcards.sequence].object))
+
+
+def all_entries():
+    """Param: digest of every object's and subject's entry that the sequences use."""
+    objects = {PROJECT.sequences[name].object for name in SEQUENCES}
+    subjects = {PROJECT.sequences[name].subject for name in SEQUENCES}
+    return digest(
+        [[entry_of_object(name) for name in sorted(objects)], sorted(subjects)]
+    )
 
 
 def tracked_subject(wildcards):

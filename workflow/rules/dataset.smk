@@ -24,6 +24,7 @@ rule dataset:
     params:
         settings=settings_of("report"),
         sequences=SEQUENCES,
+        entries=all_entries(),
         code=code_of("dataset"),
     message:
         "the report over all sequences"

@@ -1,0 +1,102 @@
+"""`intercap evaluate`: virtual recordings against truth, as tables and as flat JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core.errors import UserError
+from intercap_core.metrics import figures
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.project import Project, load_project
+from intercap_core.run import run_workflow
+
+PLAIN, ANNOTATED = "no annotations", "annotated"
+
+
+def evaluate(settings: Path, output: Path, *, cores: int = 0) -> int:
+    """Bring the evaluation captures up to date, print the tables and write ``output``.
+
+    ``output`` is flat JSON with keys ``area.measure``; areas of the annotated captures end in
+    ``_annotated``. Returns the workflow's exit status; sequences that failed are left out of the
+    figures and named. Raises UserError where none has a result.
+    """
+    project = load_project(settings)
+    status = run_workflow(settings, cores=cores)
+    groups = measured_groups(project)
+    tables = {name: areas(sequences) for name, sequences in groups.items() if sequences}
+    if not tables:
+        raise UserError(f"{settings}: no sequence has metrics; look into {project.logs}")
+    flat = {
+        f"{area}{'' if group == PLAIN else '_annotated'}.{measure}": float(f"{value:.6g}")
+        for group, found in tables.items()
+        for area, measures in found.items()
+        for measure, value in measures.items()
+        if math.isfinite(value)
+    }
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    print_tables(tables, {name: len(sequences) for name, sequences in groups.items()})
+    print(output)
+    return status
+
+
+def measured_groups(project: Project) -> dict[str, list[SequenceMetrics]]:
+    """The sequences that have metrics, apart by whether they are annotated."""
+    groups: dict[str, list[SequenceMetrics]] = {PLAIN: [], ANNOTATED: []}
+    for name in project.sequences:
+        path = project.artefact(name, "metrics")
+        if path.is_file():
+            annotated = project.annotation_made(name) or project.annotation_path(name).exists()
+            groups[ANNOTATED if annotated else PLAIN].append(SequenceMetrics.read(path))
+    return groups
+
+
+def areas(sequences: Sequence[SequenceMetrics]) -> dict[str, dict[str, float]]:
+    """Every figure of a group of sequences by area: the stages, and what is not one stage's."""
+    found = {stage: figures.truth_figures(sequences, stage) for stage in figures.STAGES}
+    for stage in figures.STAGES:
+        sweep = figures.contact_sweep(sequences, stage)
+        found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
+    return {
+        **found,
+        "penetration": figures.penetration_figures(sequences),
+        "vertex_to_cloud": figures.cloud_figures(sequences),
+        "vertex_to_cloud_floor": figures.floor_figures(sequences),
+        "extrinsics": figures.extrinsics_figures(sequences),
+        "flags": figures.flag_figures(sequences),
+    }
+
+
+def print_tables(tables: dict[str, dict[str, dict[str, float]]], counts: dict[str, int]) -> None:
+    """One table for the three stages side by side, one for the rest; a column for each group."""
+    console = Console()
+    groups = list(tables)
+    for group in groups:
+        found = tables[group]
+        table = Table("measure", *figures.STAGES, box=None)
+        table.title = f"against truth, {group} ({counts[group]} sequences)"
+        measures = list(dict.fromkeys(m for stage in figures.STAGES for m in found[stage]))
+        for measure in measures:
+            cells = [_number(found[stage].get(measure)) for stage in figures.STAGES]
+            table.add_row(measure, *cells)
+        console.print(table)
+    table = Table("after joint", *groups, box=None, title="all frames")
+    for area in tables[groups[0]]:
+        if area in figures.STAGES:
+            continue
+        names = list(dict.fromkeys(m for group in groups for m in tables[group][area]))
+        for name in names:
+            table.add_row(
+                f"{area}.{name}", *(_number(tables[group][area].get(name)) for group in groups)
+            )
+    console.print(table)
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None or not math.isfinite(value) else f"{value:.3f}"
