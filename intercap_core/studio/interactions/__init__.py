@@ -1,0 +1,25 @@
+"""The scripts that the studio can play, by name."""
+
+from __future__ import annotations
+
+from intercap_core.errors import UserError
+from intercap_core.studio.interactions.base import Interaction
+from intercap_core.studio.interactions.cup_drink import CupDrink
+from intercap_core.studio.interactions.stool_sit import StoolSit
+from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
+
+INTERACTIONS: dict[str, type[Interaction]] = {
+    "suitcase_carry": SuitcaseCarry,
+    "cup_drink": CupDrink,
+    "stool_sit": StoolSit,
+}
+
+
+def interaction_named(name: str) -> type[Interaction]:
+    """Return a script. Raises UserError where there is none of that name."""
+    if name not in INTERACTIONS:
+        raise UserError(
+            f"studio: no interaction {name!r}, there are {', '.join(INTERACTIONS)}; correct "
+            "'interaction' of the capture"
+        )
+    return INTERACTIONS[name]

@@ -1,0 +1,103 @@
+"""What every scripted interaction has: a puppet, the true object, furniture, and times."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.studio.controls import Wander
+from intercap_core.studio.motion import Puppet
+
+SCRIPT_S = 3.0  # a script's own length; longer recordings play it slower
+
+
+@dataclass(frozen=True)
+class TrueObject:
+    """The object as it truly is: its frame, metres; ``colours`` (V, 3) uint8 RGB."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray
+    surface: DistanceField
+
+    @property
+    def standing_height(self) -> float:
+        """Height of the origin when the object stands on the floor."""
+        return float(-self.vertices[:, 2].min())
+
+
+@dataclass(frozen=True)
+class Box:
+    """A piece of static furniture: upright box, ``low`` and ``high`` corners (3,), heading rad
+    about its middle; ``material`` names its looks."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    heading: float = 0.0
+    material: str = "wood"
+
+
+@dataclass(frozen=True)
+class Performance:
+    """N moments: joint rotations (N, 55, 3, 3), pelvis (N, 3), stage_from_object (N, 4, 4)."""
+
+    world: np.ndarray
+    pelvis: np.ndarray
+    stage_from_object: np.ndarray
+
+
+@dataclass
+class Interaction(ABC):
+    """One script for one person and one object.
+
+    Script time runs from 0 to ``SCRIPT_S``. ``highlight`` is the script time around which a
+    recording shorter than the script is taken.
+    """
+
+    puppet: Puppet
+    thing: TrueObject
+    rng: np.random.Generator
+    furniture: list[Box] = field(default_factory=list)
+    object_class = ""
+    highlight = SCRIPT_S / 2
+
+    def __post_init__(self) -> None:
+        self.sway = Wander(6, 0.010, self.rng)  # rad, trunk and head
+        self.weight_shift = Wander(3, 0.0025, self.rng)  # metres, pelvis
+        self.arm_swing = Wander(2, 0.006, self.rng)  # metres
+        self.plan()
+
+    @abstractmethod
+    def plan(self) -> None:
+        """Decide on places, times and grasps."""
+
+    @abstractmethod
+    def perform(self, times: np.ndarray) -> Performance:
+        """Play the script at script times (N,), any order."""
+
+    def script_times(self, times: np.ndarray, duration: float) -> np.ndarray:
+        """Script times of recording times (N,), seconds from its first set.
+
+        A recording longer than the script slows it down; a shorter one shows the part around
+        the highlight at natural speed.
+        """
+        if duration >= SCRIPT_S:
+            return times * (SCRIPT_S / duration)
+        return times + np.clip(self.highlight - duration / 2, 0, SCRIPT_S - duration)
+
+
+def transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """(4, 4) of a rotation (3, 3) and translation (3,)."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, translation
+    return result
+
+
+def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
+    """stage_from_object (4, 4) of an object that stands, turned about the vertical."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return transform(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([x, y, z]))

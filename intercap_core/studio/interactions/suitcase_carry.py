@@ -1,0 +1,177 @@
+"""Walk up to a suitcase, take it by its top handle, carry it two steps, put it down."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.camera.transforms import invert
+from intercap_core.studio.controls import Footwork, Pose, Step, bump, plateau, ramp
+from intercap_core.studio.hands import RELAXED, HandShape, shape
+from intercap_core.studio.interactions.base import (
+    SCRIPT_S,
+    Interaction,
+    Performance,
+    transform,
+    upright,
+)
+from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.skeleton import turn
+
+RIGHT, LEFT = 1, 0
+HOOK = shape((66, 6, 4), (0, 6, 8), 15, 1)
+BAR_HALF_M = 0.008  # half the thickness of the handle's bar
+ATTACH_S, RELEASE_S = 1.08, 2.46
+LIFT_M = (0.14, 0.20)  # how high the case is carried, from the floor
+
+
+class SuitcaseCarry(Interaction):
+    """The case stands to the right of the person's way, its handle along the way."""
+
+    object_class = "suitcase"
+    highlight = 1.5
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        side_way = -(puppet.hip_width + 0.235 + rng.uniform(0, 0.02))
+        height = self.thing.standing_height
+        self.taken = upright(0.02 + rng.normal(0, 0.01), side_way, height, np.pi + rng.normal(0, 0.03))
+        stride = 0.43 + 0.05 * rng.random()
+        self.put = upright(2 * stride - 0.02, side_way - 0.02, height, np.pi + rng.normal(0, 0.04))
+        self.lift = rng.uniform(*LIFT_M)
+        w = puppet.hip_width * 0.95
+        start = np.array([[-0.62, w], [-0.68, -w]])
+        steps = [
+            Step(RIGHT, 0.05, 0.46, (-0.20, -w)),
+            Step(LEFT, 0.44, 0.86, (0.10, w)),
+            Step(RIGHT, 1.20, 1.62, (stride - 0.05, -w)),
+            Step(LEFT, 1.60, 2.02, (2 * stride - 0.04, w)),
+            Step(RIGHT, 2.00, 2.34, (2 * stride - 0.22, -w)),
+        ]
+        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
+        self.pelvis_track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
+        )
+        self._grasp()
+
+    def _grasp(self) -> None:
+        """Fingers level under the handle's bar where they have most room, then curled up.
+
+        The case's trolley bar is on the side away from the hand; the hand comes from the case's
+        +y, its thumb towards -x.
+        """
+        hand, surface = self.puppet.hands[RIGHT], self.thing.surface
+        near = (np.abs(self.thing.vertices[:, :2]) < (0.04, 0.02)).all(1)
+        bar_height = self.thing.vertices[near, 2].max() - BAR_HALF_M
+        best = (-np.inf, HOOK, np.eye(4))
+        for knuckle_deg in (50, 58, 66, 74):
+            hook = shape((knuckle_deg, 6, 4), (0, 6, 8), 15, 1)
+            for tilt in np.radians((10, 20, 30)):
+                sin, cos = np.sin(tilt), np.cos(tilt)
+                rotation = self.puppet.wrist_rotation(
+                    RIGHT, np.array([0, -sin, -cos]), np.array([0, -cos, sin])
+                )
+                knuckle = rotation @ hand.knuckles.mean(0)
+                for aside in (0.020, 0.025, 0.030):
+                    for below in (0.020, 0.024, 0.028, 0.032):
+                        at = np.array([0.0, aside, bar_height - below])
+                        grip = transform(rotation, at - knuckle)
+                        gap = hand.gap(hook, surface, grip)
+                        if gap > best[0]:
+                            best = (gap, hook, grip)
+        _, self.hook, self.object_from_wrist = best
+        knuckle_limit = float(self.hook.flexion[0, 0]) + 5
+        limits = {"finger": (knuckle_limit, 98.0, 62.0), "thumb": (40.0, 55.0, 60.0)}
+        self.grip_shape, self.grip_gaps = hand.close(
+            self.hook, limits, surface, self.object_from_wrist
+        )
+
+    def _trunk(self, times: np.ndarray) -> Trunk:
+        track = self.pelvis_track(times)
+        sway, shift = self.sway(times), self.weight_shift(times)
+        stoop = plateau(times, 0.55, 1.02, 1.10, 1.50) + plateau(times, 1.95, 2.40, 2.52, 2.95)
+        carry = plateau(times, 1.15, 1.5, 1.9, 2.3)
+        pelvis = track[:, :3] + shift
+        pelvis[:, 2] -= 0.19 * stoop
+        pelvis[:, 0] -= 0.05 * stoop
+        bend = 0.6 * sway[:, :3]
+        bend[:, 0] += 0.04 + 0.42 * stoop
+        bend[:, 2] += 0.10 * stoop - 0.10 * carry
+        bend[:, 1] -= 0.10 * stoop
+        head = 1.5 * sway[:, 3:]
+        head[:, 0] += 0.12 + 0.45 * stoop
+        head[:, 1] -= 0.35 * plateau(times, 0.2, 0.7, 1.2, 1.6) + 0.25 * plateau(
+            times, 1.8, 2.2, 2.5, 2.9
+        )
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        count = len(times)
+        swing = 0.10 * bump(times, 0.35, 0.9) + self.arm_swing(times)[:, 0]
+        idle = self.puppet.idle_wrist(world, pelvis, RIGHT, swing)
+        first, last = self.taken @ self.object_from_wrist, self.put @ self.object_from_wrist
+        aside = np.array([0.0, -0.075, -0.012])
+        before, after = first.copy(), last.copy()
+        before[:3, 3] += aside
+        after[:3, 3] += aside
+        over, off = before.copy(), after.copy()
+        over[:3, 3] += (-0.03, -0.03, 0.13)
+        off[:3, 3] += (-0.02, -0.04, 0.15)
+        held = np.array([0.0, first[1, 3], first[2, 3] + self.lift])
+        along = pelvis[:, 0] + (first[0, 3] - self.taken[0, 3]) - 0.02
+        position = np.broadcast_to(held, (count, 3)).copy()
+        share = ramp(times, 1.2, 2.3)
+        position[:, 0] = along
+        position[:, 1] += share * (last[1, 3] - first[1, 3])
+        position[:, 2] += 0.006 * np.sin(2 * np.pi * times / 0.41)
+        tilt = np.zeros((count, 3))
+        tilt[:, 1] = 0.05 * np.sin(2 * np.pi * (times - 1.2) / 0.82) * plateau(
+            times, 1.2, 1.5, 1.9, 2.2
+        )
+        between = Pose.still(first, count).towards(Pose.still(last, count), share)
+        carried = Pose(position, turn(tilt) @ between.rotation)
+        wrist = idle.towards(Pose.still(over, count), ramp(times, 0.35, 0.78))
+        wrist = wrist.towards(Pose.still(before, count), ramp(times, 0.70, 0.94))
+        wrist = wrist.towards(Pose.still(first, count), ramp(times, 0.94, 1.04))
+        wrist = wrist.towards(carried, ramp(times, ATTACH_S, 1.55))
+        wrist = wrist.towards(Pose.still(last, count), ramp(times, 1.95, RELEASE_S - 0.02))
+        wrist = wrist.towards(Pose.still(after, count), ramp(times, 2.53, 2.65))
+        wrist = wrist.towards(Pose.still(off, count), ramp(times, 2.62, 2.86))
+        return wrist.towards(idle, ramp(times, 2.80, 3.15))
+
+    def perform(self, times: np.ndarray) -> Performance:
+        puppet = self.puppet
+        trunk = self._trunk(times)
+        world = puppet.trunk(trunk)
+        needs = plateau(times, 0.5, 0.95, 2.6, 2.95)
+        for _ in range(2):
+            right = self._right_wrist(world, trunk.pelvis, times)
+            trunk = puppet.assist(trunk, {RIGHT: (right, needs)})
+            world = puppet.trunk(trunk)
+        pelvis = trunk.pelvis
+        right = self._right_wrist(world, pelvis, times)
+        puppet.legs(world, pelvis, *self.footwork.feet(times))
+        puppet.arm_to(world, pelvis, RIGHT, right)
+        swing = -0.10 * bump(times, 0.0, 0.5) + 0.14 * bump(times, 1.2, 1.7)
+        left = puppet.idle_wrist(world, pelvis, LEFT, swing + self.arm_swing(times)[:, 1])
+        balance = plateau(times, 0.7, 1.0, 2.5, 2.9)[:, None]
+        left = Pose(left.position + balance * np.array([0.06, 0.10, 0.05]), left.rotation)
+        puppet.arm_to(world, pelvis, LEFT, left)
+        stages: list[tuple[np.ndarray, HandShape]] = [
+            (ramp(times, 0.5, 0.88), self.hook),
+            (ramp(times, 0.98, 1.07), self.grip_shape),
+            (ramp(times, 2.46, 2.53), self.hook),
+            (ramp(times, 2.63, 2.9), RELAXED),
+        ]
+        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, stages))
+        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
+        return Performance(world, pelvis, self._object(world, pelvis, times))
+
+    def _object(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Standing, in the hand, standing: the hand's own pose decides while it is held."""
+        joints = self.puppet.skeleton.forward(world, pelvis)
+        wrist = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
+        index = self.puppet.hands[RIGHT].wrist
+        wrist[:, :3, :3], wrist[:, :3, 3] = world[:, index], joints[:, index]
+        held = wrist @ invert(self.object_from_wrist)
+        pose = np.where((times <= ATTACH_S)[:, None, None], self.taken, held)
+        return np.where((times >= RELEASE_S)[:, None, None], self.put, pose)

@@ -1,0 +1,188 @@
+"""2D keypoints that err as a detector of OpenPose's kind does, in its file format.
+
+Errors of one joint: a bias of its own in the body (the detector's idea of a joint is not the
+skeleton's), a bias that depends on the view, jitter that lasts, swaps of left and right, and when
+the joint is hidden a plausible wrong place with a confidence that only partly knows.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.body.keypoints import BODY, CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
+from intercap_core.camera.rig import Camera
+from intercap_core.studio.noise import NoiseSource
+
+BODY_BIAS_M = (0.010, 0.020)  # fixed, of each body joint
+HAND_BIAS_M, FACE_BIAS_M = (0.002, 0.005), (0.001, 0.004)
+VIEW_BIAS_PX = 2.0  # at 1080p
+JITTER_PX, HAND_JITTER_PX, FACE_JITTER_PX = 2.4, 2.0, 1.2
+FAST_JITTER = 0.4  # share of the jitter that changes from frame to frame
+JITTER_S = 0.5
+HIDDEN_SHIFT_M, HIDDEN_HAND_SHIFT_M = 0.045, 0.030
+SWAP_PROBABILITY, SWAP_S = 0.015, 0.3
+MISS_PROBABILITY, MISS_S = 0.012, 0.25
+BYSTANDER_PROBABILITY, BYSTANDER_S = 0.08, 1.0
+BLIND = 0.35  # how little the confidence knows about the true error, 0 all to 1 nothing
+
+_SWAPPED = np.arange(135)
+for _i, _name in enumerate(KEYPOINT_NAMES[:25]):
+    if _name.startswith("left_"):
+        _j = KEYPOINT_NAMES.index("right_" + _name[5:])
+        _SWAPPED[_i], _SWAPPED[_j] = _j, _i
+_SWAPPED[LEFT_HAND], _SWAPPED[RIGHT_HAND] = np.arange(46, 67), np.arange(25, 46)
+_LEGS = np.array([i for i, n in enumerate(KEYPOINT_NAMES[:25])
+                  if any(w in n for w in ("hip", "knee", "ankle", "toe", "heel")) and n != "mid_hip"])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A detector over one recording: fixed biases (135, 3) in metres in each body's own axes."""
+
+    noise: NoiseSource
+    frames: int
+    body_bias: np.ndarray
+
+    @classmethod
+    def build(cls, noise: NoiseSource, frames: int) -> Detector:
+        """Draw the fixed biases; they are the same in all cameras."""
+        rng = noise.rng("keypoint bias")
+        size = np.empty(135)
+        size[BODY] = rng.uniform(*BODY_BIAS_M, 25)
+        size[25:67] = rng.uniform(*HAND_BIAS_M, 42)
+        size[67:] = rng.uniform(*FACE_BIAS_M, 68)
+        size[[0, 15, 16, 17, 18]] *= 0.35  # nose, eyes, ears are seen, not guessed
+        direction = rng.normal(size=(135, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return cls(noise, frames, direction * size[:, None] * noise.scale)
+
+    def detect(self, camera: Camera, points: np.ndarray, axes: np.ndarray,
+               hidden: np.ndarray) -> np.ndarray:  # fmt: skip
+        """Keypoints (T, 135, 3) x, y, confidence of the subject in one camera.
+
+        ``points`` (T, 135, 3) true points and ``axes`` (T, 3, 3) the pelvis's rotation, both in
+        the master frame; ``hidden`` (T, 135) bool: something is in the way.
+        """
+        noise, scale = self.noise, self.noise.scale
+        rng = noise.rng("keypoints", camera.name)
+        per_metre = self._pixels_per_metre(camera, points)
+        biased = points + np.einsum("tij,kj->tki", axes, self.body_bias)
+        pose = camera.colour_from_master
+        at = biased @ pose[:3, :3].T + pose[:3, 3]
+        pixels = camera.colour.project(at)
+        unit_px = per_metre / 370.0  # 1 where the subject is as large as at 2.5 m in 1080p
+
+        jitter = np.empty(135)
+        jitter[BODY], jitter[25:67], jitter[67:] = JITTER_PX, HAND_JITTER_PX, FACE_JITTER_PX
+        slow = noise.process(rng, self.frames, 270, JITTER_S).reshape(-1, 135, 2)
+        fast = noise.tails(rng.normal(size=slow.shape))
+        group = noise.process(rng, self.frames, 4, JITTER_S).reshape(-1, 2, 2)
+        wander = np.sqrt(1 - FAST_JITTER**2) * slow + FAST_JITTER * fast
+        wander[:, LEFT_HAND] += 0.9 * group[:, :1]
+        wander[:, RIGHT_HAND] += 0.9 * group[:, 1:]
+        error = wander * (jitter * scale)[:, None]
+        view_bias = noise.tails(rng.normal(size=(135, 2))) * VIEW_BIAS_PX * scale
+        view_bias[67:] *= 0.4
+        error += view_bias
+
+        hidden_share = noise.process(rng, self.frames, 270, JITTER_S).reshape(-1, 135, 2)
+        shift = np.full(135, HIDDEN_SHIFT_M)
+        shift[25:67], shift[67:] = HIDDEN_HAND_SHIFT_M, 0.015
+        hallucinated = hidden_share * shift[:, None] * 370.0 * scale
+        error += np.where(hidden[..., None], hallucinated, 0)
+        pixels = pixels + error * unit_px
+
+        confidence = self._confidence(rng, error, hidden)
+        pixels, confidence = self._swapped(rng, pixels, confidence)
+        inside = (pixels > -0.5).all(-1) & (
+            pixels < (camera.colour.width - 0.5, camera.colour.height - 0.5)
+        ).all(-1)
+        confidence = np.where(inside & (at[..., 2] > 0.1), confidence, 0)
+        return np.concatenate([pixels, confidence[..., None]], -1)
+
+    def _pixels_per_metre(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """(T, 1, 1): how large a metre at the pelvis is in the image."""
+        pose = camera.colour_from_master
+        depth = points[:, 8] @ pose[2, :3] + pose[2, 3]
+        return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
+
+    def _confidence(self, rng: np.random.Generator, error: np.ndarray,
+                    hidden: np.ndarray) -> np.ndarray:  # fmt: skip
+        """(T, 135) in [0, 1]: falls with the error, but knows only part of it."""
+        size = np.linalg.norm(error, axis=-1)
+        chance = self.noise.process(rng, self.frames, 135, 0.3)
+        guess = 0.86 - 0.012 * size - 0.22 * hidden + 0.08 * chance
+        ignorant = 0.72 + 0.13 * self.noise.process(rng, self.frames, 135, 0.3)
+        confidence = (1 - BLIND) * guess + BLIND * ignorant
+        confidence[:, 25:67] -= 0.12
+        return np.clip(confidence, 0.02, 0.98)
+
+    def _swapped(self, rng: np.random.Generator, pixels: np.ndarray,
+                 confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Left and right of the whole body or of the legs, exchanged for a short while."""
+        chance = np.full((self.frames, 2), SWAP_PROBABILITY)
+        shared = self.noise.process(rng, self.frames, 1, SWAP_S)[:, 0]
+        swapped = self.noise.episodes(rng, self.frames, chance, shared, SWAP_S, 0.0)
+        pixels, confidence = pixels.copy(), confidence.copy()
+        for t in np.flatnonzero(swapped.any(1)):
+            rows = np.arange(67) if swapped[t, 0] else _LEGS
+            source = _SWAPPED[rows]
+            pixels[t, rows], confidence[t, rows] = pixels[t, source], confidence[t, source]
+            confidence[t, rows] *= 0.92
+        return pixels, confidence
+
+    def people(self, camera: Camera, subject: np.ndarray) -> list[list[np.ndarray]]:
+        """People (135, 3) in each frame's file: the subject mostly, sometimes nobody, sometimes a
+        bystander who is not there, before or after the subject."""
+        noise = self.noise
+        rng = noise.rng("people", camera.name)
+        one = np.ones((self.frames, 1))
+        shared = noise.rng("people")
+        common = noise.process(shared, self.frames, 1, MISS_S)[:, 0]
+        missed = noise.episodes(
+            rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.3
+        )[:, 0]
+        common = noise.process(shared, self.frames, 1, BYSTANDER_S)[:, 0]
+        bystander = noise.episodes(
+            rng, self.frames, one * BYSTANDER_PROBABILITY, common, BYSTANDER_S, 0.4
+        )[:, 0]
+        width, height = camera.colour.width, camera.colour.height
+        place = np.array([rng.uniform(0.1, 0.9) * width, rng.uniform(0.3, 0.5) * height])
+        size = rng.uniform(0.3, 0.6)
+        result = []
+        for t in range(self.frames):
+            people = [] if missed[t] else [subject[t]]
+            if bystander[t]:
+                ghost = subject[t].copy()
+                ghost[:, :2] = (ghost[:, :2] - ghost[8, :2]) * size + place
+                ghost[:, :2] += rng.normal(0, 6, ghost[:, :2].shape) * width / 1920
+                ghost[:, 2] *= rng.uniform(0.3, 0.8)
+                people.insert(int(rng.integers(len(people) + 1)), ghost)
+            result.append(people)
+        return result
+
+
+def to_json(people: list[np.ndarray]) -> str:
+    """A file's content as OpenPose writes it: body 25, face 70, hands 21; x, y, confidence."""
+    entries = []
+    for person in people:
+        face = np.zeros((70, 3))
+        face[:17], face[17:68] = person[CONTOUR], person[FACE]
+        face[68], face[69] = person[FACE][19:25].mean(0), person[FACE][25:31].mean(0)
+        parts = {
+            "pose_keypoints_2d": person[BODY],
+            "face_keypoints_2d": face,
+            "hand_left_keypoints_2d": person[LEFT_HAND],
+            "hand_right_keypoints_2d": person[RIGHT_HAND],
+        }
+        entry: dict[str, list[float] | list[int]] = {"person_id": [-1]}
+        for name, rows in parts.items():
+            rows = np.where(rows[:, 2:] > 0, rows, 0.0)
+            entry[name] = [round(float(v), 3) for v in rows.ravel()]
+        for name in ("pose", "face", "hand_left", "hand_right"):
+            entry[f"{name}_keypoints_3d"] = []
+        entries.append(entry)
+    return json.dumps({"version": 1.3, "people": entries}, separators=(",", ":"))

@@ -1,0 +1,220 @@
+"""Instance candidates that err as a segmentation network does, in COCO's result format.
+
+What goes wrong lasts for a third of a second to a second and is partly the same in all views:
+borders, labels, misses, blobs of person and object, things that are not there. Score and order say
+nothing about which candidate is right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from pycocotools import mask as coco
+
+from intercap_core.studio.noise import NoiseSource
+from intercap_core.studio.render import BODY, OBJECT
+
+LABELS = {
+    "suitcase": "suitcase", "skateboard": "skateboard", "football": "sports ball",
+    "umbrella": "umbrella", "tennis_racquet": "tennis racket", "toolbox": "suitcase",
+    "chair": "chair", "bottle": "bottle", "cup": "cup", "stool": "chair",
+}  # fmt: skip
+CONFUSED = {
+    "suitcase": ("handbag", "backpack", "refrigerator"), "skateboard": ("surfboard", "snowboard"),
+    "sports ball": ("frisbee", "apple"), "umbrella": ("baseball bat", "tie"),
+    "tennis racket": ("baseball bat", "frisbee"), "chair": ("bench", "dining table", "toilet"),
+    "bottle": ("vase", "wine glass"), "cup": ("bowl", "vase", "wine glass"),
+}  # fmt: skip
+OTHER_THINGS = ("book", "tv", "potted plant", "clock", "vase", "handbag", "chair", "bottle")
+CATEGORY_IDS = {
+    "person": 1, "bench": 15, "backpack": 27, "umbrella": 28, "handbag": 31, "tie": 32,
+    "suitcase": 33, "frisbee": 34, "snowboard": 36, "sports ball": 37, "baseball bat": 39,
+    "skateboard": 41, "surfboard": 42, "tennis racket": 43, "bottle": 44, "wine glass": 46,
+    "cup": 47, "bowl": 51, "apple": 53, "chair": 62, "potted plant": 64, "dining table": 67,
+    "toilet": 70, "tv": 72, "refrigerator": 82, "book": 84, "clock": 85, "vase": 86,
+}  # fmt: skip
+BORDER_PX = 2.2  # RMS at 1080p; capped at MAX_BORDER_PX
+MAX_BORDER_PX = 5.0
+WRONG_LABEL, MERGED, SPLIT = 0.15, 0.06, 0.05
+MISS_FREE, MISS_HIDDEN = 0.03, 0.85  # chance of a miss when in full view, when all is hidden
+PERSON_MISSED = 0.015
+CLUTTER = 0.35  # chance of each false instance in a frame
+EPISODE_S = (0.3, 1.0)
+AGREEMENT = 0.5
+MIN_PIXELS = 30
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What one camera's image truly shows: ``identity`` (h, w) in a window at (x0, y0) of an image
+    of ``size`` (width, height); ``visible`` share of the object that nothing hides."""
+
+    identity: np.ndarray
+    x0: int
+    y0: int
+    size: tuple[int, int]
+    visible: float
+
+
+class Segmenter:
+    """The network over one recording; every camera's errors partly agree."""
+
+    def __init__(self, noise: NoiseSource, frames: int, object_name: str) -> None:
+        self.noise, self.frames = noise, frames
+        self.label = LABELS.get(object_name, object_name)
+        shared = noise.rng("masks")
+        self._shared = {
+            name: noise.process(shared, frames, 1, shared.uniform(*EPISODE_S))[:, 0]
+            for name in ("label", "miss", "merge", "split", "person")
+        }
+
+    def camera(self, name: str, clutter: np.ndarray | None, size: tuple[int, int]) -> CameraMasks:
+        """The errors of one camera; ``clutter`` (H, W) bool: a thing of the room that looks like
+        the object, or None; ``size`` width and height of its images."""
+        return CameraMasks(self, name, clutter, size)
+
+
+class CameraMasks:
+    """Candidates of one camera, frame by frame in any order."""
+
+    def __init__(self, network: Segmenter, name: str, clutter: np.ndarray | None,
+                 size: tuple[int, int]) -> None:  # fmt: skip
+        noise, frames = network.noise, network.frames
+        self.network, self.noise, self.size = network, noise, size
+        self._rng = rng = noise.rng("masks", name)
+        one = np.ones((frames, 1))
+
+        def episodes(kind: str, probability: float) -> np.ndarray:
+            seconds = rng.uniform(*EPISODE_S)
+            return noise.episodes(
+                rng, frames, one * probability, network._shared[kind], seconds, AGREEMENT
+            )[:, 0]
+
+        self._wrong_label = episodes("label", WRONG_LABEL)
+        self._merged, self._split = episodes("merge", MERGED), episodes("split", SPLIT)
+        self._person_missed = episodes("person", PERSON_MISSED)
+        miss = noise.process(rng, frames, 1, rng.uniform(*EPISODE_S))[:, 0]
+        self._miss = np.sqrt(AGREEMENT) * network._shared["miss"] + np.sqrt(1 - AGREEMENT) * miss
+        self._wrong = rng.integers(0, 1000, frames // 8 + 2)
+        # slow waves that move the borders in and out, one set for the object, one for the person
+        self._waves = noise.process(rng, frames, 24, rng.uniform(*EPISODE_S)).reshape(-1, 2, 12)
+        self._directions = rng.normal(size=(2, 12, 2))
+        self._phases = rng.uniform(0, 2 * np.pi, (2, 12))
+        self._clutter = self._things(clutter)
+        self._clutter_on = np.stack(
+            [noise.episodes(rng, frames, one * CLUTTER, miss, 0.7, 0.0)[:, 0]
+             for _ in self._clutter], 1
+        ) if self._clutter else np.zeros((frames, 0), bool)  # fmt: skip
+        self._score = noise.process(rng, frames, 4 + len(self._clutter), 0.3)
+
+    def _things(self, like_object: np.ndarray | None) -> list[tuple[str, dict[str, Any]]]:
+        """False instances of this view that stand still: label and RLE."""
+        width, height = self.size
+        things = []
+        if like_object is not None and like_object.sum() > MIN_PIXELS:
+            things.append((self.network.label, _encode(like_object, 0, 0, self.size)))
+        for _ in range(3):
+            label = OTHER_THINGS[self._rng.integers(len(OTHER_THINGS))]
+            blob = np.zeros((height, width), np.uint8)
+            centre = (int(self._rng.uniform(0, width)), int(self._rng.uniform(0, height)))
+            axes = self._rng.uniform(15, 90, 2) * width / 1920
+            angle = self._rng.uniform(0, 180)
+            cv2.ellipse(blob, centre, (int(axes[0]), int(axes[1])), angle, 0, 360, 1, -1)
+            things.append((label, _encode(blob, 0, 0, self.size)))
+        return things
+
+    def candidates(self, t: int, truth: Labels) -> list[dict[str, Any]]:
+        """COCO results of set ``t`` without image_id, in random order."""
+        found: list[tuple[str, dict[str, Any], float]] = []
+        person = self._bordered(truth, BODY, t)
+        thing = self._bordered(truth, OBJECT, t)
+        score = 0.72 + 0.12 * self._score[t]
+        if self._merged[t] and thing is not None and person is not None:
+            person = person | thing
+            if self._score[t, 3] > 0:
+                thing = None
+        if person is not None and not self._person_missed[t]:
+            found.append(("person", self._rle(person, truth), score[0] + 0.15))
+        missed = MISS_FREE + (MISS_HIDDEN - MISS_FREE) * (1 - truth.visible) ** 2
+        threshold = np.clip(missed * self.noise.scale, 0, 0.97)
+        rank = 0.5 * (1 + np.tanh(0.8 * self._miss[t]))
+        if thing is not None and rank > threshold:
+            if self._split[t]:
+                thing = self._half(thing, t)
+            found.append((self._object_label(t), self._rle(thing, truth), score[1]))
+        for k, (label, rle) in enumerate(self._clutter):
+            if self._clutter_on[t, k]:
+                found.append((label, rle, score[4 + k] - 0.08))
+        order = self.noise.rng("mask order", t, truth.x0, truth.y0).permutation(len(found))
+        return [self._result(*found[i]) for i in order]
+
+    def _object_label(self, t: int) -> str:
+        label = self.network.label
+        if not self._wrong_label[t]:
+            return label
+        others = CONFUSED.get(label, OTHER_THINGS)
+        return others[self._wrong[t // 8] % len(others)]
+
+    def _result(self, label: str, rle: dict[str, Any], score: float) -> dict[str, Any]:
+        box = [round(float(v), 2) for v in coco.toBbox(rle)]
+        counts = rle["counts"].decode() if isinstance(rle["counts"], bytes) else rle["counts"]
+        return {
+            "category": label,
+            "category_id": CATEGORY_IDS.get(label, 0),
+            "segmentation": {"size": [int(n) for n in rle["size"]], "counts": counts},
+            "score": round(float(np.clip(score, 0.06, 0.99)), 4),
+            "bbox": box,
+        }
+
+    def _bordered(self, truth: Labels, kind: int, t: int) -> np.ndarray | None:
+        """A mask (h + 2m, w + 2m) with its border moved, or None where too little is seen."""
+        mask = truth.identity == kind
+        if mask.sum() < MIN_PIXELS:
+            return None
+        margin = int(MAX_BORDER_PX) + 2
+        padded = np.pad(mask, margin).astype(np.uint8)
+        inside = cv2.distanceTransform(padded, cv2.DIST_L2, 3)
+        outside = cv2.distanceTransform(1 - padded, cv2.DIST_L2, 3)
+        y, x = np.mgrid[: padded.shape[0], : padded.shape[1]].astype(np.float32)
+        rows, columns = np.nonzero(padded)
+        size = max(np.sqrt(len(rows)), 12.0)
+        x, y = (x - columns.mean()) / size, (y - rows.mean()) / size
+        which = kind - 1
+        offset = np.zeros(padded.shape, np.float32)
+        for k in range(12):
+            direction = self._directions[which, k] * (2.0 + 0.5 * k)
+            wave = np.cos(direction[0] * x + direction[1] * y + self._phases[which, k])
+            offset += np.float32(self._waves[t, which, k] * np.sqrt(2 / 12)) * wave
+        scale = self.size[0] / 1920 * self.noise.scale
+        offset = np.clip(offset * BORDER_PX * scale, -MAX_BORDER_PX * scale, MAX_BORDER_PX * scale)
+        # a thin part is not eaten away altogether
+        moved = (inside - outside + offset) > 0
+        return moved if moved.sum() >= MIN_PIXELS else None
+
+    def _half(self, mask: np.ndarray, t: int) -> np.ndarray:
+        """Part of a mask, as when a network takes one object for two."""
+        rows, columns = np.nonzero(mask)
+        angle = self._phases[0, t % 12]
+        along = np.cos(angle) * columns + np.sin(angle) * rows
+        keep = along > np.quantile(along, 0.35)
+        part = np.zeros_like(mask)
+        part[rows[keep], columns[keep]] = True
+        return part
+
+    def _rle(self, mask: np.ndarray, truth: Labels) -> dict[str, Any]:
+        margin = int(MAX_BORDER_PX) + 2
+        return _encode(mask, truth.x0 - margin, truth.y0 - margin, truth.size)
+
+
+def _encode(mask: np.ndarray, x0: int, y0: int, size: tuple[int, int]) -> dict[str, Any]:
+    """COCO RLE of a window at (x0, y0), which may reach over the image's edge."""
+    width, height = size
+    image = np.zeros((height, width), np.uint8, order="F")
+    left, top = max(x0, 0), max(y0, 0)
+    right, bottom = min(x0 + mask.shape[1], width), min(y0 + mask.shape[0], height)
+    if right > left and bottom > top:
+        image[top:bottom, left:right] = mask[top - y0 : bottom - y0, left - x0 : right - x0]
+    return coco.encode(image)

@@ -1,0 +1,186 @@
+"""What one Kinect records of the stage, and what detectors make of its images."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from intercap_core.camera.rig import Camera
+from intercap_core.camera.transforms import invert
+from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH, write_calibration
+from intercap_core.studio.keypoints import Detector, to_json
+from intercap_core.studio.looks import body_colours
+from intercap_core.studio.masks import Labels, Segmenter
+from intercap_core.studio.mkv import MkvWriter
+from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View, scene_of
+from intercap_core.studio.rig import DEPTH_MODE, STAGGER_S
+from intercap_core.studio.sensor import DepthSensor
+from intercap_core.studio.stage import Moment, Stage
+
+START_US = 1_000_000  # device time of the first set
+GRAVITY = 9.81
+IMU_PER_FRAME = 8
+ACCELEROMETER_NOISE, GYROSCOPE_NOISE = 0.03, 0.004  # m/s^2, rad/s
+# A joint lies inside the body: it is hidden only by what is nearer by more than this (metres)
+COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """``object_pixels`` (T,) seen and ``object_whole`` (T,) unhidden, of the object in this view."""
+
+    object_pixels: np.ndarray
+    object_whole: np.ndarray
+
+
+class Kinect:
+    """One device of the rig over one capture."""
+
+    def __init__(self, stage: Stage, index: int, colour_mode: str) -> None:
+        self.stage, self.index, self.colour_mode = stage, index, colour_mode
+        self.true: Camera = stage.rig.true[index]
+        self.claimed: Camera = stage.rig.claimed[index]
+        self.serial = f"{100_000 + stage.noise.seed % 100_000:06d}{index + 1:06d}"
+        self.sets = [t for t in range(stage.frames) if t not in stage.rig.missing[index]]
+
+    @property
+    def exposures(self) -> np.ndarray:
+        """True times (T,) of the images of all sets, seconds since the first set."""
+        late = self.stage.rig.slip[:, self.index] / self.stage.fps
+        offset = self.stage.rig.offset_s[self.index] + STAGGER_S * self.index
+        return self.stage.set_times + offset - late
+
+    def device_time_us(self, t: int) -> int:
+        """What the device says about the image of set ``t``."""
+        stagger = round(STAGGER_S * 1e6) * self.index
+        return START_US + round(t * 1e6 / self.stage.fps) + stagger
+
+    def record(self, folder: Path, detector: Detector, segmenter: Segmenter) -> Recorded:
+        """Write <camera>.mkv, keypoints/<camera>/ and candidates/<camera>.json."""
+        stage, name = self.stage, self.true.name
+        moment = stage.at(self.exposures)
+        stage_from_master = invert(stage.rig.master_from_stage)
+        colour_pose = stage_from_master @ self.true.master_from_colour
+        depth_pose = stage_from_master @ self.true.master_from_depth
+        assert self.true.depth is not None
+        colour_view = View(self.true.colour, colour_pose, stage.room, coloured=True)
+        depth_view = View(self.true.depth, depth_pose, stage.room, coloured=False)
+        sensor = DepthSensor(depth_view, stage.noise, name)
+        rng = stage.noise.rng("photo", name)
+        gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
+        photographer = Photographer(colour_view, gain, rng)
+        clutter = colour_view.material == stage.room.distractor
+        if stage.room.distractor < 0:
+            clutter = None
+        size = (self.true.colour.width, self.true.colour.height)
+        masks = segmenter.camera(name, clutter, size)
+        colours = body_colours(stage.subject, stage.noise.rng("looks"))
+
+        points = stage.keypoints(moment)
+        hidden = np.zeros(points.shape[:2], bool)
+        seen, whole = np.zeros(stage.frames, int), np.zeros(stage.frames, int)
+        candidates = []
+        with self._writer(folder / f"{name}.mkv") as writer:
+            for number, t in enumerate(self.sets):
+                surfaces, normals = _surfaces(stage, moment, t, colours)
+                scene = scene_of(*((s.vertices, s.faces) for s in surfaces))
+                cast = colour_view.cast(scene, surfaces, normals)
+                self._inertial(writer, t, rng, depth_pose)
+                jpeg = photographer.jpeg(photographer.photograph(cast))
+                writer.write_colour(jpeg, self.device_time_us(t))
+                depth = sensor.image(depth_view.cast(scene, surfaces, normals))
+                writer.write_depth(depth, self.device_time_us(t))
+                hidden[t] = _hidden(scene, colour_view, points[t])
+                seen[t], whole[t] = self._object_pixels(cast, colour_view, surfaces[1])
+                truth = Labels(
+                    cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1)
+                )
+                for result in masks.candidates(t, truth):
+                    candidates.append({"image_id": number, **result})
+        self._write_candidates(folder, candidates)
+        self._write_keypoints(folder, detector, moment, points, hidden)
+        return Recorded(seen, whole)
+
+    def _writer(self, path: Path) -> MkvWriter:
+        calibration = write_calibration(
+            self.claimed, colour_mode=self.colour_mode, depth_mode=DEPTH_MODE, serial=self.serial
+        )
+        return MkvWriter(
+            path,
+            calibration_json=calibration,
+            colour_mode=self.colour_mode,
+            depth_mode=DEPTH_MODE,
+            fps=self.stage.fps,
+            serial=self.serial,
+            start_offset_ns=self.device_time_us(self.sets[0]) * 1000,
+            wired_sync_mode="SUBORDINATE" if self.index else "MASTER",
+            subordinate_delay_ns=round(STAGGER_S * 1e9) * self.index,
+            with_imu=True,
+        )
+
+    def _inertial(self, writer: MkvWriter, t: int, rng: np.random.Generator,
+                  stage_from_depth: np.ndarray) -> None:  # fmt: skip
+        """The device stands still: its accelerometer feels the ground push up."""
+        up = ACCELEROMETER_FROM_DEPTH @ stage_from_depth[:3, :3].T @ (0, 0, GRAVITY)
+        period = 1_000_000 // self.stage.fps
+        for k in range(IMU_PER_FRAME):
+            time = self.device_time_us(t) + (k * period // IMU_PER_FRAME) // 3
+            writer.write_imu(
+                up + rng.normal(0, ACCELEROMETER_NOISE, 3), rng.normal(0, GYROSCOPE_NOISE, 3), time
+            )
+
+    def _object_pixels(self, cast: Cast, view: View, thing: Surface) -> tuple[int, int]:
+        seen = int((cast.identity == OBJECT).sum())
+        return seen, view.count(scene_of((thing.vertices, thing.faces)), thing.vertices)
+
+    def _write_candidates(self, folder: Path, candidates: list[dict[str, object]]) -> None:
+        path = folder / "candidates" / f"{self.true.name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
+
+    def _write_keypoints(self, folder: Path, detector: Detector, moment: Moment,
+                         points: np.ndarray, hidden: np.ndarray) -> None:  # fmt: skip
+        master = self.stage.rig.master_from_stage[:3, :3]
+        subject = detector.detect(
+            self.true, self.stage.to_master(points), master @ moment.pelvis, hidden
+        )
+        people = detector.people(self.true, subject)
+        target = folder / "keypoints" / self.true.name
+        target.mkdir(parents=True)
+        for number, t in enumerate(self.sets):
+            (target / f"{number:012d}_keypoints.json").write_text(to_json(people[t]))
+
+
+def _surfaces(stage: Stage, moment: Moment, t: int, colours: np.ndarray
+              ) -> tuple[tuple[Surface, Surface], tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+    """The clothed body and the object at one moment, and their smooth normals."""
+    pose, thing = moment.stage_from_object[t], stage.thing
+    body = Surface(moment.clothed[t], stage.subject.faces, colours)
+    moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
+    body_normals = stage.subject.normals(moment.clothed[t][None])[0]
+    return (
+        (body, Surface(moved, thing.faces, thing.colours)),
+        (body_normals, stage.thing_normals @ pose[:3, :3].T),
+    )
+
+
+def _hidden(scene: o3d.t.geometry.RaycastingScene, view: View, points: np.ndarray) -> np.ndarray:
+    """Which keypoints (135,) something stands before."""
+    cover = np.full(135, COVER_M["body"])
+    cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]
+    cover[[0, 15, 16, 17, 18]] = COVER_M["face"] * 2
+    way = points - view.eye
+    rays = np.concatenate([np.broadcast_to(view.eye, way.shape), way], 1).astype(np.float32)
+    hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
+    distance = np.linalg.norm(way, axis=1)
+    hidden = hit * distance < distance - cover
+    at = points @ view.camera_from_stage[:3, :3].T + view.camera_from_stage[:3, 3]
+    u, v = np.round(view.lens.project(at)).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height) & (at[:, 2] > 0)
+    room = np.full(135, np.inf)
+    room[inside] = view.depth[v[inside], u[inside]]
+    return hidden | (room < at[:, 2] - 0.03)

@@ -1,0 +1,132 @@
+"""The stage of one capture: who, what and where, and how it all is at any moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel
+from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.errors import UserError
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.render import vertex_normals
+from intercap_core.studio.interactions import interaction_named
+from intercap_core.studio.interactions.base import TrueObject
+from intercap_core.studio.motion import Puppet
+from intercap_core.studio.noise import NoiseSource
+from intercap_core.studio.objects import true_mesh
+from intercap_core.studio.rig import StudioRig, build_rig
+from intercap_core.studio.room import build_room
+from intercap_core.studio.subjects import Subject, subject_names
+from intercap_core.studio.tissue import press_out
+
+BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
+
+
+@dataclass(frozen=True)
+class Moment:
+    """N moments in the stage frame, metres: ``body`` and ``clothed`` (N, V, 3), ``joints``
+    (N, 55, 3), ``tips`` (N, 10, 3) thumb to little finger, left then right, ``pelvis`` (N, 3, 3)
+    stage_from_rest rotations, ``stage_from_object`` (N, 4, 4)."""
+
+    body: np.ndarray
+    clothed: np.ndarray
+    joints: np.ndarray
+    tips: np.ndarray
+    pelvis: np.ndarray
+    stage_from_object: np.ndarray
+
+
+class Stage:
+    """Everything that is true about one capture.
+
+    Raises UserError for a subject, interaction or object that does not fit.
+    """
+
+    def __init__(self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry) -> None:
+        kind = interaction_named(capture.interaction)
+        if entry.name != kind.object_class:
+            raise UserError(
+                f"studio: interaction {capture.interaction!r} needs object {kind.object_class!r}, "
+                f"the sequence has {entry.name!r}; correct the sequence's object"
+            )
+        if capture.subject not in subject_names():
+            raise UserError(
+                f"studio: no subject {capture.subject!r}, there are {', '.join(subject_names())}; "
+                "correct 'subject' of the capture"
+            )
+        self.frames, self.fps = capture.frames, settings.fps
+        self.duration = capture.frames / settings.fps
+        self.noise = NoiseSource(capture.seed, settings.noise, settings.noise_family, settings.fps)
+        self.subject = Subject.load(capture.subject)
+        self.puppet = Puppet(self.subject)
+        vertices, faces, colours = true_mesh(entry, capture.seed)
+        self.thing = TrueObject(
+            entry.name, vertices, faces, colours / 255.0, DistanceField(vertices, faces, threads=1)
+        )
+        self.bounds = np.stack([vertices.min(0), vertices.max(0)])
+        self.interaction = kind(self.puppet, self.thing, self.noise.rng("script"))
+        rng = self.noise.rng("room")
+        bare = bool(rng.random() < BARE_ROOM_SHARE)
+        self.room = build_room(rng, self.interaction.furniture, bare=bare)
+        self.rig: StudioRig = build_rig(
+            self.noise.rng("rig"),
+            cameras=settings.cameras,
+            frames=capture.frames,
+            colour_mode=settings.colour_mode,
+            noise=settings.noise,
+            slips=settings.slips,
+        )
+
+    @cached_property
+    def set_times(self) -> np.ndarray:
+        """Times (T,) of the sets, seconds since the first."""
+        return np.arange(self.frames) / self.fps
+
+    @cached_property
+    def thing_normals(self) -> np.ndarray:
+        """Smooth outward normals (Vo, 3) of the object, its frame."""
+        return vertex_normals(self.thing.vertices, self.thing.faces)
+
+    @cached_property
+    def fitted(self) -> BodyModel:
+        """The open body, for the names of its points."""
+        return BodyModel.load()
+
+    def at(self, times: np.ndarray) -> Moment:
+        """Everything at recording times (N,), seconds since the first set."""
+        script = self.interaction.script_times(times, self.duration)
+        played = self.interaction.perform(script)
+        posed = self.puppet.skin(played.world, played.pelvis)
+        body, clothed = posed.vertices.copy(), posed.clothed.copy()
+        for n in range(len(times)):
+            for points in (body, clothed):
+                points[n] = press_out(
+                    points[n], self.thing.surface, played.stage_from_object[n], self.bounds
+                )
+        order = [4, 0, 1, 3, 2]  # thumb, index, middle, ring, little finger
+        tips = posed.tips[:, [*order, *(5 + i for i in order)]]
+        return Moment(
+            body,
+            clothed,
+            posed.joints,
+            tips,
+            played.world[:, JOINT_INDEX["pelvis"]],
+            played.stage_from_object,
+        )
+
+    def keypoints(self, moment: Moment) -> np.ndarray:
+        """The 135 true keypoints (N, 135, 3) in the stage."""
+        chart = self.fitted.keypoint_map
+        corners = self.subject.faces[self.subject.fitted_face[chart.vertex_ids]]
+        weights = self.subject.fitted_bary[chart.vertex_ids]
+        seen = np.einsum("nvkc,vk->nvc", moment.body[:, corners], weights)
+        return chart.matrix @ np.concatenate([seen, moment.joints], 1)
+
+    def to_master(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) of the stage in the master's colour frame."""
+        pose = self.rig.master_from_stage
+        return points @ pose[:3, :3].T + pose[:3, 3]

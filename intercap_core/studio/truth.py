@@ -1,0 +1,148 @@
+"""What is true of a capture, for the metrics alone, and an annotation that errs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.config import StudioCapture
+from intercap_core.schemas import CONTACT_REGIONS, TRUTH
+from intercap_core.studio.render import scene_of
+from intercap_core.studio.rig import STAGGER_S
+from intercap_core.studio.skeleton import turn, unit
+from intercap_core.studio.stage import Moment, Stage
+
+CONTACT_M = 0.0045
+SEEN_PIXELS, SEEN_SHARE = 40, 0.05  # of the object, for a view to count as seeing it
+OFF_SURFACE_M = 0.001
+ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 5
+
+
+def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture: StudioCapture,
+                seen: np.ndarray, whole: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Write the truth artefact of the set times' ``moment``.
+
+    ``seen`` and ``whole`` (T, C): pixels of the object, hidden and not. Returns the true region
+    contact (T, R).
+    """
+    rig = stage.rig
+    master = rig.master_from_stage
+    pose = master @ moment.stage_from_object
+    contact = region_contact(stage, moment)
+    body_visible, object_visible = visible(stage, moment)
+    views = (seen >= SEEN_PIXELS) & (seen >= SEEN_SHARE * np.maximum(whole, 1))
+    normal = master[:3, 2]
+    with artefacts.write(
+        path,
+        TRUTH,
+        sequence=sequence,
+        interaction=capture.interaction,
+        subject=capture.subject,
+        object=stage.thing.name,
+        ground_offset=float(-normal @ master[:3, 3]),
+        fps=float(stage.fps),
+    ) as file:
+        file.put("times", stage.set_times)
+        file.put("body_vertices", stage.to_master(moment.body))
+        file.put("body_faces", stage.subject.faces)
+        file.put("correspondence_face", stage.subject.fitted_face)
+        file.put("correspondence_weights", stage.subject.fitted_bary)
+        file.put("joints", stage.to_master(moment.joints))
+        file.put("fingertips", stage.to_master(moment.tips))
+        file.put("object_vertices", stage.thing.vertices)
+        file.put("object_faces", stage.thing.faces)
+        file.put("rotation", pose[:, :3, :3])
+        file.put("translation", pose[:, :3, 3])
+        file.put("object_views", views.sum(1))
+        file.put("region_names", CONTACT_REGIONS)
+        file.put("region_contact", contact)
+        file.put("camera_names", rig.true.names)
+        file.put("master_from_colour", rig.true.master_from_colour)
+        file.put("time_offset", rig.offset_s + STAGGER_S * np.arange(len(rig.offset_s)))
+        file.put("slip", rig.slip)
+        file.put("ground_normal", normal)
+        file.put("body_visible", body_visible)
+        file.put("object_visible", object_visible)
+    return contact
+
+
+def region_contact(stage: Stage, moment: Moment) -> np.ndarray:
+    """(T, R): some point of the region is within ``CONTACT_M`` of the object."""
+    regions = stage.fitted.regions
+    result = np.zeros((len(moment.body), len(CONTACT_REGIONS)), bool)
+    for t, pose in enumerate(moment.stage_from_object):
+        points = stage.subject.on_fitted_topology(moment.body[t : t + 1])[0]
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        near = ((local > stage.bounds[0] - 0.01) & (local < stage.bounds[1] + 0.01)).all(1)
+        touching = np.zeros(len(points), bool)
+        touching[near] = stage.thing.surface.signed_distance(local[near]) <= CONTACT_M
+        result[t] = [touching[regions[name]].any() for name in CONTACT_REGIONS]
+    return result
+
+
+def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+    """Which body vertices (T, V), clothed, and object vertices (T, Vo) some camera truly sees."""
+    thing, faces = stage.thing, stage.subject.faces
+    count = moment.clothed.shape[1]
+    result = np.zeros((len(moment.clothed), count + len(thing.vertices)), bool)
+    stage_from_master = np.linalg.inv(stage.rig.master_from_stage)
+    for t, pose in enumerate(moment.stage_from_object):
+        moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
+        points = np.concatenate([moment.clothed[t], moved])
+        normals = np.concatenate(
+            [stage.subject.normals(moment.clothed[t][None])[0],
+             stage.thing_normals @ pose[:3, :3].T]
+        )  # fmt: skip
+        room = stage.room
+        scene = scene_of((moment.clothed[t], faces), (moved, thing.faces),
+                         (room.vertices, room.faces))  # fmt: skip
+        for camera in stage.rig.true:
+            place = stage_from_master @ camera.master_from_colour
+            to_eye = place[:3, 3] - points
+            ids = np.flatnonzero(~result[t] & ((to_eye * normals).sum(1) > 0))
+            local = (points[ids] - place[:3, 3]) @ place[:3, :3]
+            ids = ids[np.asarray(camera.colour.sees(local))]
+            start = points[ids] + OFF_SURFACE_M * normals[ids]
+            rays = np.concatenate([start, place[:3, 3] - start], 1).astype(np.float32)
+            hidden = scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0)
+            result[t, ids] = ~hidden.numpy()
+    return result[:, :count], result[:, count:]
+
+
+def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict[str, Any]:
+    """An annotation as a person makes it: off by up to 10 mm, 5 degrees, 5 frames."""
+    rng, scale = stage.noise.rng("annotation"), min(stage.noise.scale, 1.0)
+
+    def off(size: float) -> np.ndarray:
+        return unit(rng.normal(size=3)) * rng.uniform(0, size) * scale
+
+    intervals = []
+    for region, name in enumerate(CONTACT_REGIONS):
+        padded = np.concatenate([[False], contact[:, region], [False]]).astype(int)
+        starts, ends = np.flatnonzero(np.diff(padded) > 0), np.flatnonzero(np.diff(padded) < 0)
+        for start, end in zip(starts, ends, strict=True):
+            reach = round(ANNOTATION_ERROR_FRAMES * scale)
+            first = int(np.clip(start + rng.integers(-reach, reach + 1), 0, stage.frames - 1))
+            last = int(np.clip(end + rng.integers(-reach, reach + 1), first + 1, stage.frames))
+            intervals.append({"part": name, "start": first, "end": last})
+    frame = int(rng.integers(0, max(1, stage.frames // 5)))
+    pose = stage.rig.master_from_stage @ moment.stage_from_object[frame]
+    rotation = turn(np.radians(off(ANNOTATION_ERROR_DEG))) @ pose[:3, :3]
+    floor = []
+    for angle in np.arange(4) * np.pi / 2 + rng.uniform(0, 1):
+        point = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0])
+        floor.append((stage.to_master(point) + off(ANNOTATION_ERROR_M)).round(5).tolist())
+    return {
+        "contact": intervals,
+        "object_pose": {
+            "frame": frame,
+            "rotation_vector": Rotation.from_matrix(rotation).as_rotvec().round(6).tolist(),
+            "translation": (pose[:3, 3] + off(ANNOTATION_ERROR_M)).round(6).tolist(),
+        },
+        "floor": floor,
+    }
