@@ -14,9 +14,11 @@ Everything a view says about a keypoint acts through the 3D point, so the views 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,56 +50,77 @@ class PointTerm(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Carriers:
-    """Which bone carries each keypoint: joint (K,) ids, and (K,55) the joints that turn it."""
+class KeypointSet:
+    """Some of the 135 keypoints, by ``index`` (K,), and what they are made of.
 
-    joint: Tensor
+    vertices (N,) ids; matrix (K,N+55) over those vertices and the joints; carrier (K,): joint whose
+    bone carries the keypoint's offset, and turned_by (K,55): 1 for the joints that turn that bone.
+    """
+
+    index: Tensor
+    vertices: Tensor
+    matrix: Tensor
+    carrier: Tensor
     turned_by: Tensor
 
 
-def carriers(model: BodyModel) -> Carriers:
+def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
     """A joint is carried by its parent's bone, a vertex by the bone with the largest weight."""
-    keypoints = model.keypoint_map
+    keypoints, rows = model.keypoint_map, np.asarray(index)
     heaviest = model.skinning_weights.argmax(1).cpu().numpy()
-    joint = [
-        max(PARENTS[j], 0) if j >= 0 else int(heaviest[ids[weights.argmax()]])
-        for j, ids, weights in zip(keypoints.joint, keypoints.ids, keypoints.weights, strict=True)
+    carrier = [
+        max(PARENTS[joint], 0) if joint >= 0 else int(heaviest[ids[weights.argmax()]])
+        for joint, ids, weights in zip(
+            keypoints.joint[rows], keypoints.ids[rows], keypoints.weights[rows], strict=True
+        )
     ]
-    turned = torch.zeros(len(joint), NUM_JOINTS, dtype=model.dtype, device=model.device)
-    for row, carrier in enumerate(joint):
-        turned[row, list(ancestors(carrier))] = 1
-    return Carriers(torch.tensor(joint, device=model.device), turned)
+    turned = np.zeros((len(rows), NUM_JOINTS))
+    for row, joint in enumerate(carrier):
+        turned[row, list(ancestors(joint))] = 1
+    matrix = keypoints.matrix[rows]
+    count = len(keypoints.vertex_ids)
+    used = np.flatnonzero(matrix[:, :count].any(0))
+    matrix = np.concatenate([matrix[:, used], matrix[:, count:]], 1)
+    device = model.device
+    return KeypointSet(
+        torch.as_tensor(rows, device=device),
+        torch.as_tensor(keypoints.vertex_ids[used], device=device),
+        torch.as_tensor(matrix, dtype=model.dtype, device=device),
+        torch.as_tensor(carrier, device=device),
+        torch.as_tensor(turned, dtype=model.dtype, device=device),
+    )
 
 
 def evaluate(
     model: BodyModel,
     params: BodyParameters,
-    carried: Carriers,
+    chosen: KeypointSet,
     offsets: Tensor,
     *,
     derivatives: bool,
 ) -> Keypoints:
-    """Keypoints of B bodies, displaced by offsets (K,3), metres, in the frames of their bones."""
+    """Keypoints (B,K,3) of B bodies; offsets (K,3), metres, in the frames of their bones."""
     local = rotation_from_axis_angle(params.full_pose())
     still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
     world = pose_joints(still, local, still[:, 0]).rotations
-    rotations = world[:, carried.joint]
+    rotations = world[:, chosen.carrier]
     arms = (rotations @ offsets[..., None])[..., 0]
-    matrix = torch.as_tensor(model.keypoint_map.matrix, dtype=local.dtype, device=local.device)
-    ids = model.keypoint_map.vertex_ids
     if not derivatives:
-        output = model.forward(params, vertex_ids=ids)
-        points = matrix @ torch.cat([output.vertices, output.joints], 1)
+        output = model.forward(params, vertex_ids=chosen.vertices)
+        points = chosen.matrix @ torch.cat([output.vertices, output.joints], 1)
         return Keypoints(points + arms, None, rotations)
-    linear = model.linearise(params, vertex_ids=ids, joints=True)
+    linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
     full = linear.full()
     batch, _, _, size = full.shape
-    by = (matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
+    by = (chosen.matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
     # a turn w of joint l moves the arm R o by w x R o, for every l the carrier hangs on
-    turned = -skew(arms)[:, :, None] @ linear.frames[:, None]
-    turned = turned * carried.turned_by[None, :, :, None, None]
-    by[..., : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(batch, -1, 3, 3 * NUM_JOINTS)
-    return Keypoints(matrix @ linear.points + arms, by, rotations)
+    moved = (offsets != 0).any(1).nonzero()[:, 0]
+    turned = -skew(arms[:, moved])[:, :, None] @ linear.frames[:, None]
+    turned = turned * chosen.turned_by[moved][None, :, :, None, None]
+    by[:, moved, :, : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(
+        batch, len(moved), 3, 3 * NUM_JOINTS
+    )
+    return Keypoints(chosen.matrix @ linear.points + arms, by, rotations)
 
 
 def reprojection(

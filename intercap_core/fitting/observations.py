@@ -176,14 +176,16 @@ def view_points(
     if background is not None:
         behind = background[rows, columns].astype(np.int32)
         counts &= (behind == 0) | (near < behind - int(1000 * _BEFORE_BACKGROUND_M))
+    # what stands before the background is all that can cover the person
+    before = np.zeros_like(depth)
+    before[rows, columns] = np.where(counts, near, 0)
     counts[1::2] = False
     counts[:, 1::2] = False
     row, column = np.nonzero(counts)
-    width = depth.shape[1]
-    index = (row + rows.start) * width + column + columns.start
+    index = (row + rows.start) * depth.shape[1] + column + columns.start
     if not len(index):
         return None
-    lookup = colour_lookup(depth, camera, index)
+    lookup = colour_lookup(before, camera, index)
     inside = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
     index = lookup.depth_index[inside]
     if not len(index):

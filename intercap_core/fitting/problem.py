@@ -16,7 +16,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.energy import body_cloud, body_keypoints, body_priors
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows, Samples
-from intercap_core.energy.body_keypoints import Carriers, Keypoints, PointTerm
+from intercap_core.energy.body_keypoints import Keypoints, KeypointSet, PointTerm
 from intercap_core.solve.levenberg_marquardt import NormalEquations
 
 NUM_OFFSETS = 25  # OpenPose's body keypoints
@@ -34,8 +34,9 @@ _COVERING_PRIOR_PER_FRAME = 2.0
 
 @dataclass
 class Views:
-    """What E_J compares with: observed (T,C,K,2) px, confidence (T,C,K), sigma (T,C,K) px, lenses
-    (C,13), colour_from_master (C,4,4), shift (T,C,K,3) m or None.
+    """What E_J compares with, for the problem's K keypoints.
+
+    observed (T,C,K,2) px, confidence (T,C,K), sigma (T,C,K) px, lenses (C,13), colour_from_master (C,4,4), shift (T,C,K,3) m or None.
     """
 
     observed: Tensor
@@ -48,7 +49,7 @@ class Views:
 
 @dataclass
 class Targets:
-    """Triangulated keypoints (T,K,3) with confidence (T,K) and one sigma in metres."""
+    """Triangulated chosen keypoints (T,K,3) with confidence (T,K) and one sigma in metres."""
 
     points: Tensor
     confidence: Tensor
@@ -59,13 +60,14 @@ class Targets:
 class BodyProblem:
     """E_B of T frames; see :class:`intercap_core.solve.levenberg_marquardt.Problem`.
 
-    base (T,P): parameters that are not fitted keep these values. columns (n,): own parameters.
-    one_shape: betas are shared; else they belong in ``columns`` (or stay). offsets (25,3) and
-    thickness logarithms u (G,) are fitted where ``fit_shared`` says so, else fixed.
+    keypoints: those that take part, the 25 of the body first. base (T,P): parameters that are not
+    fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they
+    belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
+    where ``fit_shared`` says so, else fixed.
     """
 
     model: BodyModel
-    carried: Carriers
+    keypoints: KeypointSet
     samples: Samples
     base: Tensor
     columns: Tensor
@@ -102,14 +104,14 @@ class BodyProblem:
         return torch.cat(parts) if parts else self.base.new_zeros(0)
 
     def _split(self, shared: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        """betas or None, offsets (K,3) of all keypoints, u (G,)."""
+        """betas or None, offsets (K,3) of the chosen keypoints, u (G,)."""
         betas, offsets, u = None, self.offsets, self.u
         if self.one_shape:
             betas, shared = shared[: self.model.num_betas], shared[self.model.num_betas :]
         if self.fit_shared:
             offsets = shared[: 3 * NUM_OFFSETS].reshape(NUM_OFFSETS, 3)
             u = shared[3 * NUM_OFFSETS :]
-        rest = offsets.new_zeros(len(self.carried.joint) - NUM_OFFSETS, 3)
+        rest = offsets.new_zeros(len(self.keypoints.index) - NUM_OFFSETS, 3)
         return betas, torch.cat([offsets, rest]), u
 
     def accept(self, own: Tensor, shared: Tensor) -> None:
@@ -149,7 +151,7 @@ class BodyProblem:
         x = self._vector(own, betas, index)
         params = self.model.parameters(x)
         keypoints = body_keypoints.evaluate(
-            self.model, params, self.carried, offsets, derivatives=False
+            self.model, params, self.keypoints, offsets, derivatives=False
         )
         total = self._points(keypoints, index).cost + self._prior_cost(x, shared)
         if self.rows is not None:
@@ -176,7 +178,7 @@ class BodyProblem:
         gradient = x.new_zeros(len(x), size)
         hessian = x.new_zeros(len(x), size, size)
         keypoints = body_keypoints.evaluate(
-            self.model, params, self.carried, offsets, derivatives=True
+            self.model, params, self.keypoints, offsets, derivatives=True
         )
         term = self._points(keypoints, index)
         gradient[:, :n], hessian[:, :n, :n] = body_keypoints.assemble(term, keypoints, columns)

@@ -15,6 +15,7 @@ from intercap_core.body.parameters import TRANSL
 from intercap_core.config import BodyFitSettings
 from intercap_core.energy import body_cloud, body_keypoints
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows
+from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import BodyProblem, Targets, Views
 from intercap_core.fitting.start import place_trunk, turned_around
@@ -107,7 +108,6 @@ class Fitter:
         self.model, self.seen, self.settings = model, seen, settings
         self.frames = np.flatnonzero(seen.usable)
         self.clouds = [clouds[t] for t in self.frames]
-        self.carried = body_keypoints.carriers(model)
         self.samples = body_cloud.choose_samples(model)
         self.patch = torch.as_tensor(self.samples.patch, device=model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
@@ -126,7 +126,7 @@ class Fitter:
         """All rounds; see the module's text."""
         base = self._start()
         problem = BodyProblem(
-            self.model, self.carried, self.samples, base,
+            self.model, self._keypoints(), self.samples, base,
             columns_of(self.model, hands=False, face=False, betas=not self.one_shape),
             self.one_shape,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
@@ -164,7 +164,7 @@ class Fitter:
         self.keypoint_sigma = settled.keypoint_sigma.to(base)
         self.cloud_noise = settled.cloud_noise.to(base)
         return BodyProblem(
-            self.model, self.carried, self.samples, base,
+            self.model, self._keypoints(), self.samples, base,
             columns_of(
                 self.model, hands=self.settings.hands, face=self.settings.face, betas=False
             ),
@@ -221,7 +221,7 @@ class Fitter:
             problem.own_start(),
             shared if len(shared) else None,
             max_trials=trials,
-            cost_tolerance=1e-4,
+            cost_tolerance=1e-3,
             keep_normal=keep_normal,
         )
         problem.accept(solution.own, solution.shared)
@@ -256,17 +256,17 @@ class Fitter:
         base[:, 0:3], base[:, TRANSL] = self._tensor(placed[:, :3]), self._tensor(placed[:, 3:])
         for name, sign in (("left_shoulder", -1.0), ("right_shoulder", 1.0)):
             base[:, 3 * JOINT_INDEX[name] + 2] = sign * 0.8  # arms hang rather than stretch
+        joints = joints[:, BODY]
         known = np.isfinite(joints).all(2)
-        known[:, BODY.stop :] = False
         problem = BodyProblem(
-            self.model, self.carried, self.samples, base,
+            self.model, self._keypoints(), self.samples, base,
             columns_of(self.model, hands=False, face=False, betas=True), False,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
             targets=Targets(
                 self._tensor(np.nan_to_num(joints)), self._tensor(known), _START_SIGMA
             ),
         )  # fmt: skip
-        solution = minimise(problem, problem.own_start(), max_trials=20, cost_tolerance=1e-3)
+        solution = minimise(problem, problem.own_start(), max_trials=15, cost_tolerance=1e-2)
         problem.accept(solution.own, solution.shared)
         solution.own = problem.base
         return solution
@@ -285,36 +285,47 @@ class Fitter:
     def _body_views(self, problem: BodyProblem, *, hands: bool, face: bool) -> None:
         """Set E_J up at the current solution: which keypoints, their sigma in pixels, shifts."""
         seen, frames = self.seen, self.frames
-        confidence = seen.confidence[frames].copy()
-        if not hands:
-            confidence[:, :, LEFT_HAND.start : RIGHT_HAND.stop] = 0
-        # The jaw line's landmarks slide over the cheek with the view: they have no fixed vertex.
-        confidence[:, :, FACE.stop :] = 0
-        if not face:
-            confidence[:, :, FACE] = 0
+        problem.keypoints = self._keypoints(hands=hands, face=face)
+        chosen = problem.keypoints.index
+        at = np.ix_(frames, np.arange(len(seen.rig)), chosen.cpu().numpy())
         points = self.points(problem)
         pose = self._tensor(seen.rig.colour_from_master)
         lenses = self._tensor(seen.rig.colour_parameters)
         z = points[:, None] @ pose[:, 2, :3, None]
         z = z[..., 0] + pose[:, 2, 3][:, None]
-        sigma = self.keypoint_sigma * lenses[:, None, 0] / z.clamp_min(0.3)
+        sigma = self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
         problem.views = Views(
-            self._tensor(seen.keypoints[frames]),
-            self._tensor(confidence),
+            self._tensor(seen.keypoints[at]),
+            self._tensor(seen.confidence[at]),
             sigma.clamp_min(_SMALLEST_SIGMA_PX),
             lenses,
             pose,
             self._shift(points),
         )
 
+    def _keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
+        """Those of the body, and of hands and face where asked for.
+
+        The jaw line is left out: its landmarks slide over the cheek with the view.
+        """
+        index = list(range(BODY.start, BODY.stop))
+        if hands:
+            index += range(LEFT_HAND.start, RIGHT_HAND.stop)
+        if face:
+            index += range(FACE.start, FACE.stop)
+        return body_keypoints.keypoint_set(self.model, index)
+
     def points(self, problem: BodyProblem) -> Tensor:
-        """Current keypoints (N,K,3) with offsets."""
-        offsets = torch.zeros(NUM_KEYPOINTS, 3).to(problem.base)
-        offsets[:25] = problem.offsets
+        """Current positions (N,K,3) of the problem's keypoints, with offsets."""
+        offsets = torch.zeros(len(problem.keypoints.index), 3).to(problem.base)
+        offsets[: BODY.stop] = problem.offsets
         return body_keypoints.evaluate(
-            self.model, self.model.parameters(problem.base), self.carried, offsets,
+            self.model,
+            self.model.parameters(problem.base),
+            problem.keypoints,
+            offsets,
             derivatives=False,
-        ).points  # fmt: skip
+        ).points
 
     def _shift(self, points: Tensor) -> Tensor | None:
         """How far points (N,...,3) move until each camera exposes: (N,C,...,3), or None."""
@@ -332,11 +343,14 @@ class Fitter:
             self.points(problem), views.observed, views.lenses, views.colour_from_master,
             shift=views.shift,
         )  # fmt: skip
-        scaled = residual.abs() / views.sigma[..., None] * self.keypoint_sigma[:, None]
+        scaled = residual.abs() / views.sigma[..., None]
+        scaled = scaled * self.keypoint_sigma[problem.keypoints.index, None]
         for part, start in _KEYPOINT_SIGMA:
-            known = views.confidence[:, :, part] > 0
+            index = problem.keypoints.index
+            here = (index >= part.start) & (index < part.stop)
+            known = views.confidence[:, :, here] > 0
             if bool(known.any()):
-                found = 1.4826 * _PERSISTENCE * float(scaled[:, :, part][known].median())
+                found = 1.4826 * _PERSISTENCE * float(scaled[:, :, here][known].median())
                 low, high = (start * factor for factor in _SIGMA_RANGE)
                 self.keypoint_sigma[part] = min(max(found, low), high)
 

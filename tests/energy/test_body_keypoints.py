@@ -29,7 +29,7 @@ def _vector(model: BodyModel, batch: int = 2) -> Tensor:
 
 def test_offset_keypoints_follow_their_bones(model: BodyModel) -> None:
     """Derivatives of displaced keypoints by every parameter match central differences."""
-    carried = term.carriers(model)
+    carried = term.keypoint_set(model, range(K))
     offsets = 0.02 * _random(K, 3, seed=1)
     x = _vector(model)
     found = term.evaluate(model, model.parameters(x), carried, offsets, derivatives=True)
@@ -49,7 +49,11 @@ def test_offset_keypoints_follow_their_bones(model: BodyModel) -> None:
 def test_no_offset_gives_the_model_s_keypoints(model: BodyModel) -> None:
     params = model.parameters(_vector(model))
     found = term.evaluate(
-        model, params, term.carriers(model), torch.zeros(K, 3).double(), derivatives=False
+        model,
+        params,
+        term.keypoint_set(model, range(K)),
+        torch.zeros(K, 3).double(),
+        derivatives=False,
     )
     torch.testing.assert_close(found.points, model.keypoints_of(params))
 
@@ -73,7 +77,7 @@ def _views(cameras: int = 3) -> tuple[Tensor, ...]:
 
 def test_gradient_of_the_whole_term(model: BodyModel) -> None:
     """By pose, shape and offsets, through projection, robust weight and sums over views."""
-    carried = term.carriers(model)
+    carried = term.keypoint_set(model, range(K))
     offsets = 0.02 * _random(K, 3, seed=1)
     views, x = _views(), _vector(model)
     shift = 0.01 * _random(2, 3, K, 3, seed=8)
