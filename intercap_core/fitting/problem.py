@@ -36,7 +36,8 @@ _COVERING_PRIOR_PER_FRAME = 2.0
 class Views:
     """What E_J compares with, for the problem's K keypoints.
 
-    observed (T,C,K,2) px, confidence (T,C,K), sigma (T,C,K) px, lenses (C,13), colour_from_master (C,4,4), shift (T,C,K,3) m or None.
+    observed (T,C,K,2) px, confidence (T,C,K), sigma (T,C,K) px, lenses (C,13),
+    colour_from_master (C,4,4), shift (T,C,K,3) m or None.
     """
 
     observed: Tensor
