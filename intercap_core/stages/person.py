@@ -1,0 +1,116 @@
+"""Stage ``person``: the subject in every view, its triangulated keypoints and masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.body.keypoints import NUM_KEYPOINTS
+from intercap_core.camera.rig import Rig
+from intercap_core.config import PersonSettings
+from intercap_core.detection.person_masks import choose_mask
+from intercap_core.detection.read import Detections
+from intercap_core.detection.sides import BODY_POINTS
+from intercap_core.detection.subject import NOBODY, find_subject
+from intercap_core.detection.swaps import triangulate_people
+from intercap_core.detection.triangulation import Triangulation, reproject
+from intercap_core.errors import UserError
+from intercap_core.project import digest
+from intercap_core.schemas import PERSON, SCENE
+
+
+def run(*, detections: Path, scene: Path, output: Path, settings: PersonSettings) -> None:
+    """Find the subject by geometry and write the person artefact.
+
+    Sets in which fewer than two views agree on the subject are flagged ``missing``. Raises
+    UserError where no set has the subject in two views, or the inputs are of different captures.
+    """
+    found = Detections.load(detections)
+    with artefacts.read(scene, SCENE) as source:
+        rig = Rig.from_artefact(source)
+        times = source["times"]
+    if rig.names != found.camera_names or len(times) != found.num_sets:
+        raise UserError(
+            f"{detections} and {scene}: cameras or frame sets differ ({len(found.camera_names)} "
+            f"cameras, {found.num_sets} sets against {len(rig)} and {len(times)}); re-run stages "
+            "'detections' and 'scene' for this sequence"
+        )
+    person = find_subject(found, rig, times, min_confidence=settings.min_confidence)
+    keypoints = subject_keypoints(found, person)
+    keypoints, points = triangulate_people(
+        keypoints,
+        rig,
+        min_confidence=settings.min_confidence,
+        max_error_px=settings.max_reprojection_px,
+    )
+    missing = (person != NOBODY).sum(1) < 2
+    if missing.all():
+        raise UserError(
+            f"sequence {found.sequence}: no frame set has one person in two views that agree "
+            f"({detections}); check the keypoint files and the calibration"
+        )
+    masks = _masks(found, keypoints, points, rig, settings.min_confidence)
+    _write(output, found, person, keypoints, points, missing, masks, settings)
+
+
+def subject_keypoints(detections: Detections, person: np.ndarray) -> np.ndarray:
+    """The chosen people's keypoints (T, C, 135, 3) float64, zeros where ``person`` is -1."""
+    result = np.zeros((*person.shape, NUM_KEYPOINTS, 3))
+    for t, c in np.argwhere(person != NOBODY):
+        result[t, c] = detections.people(int(t), int(c))[person[t, c]]
+    return result
+
+
+def _masks(
+    detections: Detections,
+    keypoints: np.ndarray,
+    points: Triangulation,
+    rig: Rig,
+    min_confidence: float,
+) -> list[bytes]:
+    """One RLE, maybe empty, for every (T, C)."""
+    sets, views = keypoints.shape[:2]
+    joints = points.points.reshape(sets, NUM_KEYPOINTS, 3)[:, BODY_POINTS]
+    pixels = reproject(np.nan_to_num(joints.reshape(-1, 3), nan=1.0), rig)
+    pixels = pixels.reshape(sets, -1, views, 2)
+    known = np.isfinite(joints[..., 0])
+    result = []
+    for t in range(sets):
+        for c in range(views):
+            body = keypoints[t, c, BODY_POINTS]
+            # What several views agree on is where the body is; one view alone may hallucinate.
+            at = np.where(known[t][:, None], pixels[t, :, c], body[:, :2])
+            seen = known[t] | (body[:, 2] >= min_confidence)
+            where = f"sequence {detections.sequence}, camera {rig.names[c]}, frame {t}"
+            result.append(choose_mask(detections.candidates(t, c), at, seen, where))
+    return result
+
+
+def _write(
+    output: Path,
+    detections: Detections,
+    person: np.ndarray,
+    keypoints: np.ndarray,
+    points: Triangulation,
+    missing: np.ndarray,
+    masks: list[bytes],
+    settings: PersonSettings,
+) -> None:
+    sets, views = person.shape
+    offsets, rle = artefacts.pack_ragged(masks)
+    inlier = np.swapaxes(points.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
+    with artefacts.write(
+        output, PERSON, settings_digest=digest(settings), sequence=detections.sequence
+    ) as writer:
+        writer.put("camera_names", list(detections.camera_names))
+        writer.put("person", person)
+        writer.put("keypoints", keypoints)
+        writer.put("joints", points.points.reshape(sets, NUM_KEYPOINTS, 3))
+        writer.put("joint_views", points.views.reshape(sets, NUM_KEYPOINTS))
+        writer.put("joint_error", points.error.reshape(sets, NUM_KEYPOINTS))
+        writer.put("inlier", inlier)
+        writer.put("missing", missing)
+        writer.put("mask_offsets", offsets)
+        writer.put("mask_rle", rle)

@@ -1,0 +1,85 @@
+"""The subject among several people, whatever order and side the detector gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_capture import ring
+from synthetic_people import seen_by, walking, write_detections
+
+from intercap_core.camera.transforms import apply
+from intercap_core.detection.read import Detections
+from intercap_core.detection.sides import swapped
+from intercap_core.detection.subject import find_subject, ring_centre
+
+RIG, UP = ring()
+T = 12
+TIMES = np.arange(T) / 15
+
+
+def subject_of(tmp_path, people) -> np.ndarray:
+    path = write_detections(tmp_path / "detections.h5", RIG, people)
+    return find_subject(Detections.load(path), RIG, TIMES, min_confidence=0.3)
+
+
+@pytest.fixture(scope="module")
+def subject() -> np.ndarray:
+    keypoints = seen_by(walking(T, np.array([-0.2, 0.1]), np.array([0.01, 0])), RIG, UP)
+    keypoints[..., :2] += np.random.default_rng(0).normal(0, 4, keypoints[..., :2].shape)
+    return keypoints
+
+
+@pytest.fixture(scope="module")
+def bystander() -> np.ndarray:
+    return seen_by(walking(T, np.array([1.1, 0.9]), np.array([0, -0.02])), RIG, UP)
+
+
+def test_the_rings_centre_is_where_the_cameras_look():
+    np.testing.assert_allclose(apply(UP, ring_centre(RIG)[None])[0], [0, 0, 0.8], atol=1e-6)
+
+
+def test_the_one_in_the_middle_is_found_whatever_the_order(tmp_path, subject, bystander):
+    first = (np.arange(T)[:, None] + np.arange(6)) % 2 == 0
+    people = [
+        [
+            [subject[t, c], bystander[t, c]] if first[t, c] else [bystander[t, c], subject[t, c]]
+            for c in range(6)
+        ]
+        for t in range(T)
+    ]
+    people[4][3] = []
+    expected = np.where(first, 0, 1)
+    expected[4, 3] = -1
+    np.testing.assert_array_equal(subject_of(tmp_path, people), expected)
+
+
+def test_a_view_that_takes_back_for_front_is_still_the_subject(tmp_path, subject):
+    people = [[[subject[t, c]] for c in range(6)] for t in range(T)]
+    for t in range(T):
+        people[t][2] = [swapped(subject[t, 2])]
+    assert (subject_of(tmp_path, people) == 0).all()
+
+
+def test_a_single_view_is_bridged_by_what_was_known(tmp_path, subject, bystander):
+    people = [[[bystander[t, c], subject[t, c]] for c in range(6)] for t in range(T)]
+    people[5] = [[bystander[5, 0], subject[5, 0]], [], [], [], [], []]
+    np.testing.assert_array_equal(subject_of(tmp_path, people)[5], [1, -1, -1, -1, -1, -1])
+
+
+def test_someone_seen_briefly_nearer_the_middle_does_not_take_over(tmp_path, subject, bystander):
+    brief = seen_by(walking(T, np.zeros(2), np.zeros(2)), RIG, UP)
+    people = [[[bystander[t, c]] for c in range(6)] for t in range(T)]
+    for c in range(6):
+        people[7][c] = [brief[7, c], bystander[7, c]]
+    found = subject_of(tmp_path, people)
+    assert (found[7] == 1).all() and (np.delete(found, 7, 0) == 0).all()
+
+
+def test_ghosts_that_no_two_views_share_are_nobody(tmp_path, subject):
+    rng = np.random.default_rng(1)
+    people = [
+        [[np.column_stack([rng.uniform(0, 1000, (135, 2)), np.full(135, 0.9)])] for _ in range(6)]
+        for _ in range(T)
+    ]
+    assert (subject_of(tmp_path, people) == -1).mean() > 0.9
+    assert (subject_of(tmp_path, [[[] for _ in range(6)] for _ in range(T)]) == -1).all()
