@@ -26,7 +26,7 @@ def test_rays_that_meet_and_rays_that_do_not():
     point, gap = midpoints(one, two, at, other)
     np.testing.assert_allclose(point, [2, 0, 0.05])
     np.testing.assert_allclose(gap, 0.1)
-    for direction, origin in ((-two, other), (one, other), (one + [0, 0.03, 0], other)):
+    for direction, origin in ((-two, other), (one, other), (one + 0.03 * two, other)):
         assert np.isnan(midpoints(one, direction, at, origin)[0]).all()
 
 
