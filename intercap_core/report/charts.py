@@ -1,0 +1,166 @@
+"""Charts as inline SVG: coloured by the page's style sheet, the same bytes for the same numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+_WIDTH, _HEIGHT = 520, 300
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 14, 44
+_ROW = 22
+_LABEL = 150
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A line through (x, y), drawn in the page's ``colour`` (a CSS class)."""
+
+    name: str
+    colour: str
+    x: np.ndarray
+    y: np.ndarray
+
+
+def line_chart(
+    series: Sequence[Series],
+    *,
+    x_label: str,
+    y_label: str,
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    marks: Sequence[tuple[float, str]] = (),
+) -> str:
+    """Lines with axes, a grid and a legend; ``marks`` are labelled vertical lines."""
+    inner_width, inner_height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+
+    def at_x(value: float) -> float:
+        return _LEFT + inner_width * (value - x_range[0]) / (x_range[1] - x_range[0])
+
+    def at_y(value: float) -> float:
+        return _TOP + inner_height * (1 - (value - y_range[0]) / (y_range[1] - y_range[0]))
+
+    parts = [_open(_WIDTH, _HEIGHT, f"{y_label} by {x_label}")]
+    for tick in ticks(*y_range):
+        y = at_y(tick)
+        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" {_same("y", y)}/>')
+        parts.append(_text(_LEFT - 6, y + 4, _number(tick), "tick", "end"))
+    for tick in ticks(*x_range):
+        x = at_x(tick)
+        parts.append(_text(x, _HEIGHT - _BOTTOM + 16, _number(tick), "tick", "middle"))
+        parts.append(f'<line class="grid" {_same("x", x)} y1="{_TOP}" y2="{_TOP + inner_height}"/>')
+    for value, label in marks:
+        x = at_x(value)
+        parts.append(f'<line class="mark" {_same("x", x)} y1="{_TOP}" y2="{_TOP + inner_height}"/>')
+        parts.append(_text(x + 3, _TOP + 10, label, "tick", "start"))
+    for line in series:
+        points = " ".join(
+            f"{at_x(float(x)):.1f},{at_y(float(y)):.1f}"
+            for x, y in zip(line.x, line.y, strict=True)
+        )
+        parts.append(f'<polyline class="line {line.colour}" points="{points}"/>')
+    for index, line in enumerate(series):
+        y = _TOP + 24 + 16 * index
+        x = _WIDTH - _RIGHT - 88
+        parts.append(
+            f'<line class="line {line.colour}" x1="{x}" x2="{x + 20}" {_same("y", y - 4)}/>'
+        )
+        parts.append(_text(x + 26, y, line.name, "legend", "start"))
+    parts.append(_text(_LEFT + inner_width / 2, _HEIGHT - 8, x_label, "label", "middle"))
+    parts.append(
+        f'<text class="label" text-anchor="middle" transform="translate(14 '
+        f'{_TOP + inner_height / 2:.1f}) rotate(-90)">{escape(y_label)}</text>'
+    )
+    return "".join([*parts, "</svg>"])
+
+
+@dataclass(frozen=True)
+class Band:
+    """One row of a timeline: ``runs`` are (first, last, what it says on hovering)."""
+
+    name: str
+    colour: str
+    runs: Sequence[tuple[int, int, str]]
+
+
+def timeline(bands: Sequence[Band], total: int) -> str:
+    """Rows of bars over ``total`` frames."""
+    width = 860
+    inner = width - _LABEL - _RIGHT
+    height = _ROW * len(bands) + 24
+    parts = [_open(width, height, "timeline")]
+    for row, band in enumerate(bands):
+        y = _ROW * row + 4
+        parts.append(_text(_LABEL - 8, y + 12, band.name, "tick", "end"))
+        parts.append(
+            f'<rect class="track" x="{_LABEL}" y="{y}" width="{inner}" height="{_ROW - 7}" rx="3"/>'
+        )
+        for first, last, says in band.runs:
+            x = _LABEL + inner * first / total
+            long = max(1.5, inner * (last + 1 - first) / total)
+            parts.append(
+                f'<rect class="fill {band.colour}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
+                f'height="{_ROW - 7}" rx="2"><title>{escape(says)}</title></rect>'
+            )
+    for tick in ticks(0, total, 8):
+        if tick < total:
+            x = _LABEL + inner * (tick + 0.5) / total
+            parts.append(_text(x, height - 6, _number(tick), "tick", "middle"))
+    return "".join([*parts, "</svg>"])
+
+
+def dumbbells(rows: Sequence[tuple[str, float, float]], unit: str) -> str:
+    """One row a pair of numbers, before and after."""
+    finite = [v for _, *pair in rows for v in pair if math.isfinite(v)]
+    top = max([*finite, 1e-9]) * 1.1
+    height = _ROW * len(rows) + 40
+    inner = _WIDTH - _LEFT - _RIGHT - 20
+    parts = [_open(_WIDTH, height, f"before and after, {unit}")]
+    for tick in ticks(0, top):
+        x = _LEFT + 20 + inner * tick / top
+        parts.append(f'<line class="grid" {_same("x", x)} y1="4" y2="{height - 36}"/>')
+        parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
+    for row, (name, before, after) in enumerate(rows):
+        y = _ROW * row + 14
+        parts.append(_text(_LEFT + 12, y + 4, name, "tick", "end"))
+        if not (math.isfinite(before) and math.isfinite(after)):
+            continue
+        x0, x1 = (_LEFT + 20 + inner * v / top for v in (before, after))
+        parts.append(f'<line class="link" x1="{x0:.1f}" x2="{x1:.1f}" {_same("y", y)}/>')
+        parts.append(f'<circle class="dot faint" cx="{x0:.1f}" cy="{y}" r="4"/>')
+        parts.append(f'<circle class="dot c1" cx="{x1:.1f}" cy="{y}" r="4.5"/>')
+    parts.append(_text(_LEFT + 20 + inner / 2, height - 6, unit, "label", "middle"))
+    return "".join([*parts, "</svg>"])
+
+
+def ticks(low: float, high: float, count: int = 6) -> list[float]:
+    """Round numbers from ``low`` to ``high``, about ``count`` of them."""
+    step = (high - low) / count
+    size = 10 ** math.floor(math.log10(step)) if step > 0 else 1.0
+    step = min((s * size for s in (1, 2, 5, 10) if s * size >= step * 0.999), default=size)
+    first = math.ceil(low / step - 1e-9)
+    return [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _open(width: int, height: int, name: str) -> str:
+    return (
+        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}" '
+        f'style="max-width:{width}px">'
+    )
+
+
+def _same(axis: str, value: float) -> str:
+    return f'{axis}1="{value:.1f}" {axis}2="{value:.1f}"'
+
+
+def _text(x: float, y: float, text: str, css: str, anchor: str) -> str:
+    return (
+        f'<text class="{css}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"

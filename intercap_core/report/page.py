@@ -1,0 +1,457 @@
+"""The dataset's report: one HTML page that needs nothing beside itself."""
+
+from __future__ import annotations
+
+import base64
+import importlib.metadata
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+from markupsafe import Markup
+
+from intercap_core.metrics import figures, flags
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.report import charts
+from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
+from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.schemas import METRIC_REGIONS
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_WORST = 10
+_MAX_RUNS = 400  # rows of the list of flagged frames
+_MAX_CAMERA_ROWS = 40
+_HISTOGRAM_MM = 30.0
+_BIN_MM = 1.0
+_PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, the paper's Experiments
+_LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "scipy")
+_NAMES = {"object_track": "object track", "body_fit": "body fit", "joint": "joint"}
+# key, what it is, digits, whether more is better (None: neither)
+_TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
+    ("body_pve_mm", "body, per vertex, mm", 1, False),
+    ("body_mpjpe_mm", "body, 22 joints, mm", 1, False),
+    ("hand_mpjpe_mm", "hands, joints and tips, mm", 1, False),
+    ("hand_grasp_mpjpe_mm", "hands while touching, mm", 1, False),
+    ("hand_mpjpe_wrist_mm", "hands, wrists aligned, mm", 1, False),
+    ("object_translation_mm", "object, centre of mass, mm", 1, False),
+    ("object_translation_p95_mm", "… 95th percentile, mm", 1, False),
+    ("object_rotation_deg", "object, rotation, degrees", 2, False),
+    ("object_rotation_p95_deg", "… 95th percentile, degrees", 2, False),
+    ("lost_share", "object lost (50 mm or 20 degrees), share", 3, False),
+    ("lost_unnoticed_share", "… and not flagged, share", 3, False),
+    ("first_frame_success", "first seen frame found (20 mm, 10 degrees), share", 2, True),
+    ("contact_region_f1", "contact by region, F1", 3, True),
+    ("contact_f1", "contact by vertex at 4.5 mm, F1", 3, True),
+    ("contact_recall", "frames in contact found, share", 3, True),
+    ("acceleration_body_mm", "acceleration error, body, mm/frame² at 30 fps", 2, False),
+    ("acceleration_hands_mm", "acceleration error, hands, mm/frame²", 2, False),
+    ("acceleration_object_mm", "acceleration error, object, mm/frame²", 2, False),
+    ("rest_jitter_mm", "jitter while the object rests, mm", 2, False),
+    ("motion_onset_frames", "late at the start of motion, frames", 1, None),
+    ("joint_normalised_median", "error over stated deviation, joints (honest: 0.7-1.4)", 2, None),
+    ("object_normalised_median", "error over stated deviation, object (honest: 0.7-1.4)", 2, None),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Detail:
+    """What the page shows of one sequence: overlays by camera, or why there are none."""
+
+    name: str
+    overlays: Sequence[Overlay]
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectHeat:
+    """Pictures of one object's heatmap and the likelihood that its last colour stands for."""
+
+    name: str
+    pictures: Sequence[HeatPicture]
+    top: float
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """All that the page is made from.
+
+    ``residuals`` by sequence: name, before and after of each camera pair, metres. ``trace`` by
+    sequence: what to print of each stage. ``failed``: sequences without a result and why.
+    """
+
+    dataset: str
+    sequences: Sequence[SequenceMetrics]
+    table: pd.DataFrame
+    details: Sequence[Detail]
+    body_heat: Sequence[HeatPicture]
+    body_top: float
+    body_frames: int
+    object_heat: Sequence[ObjectHeat]
+    objects_left_out: int
+    residuals: Mapping[str, Sequence[tuple[str, float, float]]]
+    trace: Mapping[str, Mapping[str, str]]
+    body_model: str
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+
+def render(content: Content) -> str:
+    """The whole page as text."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    return environment.get_template("report.html.j2").render(_context(content))
+
+
+def _context(content: Content) -> dict[str, Any]:
+    rows = _rows(content)
+    runs = [
+        {"sequence": s.name, "frames": _span(first, last), "reason": reason}
+        for s in content.sequences
+        for first, last, reason in flags.ranges(list(s.values["flag_reason"]))
+    ]
+    return {
+        "dataset": content.dataset,
+        "style": Markup((_TEMPLATES / "style.css").read_text(encoding="utf-8")),
+        "script": Markup((_TEMPLATES / "script.js").read_text(encoding="utf-8")),
+        "headline": _headline(content),
+        "tiles": _tiles(content),
+        "rows": rows,
+        "failed": sorted(content.failed.items()),
+        "truth": _truth(content),
+        "penetration": _penetration(content),
+        "clouds": _clouds(content),
+        "heat": _heat(content),
+        "cameras": _cameras(content),
+        "worst": sorted(rows, key=lambda row: row["rank"])[:_WORST],
+        "flagged_runs": runs[:_MAX_RUNS],
+        "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
+        "flagged_frames": sum(int(s.values["flagged"].sum()) for s in content.sequences),
+        "details": [_detail(content, detail) for detail in content.details],
+        "not_shown": len(content.sequences) - len(content.details),
+        "colours": {"body": _css(BODY_COLOUR), "object": _css(OBJECT_COLOUR)},
+        "versions": _versions(content),
+        "trace": _trace(content),
+    }
+
+
+def _headline(content: Content) -> str:
+    frames = sum(len(s) for s in content.sequences)
+    seconds = sum(len(s) / s.fps for s in content.sequences)
+    subjects = len({s.subject for s in content.sequences})
+    objects = len({s.object_ for s in content.sequences})
+    parts = [
+        _counted(len(content.sequences), "sequence"),
+        _counted(frames, "frame"),
+        f"{seconds / 60:.1f} minutes" if seconds >= 120 else f"{seconds:.0f} seconds",
+        _counted(subjects, "subject"),
+        _counted(objects, "object"),
+    ]
+    if content.failed:
+        parts.append(f"{len(content.failed)} failed")
+    return ", ".join(parts)
+
+
+def _tiles(content: Content) -> list[dict[str, str]]:
+    depth = figures.penetration_figures(content.sequences)
+    cloud = figures.cloud_figures(content.sequences)
+    flagged = np.concatenate([s.values["flagged"] for s in content.sequences])
+    tiles = []
+    if any(s.has_truth for s in content.sequences):
+        joint = figures.truth_figures(content.sequences, "joint")
+        for key, name, unit, note in (
+            ("body_pve_mm", "body error", "mm", "per vertex, against truth"),
+            ("object_translation_mm", "object error", "mm", "centre, median, against truth"),
+            ("object_rotation_deg", "object rotation error", "°", "median, against truth"),
+            ("contact_region_f1", "contact", "", "F1 by body region"),
+        ):
+            if key in joint:
+                digits = 2 if unit in ("", "°") else 1
+                tiles.append(_tile(name, joint[key], unit, note, digits))
+    tiles += [
+        _tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"),
+        _tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"),
+        _tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"),
+        _tile("flagged", 100 * float(flagged.mean()), "%", f"{int(flagged.sum())} frames"),
+    ]
+    return tiles
+
+
+def _tile(name: str, value: float | None, unit: str, note: str, digits: int = 1) -> dict[str, str]:
+    known = value is not None and np.isfinite(value)
+    text = f"{value:.{digits}f}{'' if unit == '°' else ' '}{unit}".rstrip() if known else "–"
+    return {"name": name, "value": text, "note": note}
+
+
+def _rows(content: Content) -> list[dict[str, Any]]:
+    shown = {detail.name for detail in content.details}
+    columns = {
+        "penetration": "penetration.mean_mm",
+        "penetration_p98": "penetration.p98_mm",
+        "body_visible": "vertex_to_cloud.body_visible_mm",
+        "object_visible": "vertex_to_cloud.object_visible_mm",
+        "acceleration_body": "acceleration_body_mm",
+        "acceleration_object": "acceleration_object_mm",
+        "pve": "joint.body_pve_mm",
+        "object_mm": "joint.object_translation_mm",
+        "object_deg": "joint.object_rotation_deg",
+    }
+    rows = []
+    for record in content.table.to_dict("records"):
+        row = {name: record.get(column) for name, column in columns.items()}
+        for name in ("sequence", "subject", "object", "frames", "rank"):
+            row[name] = record[name]
+        row["flagged"] = 100 * record["flagged_frames"] / record["frames"]
+        row["contact"] = 100 * record["contact_frames"] / record["frames"]
+        row["shown"] = record["sequence"] in shown
+        rows.append(row)
+    return rows
+
+
+def _truth(content: Content) -> dict[str, Any] | None:
+    known = [s for s in content.sequences if s.has_truth]
+    if not known:
+        return None
+    by_stage = {stage: figures.truth_figures(known, stage) for stage in figures.STAGES}
+    rows = []
+    for key, name, digits, more in _TRUTH_ROWS:
+        values = [by_stage[stage].get(key) for stage in figures.STAGES]
+        found = [v for v in values if v is not None]
+        if not found:
+            continue
+        best = None
+        if len(found) > 1 and more is not None:
+            best = max(found) if more else min(found)
+        rows.append(
+            {
+                "name": name,
+                "cells": [
+                    {
+                        "text": "" if v is None else f"{v:.{digits}f}",
+                        "best": v is not None and v == best,
+                    }
+                    for v in values
+                ],
+            }
+        )
+    own = figures.pooled(known, "truth/penetration_mean")
+    touching = figures.pooled(known, "truth/contact_frame")
+    own_mm = float("nan")
+    if own is not None and touching is not None and touching.any():
+        own_mm = 1e3 * float(own[touching].mean())
+    return {
+        "sequences": len(known),
+        "frames": sum(len(s) for s in known),
+        "stages": [_NAMES[stage] for stage in figures.STAGES],
+        "rows": rows,
+        "flags": figures.flag_figures(known),
+        "own_penetration": own_mm,
+        "sweep": _sweep(known),
+    }
+
+
+def _sweep(known: Sequence[SequenceMetrics]) -> str:
+    lines = []
+    for stage, colour in (("body_fit", "c2"), ("joint", "c1")):
+        found = figures.contact_sweep(known, stage)
+        if found and np.isfinite(list(found.values())).all():
+            x, y = np.array(list(found)), np.array(list(found.values()))
+            lines.append(charts.Series(_NAMES[stage], colour, x, y))
+    if not lines:
+        return ""
+    return charts.line_chart(
+        lines,
+        x_label="threshold, mm",
+        y_label="F1 of body vertices",
+        x_range=(0, 30),
+        y_range=(0, 1),
+        marks=((4.5, "4.5 mm"),),
+    )
+
+
+def _penetration(content: Content) -> dict[str, Any]:
+    touching = figures.pooled(content.sequences, "contact_frame")
+    assert touching is not None
+    edges = np.arange(0, _HISTOGRAM_MM + _BIN_MM / 2, _BIN_MM)
+    lines, shares, tallest = [], [], 1.0
+    for name, colour in (("max", "c2"), ("mean", "c1"), ("median", "c3")):
+        values = figures.pooled(content.sequences, f"penetration_{name}")
+        assert values is not None
+        depth = 1e3 * values[touching].astype(np.float64)
+        counts = np.histogram(np.clip(depth, 0, _HISTOGRAM_MM), edges)[0].astype(float)
+        tallest = max(tallest, float(counts.max()))
+        outline = np.repeat(counts, 2)
+        lines.append(charts.Series(name, colour, np.repeat(edges, 2)[1:-1], outline))
+        grid = np.linspace(0, _HISTOGRAM_MM, 121)
+        share = np.array([(depth <= g).mean() if len(depth) else 0.0 for g in grid])
+        shares.append(charts.Series(name, colour, grid, 100 * share))
+    x_range = (0.0, _HISTOGRAM_MM)
+    summary = figures.penetration_figures(content.sequences)
+    return {
+        **summary,
+        "frames": int(touching.sum()),
+        "bin": f"{_BIN_MM:g}",
+        "histogram": charts.line_chart(
+            lines,
+            x_label="penetration depth, mm (the last bin holds all beyond)",
+            y_label="contact frames",
+            x_range=x_range,
+            y_range=(0, 1.08 * tallest),
+        ),
+        "cumulative": charts.line_chart(
+            shares,
+            x_label="penetration depth, mm",
+            y_label="contact frames, %",
+            x_range=x_range,
+            y_range=(0, 100),
+            marks=((5, "5"), (7, "7"), (20, "20")),
+        ),
+    }
+
+
+def _clouds(content: Content) -> list[dict[str, Any]]:
+    names = ("body_mm", "object_mm", "body_visible_mm", "object_visible_mm")
+    found = figures.cloud_figures(content.sequences)
+    floor = figures.floor_figures(content.sequences)
+    rows = [{"name": content.dataset, "cells": [found[n] for n in names], "reference": False}]
+    if floor:
+        cells = [floor.get(n) for n in names]
+        rows.append({"name": "floor: true poses", "cells": cells, "reference": True})
+    published = [*_PUBLISHED_CLOUD_MM, None, None]
+    rows.append({"name": "InterCap, as published", "cells": published, "reference": True})
+    return rows
+
+
+def _heat(content: Content) -> dict[str, Any]:
+    stops = ", ".join(
+        f"{_css(colour)} {100 * at:g}%"
+        for colour, at in zip(COLOUR_STOPS, (0, 0.25, 0.6, 1), strict=True)
+    )
+    return {
+        "gradient": f"linear-gradient(90deg, {stops})",
+        "body": [_embedded(p, p.caption) for p in content.body_heat],
+        "body_top": content.body_top,
+        "body_frames": content.body_frames,
+        "left_out": content.objects_left_out,
+        "objects": [
+            {
+                "name": heat.name,
+                "top": heat.top,
+                "frames": heat.frames,
+                "pictures": [_embedded(p, p.caption) for p in heat.pictures],
+            }
+            for heat in content.object_heat
+        ],
+    }
+
+
+def _cameras(content: Content) -> dict[str, Any]:
+    """By pair for one sequence, by sequence for several."""
+    if len(content.residuals) == 1:
+        rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(content.residuals.values()))]
+    else:
+        rows = []
+        for name, pairs in content.residuals.items():
+            values = 1e3 * np.array([pair[1:] for pair in pairs]).reshape(-1, 2)
+            before, after = np.median(values, axis=0) if len(values) else (np.nan, np.nan)
+            rows.append((name, float(before), float(after)))
+        rows.sort(key=lambda row: -np.nan_to_num(row[2], nan=-1.0))
+    note = "Worst first." if len(rows) > 3 else ""
+    if len(rows) > _MAX_CAMERA_ROWS:
+        note = f"The {_MAX_CAMERA_ROWS} worst of {len(rows)}; all are in tables/sequences.csv."
+    return {
+        "chart": charts.dumbbells(rows[:_MAX_CAMERA_ROWS], "residual, mm") if rows else "",
+        "note": note,
+        "truth": figures.extrinsics_figures(content.sequences) or None,
+    }
+
+
+def _detail(content: Content, detail: Detail) -> dict[str, Any]:
+    s = next(s for s in content.sequences if s.name == detail.name)
+    cameras: dict[str, list[dict[str, Any]]] = {}
+    for overlay in detail.overlays:
+        caption = f"camera {overlay.camera}, frame {overlay.frame}"
+        if s.values["flagged"][overlay.frame]:
+            caption += f" (flagged: {s.values['flag_reason'][overlay.frame]})"
+        cameras.setdefault(overlay.camera, []).append(_embedded(overlay, caption))
+    reasons = list(s.values["flag_reason"])
+    bands = [
+        charts.Band(
+            "flagged",
+            "flag",
+            [(a, b, f"{_span(a, b)}: {why}") for a, b, why in flags.ranges(reasons)],
+        ),
+        charts.Band("in contact", "any", _runs(s.values["contact_frame"])),
+    ]
+    names = list(s.values["region_names"])
+    for region in METRIC_REGIONS:
+        touching = s.values["region_contact"][:, names.index(region)]
+        if touching.any():
+            bands.append(charts.Band(region.replace("_", " "), "touch", _runs(touching)))
+    return {
+        "name": s.name,
+        "subject": s.subject,
+        "object": s.object_,
+        "frames": len(s),
+        "fps": s.fps,
+        "cameras": list(cameras.values()),
+        "note": detail.note,
+        "timeline": charts.timeline(bands, len(s)),
+    }
+
+
+def _versions(content: Content) -> list[tuple[str, str]]:
+    rows = [("intercap-core", importlib.metadata.version("intercap-core"))]
+    rows.append(("Python", platform.python_version()))
+    for name in _LIBRARIES:
+        try:
+            rows.append((name, importlib.metadata.version(name)))
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    rows.append(("body file", content.body_model))
+    return rows
+
+
+def _trace(content: Content) -> dict[str, Any]:
+    stages = list(next(iter(content.trace.values()), {}))
+    return {
+        "stages": stages,
+        "rows": [
+            {"sequence": name, "cells": [by_stage[stage] for stage in stages]}
+            for name, by_stage in content.trace.items()
+        ],
+    }
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int, str]]:
+    runs = flags.ranges(["x" if value else "" for value in mask])
+    return [(first, last, _span(first, last)) for first, last, _ in runs]
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first}" if first == last else f"{first}–{last}"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
+def _embedded(picture: HeatPicture | Overlay, caption: str) -> dict[str, Any]:
+    return {
+        "data": base64.b64encode(picture.jpeg).decode(),
+        "width": picture.width,
+        "height": picture.height,
+        "caption": caption,
+    }
+
+
+def _css(colour: Sequence[float]) -> str:
+    return "#" + "".join(f"{round(255 * c):02x}" for c in colour)

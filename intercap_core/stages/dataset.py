@@ -1,0 +1,210 @@
+"""All sequences together: tables, heatmaps, the summary and the report."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.artefacts import Schema
+from intercap_core.body.artefact import load_model, read_parameters
+from intercap_core.camera.rig import Rig
+from intercap_core.capture.frames import Frames
+from intercap_core.config import BodyModels, ObjectEntry, ReportSettings, SubjectEntry
+from intercap_core.errors import UserError
+from intercap_core.metrics import figures
+from intercap_core.metrics.contact import CONTACT_M
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.metrics.heatmaps import Heatmaps, collect
+from intercap_core.report import tables
+from intercap_core.report.heat_pictures import body_pictures, object_pictures
+from intercap_core.report.overlays import Fit, choose_cameras, choose_frames, overlays
+from intercap_core.report.page import Content, Detail, ObjectHeat, render
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import FRAMES, HEATMAPS, JOINT, METRICS, OBJECT_TRACK, SCENE
+
+log = logging.getLogger(__name__)
+
+_MAX_OBJECTS = 12  # objects whose heatmaps are drawn; all are in heatmaps.h5
+
+
+@dataclass(frozen=True)
+class SequenceArtefacts:
+    """Artefacts of one sequence that the dataset is made from."""
+
+    frames: Path
+    scene: Path
+    object_track: Path
+    joint: Path
+    metrics: Path
+
+
+def run(
+    *,
+    dataset: str,
+    sequences: Mapping[str, SequenceArtefacts],
+    objects: Mapping[str, ObjectEntry],
+    subjects: Mapping[str, SubjectEntry],
+    body_models: BodyModels,
+    settings: ReportSettings,
+    report: Path,
+    summary: Path,
+    heatmaps: Path,
+    tables_folder: Path,
+    failed: Mapping[str, str] | None = None,
+) -> None:
+    """Write the report, summary.json, heatmaps.h5 and the tables of a dataset.
+
+    ``sequences`` by name, in the order of the table; ``failed`` are sequences without a result,
+    with the reason. Raises UserError where there is no sequence at all or an artefact is broken.
+    """
+    if not sequences:
+        raise UserError(
+            f"dataset {dataset!r}: no sequence has a result to report; look into the logs of the "
+            "sequences that failed"
+        )
+    measured = [SequenceMetrics.read(s.metrics) for s in sequences.values()]
+    residuals = {name: _residuals(s.scene) for name, s in sequences.items()}
+    by_sequence = tables.sequence_table(measured, {n: _medians(p) for n, p in residuals.items()})
+    tables.write(tables_folder, by_sequence, tables.frame_table(measured))
+    heat = collect([s.metrics for s in sequences.values()])
+    _write_heatmaps(heatmaps, dataset, heat)
+    text = json.dumps(figures.summary(dataset, measured), indent=2) + "\n"
+    _replace(summary, text)
+
+    ranked = by_sequence.sort_values("rank")["sequence"].tolist()
+    shown = set(ranked[: settings.max_sequences])
+    details = [
+        _detail(name, sequences[name], s, objects, subjects, body_models, settings)
+        for name, s in zip(sequences, measured, strict=True)
+        if name in shown
+    ]
+    first = next(iter(sequences.values()))
+    with artefacts.read(first.joint, JOINT) as artefact:
+        model = load_model(
+            body_models, str(artefact.attributes["gender"]), read_parameters(artefact)
+        )
+    body_top = _top(heat.body)
+    drawn = sorted(heat.objects, key=lambda name: (-heat.objects[name].frames, name))[:_MAX_OBJECTS]
+    content = Content(
+        dataset=dataset,
+        sequences=measured,
+        table=by_sequence,
+        details=details,
+        body_heat=body_pictures(model, heat.body, body_top),
+        body_top=body_top,
+        body_frames=heat.body_frames,
+        object_heat=[_object_heat(name, heat, objects) for name in sorted(drawn)],
+        objects_left_out=len(heat.objects) - len(drawn),
+        residuals=residuals,
+        trace={name: _trace(s) for name, s in sequences.items()},
+        body_model=model.path.name,
+        failed=failed or {},
+    )
+    _replace(report, render(content))
+
+
+def _detail(
+    name: str,
+    paths: SequenceArtefacts,
+    measured: SequenceMetrics,
+    objects: Mapping[str, ObjectEntry],
+    subjects: Mapping[str, SubjectEntry],
+    body_models: BodyModels,
+    settings: ReportSettings,
+) -> Detail:
+    mesh = ObjectMesh.load(objects[measured.object_])
+    with artefacts.read(paths.joint, JOINT) as joint:
+        parameters = read_parameters(joint)
+        model = load_model(body_models, subjects[measured.subject].gender, parameters)
+        fit = Fit(model, parameters, joint["rotation"], joint["translation"], mesh)
+    rig = Rig.from_scene(paths.scene)
+    chosen = choose_frames(measured.values["object_visible_to_cloud"], settings.frames)
+    cameras = choose_cameras(fit, rig, chosen, settings.cameras)
+    try:
+        with Frames.open(paths.frames) as images:
+            return Detail(name, overlays(images, rig, fit, cameras, chosen))
+    except UserError as error:  # one image that does not decode must not cost the whole report
+        log.warning("%s: no overlays: %s", name, error)
+        return Detail(name, [], str(error))
+
+
+def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) -> ObjectHeat:
+    mesh = ObjectMesh.load(objects[name])
+    found = heat.objects[name]
+    top = _top(found.likelihood)
+    return ObjectHeat(
+        name, object_pictures(mesh.vertices, mesh.faces, found, top), top, found.frames
+    )
+
+
+def _top(likelihood: np.ndarray) -> float:
+    """What the last colour stands for: the highest value; all grey where nothing touches."""
+    return max(float(likelihood.max(initial=0.0)), 1e-6)
+
+
+def _residuals(scene: Path) -> list[tuple[str, float, float]]:
+    """Name, before and after of each pair of cameras, metres."""
+    with artefacts.read(scene, SCENE) as artefact:
+        names = artefact.text("camera_names")
+        return [
+            (f"{names[i]}–{names[j]}", float(before), float(after))
+            for (i, j), before, after in zip(
+                artefact["pairs"],
+                artefact["pair_residual_before"],
+                artefact["pair_residual_after"],
+                strict=True,
+            )
+        ]
+
+
+def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
+    if not pairs:
+        return float("nan"), float("nan")
+    before, after = np.median(np.array([pair[1:] for pair in pairs]), axis=0)
+    return float(before), float(after)
+
+
+def _trace(paths: SequenceArtefacts) -> dict[str, str]:
+    schemas: tuple[tuple[Path, Schema], ...] = (
+        (paths.frames, FRAMES),
+        (paths.scene, SCENE),
+        (paths.object_track, OBJECT_TRACK),
+        (paths.joint, JOINT),
+        (paths.metrics, METRICS),
+    )
+    found = {}
+    for path, schema in schemas:
+        with artefacts.read(path, schema) as artefact:
+            digest = artefact.attributes.get("settings_digest") or "-"
+            found[schema.stage] = f"v{schema.version} {digest}"
+    return found
+
+
+def _write_heatmaps(path: Path, dataset: str, heat: Heatmaps) -> None:
+    counts = [len(found.likelihood) for found in heat.objects.values()]
+    with artefacts.write(
+        path, HEATMAPS, dataset=dataset, contact_m=CONTACT_M, body_frames=heat.body_frames
+    ) as writer:
+        writer.put("body_likelihood", heat.body)
+        writer.put("object_names", list(heat.objects))
+        writer.put("object_frames", [found.frames for found in heat.objects.values()])
+        writer.put("object_offsets", np.concatenate([[0], np.cumsum(counts)]))
+        writer.put("object_points", np.concatenate([f.points for f in heat.objects.values()]))
+        writer.put(
+            "object_likelihood", np.concatenate([f.likelihood for f in heat.objects.values()])
+        )
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a whole text file or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
