@@ -105,13 +105,14 @@ class Step:
 class Footwork:
     """Feet that stand without sliding, step, and carry a pelvis along.
 
-    ``start`` (2, 2): where the ankles stand first, left and right; ``heading`` rad.
+    ``start`` (2, 2): where the ankles stand first, left and right; ``heading`` rad;
+    ``ankle_height`` (2,) above the floor, metres.
     """
 
     start: np.ndarray
     heading: float
     steps: Sequence[Step]
-    ankle_height: float
+    ankle_height: np.ndarray
     end_s: float
 
     def feet(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -128,7 +129,7 @@ class Footwork:
             u = np.clip((times - step.start) / (step.end - step.start), 0, 1)
             ankle[:, step.foot, :2] += share[:, None] * (np.array(step.place) - placed[step.foot])
             heading[:, step.foot] += share * (step.heading - turned[step.foot])
-            length = np.linalg.norm(np.array(step.place) - placed[step.foot])
+            length = float(np.linalg.norm(np.array(step.place) - placed[step.foot]))
             roll = np.sin(np.pi * u) ** 2 * np.cos(np.pi * u) * min(1.0, length / 0.4)
             pitch[:, step.foot] += 0.9 * roll * (u < 0.5) + 0.5 * roll * (u >= 0.5)
             lift = STEP_LIFT_M * min(1.0, 0.4 + length / 0.5) * np.sin(np.pi * u) ** 2

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.rigid.distance import DistanceField
@@ -83,26 +84,35 @@ class Hand:
         """Knuckles (4, 3) of index, middle, pinky, ring relative to the wrist, rest frame."""
         return self.rest.rest[self.first : self.first + 12 : 3] - self.rest.rest[self.wrist]
 
-    def local(self, hand: HandShape) -> np.ndarray:
-        """Rotation vectors (15, 3) of a shape, in the order of the joints."""
-        vectors = np.zeros((15, 3))
+    @cached_property
+    def _axes(self) -> np.ndarray:
+        """Flexion axes (5, 3, 3), unit, rest frame."""
         rest = self.rest.rest
+        axes = np.empty((5, 3, 3))
         for f in range(5):
             chain = np.vstack([rest[self.first + 3 * f : self.first + 3 * f + 3], self._tips[f]])
-            bones = np.diff(chain, axis=0)
             bend_to = self.palm if f < 4 else unit(0.55 * self.palm - self.radial)
-            for j in range(3):
-                axis = unit(np.cross(bones[j], bend_to))
-                vectors[3 * f + j] = axis * np.radians(hand.flexion[f, j])
-            if f < 4:
-                sideways = np.cross(self.out, self.radial) * np.radians(hand.spread[f])
-                first = turn(sideways) @ turn(vectors[3 * f])
-            else:
-                lift = unit(np.cross(bones[0], self.palm)) * np.radians(hand.opposition)
-                roll = unit(bones[0]) * np.radians(0.5 * hand.opposition) * self.out[0]
-                first = turn(vectors[3 * f]) @ turn(lift) @ turn(roll)
-            vectors[3 * f] = _vector(first)
+            axes[f] = unit(np.cross(np.diff(chain, axis=0), bend_to))
+        return axes
+
+    def _finger(self, f: int, flexion: np.ndarray, hand: HandShape) -> np.ndarray:
+        """Rotation vectors (B, 3, 3) of one finger for flexions (B, 3), degrees."""
+        vectors = self._axes[f] * np.radians(flexion)[..., None]
+        if f < 4:
+            sideways = np.cross(self.out, self.radial) * np.radians(hand.spread[f])
+            first = turn(sideways) @ turn(vectors[:, 0])
+        else:
+            bone = self.rest.rest[self.first + 13] - self.rest.rest[self.first + 12]
+            lift = unit(np.cross(bone, self.palm)) * np.radians(hand.opposition)
+            roll = unit(bone) * np.radians(0.5 * hand.opposition) * self.out[0]
+            first = turn(vectors[:, 0]) @ (turn(lift) @ turn(roll))
+        vectors[:, 0] = Rotation.from_matrix(first).as_rotvec()
         return vectors
+
+    def local(self, hand: HandShape) -> np.ndarray:
+        """Rotation vectors (15, 3) of a shape, in the order of the joints."""
+        fingers = [self._finger(f, hand.flexion[f][None], hand)[0] for f in range(5)]
+        return np.concatenate(fingers)
 
     def skin(self, vectors: np.ndarray) -> np.ndarray:
         """Vertices (B, n, 3) relative to the wrist, rest frame, of finger poses (B, 15, 3)."""
@@ -127,12 +137,12 @@ class Hand:
 
                 def least(angles: np.ndarray, f: int = f, j: int = j,
                           moved: np.ndarray = moved) -> np.ndarray:  # fmt: skip
-                    poses = []
-                    for angle in angles:
-                        trial = flexion.copy()
-                        trial[f, j] = angle
-                        poses.append(self.local(replace(start, flexion=trial)))
-                    points = self.skin(np.stack(poses))[:, moved]
+                    trial = np.tile(flexion[f], (len(angles), 1))
+                    trial[:, j] = angles
+                    poses = np.tile(self.local(replace(start, flexion=flexion)),
+                                    (len(angles), 1, 1))  # fmt: skip
+                    poses[:, 3 * f : 3 * f + 3] = self._finger(f, trial, start)
+                    points = self.skin(poses)[:, moved]
                     return self._distance(points, surface, object_from_wrist)
 
                 angles = np.arange(flexion[f, j], largest[j] + SCAN_DEG, SCAN_DEG)
@@ -184,9 +194,3 @@ def part_of(subject: Subject, ids: np.ndarray) -> Subject:
         bulges=subject.bulges[:, ids],
         clothing=subject.clothing[ids],
     )
-
-
-def _vector(rotation: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_rotvec()

@@ -34,8 +34,10 @@ for _i, _name in enumerate(KEYPOINT_NAMES[:25]):
         _j = KEYPOINT_NAMES.index("right_" + _name[5:])
         _SWAPPED[_i], _SWAPPED[_j] = _j, _i
 _SWAPPED[LEFT_HAND], _SWAPPED[RIGHT_HAND] = np.arange(46, 67), np.arange(25, 46)
-_LEGS = np.array([i for i, n in enumerate(KEYPOINT_NAMES[:25])
-                  if any(w in n for w in ("hip", "knee", "ankle", "toe", "heel")) and n != "mid_hip"])  # fmt: skip
+_LEG_WORDS = ("_hip", "knee", "ankle", "toe", "heel")
+_LEGS = np.array(
+    [i for i, n in enumerate(KEYPOINT_NAMES[:25]) if any(w in n for w in _LEG_WORDS) and i != 8]
+)
 
 
 @dataclass(frozen=True)

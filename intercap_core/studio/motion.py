@@ -6,6 +6,7 @@ Headings turn about the stage's z axis; a person with heading 0 faces +x.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -55,6 +56,12 @@ class Trunk:
     head: np.ndarray
 
 
+def _sole_depth(subject: Subject, side: int) -> float:
+    """How far the ankle is above the sole of a level foot, metres."""
+    share = np.asarray(subject.weights[:, [7 + side, 10 + side]].sum(1)).ravel()
+    return float(subject.rest_joints[7 + side, 1] - subject.rest[share > 0.5, 1].min())
+
+
 class Puppet:
     """One subject that can be posed."""
 
@@ -67,10 +74,8 @@ class Puppet:
         self.arm = self.skeleton.length("left_shoulder", "left_elbow", "left_wrist")
         self.hip_width = float(rest[_J["left_hip"], 0] - rest[_J["right_hip"], 0]) / 2
         self.hip_drop = float(rest[0, 1] - rest[[1, 2], 1].mean())
-        share = np.asarray(subject.weights[:, [7, 8, 10, 11]].sum(1)).ravel()
-        sole = subject.rest[share > 0.5, 1].min()
-        self.ankle_height = float(rest[[7, 8], 1].mean() - sole)
-        self.stand = STAND * self.leg + self.ankle_height + self.hip_drop
+        self.ankle_height = np.array([_sole_depth(subject, side) for side in (0, 1)])
+        self.stand = STAND * self.leg + float(self.ankle_height.min()) + self.hip_drop
 
     # --- the parts of a pose ---------------------------------------------------------------
 
@@ -104,12 +109,13 @@ class Puppet:
 
         The knees point between the pelvis's and the foot's heading, ``splay`` rad outward.
         """
+        hinge = np.array([1.0, 0, 0])
         for side, (name, sign) in enumerate(zip(SIDES, (1.0, -1.0), strict=True)):
             hip = pelvis + world[:, 0] @ self.skeleton.bone("pelvis", f"{name}_hip")
             foot = facing(heading[:, side] + sign * splay)
             names = (f"{name}_hip", f"{name}_knee", f"{name}_ankle")
             pole = unit(world[:, 0, :, 2] * np.array([1, 1, 0.2])) + 1.5 * foot[:, :, 2]
-            upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, np.array([1.0, 0, 0]))
+            upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, hinge)
             world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
             tilt = np.zeros((len(pelvis), 3))
             tilt[:, 0] = pitch[:, side]
@@ -122,7 +128,7 @@ class Puppet:
         chain = ("pelvis", "spine1", "spine2", "spine3", f"{SIDES[side]}_collar",
                  f"{SIDES[side]}_shoulder")  # fmt: skip
         at = pelvis
-        for a, b in zip(chain[:-1], chain[1:], strict=True):
+        for a, b in pairwise(chain):
             at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
         return at
 
@@ -131,7 +137,7 @@ class Puppet:
         chain = ["pelvis", "spine1", "spine2", "spine3", "neck", "head"]
         chain = chain[: chain.index(name) + 1]
         at = pelvis
-        for a, b in zip(chain[:-1], chain[1:], strict=True):
+        for a, b in pairwise(chain):
             at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
         return at
 

@@ -62,8 +62,15 @@ class NoiseSource:
         rank = np.clip(ndtr(gaussian), 1e-6, 1 - 1e-6) - 0.5
         return -np.sign(rank) * np.log1p(-2 * np.abs(rank)) / np.sqrt(2)
 
-    def episodes(self, rng: np.random.Generator, frames: int, probability: np.ndarray,
-                 shared: np.ndarray, correlation_s: float, agreement: float) -> np.ndarray:  # fmt: skip
+    def episodes(
+        self,
+        rng: np.random.Generator,
+        frames: int,
+        probability: np.ndarray,
+        shared: np.ndarray,
+        correlation_s: float,
+        agreement: float,
+    ) -> np.ndarray:
         """(frames, n) on/off episodes that last about ``correlation_s`` and are partly shared.
 
         ``probability`` (frames, n) of being on; ``shared`` (frames,) a process that all views have

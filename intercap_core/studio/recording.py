@@ -31,7 +31,8 @@ COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 
 @dataclass(frozen=True)
 class Recorded:
-    """``object_pixels`` (T,) seen and ``object_whole`` (T,) unhidden, of the object in this view."""
+    """Pixels of the object in this view: ``object_pixels`` (T,) seen, ``object_whole`` (T,) that it
+    would cover if nothing hid it."""
 
     object_pixels: np.ndarray
     object_whole: np.ndarray
@@ -86,7 +87,7 @@ class Kinect:
         candidates = []
         with self._writer(folder / f"{name}.mkv") as writer:
             for number, t in enumerate(self.sets):
-                surfaces, normals = _surfaces(stage, moment, t, colours)
+                surfaces, normals = surfaces_at(stage, moment, t, colours)
                 scene = scene_of(*((s.vertices, s.faces) for s in surfaces))
                 cast = colour_view.cast(scene, surfaces, normals)
                 self._inertial(writer, t, rng, depth_pose)
@@ -155,7 +156,7 @@ class Kinect:
             (target / f"{number:012d}_keypoints.json").write_text(to_json(people[t]))
 
 
-def _surfaces(stage: Stage, moment: Moment, t: int, colours: np.ndarray
+def surfaces_at(stage: Stage, moment: Moment, t: int, colours: np.ndarray
               ) -> tuple[tuple[Surface, Surface], tuple[np.ndarray, np.ndarray]]:  # fmt: skip
     """The clothed body and the object at one moment, and their smooth normals."""
     pose, thing = moment.stage_from_object[t], stage.thing

@@ -38,7 +38,7 @@ class Cast:
     """What moving things look like in a window whose first pixel is (x0, y0).
 
     ``identity`` (h, w) uint8 BODY, OBJECT or 0 where the room is nearer; ``depth`` (h, w) float32
-    z in metres, inf where 0; ``normal`` (h, w, 3) float32 stage frame; ``colour`` (h, w, 3) float32.
+    z in metres, inf where 0; ``normal`` (h, w, 3) stage frame and ``colour`` (h, w, 3) float32.
     """
 
     x0: int
@@ -85,9 +85,12 @@ class View:
         self.rotation = stage_from_camera[:3, :3].astype(np.float32)
         self.eye = stage_from_camera[:3, 3].astype(np.float32)
         shape = (lens.height, lens.width)
-        room_scene = scene_of((room.vertices, room.faces))
+        xy = lens.rays  # no ray beyond the lens's radius: directions of zero hit nothing
+        ahead = np.ones((*shape, 1), np.float32)
+        self._directions = np.nan_to_num(np.concatenate([xy, ahead], -1) @ self.rotation.T)
         self.depth = np.full(shape, np.inf, np.float32)
         self.normal = np.zeros((*shape, 3), np.float32)
+        room_scene = scene_of((room.vertices, room.faces))
         self.colour = np.zeros((*shape, 3), np.float32)
         self.material = np.full(shape, -1, np.int16)
         for top in range(0, lens.height, 120):
@@ -105,11 +108,11 @@ class View:
                 self.colour[rows] = _room_colours(room, rays, depth, face, normal, seen)
 
     def _rays(self, rows: slice, columns: slice) -> np.ndarray:
-        """(h, w, 6) float32: origin and direction in the stage; no ray beyond the lens's radius."""
-        xy = self.lens.rays[rows, columns]
-        directions = np.concatenate([xy, np.ones((*xy.shape[:2], 1), np.float32)], -1)
-        directions = np.nan_to_num(directions @ self.rotation.T)
-        return np.concatenate([np.broadcast_to(self.eye, directions.shape), directions], -1)
+        """(h, w, 6) float32: origin and direction in the stage."""
+        directions = self._directions[rows, columns]
+        rays = np.empty((*directions.shape[:2], 6), np.float32)
+        rays[..., :3], rays[..., 3:] = self.eye, directions
+        return rays
 
     def box(self, points: np.ndarray) -> tuple[int, int, int, int]:
         """x0, y0, x1, y1 around points (N, 3) of the stage, clipped to the image; maybe empty."""
@@ -159,7 +162,8 @@ class View:
         if x1 <= x0 or y1 <= y0:
             return 0
         rays = self._rays(slice(y0, y1), slice(x0, x1))
-        return int(np.isfinite(scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()).sum())
+        hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
+        return int(np.isfinite(hit).sum())
 
 
 def _room_colours(room: Room, rays: np.ndarray, depth: np.ndarray, face: np.ndarray,

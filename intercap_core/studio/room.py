@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from intercap_core.studio.interactions.base import Box
@@ -30,12 +31,16 @@ class Room:
     distractor: int  # index of the material of a thing that detectors take for the object
 
 
-def build_room(rng: np.random.Generator, furniture: Sequence[Box], *, bare: bool) -> Room:
-    """Make a room around the stage; ``bare`` leaves only the floor and the scripts' furniture."""
-    names = ["floor", *sorted({box.material for box in furniture})]
+def build_room(
+    rng: np.random.Generator, furniture: Sequence[Box], eyes: np.ndarray, *, bare: bool
+) -> Room:
+    """Make a room around the stage; ``bare`` leaves only the floor and the script's ``furniture``.
+
+    ``eyes`` (C, 2): where the cameras stand; their view of the middle stays free.
+    """
     boxes = list(furniture)
     if not bare:
-        boxes += _walls(rng) + _pieces(rng)
+        boxes += _walls(rng) + _pieces(rng, eyes)
     names = list(dict.fromkeys(["floor", *(box.material for box in boxes)]))
     vertices = [np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M]
     faces, material = [np.array([[0, 2, 1], [1, 2, 3]])], [np.zeros(2, int)]
@@ -64,26 +69,31 @@ def _walls(rng: np.random.Generator) -> list[Box]:
         px, py = (far - 0.06) * np.cos(angle), (far - 0.06) * np.sin(angle)
         side = rng.uniform(-1.2, 1.2)
         px, py = px - side * np.sin(angle), py + side * np.cos(angle)
-        walls.append(Box((px - 0.015, py - 0.45, 1.0), (px + 0.015, py + 0.45, 1.7), angle, "poster"))
+        low, high = (px - 0.015, py - 0.45, 1.0), (px + 0.015, py + 0.45, 1.7)
+        walls.append(Box(low, high, angle, "poster"))
     return walls
 
 
-def _pieces(rng: np.random.Generator) -> list[Box]:
-    """Shelves, boxes, a table and one thing that could be taken for the object, outside the ring
-    of action."""
+def _pieces(rng: np.random.Generator, eyes: np.ndarray) -> list[Box]:
+    """Shelves, boxes, a table and one thing that could be taken for the object, between the
+    cameras and outside the ring of action."""
+    azimuths = np.sort(np.arctan2(eyes[:, 1], eyes[:, 0]))
+    gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
+    between = azimuths + gaps / 2
     pieces = []
-    start = rng.uniform(0, 2 * np.pi)
-    kinds = ["shelf", "cardboard", "wood", "distractor", "cardboard", "wood"]
-    for index, kind in enumerate(kinds):
-        angle = start + 2 * np.pi * index / len(kinds) + rng.uniform(-0.25, 0.25)
-        far = rng.uniform(1.75, 2.15)
-        x, y = far * np.cos(angle), far * np.sin(angle)
+    for index, kind in enumerate(("shelf", "cardboard", "wood", "distractor", "cardboard", "wood")):
         size = {
-            "shelf": (0.15, 0.40, rng.uniform(1.0, 1.5)),
+            "shelf": (0.13, 0.36, rng.uniform(0.9, 1.3)),
             "cardboard": (rng.uniform(0.15, 0.25), rng.uniform(0.15, 0.3), rng.uniform(0.25, 0.6)),
-            "wood": (rng.uniform(0.25, 0.35), rng.uniform(0.3, 0.45), rng.uniform(0.4, 0.75)),
+            "wood": (rng.uniform(0.22, 0.3), rng.uniform(0.25, 0.4), rng.uniform(0.4, 0.7)),
             "distractor": (0.10, 0.17, rng.uniform(0.3, 0.45)),
         }[kind]
+        gap = index % len(between)
+        angle = between[gap] + gaps[gap] * rng.uniform(-0.12, 0.12)
+        if len(between) < 6:
+            angle += np.pi / 3 * (index // len(between))
+        far = rng.uniform(1.85, 2.2) + (0.25 if kind == "shelf" else 0.0)
+        x, y = far * np.cos(angle), far * np.sin(angle)
         pieces.append(
             Box((x - size[0], y - size[1], 0), (x + size[0], y + size[1], size[2]), angle, kind)
         )
@@ -105,24 +115,37 @@ def _box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:
     return corners, np.array(faces)
 
 
+NOISE_TABLE = np.random.default_rng(0).random((256, 256)).astype(np.float32)
+
+
 def value_noise(points: np.ndarray, scale: float, seed: int) -> np.ndarray:
-    """Smooth pseudo-random values in [0, 1] of points (N, 3), features of ``scale`` metres."""
-    p = points / scale
-    cell = np.floor(p).astype(np.int64)
-    part = p - cell
-    part = part * part * (3 - 2 * part)
-    total = np.zeros(len(points))
-    for corner in range(8):
-        offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
-        weight = np.prod(np.where(offset, part, 1 - part), axis=1)
-        total += weight * _hash(cell + offset, seed)
-    return total
+    """Smooth pseudo-random values in [0, 1] of points (N, 3), features of ``scale`` metres.
+
+    A wrapped table looked up along two slanted directions, so that no wall looks striped.
+    """
+    start = np.random.default_rng(seed).uniform(0, 256, 2)
+    u = (points[:, 0] + 0.53 * points[:, 2]) / scale + start[0]
+    v = (points[:, 1] - 0.71 * points[:, 2]) / scale + start[1]
+    width = 1024
+    rows = -(-len(points) // width)
+    at = np.zeros((2, rows * width), np.float32)
+    at[0, : len(points)], at[1, : len(points)] = u % 256, v % 256
+    maps = at.reshape(2, rows, width)
+    values = np.empty((rows, width), np.float32)
+    for top in range(0, rows, 16384):  # the look-up takes images of up to 32767 rows
+        part = slice(top, top + 16384)
+        values[part] = cv2.remap(
+            NOISE_TABLE, maps[0, part], maps[1, part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+        )
+    return values.ravel()[: len(points)]
 
 
 def _hash(cell: np.ndarray, seed: int) -> np.ndarray:
-    h = (cell * np.array([73856093, 19349663, 83492791])).sum(1) + seed * 2654435761
-    h = (h ^ (h >> 13)) * 1274126177
-    return ((h ^ (h >> 16)) & 0xFFFF) / 65535.0
+    """A value in [0, 1] for each cell (N, 3) of integers."""
+    start = np.random.default_rng(seed).integers(0, 256, 2)
+    i = cell[:, 0] * 7 + cell[:, 2] * 101 + start[0]
+    j = cell[:, 1] * 13 + cell[:, 2] * 57 + start[1]
+    return NOISE_TABLE[i & 255, j & 255]
 
 
 def _look(name: str, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

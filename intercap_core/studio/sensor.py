@@ -44,8 +44,16 @@ class DepthSensor:
             persistent=True,
         )  # fmt: skip
 
-    def _holes(self, depth: np.ndarray, normal: np.ndarray, direction: np.ndarray,
-               albedo: np.ndarray, rng: np.random.Generator, *, persistent: bool) -> np.ndarray:  # fmt: skip
+    def _holes(
+        self,
+        depth: np.ndarray,
+        normal: np.ndarray,
+        direction: np.ndarray,
+        albedo: np.ndarray,
+        rng: np.random.Generator,
+        *,
+        persistent: bool,
+    ) -> np.ndarray:
         cosine = np.abs(np.einsum("hwc,hwc->hw", normal, direction))
         risk = 0.9 * np.clip(1 - cosine / (GRAZING_COSINE * (0.5 + 0.5 * self._noise.scale)), 0, 1)
         risk += np.clip(1 - albedo / DARK, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)

@@ -8,6 +8,7 @@ any number N of moments at once, so a pose can be asked for at the exposure time
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -62,8 +63,7 @@ class Skeleton:
 
     def length(self, *names: str) -> float:
         """Summed length of the bones along a chain of joints."""
-        pairs = zip(names[:-1], names[1:], strict=True)
-        return float(sum(np.linalg.norm(self.bone(a, b)) for a, b in pairs))
+        return float(sum(np.linalg.norm(self.bone(a, b)) for a, b in pairwise(names)))
 
     def forward(self, rotations: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
         """Joints (N, 55, 3) of rotations (N, 55, 3, 3) and pelvis positions (N, 3)."""

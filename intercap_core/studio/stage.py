@@ -9,6 +9,7 @@ import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
+from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.rigid.distance import DistanceField
@@ -24,6 +25,7 @@ from intercap_core.studio.subjects import Subject, subject_names
 from intercap_core.studio.tissue import press_out
 
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
+OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,9 @@ class Stage:
     Raises UserError for a subject, interaction or object that does not fit.
     """
 
-    def __init__(self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry) -> None:
+    def __init__(
+        self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry
+    ) -> None:
         kind = interaction_named(capture.interaction)
         if entry.name != kind.object_class:
             raise UserError(
@@ -70,8 +74,7 @@ class Stage:
         self.bounds = np.stack([vertices.min(0), vertices.max(0)])
         self.interaction = kind(self.puppet, self.thing, self.noise.rng("script"))
         rng = self.noise.rng("room")
-        bare = bool(rng.random() < BARE_ROOM_SHARE)
-        self.room = build_room(rng, self.interaction.furniture, bare=bare)
+        self.stage_from_script = _placed(rng, self.interaction.centre)
         self.rig: StudioRig = build_rig(
             self.noise.rng("rig"),
             cameras=settings.cameras,
@@ -80,6 +83,10 @@ class Stage:
             noise=settings.noise,
             slips=settings.slips,
         )
+        furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
+        bare = bool(rng.random() < BARE_ROOM_SHARE)
+        eyes = invert(self.rig.master_from_stage) @ self.rig.true.master_from_colour
+        self.room = build_room(rng, furniture, eyes[:, :2, 3], bare=bare)
 
     @cached_property
     def set_times(self) -> np.ndarray:
@@ -100,12 +107,16 @@ class Stage:
         """Everything at recording times (N,), seconds since the first set."""
         script = self.interaction.script_times(times, self.duration)
         played = self.interaction.perform(script)
-        posed = self.puppet.skin(played.world, played.pelvis)
+        place = self.stage_from_script
+        world = place[:3, :3] @ played.world
+        pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
+        stage_from_object = place @ played.stage_from_object
+        posed = self.puppet.skin(world, pelvis)
         body, clothed = posed.vertices.copy(), posed.clothed.copy()
         for n in range(len(times)):
             for points in (body, clothed):
                 points[n] = press_out(
-                    points[n], self.thing.surface, played.stage_from_object[n], self.bounds
+                    points[n], self.thing.surface, stage_from_object[n], self.bounds
                 )
         order = [4, 0, 1, 3, 2]  # thumb, index, middle, ring, little finger
         tips = posed.tips[:, [*order, *(5 + i for i in order)]]
@@ -114,8 +125,8 @@ class Stage:
             clothed,
             posed.joints,
             tips,
-            played.world[:, JOINT_INDEX["pelvis"]],
-            played.stage_from_object,
+            world[:, JOINT_INDEX["pelvis"]],
+            stage_from_object,
         )
 
     def keypoints(self, moment: Moment) -> np.ndarray:
@@ -130,3 +141,13 @@ class Stage:
         """Points (..., 3) of the stage in the master's colour frame."""
         pose = self.rig.master_from_stage
         return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:
+    """stage_from_script (4, 4): any heading, the action's ``centre`` near the stage's middle."""
+    heading = rng.uniform(0, 2 * np.pi)
+    cos, sin = np.cos(heading), np.sin(heading)
+    place = np.eye(4)
+    place[:2, :2] = [[cos, -sin], [sin, cos]]
+    place[:2, 3] = rng.normal(0, OFF_CENTRE_M, 2) - place[:2, :2] @ centre
+    return place

@@ -40,6 +40,14 @@ class Box:
     heading: float = 0.0
     material: str = "wood"
 
+    def moved(self, transform: np.ndarray) -> Box:
+        """The box turned about the vertical and shifted by a transform (4, 4)."""
+        middle = (np.array(self.low) + self.high) / 2
+        shift = transform[:3, :3] @ middle + transform[:3, 3] - middle
+        low, high = np.array(self.low) + shift, np.array(self.high) + shift
+        turned = np.arctan2(transform[1, 0], transform[0, 0])
+        return Box(tuple(low), tuple(high), self.heading + float(turned), self.material)
+
 
 @dataclass(frozen=True)
 class Performance:
@@ -54,7 +62,8 @@ class Performance:
 class Interaction(ABC):
     """One script for one person and one object.
 
-    Script time runs from 0 to ``SCRIPT_S``. ``highlight`` is the script time around which a
+    Script time runs from 0 to ``SCRIPT_S``. ``centre`` is the middle of the action on the floor,
+    in the script's frame: z up, the floor at z = 0. ``highlight`` is the script time around which a
     recording shorter than the script is taken.
     """
 
@@ -64,6 +73,7 @@ class Interaction(ABC):
     furniture: list[Box] = field(default_factory=list)
     object_class = ""
     highlight = SCRIPT_S / 2
+    centre = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         self.sway = Wander(6, 0.010, self.rng)  # rad, trunk and head

@@ -33,6 +33,7 @@ class CupDrink(Interaction):
 
     object_class = "cup"
     highlight = 1.75
+    centre = (0.18, -0.05)
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
@@ -109,7 +110,7 @@ class CupDrink(Interaction):
         ids = np.flatnonzero((share > 0.9) & (subject.rest[:, 1] < eyes))
         face = part_of(subject, ids).rest - subject.rest_joints[head]
         middle = np.abs(face[:, 0]) < 0.012
-        corner = self.fitted_mouth - subject.rest_joints[head]
+        corner = self.mouth - subject.rest_joints[head]
         front = face[middle & (np.abs(face[:, 1] - corner[1]) < 0.01), 2].max()
         # the cup's axis leans towards the face; its near rim is at the lips
         lean = self.tilt
@@ -117,8 +118,8 @@ class CupDrink(Interaction):
         side = np.array([1.0, 0, 0])  # the handle points to the person's left
         rotation = np.stack([side, np.cross(up, side), up], 1)
         rim_up = self.thing.vertices[:, 2].max()
-        rim_out = np.linalg.norm(self.thing.vertices[self.thing.vertices[:, 2] > rim_up - 0.003, :2],
-                                 axis=1).max()  # fmt: skip
+        rim = self.thing.vertices[self.thing.vertices[:, 2] > rim_up - 0.003]
+        rim_out = np.linalg.norm(rim[:, :2], axis=1).max()
         near_rim = rotation @ np.array([0.0, 0, rim_up])
         across = np.cross(side, up)
         across *= -np.sign(across[2])
@@ -127,18 +128,19 @@ class CupDrink(Interaction):
         low, high = -0.03, 0.05
         for _ in range(18):
             ahead = (low + high) / 2
-            centre = mouth + (0, 0, ahead) - near_rim
+            centre = mouth + np.array([0, 0, ahead]) - near_rim
             if self.thing.surface.signed_distance((face - centre) @ rotation).min() < LIP_GAP_M:
                 low = ahead
             else:
                 high = ahead
-        self.head_from_cup = transform(rotation, mouth + (0, 0, high) - near_rim)
+        self.head_from_cup = transform(rotation, mouth + np.array([0, 0, high]) - near_rim)
 
     @property
-    def fitted_mouth(self) -> np.ndarray:
+    def mouth(self) -> np.ndarray:
         """The middle of the mouth in the T-pose (3,): where the jaw's skin meets the head's."""
         subject = self.puppet.subject
-        weights = np.asarray(subject.weights[:, [JOINT_INDEX["head"], JOINT_INDEX["jaw"]]].todense())
+        both = [JOINT_INDEX["head"], JOINT_INDEX["jaw"]]
+        weights = np.asarray(subject.weights[:, both].todense())
         middle = np.abs(subject.rest[:, 0]) < 0.015
         front = subject.rest[:, 2] > subject.rest[middle & (weights.sum(1) > 0.9), 2].max() - 0.035
         pick = middle & front & (weights.min(1) > 0.05)

@@ -30,6 +30,7 @@ class StoolSit(Interaction):
 
     object_class = "stool"
     highlight = 1.75
+    centre = (0.15, 0.0)
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
@@ -79,20 +80,20 @@ class StoolSit(Interaction):
     def _palm_on_seat(self, side: int, gap: float) -> np.ndarray:
         """A flat hand above the edge of the seat, ``gap`` away (negative: pressed)."""
         hand, sign = self.puppet.hands[side], (1.0, -1.0)[side]
-        fingers = unit(np.array([0.45, sign * 0.40, -0.55]))
-        palm = unit(np.array([0.30, sign * 0.25, -0.90]))
+        fingers = unit(np.array([0.12, sign * 0.62, -0.55]))
+        palm = unit(np.array([0.08, sign * 0.38, -0.90]))
         rotation = self.puppet.wrist_rotation(side, fingers, palm)
         knuckles = rotation @ hand.knuckles.mean(0)
-        place = np.array([0.03, sign * 0.152, self.seat_top + 0.10]) - knuckles
+        place = np.array([-0.05, sign * 0.152, self.seat_top + 0.10]) - knuckles
         low, high = -0.15, 0.10
         for _ in range(18):
             middle = (low + high) / 2
-            pose = invert(self.seat) @ transform(rotation, place + (0, 0, middle))
+            pose = invert(self.seat) @ transform(rotation, place + np.array([0, 0, middle]))
             if hand.gap(FLAT, self.thing.surface, pose) < gap:
                 low = middle
             else:
                 high = middle
-        return transform(rotation, place + (0, 0, high))
+        return transform(rotation, place + np.array([0, 0, high]))
 
     def _trunk(self, times: np.ndarray, *, still: bool = False) -> Trunk:
         track = self.pelvis_track(times)
@@ -100,7 +101,8 @@ class StoolSit(Interaction):
         shift = self.weight_shift(times) * (0.0 if still else 1.0)
         # the hips go back before they go down, and up before they come forward
         down = ramp(times, SIT_S, SEATED_S) - ramp(times, RISE_S, RISEN_S)
-        back = ramp(times, SIT_S - 0.05, SEATED_S - 0.22) - ramp(times, RISE_S + 0.16, RISEN_S + 0.05)
+        back = ramp(times, SIT_S - 0.05, SEATED_S - 0.22)
+        back -= ramp(times, RISE_S + 0.16, RISEN_S + 0.05)
         lean = plateau(times, SIT_S - 0.05, SIT_S + 0.38, SEATED_S - 0.15, SEATED_S + 0.15)
         lean = lean + plateau(times, RISE_S - 0.30, RISE_S + 0.05, RISE_S + 0.30, RISEN_S)
         feel = plateau(times, 0.75, 1.1, 1.2, 1.45)
@@ -134,7 +136,7 @@ class StoolSit(Interaction):
         swing = 0.06 * bump(times, 0, 0.5) * (1, -1)[side] + self.arm_swing(times)[:, side]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         place = (self.hover_place, self.palm_place)[side]
-        start, touch, leave = ((0.94, 1.20, 1.26), (0.92, 1.18, 1.30))[side]
+        start, touch, leave = ((0.90, 1.16, 1.22), (0.88, 1.14, 1.24))[side]
         above = place.copy()
         above[:3, 3] += (0.02, (0.06, -0.06)[side], 0.12)
         wrist = idle.towards(Pose.still(above, count), ramp(times, start - 0.2, touch - 0.10))
@@ -149,10 +151,11 @@ class StoolSit(Interaction):
         trunk = self._trunk(times)
         world = puppet.trunk(trunk)
         puppet.legs(world, trunk.pelvis, *self.footwork.feet(times))
-        feel = plateau(times, 1.0, 1.18, 1.28, 1.45)
+        feel = plateau(times, 0.98, 1.14, 1.24, 1.42)
         for _ in range(2):
             targets = {
-                side: (self._wrist(world, trunk.pelvis, times, side), feel) for side in (LEFT, RIGHT)
+                side: (self._wrist(world, trunk.pelvis, times, side), feel)
+                for side in (LEFT, RIGHT)
             }
             trunk = puppet.assist(trunk, targets)
             world = puppet.trunk(trunk)

@@ -29,14 +29,16 @@ class SuitcaseCarry(Interaction):
 
     object_class = "suitcase"
     highlight = 1.5
+    centre = (0.22, -0.15)
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
         side_way = -(puppet.hip_width + 0.235 + rng.uniform(0, 0.02))
         height = self.thing.standing_height
-        self.taken = upright(0.02 + rng.normal(0, 0.01), side_way, height, np.pi + rng.normal(0, 0.03))
+        start, turned = 0.02 + rng.normal(0, 0.01), np.pi + rng.normal(0, 0.03, 2)
+        self.taken = upright(start, side_way, height, turned[0])
         stride = 0.43 + 0.05 * rng.random()
-        self.put = upright(2 * stride - 0.02, side_way - 0.02, height, np.pi + rng.normal(0, 0.04))
+        self.put = upright(2 * stride - 0.02, side_way - 0.02, height, turned[1])
         self.lift = rng.uniform(*LIFT_M)
         w = puppet.hip_width * 0.95
         start = np.array([[-0.62, w], [-0.68, -w]])
