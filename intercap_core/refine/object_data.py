@@ -17,8 +17,6 @@ from intercap_core.refine.state import OBJECT, State
 
 # The tracker's views share calibration errors, so its minimum is never surer than this.
 _FLOOR = np.repeat([np.radians(0.3), 0.002], 3)
-# A tracked pose that contact and motion contradict by more than so many sigmas is doubted.
-_ROBUST = 4.0
 
 
 @dataclass(frozen=True)
@@ -49,12 +47,5 @@ class TrackedPoses:
         turn = Rotation.from_matrix(state.rotation @ self.rotation.transpose(0, 2, 1))
         away = np.concatenate([turn.as_rotvec(), state.translation - self.translation], axis=1)
         pull = np.einsum("tij,tj->ti", self.information, away)
-        squared = np.einsum("ti,ti->t", away, pull)
-        weight = np.square(_ROBUST**2 / (_ROBUST**2 + squared / 6))
-        out.add_blocks(
-            "object_data",
-            OBJECT,
-            self.information * weight[:, None, None],
-            pull * weight[:, None],
-            0.5 * float((squared / (1 + squared / 6 / _ROBUST**2)).sum()),
-        )
+        energy = 0.5 * float(np.einsum("ti,ti->", away, pull))
+        out.add_blocks("object_data", OBJECT, self.information, pull, energy)

@@ -24,15 +24,16 @@ from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 
 # What is left of a true contact after skin, mesh and calibration errors, metres. A patch counts as
-# one measurement.
-CONTACT_SIGMA = 0.002
+# one measurement, and so do about ten neighbouring vertices inside the object or under the floor.
+CONTACT_SIGMA = 0.003
 PENETRATION_SIGMA = 0.003
 GROUND_SIGMA = 0.005
-# Accelerations of everyday motion, m/s^2: people's joints stay below a few of them outside impacts
-# (hands reach 5-10), carried objects likewise.
-BODY_ACCELERATION = 2.5
-FINGER_ACCELERATION = 5.0
-OBJECT_ACCELERATION = 2.5
+VERTICES_PER_MEASUREMENT = 10.0
+# Accelerations of everyday motion, m/s^2: trunk and limbs stay below some of them outside impacts,
+# hands reach ten, carried objects are in between.
+BODY_ACCELERATION = 6.0
+FINGER_ACCELERATION = 10.0
+OBJECT_ACCELERATION = 6.0
 ROBUST_FACTOR = 2.0  # accelerations beyond so many sigmas count as a start, a stop or an impact
 _FIRST_FINGER = 25
 
@@ -49,7 +50,7 @@ class Ground:
 class Problem:
     """All that equation 6 needs beside the state.
 
-    ``data`` add E_B and E_O to the equations; ``probability`` (T, P) that each patch's region
+    ``data`` add E_B and E_O to the equations; ``probability`` (T, R) that each region
     touches (Q); ``floor`` is None where none was seen.
     """
 
@@ -91,19 +92,19 @@ class Problem:
         points = lin.vertices.double().cpu().numpy()
         near = proximity(self.field, points, state.rotation, state.translation)
         touch, touch_weight, touch_energy = contact.term(
-            near.distance, self.patches.patch, self.probability
+            near.distance, self.patches.patch, self.patches.region_of_patch, self.probability
         )
         scale = self.settings.contact_weight / CONTACT_SIGMA**2
         self._add_coupled(
             "contact", lin, near, touch, touch_weight * scale, touch_energy * scale, out
         )
         deep, deep_weight = penetration.weights(near.distance, self.patches.share)
-        scale = self.settings.penetration_weight / PENETRATION_SIGMA**2
+        scale = self.settings.penetration_weight / PENETRATION_SIGMA**2 / VERTICES_PER_MEASUREMENT
         self._add_coupled("penetration", lin, near, deep, deep_weight * scale, None, out)
         if self.floor is not None:
             height = ground.residuals(points, self.floor.point, self.floor.normal)
             weight = np.where(height < 0, self.patches.share, 0.0)
-            weight *= self.settings.ground_weight / GROUND_SIGMA**2
+            weight *= self.settings.ground_weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
             normal = np.broadcast_to(self.floor.normal, points.shape)
             active = np.flatnonzero(weight.any(axis=0))
             rows = self._body_rows(lin, normal, active)

@@ -117,7 +117,7 @@ def run(
         field=DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight),
         patches=patches,
         data=(data.add, tracked.add),
-        probability=np.zeros((len(start), len(patches.region_of_patch))),
+        probability=np.zeros((len(start), len(CONTACT_REGIONS))),
         floor=floor,
         fps=fps,
         settings=settings,
@@ -127,7 +127,7 @@ def run(
     before: dict[str, float] = {}
     found = _contact(problem, state, contact, joint_sigma, object_sigma)
     for rounds in _ROUNDS:
-        problem.probability = found.probability[:, patches.region_of_patch]
+        problem.probability = found.probability
         data.refresh(state)
         if not before:
             before = problem.equations(state).energy
@@ -219,7 +219,7 @@ def _contact(
 def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:
     parameters = state.parameters(model)
     with torch.no_grad():
-        joints = model(parameters, vertex_ids=np.zeros(0, np.int64)).joints
+        joints = model(parameters, vertex_ids=np.array([0])).joints
     writer.put("betas", state.betas)
     for name in ("expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose",
                  "reye_pose", "left_hand_pose", "right_hand_pose"):  # fmt: skip

@@ -73,7 +73,7 @@ def _problem(model, box, state, *, data=(), floor=None, touching=()) -> Problem:
         field=DistanceField(box.vertices, box.faces),
         patches=patches,
         data=data,
-        probability=probability[:, patches.region_of_patch],
+        probability=probability,
         floor=floor,
         fps=15.0,
         settings=JointSettings(),
