@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 # A vertex counts in its patch, and a patch in its region, by how much farther it is than the
-# nearest: skin yields and the meshes are some millimetres wrong, so contact is an area of this depth.
+# nearest: skin yields and meshes are some millimetres wrong, so contact is an area of this depth.
 SOFTNESS = 0.006
 # A patch farther than this gives up: the accuracy that keypoints and depth leave to a hand.
 REACH = 0.02
