@@ -29,12 +29,11 @@ POINT_STEPS = 2
 @dataclass(frozen=True, eq=False)
 class BodyViews:
     """The subject as all views see it: ``pixels`` (N, C, 2) and ``weights`` (N, C) of N points,
-    ``points`` (N, 3) triangulated at the start, ``speed`` (T,) of the body, m/s, NaN = unknown."""
+    and ``points`` (N, 3) triangulated at the start."""
 
     pixels: np.ndarray
     weights: np.ndarray
     points: np.ndarray
-    speed: np.ndarray
 
 
 def body_views(
@@ -54,22 +53,7 @@ def body_views(
     good = (found.views >= MIN_VIEWS) & np.isfinite(found.points[:, 0])
     gap = float(np.median(np.diff(times))) if sets > 1 else ERROR_TIME_S
     weights = weights * min(1.0, gap / ERROR_TIME_S)
-    joints = found.points.reshape(sets, 135, 3)[:, BODY_POINTS]
-    return BodyViews(
-        by_point[good, :, :2], weights[good], found.points[good], _speed(joints, times)
-    )
-
-
-def _speed(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Speed (T,) of the faster joints of each set (75th percentile), m/s."""
-    if len(times) < 2:
-        return np.zeros(len(times))
-    step = np.linalg.norm(np.diff(joints, axis=0), axis=-1) / np.diff(times)[:, None]
-    known = np.isfinite(step).sum(1) >= 5
-    between = np.full(len(step), np.nan)
-    between[known] = np.nanpercentile(step[known], 75, axis=1)
-    padded = np.r_[np.nan, between, np.nan]
-    return np.fmax(padded[:-1], padded[1:])
+    return BodyViews(by_point[good, :, :2], weights[good], found.points[good])
 
 
 class BodyConstraint:

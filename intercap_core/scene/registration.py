@@ -26,7 +26,7 @@ GATES_M = (0.08, 0.05, 0.03, 0.02, 0.02, 0.015, 0.015, 0.015)  # distance to the
 SEARCH_M = 0.12  # distance to the nearest cell
 # Neighbouring residuals err together (lens, multipath, bias), so a pair never counts as more than
 # this many independent measurements of this standard deviation.
-EFFECTIVE_POINTS = 150.0
+EFFECTIVE_POINTS = 30.0
 SIGMA_FLOOR_M = 0.003
 # Weak prior on the start: what a careful calibration is wrong by.
 PRIOR_TRANSLATION_M = 0.01
@@ -36,15 +36,6 @@ FREEDOMS = 7  # rotation, translation, depth bias
 
 # Adds a group's normal equations: (poses (C, 4, 4)) -> matrix (6C, 6C), gradient (6C,)
 Constraint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """The surface of one camera at one moment; only patches of one ``moment`` are compared."""
-
-    camera: int
-    moment: int
-    surface: Surface
 
 
 @dataclass
@@ -64,32 +55,31 @@ class PairResiduals:
     median: np.ndarray
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Pair:
-    """Queries of one patch in another, with the tree of the latter."""
+    """``source``'s cells sought in ``target``'s surface; both are camera indices."""
 
-    source: Patch
-    target: Patch
-    tree: cKDTree
+    source: int
+    target: int
     queries: Surface
     held_out: Surface
 
 
 class Registration:
-    """Holds the surfaces and their search trees; estimates poses of a rig from them."""
+    """Holds the surfaces and their search trees; estimates poses of a rig from them.
 
-    def __init__(self, rig: Rig, patches: list[Patch], master: int) -> None:
+    ``surfaces`` by camera index, in the depth camera's frame; ``master`` is the camera that stays.
+    """
+
+    def __init__(self, rig: Rig, surfaces: dict[int, Surface], master: int) -> None:
         self.rig = rig
         self._master = master
-        self._colour_from_depth = [camera.colour_from_depth for camera in rig]
-        kept = {id(p): _split(p.surface) for p in patches}
-        trees = {id(p): cKDTree(p.surface.points, balanced_tree=False) for p in patches}
-        self._pairs = [
-            _Pair(a, b, trees[id(b)], *kept[id(a)])
-            for a in patches
-            for b in patches
-            if a.moment == b.moment and a.camera != b.camera and min(len(a.surface), len(b.surface))
-        ]
+        self._surfaces = {c: surface for c, surface in sorted(surfaces.items()) if len(surface)}
+        self._trees = {
+            c: cKDTree(surface.points, balanced_tree=False) for c, surface in self._surfaces.items()
+        }
+        parts = {c: _split(surface) for c, surface in self._surfaces.items()}
+        self._pairs = [_Pair(a, b, *parts[a]) for a in parts for b in parts if a != b]
 
     def solve(self, start: Estimate, constraints: list[Constraint]) -> Estimate:
         """Refine ``start``; ``constraints`` add normal equations of the poses."""
@@ -112,7 +102,7 @@ class Registration:
         by_pair: dict[tuple[int, int], list[np.ndarray]] = {}
         for pair in self._pairs:
             distances = self._correspond(pair, pair.held_out, at, SEARCH_M)[0]
-            first, second = sorted((pair.source.camera, pair.target.camera))
+            first, second = sorted((pair.source, pair.target))
             by_pair.setdefault((first, second), []).append(np.abs(distances))
         values = {k: np.concatenate(v) for k, v in sorted(by_pair.items())}
         values = {k: v for k, v in values.items() if len(v) >= MIN_PAIR_POINTS / HELD_OUT_EVERY}
@@ -123,7 +113,7 @@ class Registration:
         )
 
     def _master_from_depth(self, at: Estimate, camera: int) -> np.ndarray:
-        between = self._colour_from_depth[camera]
+        between = self.rig[camera].colour_from_depth
         assert between is not None
         return at.poses[camera] @ between
 
@@ -132,22 +122,22 @@ class Registration:
     ) -> tuple[np.ndarray, ...]:
         """Signed distances (n,) to the planes, points (n, 3), normals (n, 3), and the depth
         directions of both cameras (n, 3), all in the master frame, of correspondences in reach."""
-        source = self._master_from_depth(at, pair.source.camera)
-        target = self._master_from_depth(at, pair.target.camera)
-        shifted = queries.points - at.bias[pair.source.camera] * queries.rays
+        source = self._master_from_depth(at, pair.source)
+        target = self._master_from_depth(at, pair.target)
+        shifted = queries.points - at.bias[pair.source] * queries.rays
         points = apply(source, shifted)
         # The tree holds the target's points as measured: its bias is undone for the search.
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
-        sought = in_target * (1 + at.bias[pair.target.camera] / depth)
-        distance, nearest = pair.tree.query(sought, distance_upper_bound=SEARCH_M)
+        sought = in_target * (1 + at.bias[pair.target] / depth)
+        distance, nearest = self._trees[pair.target].query(sought, distance_upper_bound=SEARCH_M)
         hit = np.isfinite(distance)
         nearest = np.where(hit, nearest, 0)
-        other = pair.target.surface
+        other = self._surfaces[pair.target]
         normals = other.normals[nearest] @ target[:3, :3].T
         own_normals = queries.normals @ source[:3, :3].T
         on_target = apply(
-            target, other.points[nearest] - at.bias[pair.target.camera] * other.rays[nearest]
+            target, other.points[nearest] - at.bias[pair.target] * other.rays[nearest]
         )
         residual = (normals * (points - on_target)).sum(1)
         hit &= (normals * own_normals).sum(1) >= MIN_AGREE_COSINE
@@ -166,7 +156,7 @@ class Registration:
             )
             if len(residual) < MIN_PAIR_POINTS:
                 continue
-            a, b = pair.source.camera, pair.target.camera
+            a, b = pair.source, pair.target
             sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(residual))))
             weight = (1 - np.minimum(np.abs(residual) / gate, 1) ** 2) ** 2  # Tukey's biweight
             weight /= sigma**2 * max(1.0, len(residual) / EFFECTIVE_POINTS)
