@@ -9,7 +9,7 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_cloud as term
-from intercap_core.fitting.schedule import vertex_normals
+from intercap_core.energy.body_cloud import vertex_normals
 
 
 @pytest.fixture(scope="module")

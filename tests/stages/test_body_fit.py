@@ -104,7 +104,7 @@ class Capture:
 
 
 def _normals(model: BodyModel, vertices: torch.Tensor) -> np.ndarray:
-    from intercap_core.fitting.schedule import vertex_normals
+    from intercap_core.energy.body_cloud import vertex_normals
 
     return vertex_normals(vertices, model.faces).double().numpy()
 

@@ -1,0 +1,205 @@
+"""What the observations ask of bodies as they stand: E_J's pixels and E_D's correspondences.
+
+Set up anew between rounds of the solver, together with how far each kind of observation is trusted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
+from intercap_core.body.model import BodyModel
+from intercap_core.energy import body_cloud, body_keypoints
+from intercap_core.energy.body_cloud import COVERINGS, CloudRows
+from intercap_core.energy.body_keypoints import KeypointSet
+from intercap_core.fitting.observations import Observations, PersonCloud
+from intercap_core.fitting.problem import BodyProblem, Views
+
+# What is left of a keypoint's error in metres once its fixed part is taken out: the start, refined
+# from the residuals themselves.
+_KEYPOINT_SIGMA = (
+    (BODY, 0.02),
+    (LEFT_HAND, 0.01),
+    (RIGHT_HAND, 0.01),
+    (slice(FACE.start, CONTOUR.stop), 0.008),
+)
+_SMALLEST_SIGMA_PX = 1.0
+_PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit do not show
+_SIGMA_RANGE = (0.1, 2.0)  # how far the refined sigma may go from the start
+_NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
+# Neighbouring samples stand on the same fold: about four of them make one measurement.
+_SAMPLE_SHARE = 0.25
+_FULL_SAMPLE = 2.0  # points with which a sample counts half
+_HUBER_M = 0.012
+_VERTEX_CHUNK = 16
+
+
+class Evidence:
+    """Observations of the N usable frames.
+
+    frames (N,) their ids. keypoint_sigma (135,) m and cloud_noise (G,) m start from what is usual
+    and are refined from residuals. cloud_residual (N,): median distance of points at the last
+    matching, metres, NaN = none.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        seen: Observations,
+        clouds: list[PersonCloud | None],
+        cloud_weight: float,
+    ) -> None:
+        self.model, self.seen, self.cloud_weight = model, seen, cloud_weight
+        self.frames = np.flatnonzero(seen.usable)
+        self.clouds = [clouds[t] for t in self.frames]
+        self.has_cloud = any(cloud is not None for cloud in self.clouds)
+        self.samples = body_cloud.choose_samples(model)
+        self.patch = torch.as_tensor(self.samples.patch, device=model.device)
+        self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
+        self.group = torch.as_tensor(self.samples.group, device=model.device)
+        self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
+        self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
+        self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
+        for part, value in _KEYPOINT_SIGMA:
+            self.keypoint_sigma[part] = value
+
+    def _tensor(self, values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
+
+    def look(self, problem: BodyProblem, *, hands: bool = False, face: bool = False) -> None:
+        """Set E_J up at the current solution: which keypoints, their sigma in pixels, shifts."""
+        seen, frames = self.seen, self.frames
+        problem.keypoints = self.keypoints(hands=hands, face=face)
+        chosen = problem.keypoints.index
+        at = np.ix_(frames, np.arange(len(seen.rig)), chosen.cpu().numpy())
+        points = self.points(problem)
+        pose = self._tensor(seen.rig.colour_from_master)
+        lenses = self._tensor(seen.rig.colour_parameters)
+        z = points[:, None] @ pose[:, 2, :3, None]
+        z = z[..., 0] + pose[:, 2, 3][:, None]
+        sigma = self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
+        problem.views = Views(
+            self._tensor(seen.keypoints[at]),
+            self._tensor(seen.confidence[at]),
+            sigma.clamp_min(_SMALLEST_SIGMA_PX),
+            lenses,
+            pose,
+            self._shift(points),
+        )
+
+    def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
+        """Those of the body, and of hands and face where asked for.
+
+        The jaw line is left out: its landmarks slide over the cheek with the view.
+        """
+        index = list(range(BODY.start, BODY.stop))
+        if hands:
+            index += range(LEFT_HAND.start, RIGHT_HAND.stop)
+        if face:
+            index += range(FACE.start, FACE.stop)
+        return body_keypoints.keypoint_set(self.model, index)
+
+    def points(self, problem: BodyProblem) -> Tensor:
+        """Current positions (N,K,3) of the problem's keypoints, with offsets."""
+        offsets = torch.zeros(len(problem.keypoints.index), 3).to(problem.base)
+        offsets[: BODY.stop] = problem.offsets
+        return body_keypoints.evaluate(
+            self.model,
+            self.model.parameters(problem.base),
+            problem.keypoints,
+            offsets,
+            derivatives=False,
+        ).points
+
+    def pixel_residuals(self, problem: BodyProblem) -> Tensor:
+        """Projections minus observations (N,C,K,2), px, of the problem's keypoints."""
+        views = problem.views
+        if views is None:
+            raise ValueError("the problem has no views to compare with")
+        return body_keypoints.pixel_residuals(
+            self.points(problem),
+            views.observed,
+            views.lenses,
+            views.colour_from_master,
+            shift=views.shift,
+        )
+
+    def _shift(self, points: Tensor) -> Tensor | None:
+        """How far points (N,...,3) move until each camera exposes: (N,C,...,3), or None."""
+        delay = self.seen.delay[self.frames]
+        if not np.any(delay) or len(self.frames) < 2:
+            return None
+        velocity = np.gradient(points.double().cpu().numpy(), self.seen.times[self.frames], axis=0)
+        return self._tensor(delay)[:, :, None, None] * self._tensor(velocity)[:, None]
+
+    def refine_sigma(self, problem: BodyProblem) -> None:
+        """Noise of each group of keypoints from its residuals: 1.48 median absolute deviation."""
+        views = problem.views
+        assert views is not None
+        scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
+        scaled = scaled * self.keypoint_sigma[problem.keypoints.index, None]
+        for part, start in _KEYPOINT_SIGMA:
+            index = problem.keypoints.index
+            here = (index >= part.start) & (index < part.stop)
+            known = views.confidence[:, :, here] > 0
+            if bool(known.any()):
+                found = 1.4826 * _PERSISTENCE * float(scaled[:, :, here][known].median())
+                low, high = (start * factor for factor in _SIGMA_RANGE)
+                self.keypoint_sigma[part] = min(max(found, low), high)
+
+    def refine_cloud_noise(self, problem: BodyProblem) -> None:
+        """The same for each covering's samples, from what is left of their distances."""
+        rows = problem.rows
+        assert rows is not None
+        points = self.model.forward(
+            self.model.parameters(problem.base), vertex_ids=self.sample_ids
+        ).vertices
+        away = body_cloud.residuals(points, rows, problem.thickness_of_group(), self.group).abs()
+        for g, covering in enumerate(COVERINGS):
+            part = self.group == g
+            known = rows.weight[:, part] > 0
+            if bool(known.any()):
+                found = 1.4826 * float(away[:, part][known].median())
+                low, high = (covering.noise * factor for factor in _NOISE_RANGE)
+                self.cloud_noise[g] = min(max(found, low), high)
+
+    def match(self, problem: BodyProblem, reach: float) -> CloudRows:
+        """Correspondences of all frames at the problem's bodies, within ``reach`` metres."""
+        count, size = len(self.frames), len(self.samples.vertex)
+        expected = problem.thickness()
+        params = self.model.parameters(problem.base)
+        faces = self.model.faces
+        where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
+        shift = self._shift(where)
+        mean = where.new_zeros(count, size)
+        total = where.new_zeros(count, size)
+        normal = where.new_zeros(count, size, 3)
+        for start in range(0, count, _VERTEX_CHUNK):
+            at = slice(start, start + _VERTEX_CHUNK)
+            vertices = self.model.forward(params.frames(at)).vertices
+            normals = body_cloud.vertex_normals(vertices, faces)
+            normal[at] = normals[:, self.sample_ids]
+            for row in range(len(vertices)):
+                t = start + row
+                cloud = self.clouds[t]
+                if cloud is None:
+                    continue
+                found = body_cloud.match(
+                    cloud.points, cloud.normals, vertices[row], normals[row],
+                    self.sample_ids, self.patch, reach,
+                )  # fmt: skip
+                if shift is not None:
+                    late = shift[t, cloud.view, found.sample]
+                    moved = (late * normal[t, found.sample]).sum(1)
+                    found = found._replace(distance=found.distance - moved)
+                self.cloud_residual[t] = found.distance[found.valid].abs().nanmedian()
+                mean[t], total[t] = body_cloud.gather(
+                    found, cloud.trust, expected, size, huber=_HUBER_M
+                )
+        noise = self.cloud_noise[self.group]
+        share = self.cloud_weight * _SAMPLE_SHARE
+        weight = share * total / (total + _FULL_SAMPLE) / noise**2
+        target = mean + (normal * where).sum(2)
+        return CloudRows(target, normal, weight, mean)
