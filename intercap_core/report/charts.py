@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 _WIDTH, _HEIGHT = 520, 300
-_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 14, 44
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 34, 44
 _ROW = 22
 _LABEL = 150
 
@@ -63,12 +63,9 @@ def line_chart(
         )
         parts.append(f'<polyline class="line {line.colour}" points="{points}"/>')
     for index, line in enumerate(series):
-        y = _TOP + 24 + 16 * index
-        x = _WIDTH - _RIGHT - 88
-        parts.append(
-            f'<line class="line {line.colour}" x1="{x}" x2="{x + 20}" {_same("y", y - 4)}/>'
-        )
-        parts.append(_text(x + 26, y, line.name, "legend", "start"))
+        x = _LEFT + 100 * index
+        parts.append(f'<line class="line {line.colour}" x1="{x}" x2="{x + 20}" {_same("y", 14)}/>')
+        parts.append(_text(x + 26, 18, line.name, "legend", "start"))
     parts.append(_text(_LEFT + inner_width / 2, _HEIGHT - 8, x_label, "label", "middle"))
     parts.append(
         f'<text class="label" text-anchor="middle" transform="translate(14 '
@@ -116,23 +113,23 @@ def dumbbells(rows: Sequence[tuple[str, float, float]], unit: str) -> str:
     """One row a pair of numbers, before and after."""
     finite = [v for _, *pair in rows for v in pair if math.isfinite(v)]
     top = max([*finite, 1e-9]) * 1.1
-    height = _ROW * len(rows) + 40
-    inner = _WIDTH - _LEFT - _RIGHT - 20
-    parts = [_open(_WIDTH, height, f"before and after, {unit}")]
+    width, height = 640, _ROW * len(rows) + 40
+    inner = width - _LABEL - _RIGHT
+    parts = [_open(width, height, f"before and after, {unit}")]
     for tick in ticks(0, top):
-        x = _LEFT + 20 + inner * tick / top
+        x = _LABEL + inner * tick / top
         parts.append(f'<line class="grid" {_same("x", x)} y1="4" y2="{height - 36}"/>')
         parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
     for row, (name, before, after) in enumerate(rows):
         y = _ROW * row + 14
-        parts.append(_text(_LEFT + 12, y + 4, name, "tick", "end"))
+        parts.append(_text(_LABEL - 8, y + 4, name, "tick", "end"))
         if not (math.isfinite(before) and math.isfinite(after)):
             continue
-        x0, x1 = (_LEFT + 20 + inner * v / top for v in (before, after))
+        x0, x1 = (_LABEL + inner * v / top for v in (before, after))
         parts.append(f'<line class="link" x1="{x0:.1f}" x2="{x1:.1f}" {_same("y", y)}/>')
         parts.append(f'<circle class="dot faint" cx="{x0:.1f}" cy="{y}" r="4"/>')
         parts.append(f'<circle class="dot c1" cx="{x1:.1f}" cy="{y}" r="4.5"/>')
-    parts.append(_text(_LEFT + 20 + inner / 2, height - 6, unit, "label", "middle"))
+    parts.append(_text(_LABEL + inner / 2, height - 6, unit, "label", "middle"))
     return "".join([*parts, "</svg>"])
 
 

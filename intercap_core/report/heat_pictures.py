@@ -24,6 +24,7 @@ _BACKGROUND = (0.965, 0.968, 0.975)
 _FAR = 40.0  # distance in sizes of what is shown: nearly parallel rays
 _MAX_EDGE_M = 0.012  # an object's mesh is refined to this before values are put on it
 _KERNEL_M = 0.006  # deviation of the kernel that spreads the surface points' values
+_WRIST_M = 0.03  # of the forearm shown with a hand
 _ARMS_DOWN = 1.0  # rad, of each shoulder from the T-pose
 
 
@@ -58,14 +59,11 @@ def body_pictures(model: BodyModel, likelihood: np.ndarray, top: float) -> list[
         for name, view in (("front", [0, 0, 1.0]), ("back", [0, 0, -1.0]))
     ]
     template = model.template.numpy().astype(np.float64)
-    weights = model.skinning_weights.numpy()
+    with torch.no_grad():
+        joints = model.forward(model.zeros(1)).joints[0].numpy()
     for side, outwards in (("left", 1.0), ("right", -1.0)):
-        hand = [JOINT_INDEX[f"{side}_wrist"]] + [
-            i
-            for name, i in JOINT_INDEX.items()
-            if name.startswith(f"{side}_") and name[-1] in "123"
-        ]
-        shown = weights[:, hand].sum(1) > 0.5
+        wrist = joints[JOINT_INDEX[f"{side}_wrist"], 0]
+        shown = outwards * (template[:, 0] - wrist) > -_WRIST_M
         kept = faces[shown[faces].all(1)]
         fingers = np.array([outwards, 0, 0])  # the T-pose's fingers point away from the body
         for what, view in (("palm", [0, -1.0, 0]), ("back", [0, 1.0, 0])):

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from intercap_core.metrics import figures, flags
 from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.report import charts
+from intercap_core.report import charts, measures
 from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
 from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
 from intercap_core.schemas import METRIC_REGIONS
@@ -25,37 +25,7 @@ from intercap_core.schemas import METRIC_REGIONS
 _TEMPLATES = Path(__file__).parent / "templates"
 _WORST = 10
 _MAX_RUNS = 400  # rows of the list of flagged frames
-_MAX_CAMERA_ROWS = 40
-_HISTOGRAM_MM = 30.0
-_BIN_MM = 1.0
-_PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, the paper's Experiments
 _LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "scipy")
-_NAMES = {"object_track": "object track", "body_fit": "body fit", "joint": "joint"}
-# key, what it is, digits, whether more is better (None: neither)
-_TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
-    ("body_pve_mm", "body, per vertex, mm", 1, False),
-    ("body_mpjpe_mm", "body, 22 joints, mm", 1, False),
-    ("hand_mpjpe_mm", "hands, joints and tips, mm", 1, False),
-    ("hand_grasp_mpjpe_mm", "hands while touching, mm", 1, False),
-    ("hand_mpjpe_wrist_mm", "hands, wrists aligned, mm", 1, False),
-    ("object_translation_mm", "object, centre of mass, mm", 1, False),
-    ("object_translation_p95_mm", "… 95th percentile, mm", 1, False),
-    ("object_rotation_deg", "object, rotation, degrees", 2, False),
-    ("object_rotation_p95_deg", "… 95th percentile, degrees", 2, False),
-    ("lost_share", "object lost (50 mm or 20 degrees), share", 3, False),
-    ("lost_unnoticed_share", "… and not flagged, share", 3, False),
-    ("first_frame_success", "first seen frame found (20 mm, 10 degrees), share", 2, True),
-    ("contact_region_f1", "contact by region, F1", 3, True),
-    ("contact_f1", "contact by vertex at 4.5 mm, F1", 3, True),
-    ("contact_recall", "frames in contact found, share", 3, True),
-    ("acceleration_body_mm", "acceleration error, body, mm/frame² at 30 fps", 2, False),
-    ("acceleration_hands_mm", "acceleration error, hands, mm/frame²", 2, False),
-    ("acceleration_object_mm", "acceleration error, object, mm/frame²", 2, False),
-    ("rest_jitter_mm", "jitter while the object rests, mm", 2, False),
-    ("motion_onset_frames", "late at the start of motion, frames", 1, None),
-    ("joint_normalised_median", "error over stated deviation, joints (honest: 0.7-1.4)", 2, None),
-    ("object_normalised_median", "error over stated deviation, object (honest: 0.7-1.4)", 2, None),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +96,11 @@ def _context(content: Content) -> dict[str, Any]:
         "tiles": _tiles(content),
         "rows": rows,
         "failed": sorted(content.failed.items()),
-        "truth": _truth(content),
-        "penetration": _penetration(content),
-        "clouds": _clouds(content),
+        "truth": measures.truth(content.sequences),
+        "penetration": measures.penetration(content.sequences),
+        "clouds": measures.clouds(content.dataset, content.sequences),
         "heat": _heat(content),
-        "cameras": _cameras(content),
+        "cameras": measures.cameras(content.sequences, content.residuals),
         "worst": sorted(rows, key=lambda row: row["rank"])[:_WORST],
         "flagged_runs": runs[:_MAX_RUNS],
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
@@ -216,120 +186,6 @@ def _rows(content: Content) -> list[dict[str, Any]]:
     return rows
 
 
-def _truth(content: Content) -> dict[str, Any] | None:
-    known = [s for s in content.sequences if s.has_truth]
-    if not known:
-        return None
-    by_stage = {stage: figures.truth_figures(known, stage) for stage in figures.STAGES}
-    rows = []
-    for key, name, digits, more in _TRUTH_ROWS:
-        values = [by_stage[stage].get(key) for stage in figures.STAGES]
-        found = [v for v in values if v is not None]
-        if not found:
-            continue
-        best = None
-        if len(found) > 1 and more is not None:
-            best = max(found) if more else min(found)
-        rows.append(
-            {
-                "name": name,
-                "cells": [
-                    {
-                        "text": "" if v is None else f"{v:.{digits}f}",
-                        "best": v is not None and v == best,
-                    }
-                    for v in values
-                ],
-            }
-        )
-    own = figures.pooled(known, "truth/penetration_mean")
-    touching = figures.pooled(known, "truth/contact_frame")
-    own_mm = float("nan")
-    if own is not None and touching is not None and touching.any():
-        own_mm = 1e3 * float(own[touching].mean())
-    return {
-        "sequences": len(known),
-        "frames": sum(len(s) for s in known),
-        "stages": [_NAMES[stage] for stage in figures.STAGES],
-        "rows": rows,
-        "flags": figures.flag_figures(known),
-        "own_penetration": own_mm,
-        "sweep": _sweep(known),
-    }
-
-
-def _sweep(known: Sequence[SequenceMetrics]) -> str:
-    lines = []
-    for stage, colour in (("body_fit", "c2"), ("joint", "c1")):
-        found = figures.contact_sweep(known, stage)
-        if found and np.isfinite(list(found.values())).all():
-            x, y = np.array(list(found)), np.array(list(found.values()))
-            lines.append(charts.Series(_NAMES[stage], colour, x, y))
-    if not lines:
-        return ""
-    return charts.line_chart(
-        lines,
-        x_label="threshold, mm",
-        y_label="F1 of body vertices",
-        x_range=(0, 30),
-        y_range=(0, 1),
-        marks=((4.5, "4.5 mm"),),
-    )
-
-
-def _penetration(content: Content) -> dict[str, Any]:
-    touching = figures.pooled(content.sequences, "contact_frame")
-    assert touching is not None
-    edges = np.arange(0, _HISTOGRAM_MM + _BIN_MM / 2, _BIN_MM)
-    lines, shares, tallest = [], [], 1.0
-    for name, colour in (("max", "c2"), ("mean", "c1"), ("median", "c3")):
-        values = figures.pooled(content.sequences, f"penetration_{name}")
-        assert values is not None
-        depth = 1e3 * values[touching].astype(np.float64)
-        counts = np.histogram(np.clip(depth, 0, _HISTOGRAM_MM), edges)[0].astype(float)
-        tallest = max(tallest, float(counts.max()))
-        outline = np.repeat(counts, 2)
-        lines.append(charts.Series(name, colour, np.repeat(edges, 2)[1:-1], outline))
-        grid = np.linspace(0, _HISTOGRAM_MM, 121)
-        share = np.array([(depth <= g).mean() if len(depth) else 0.0 for g in grid])
-        shares.append(charts.Series(name, colour, grid, 100 * share))
-    x_range = (0.0, _HISTOGRAM_MM)
-    summary = figures.penetration_figures(content.sequences)
-    return {
-        **summary,
-        "frames": int(touching.sum()),
-        "bin": f"{_BIN_MM:g}",
-        "histogram": charts.line_chart(
-            lines,
-            x_label="penetration depth, mm (the last bin holds all beyond)",
-            y_label="contact frames",
-            x_range=x_range,
-            y_range=(0, 1.08 * tallest),
-        ),
-        "cumulative": charts.line_chart(
-            shares,
-            x_label="penetration depth, mm",
-            y_label="contact frames, %",
-            x_range=x_range,
-            y_range=(0, 100),
-            marks=((5, "5"), (7, "7"), (20, "20")),
-        ),
-    }
-
-
-def _clouds(content: Content) -> list[dict[str, Any]]:
-    names = ("body_mm", "object_mm", "body_visible_mm", "object_visible_mm")
-    found = figures.cloud_figures(content.sequences)
-    floor = figures.floor_figures(content.sequences)
-    rows = [{"name": content.dataset, "cells": [found[n] for n in names], "reference": False}]
-    if floor:
-        cells = [floor.get(n) for n in names]
-        rows.append({"name": "floor: true poses", "cells": cells, "reference": True})
-    published = [*_PUBLISHED_CLOUD_MM, None, None]
-    rows.append({"name": "InterCap, as published", "cells": published, "reference": True})
-    return rows
-
-
 def _heat(content: Content) -> dict[str, Any]:
     stops = ", ".join(
         f"{_css(colour)} {100 * at:g}%"
@@ -350,27 +206,6 @@ def _heat(content: Content) -> dict[str, Any]:
             }
             for heat in content.object_heat
         ],
-    }
-
-
-def _cameras(content: Content) -> dict[str, Any]:
-    """By pair for one sequence, by sequence for several."""
-    if len(content.residuals) == 1:
-        rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(content.residuals.values()))]
-    else:
-        rows = []
-        for name, pairs in content.residuals.items():
-            values = 1e3 * np.array([pair[1:] for pair in pairs]).reshape(-1, 2)
-            before, after = np.median(values, axis=0) if len(values) else (np.nan, np.nan)
-            rows.append((name, float(before), float(after)))
-        rows.sort(key=lambda row: -np.nan_to_num(row[2], nan=-1.0))
-    note = "Worst first." if len(rows) > 3 else ""
-    if len(rows) > _MAX_CAMERA_ROWS:
-        note = f"The {_MAX_CAMERA_ROWS} worst of {len(rows)}; all are in tables/sequences.csv."
-    return {
-        "chart": charts.dumbbells(rows[:_MAX_CAMERA_ROWS], "residual, mm") if rows else "",
-        "note": note,
-        "truth": figures.extrinsics_figures(content.sequences) or None,
     }
 
 
