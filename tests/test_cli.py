@@ -1,0 +1,141 @@
+"""The command line: help at once, faults in one line, what a file holds."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.cli import STAGES
+from intercap_core.schemas import DETECTIONS
+from intercap_core.step import SEQUENCE_STAGES
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "intercap_core.cli", *arguments],
+        cwd=folder,
+        env={"PATH": "/usr/bin:/bin", "COLUMNS": "200", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_help_answers_at_once_and_teaches() -> None:
+    start = time.monotonic()
+    done = intercap("--help")
+    assert time.monotonic() - start < 2.0
+    assert done.returncode == 0
+    for command in ("check", "run", "inspect", "object-track", "intercap run config/demo"):
+        assert command in done.stdout
+
+
+def test_every_command_has_an_example() -> None:
+    from intercap_core.cli import app
+
+    commands = [c for c in app.registered_commands if c.name != "docs"]
+    texts = {c.name or c.callback.__name__: c.callback.__doc__ or "" for c in commands}  # type: ignore[union-attr]
+    texts.pop("docs", None)
+    assert len(texts) >= len(STAGES) + 6
+    assert not [name for name, text in texts.items() if "Example" not in text]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; import intercap_core.cli, intercap_core.job; "
+        "print([m for m in ('torch', 'open3d', 'cv2', 'numpy', 'h5py', 'scipy', 'matplotlib')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_commands_are_the_stages() -> None:
+    assert tuple(STAGES) == (*SEQUENCE_STAGES, "export")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("check", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
+        (("joint", "config/demo/config.yaml", "nobody"), "there is no sequence 'nobody'"),
+        (("studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
+        (("inspect", "README.md"), "README.md: not an artefact"),
+        (("inspect", "nowhere.h5"), "nowhere.h5: there is no such file"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_one(arguments: tuple[str, ...], says: str) -> None:
+    done = intercap(*arguments)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_check_names_every_fault_of_every_sequence(tmp_path: Path) -> None:
+    (tmp_path / "cup.ply").touch()
+    (tmp_path / "config.yaml").write_text("dataset: trial\n")
+    (tmp_path / "subjects.tsv").write_text("subject\tgender\ns01\tmale\n")
+    (tmp_path / "objects.yaml").write_text("cup: {mesh: cup.ply}\n")
+    (tmp_path / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\n"
+        "good\ts01\tcup\trec\tcup.ply\nbad\ts01\tcup\tnone\tnone.json\nempty\ts01\tcup\t.\tcup.ply\n"
+    )
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "k1.mkv").touch()
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
+    done = intercap("check", "config.yaml", folder=tmp_path)
+    assert done.returncode == 1
+    assert "1 of 3 sequences are ready" in done.stdout
+    problems = done.stderr.splitlines()
+    assert len(problems) == 4
+    assert sum("'bad'" in line for line in problems) == 3
+    assert "'empty'" in problems[-1]
+
+
+@pytest.fixture
+def detections(tmp_path: Path) -> Path:
+    """A detections artefact of one camera and two frame sets."""
+    path = tmp_path / "detections.h5"
+    lengths = {"T": 2, "C": 1}
+    with artefacts.write(path, DETECTIONS, sequence="one") as writer:
+        for key, field in DETECTIONS.fields.items():
+            if "{camera}" not in key:
+                shape = [lengths.get(dim) or int(dim) for dim in field.dims]
+                text = field.dtype == "str"
+                writer.put(key, ["k1"] * shape[0] if text else np.ones(shape, field.dtype))
+    return path
+
+
+def test_inspect_says_what_a_file_holds(detections: Path) -> None:
+    done = intercap("inspect", str(detections), "--verify")
+    assert done.returncode == 0, done.stderr
+    assert "sequence  one" in done.stdout
+    row = next(line for line in done.stdout.splitlines() if "keypoints_found" in line)
+    assert "2 x 1" in row
+    assert "bool" in row
+    assert "checksum is right" in done.stdout
+
+
+def test_inspect_finds_damage(detections: Path) -> None:
+    with h5py.File(detections) as file:
+        offset = file["camera_names"].id.get_chunk_info(0).byte_offset
+        size = file["camera_names"].id.get_chunk_info(0).size
+    data = np.frombuffer(detections.read_bytes(), np.uint8).copy()
+    data[offset : offset + size] ^= 0xFF
+    detections.write_bytes(data.tobytes())
+    done = intercap("inspect", str(detections), "--verify")
+    assert done.returncode == 1
+    assert "'camera_names' is damaged" in done.stderr
+    assert "re-run stage 'detections'" in done.stderr

@@ -1,0 +1,85 @@
+"""A copy of the project in a folder of its own, run by the real Snakemake."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core")
+ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
+
+
+@dataclass(frozen=True)
+class Flow:
+    """The copy's folder and which settings are run."""
+
+    folder: Path
+    settings: str = "config/test/config.yaml"
+
+    @classmethod
+    def copy(cls, folder: Path) -> Flow:
+        """Copy what a run needs; compiled caches come along."""
+        for name in COPIED:
+            source = ROOT / name
+            if source.is_dir():
+                shutil.copytree(source, folder / name)
+            else:
+                shutil.copy2(source, folder / name)
+        return cls(folder)
+
+    @property
+    def results(self) -> Path:
+        return self.folder / "results" / "test"
+
+    def artefact(self, sequence: str, stage: str) -> Path:
+        return self.results / sequence / f"{stage}.h5"
+
+    def annotation(self, sequence: str) -> Path:
+        return self.folder / Path(self.settings).parent / "annotations" / f"{sequence}.yaml"
+
+    def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run Snakemake in the folder, with the folder's own package."""
+        command = [
+            *(sys.executable, "-m", "snakemake", "--cores", "2"),
+            *("--configfile", self.settings, *arguments),
+        ]
+        return subprocess.run(
+            command,
+            cwd=self.folder,
+            env={**os.environ, "PYTHONPATH": str(self.folder)},
+            capture_output=True,
+            text=True,
+        )
+
+    @property
+    def transcript(self) -> Path:
+        """What `intercap run` said when the fixture ran it."""
+        return self.folder / "transcript.txt"
+
+    def intercap(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run the command line in the folder, with the folder's own package."""
+        return subprocess.run(
+            [sys.executable, "-m", "intercap_core.cli", *arguments],
+            cwd=self.folder,
+            env={**os.environ, "PYTHONPATH": str(self.folder), "COLUMNS": "400"},
+            capture_output=True,
+            text=True,
+        )
+
+    def pending(self) -> set[tuple[str, str]]:
+        """(sequence, rule) of every job that a run would start now; "" for the whole dataset."""
+        done = self.run("--summary")
+        assert done.returncode == 0, done.stderr
+        header, *rows = [line.split("\t") for line in done.stdout.splitlines() if "\t" in line]
+        entries = [dict(zip(header, row, strict=True)) for row in rows]
+        pending = set()
+        for entry in entries:
+            if entry["plan"] != "no update":
+                folder = Path(entry["log-file(s)"]).parent.name  # the sequence's or the dataset's
+                pending.add(("" if folder == self.results.name else folder, entry["rule"]))
+        return pending

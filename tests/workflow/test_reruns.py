@@ -1,0 +1,152 @@
+"""What an edit re-runs, on a finished run: exactly the stages that it concerns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import yaml
+from flow import ONE, OTHER, Flow
+
+AFTER_SCENE = {"scene", "person", "object_track", "body_fit", "joint", "metrics", "export"}
+DATASET = ("", "dataset")
+CONTACT = "contact:\n- {part: right_hand, start: 1, end: 4}\n"
+FLOOR = "floor: [[0.0, 1.0, 2.0], [1.0, 1.0, 2.0], [0.0, 1.0, 3.0]]\n"
+
+
+@contextmanager
+def edited(path: Path, text: str) -> Iterator[None]:
+    """Write ``text`` for a while; afterwards the file is as it was, or gone."""
+    before = path.read_bytes() if path.exists() else None
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    try:
+        yield
+    finally:
+        if before is None:
+            path.unlink()
+        else:
+            path.write_bytes(before)
+
+
+@contextmanager
+def replaced(path: Path, old: str, new: str) -> Iterator[None]:
+    text = path.read_text()
+    assert old in text, f"{path} has no {old!r}"
+    with edited(path, text.replace(old, new)):
+        yield
+
+
+def test_running_again_does_nothing(flow: Flow) -> None:
+    assert flow.pending() == set()
+    done = flow.run()
+    assert done.returncode == 0
+    assert "Nothing to be done" in done.stderr
+
+
+def test_touching_re_runs_nothing(flow: Flow) -> None:
+    for path in [*flow.results.rglob("*.h5"), *(flow.folder / "config").rglob("*.*")]:
+        os.utime(path)
+    assert flow.pending() == set()
+
+
+@pytest.mark.parametrize(
+    ("text", "stages"),
+    [
+        (CONTACT, {"joint", "metrics", "export"}),
+        (FLOOR, AFTER_SCENE),
+        (
+            "object_pose: {rotation_vector: [0, 0, 0], translation: [0, 0, 2]}\n",
+            {"object_track", "joint", "metrics", "export"},
+        ),
+        ("drop_frames: [2]\n", {"frames", "detections", *AFTER_SCENE}),
+        ("# nothing yet\ncontact:\n", set()),
+    ],
+)
+def test_a_new_annotation_re_runs_its_sequence_from_the_stage_that_reads_it(
+    flow: Flow, text: str, stages: set[str]
+) -> None:
+    with edited(flow.annotation(OTHER), text):
+        pending = flow.pending()
+    assert pending == {(OTHER, stage) for stage in stages} | ({DATASET} if stages else set())
+    assert flow.pending() == set()
+
+
+def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None:
+    """The run has contact and floor annotated; then one of the two is edited or both touched."""
+    path = flow.annotation(OTHER)
+    with edited(path, CONTACT + FLOOR):
+        made = flow.run("--touch")  # as if all had run with this file
+        assert made.returncode == 0, made.stderr
+        path.write_text("# a comment, and the same content\n" + FLOOR + CONTACT)
+        assert flow.pending() == set()
+        path.write_text(FLOOR + CONTACT.replace("end: 4", "end: 5"))
+        contact = {(OTHER, stage) for stage in ("joint", "metrics", "export")}
+        assert flow.pending() == contact | {DATASET}
+        path.write_text(CONTACT + FLOOR.replace("2.0", "2.1"))
+        assert flow.pending() == {(OTHER, stage) for stage in AFTER_SCENE} | {DATASET}
+    assert flow.run("--touch").returncode == 0  # back to no annotation
+
+
+@pytest.mark.parametrize(
+    ("term", "stages"),
+    [
+        ("ground", {"joint"}),
+        ("object_silhouette", {"object_track", "joint"}),
+        ("body_priors", {"body_fit", "joint"}),
+    ],
+)
+def test_editing_an_energy_term_re_runs_what_reaches_it(
+    flow: Flow, term: str, stages: set[str]
+) -> None:
+    path = flow.folder / "intercap_core" / "energy" / f"{term}.py"
+    with edited(path, path.read_text() + "\nEDITED = 1\n"):
+        pending = {rule for _, rule in flow.pending()}
+    assert pending == stages | {"metrics", "export", "dataset"}
+
+
+def test_an_import_inside_a_function_counts(flow: Flow) -> None:
+    core = flow.folder / "intercap_core"
+    term = core / "energy" / "hidden_term.py"
+    person = core / "stages" / "person.py"
+    with (
+        edited(term, "WEIGHT = 1\n"),
+        edited(
+            person,
+            person.read_text()
+            + "\n\ndef _late():\n    from intercap_core.energy import hidden_term\n\n"
+            "    return hidden_term\n",
+        ),
+    ):
+        assert flow.run("--touch").returncode == 0
+        assert flow.pending() == set()
+        term.write_text("WEIGHT = 2\n")
+        pending = {rule for _, rule in flow.pending()}
+    assert flow.run("--touch").returncode == 0
+    assert pending == AFTER_SCENE - {"scene"} | {"dataset"}
+
+
+def test_rewording_a_docstring_re_runs_nothing(flow: Flow) -> None:
+    path = flow.folder / "intercap_core" / "energy" / "ground.py"
+    with edited(path, "# a comment\n" + path.read_text().replace('"""', '"""Reworded: ', 1)):
+        assert flow.pending() == set()
+
+
+def test_a_setting_re_runs_its_own_stage(flow: Flow) -> None:
+    path = flow.folder / flow.settings
+    settings = yaml.safe_load(path.read_text())
+    with edited(path, yaml.safe_dump({**settings, "report": {"frames": 2}})):
+        assert flow.pending() == {DATASET}
+    with edited(path, yaml.safe_dump({**settings, "joint": {"ground_weight": 2.0}})):
+        after = {(name, rule) for name in (ONE, OTHER) for rule in ("joint", "metrics", "export")}
+        assert flow.pending() == after | {DATASET}
+
+
+def test_another_seed_makes_another_recording(flow: Flow) -> None:
+    with replaced(flow.folder / flow.settings, "seed: 22", "seed: 23"):
+        pending = flow.pending()
+    assert {name for name, _ in pending} == {OTHER, ""}
+    assert (OTHER, "studio") in pending
