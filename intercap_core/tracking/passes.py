@@ -37,6 +37,7 @@ RECOVERY_CONFIDENCE = 0.40
 RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
 SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
 STILL_M, STILL_RAD = 0.004, np.radians(1.5)  # slower than this: no motion is predicted
+ONSET_M, ONSET_RAD = 0.02, np.radians(5)  # in one frame, from rest
 AGREE_M, AGREE_DEG = 0.02, 10.0
 GROWTH_LOST_M, GROWTH_LOST_RAD = 0.04, np.radians(8)  # standard deviation added a lost frame
 CACHED_FRAMES = 12
@@ -232,11 +233,7 @@ class Tracker:
         self._searches = 0
         for t in frames:
             predicted = now if lost_for else _extrapolated(before, now)
-            prior = MotionPrior(
-                predicted,
-                MotionPrior.sigma_m + lost_for * GROWTH_LOST_M,
-                MotionPrior.sigma_rad + lost_for * GROWTH_LOST_RAD,
-            )
+            prior = _expected(before, now, predicted, lost_for)
             start_pose = self._better_start(t, predicted, now)
             if known is not None and same_pose(self._mesh, start_pose, known[t].fit.pose):
                 result = known[t]
@@ -351,6 +348,23 @@ def _extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
     if turn.magnitude() > STILL_RAD:
         predicted[:3, :3] = turn.as_matrix() @ now[:3, :3]
     return predicted
+
+
+def _expected(
+    before: np.ndarray, now: np.ndarray, predicted: np.ndarray, lost_for: int
+) -> MotionPrior:
+    """How far the object may be from the prediction: it may start to move, turn or stop.
+
+    From rest one frame of a hand's acceleration, in motion half of the last step beside that, and
+    more for every frame since it was last seen.
+    """
+    shift = float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
+    turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())
+    return MotionPrior(
+        predicted,
+        ONSET_M + 0.5 * shift + lost_for * GROWTH_LOST_M,
+        ONSET_RAD + 0.5 * turn + lost_for * GROWTH_LOST_RAD,
+    )
 
 
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:

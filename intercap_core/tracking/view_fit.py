@@ -106,7 +106,11 @@ class ViewFit:
 
     def _cut(self, pose: np.ndarray) -> None:
         self._mask = self._candidate.mask if self._candidate else EMPTY
-        self._cut_silhouette(self._draw_silhouette(pose))
+        image = self._draw_silhouette(pose)
+        self._cut_silhouette(image)
+        person = self._view.person.window(image.x0, image.y0, *image.mask.shape)
+        overlap = mask_overlap(image, self._mask, person)
+        self._contour_trust = float(np.clip((overlap - 0.3) / 0.4, 0.1, 1.0))
         self._cut_depth(pose)
 
     def _cut_silhouette(self, predicted: Rendering) -> None:
@@ -276,7 +280,7 @@ class ViewFit:
             self._camera.colour_from_master,
             pose[:3, 3],
         )
-        weight = _geman_mcclure(residual, scale_px)
+        weight = self._contour_trust * _geman_mcclure(residual, scale_px)
         # Weights go by the whole rim: a rim that fits nearly everywhere must not let the few
         # pixels that do not count as much as a rim that is off all around.
         samples = CONTOUR_SAMPLES / max(len(self._contour), len(rim))
