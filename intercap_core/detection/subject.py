@@ -89,12 +89,15 @@ def _groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) ->
         directions = rig[c].colour.unproject(found[..., :2]) if len(found) else np.zeros((0, 25, 3))
         rays.append(directions @ rig[c].master_from_colour[:3, :3].T)
         seen.append(found[..., 2] >= min_confidence)
-    proposals = _pair_proposals(rays, seen, rig)
-    grown = [
-        group
-        for points, first, second in proposals
-        if (group := _grow(points, first, second, people, seen, rig)) is not None
-    ]
+    grown: list[Group] = []
+    for _, points, first, second in sorted(_pair_proposals(rays, seen, rig), key=lambda p: p[0]):
+        if any(
+            g.members[first[0]] == first[1] and g.members[second[0]] == second[1] for g in grown
+        ):
+            continue  # a better pair of views has led to these two already
+        group = _grow(points, first, second, people, seen, rig)
+        if group is not None:
+            grown.append(group)
     grown.sort(key=lambda group: -group.support)
     taken: set[tuple[int, int]] = set()
     result = []
@@ -108,8 +111,9 @@ def _groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) ->
 
 def _pair_proposals(
     rays: list[np.ndarray], seen: list[np.ndarray], rig: Rig
-) -> list[tuple[np.ndarray, tuple[int, int], tuple[int, int]]]:
-    """Two views' people whose rays meet: points (25, 3) and (view, person) of both."""
+) -> list[tuple[float, np.ndarray, tuple[int, int], tuple[int, int]]]:
+    """Two views' people whose rays meet: the median gap, metres, points (25, 3) and (view, person)
+    of both."""
     centres = rig.master_from_colour[:, :3, 3]
     result = []
     for a, b in combinations(range(len(rig)), 2):
@@ -124,9 +128,10 @@ def _pair_proposals(
                     common = seen[a][i] & other_seen & np.isfinite(gap)
                     if common.sum() < MIN_COMMON_POINTS:
                         continue
-                    if np.median(gap[common]) < SAME_PERSON_GAP_M:
+                    middle_gap = float(np.median(gap[common]))
+                    if middle_gap < SAME_PERSON_GAP_M:
                         points[~common] = np.nan
-                        result.append((points, (a, i), (b, j)))
+                        result.append((middle_gap, points, (a, i), (b, j)))
                         break
     return result
 

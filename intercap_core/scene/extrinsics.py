@@ -35,14 +35,14 @@ class Refinement:
 
 
 def refine(
-    frames: Frames, detections: Detections, backgrounds: list[Background | None], master: int
+    frames: Frames, detections: Detections, surfaces: dict[int, Surface], master: int
 ) -> Refinement:
     """Refine all cameras' poses but the ``master``'s; the start is kept where held-out points and
-    keypoints together do not get better."""
+    keypoints together do not get better. ``surfaces`` as :func:`background_surfaces` gives."""
     rig = frames.rig
     start = Estimate(rig.master_from_colour.copy(), np.zeros(len(rig)))
     views = body_views(detections, rig, frames.time_s, min_confidence=MIN_CONFIDENCE)
-    registration = Registration(rig, _background_surfaces(rig, backgrounds), master)
+    registration = Registration(rig, surfaces, master)
     body = BodyConstraint(views, rig) if len(views.points) >= MIN_BODY_POINTS else None
     before = registration.residuals(start)
     found = registration.solve(start, [body] if body else [])
@@ -74,7 +74,8 @@ def _cost(residuals: PairResiduals) -> float:
     return float(residuals.median.mean())
 
 
-def _background_surfaces(rig: Rig, backgrounds: list[Background | None]) -> dict[int, Surface]:
+def background_surfaces(rig: Rig, backgrounds: list[Background | None]) -> dict[int, Surface]:
+    """The static surface that each camera sees, in its depth camera's frame, by camera index."""
     surfaces = {}
     for c, background in enumerate(backgrounds):
         lens = rig[c].depth

@@ -16,10 +16,15 @@ from intercap_core.detection.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.scene.background import Background, background_of
-from intercap_core.scene.extrinsics import BACKGROUND_CELL_M, MAX_DEPTH_M, Refinement, refine
+from intercap_core.scene.extrinsics import (
+    BACKGROUND_CELL_M,
+    Refinement,
+    background_surfaces,
+    refine,
+)
 from intercap_core.scene.ground import Ground, annotated_ground, fit_ground, zup_from_master
 from intercap_core.scene.registration import PairResiduals
-from intercap_core.scene.surface import surface_of
+from intercap_core.scene.surface import Surface
 from intercap_core.schemas import SCENE
 
 Floor = Sequence[tuple[float, float, float]]
@@ -41,22 +46,23 @@ def run(
                 "recordings and the dropped frames of its annotation, then re-run stage 'frames'"
             )
         backgrounds = [background_of(source, c) for c in range(len(source.rig))]
-        found = _refined(source, detections, backgrounds, settings)
+        surfaces = background_surfaces(source.rig, backgrounds)
+        found = _refined(source, detections, surfaces, settings)
         rig = source.rig.moved(found.poses)
-        ground = _ground(source, rig, backgrounds, found.bias, settings, floor)
+        ground = _ground(source, rig, surfaces, found.bias, settings, floor)
         _write(output, source, rig, backgrounds, found, ground, settings)
 
 
 def _refined(
     source: Frames,
     detections: Path,
-    backgrounds: list[Background | None],
+    surfaces: dict[int, Surface],
     settings: SceneSettings,
 ) -> Refinement:
     rig = source.rig
     if settings.refine_extrinsics and len(rig) > 1:
         found = Detections.load(detections)
-        return refine(source, found, backgrounds, rig.names.index(source.master))
+        return refine(source, found, surfaces, rig.names.index(source.master))
     none = PairResiduals(np.zeros((0, 2), np.int32), np.zeros(0, np.int64), np.zeros(0))
     return Refinement(rig.master_from_colour, np.zeros(len(rig)), False, none, none)
 
@@ -64,20 +70,16 @@ def _refined(
 def _ground(
     source: Frames,
     rig: Rig,
-    backgrounds: list[Background | None],
+    surfaces: dict[int, Surface],
     bias: np.ndarray,
     settings: SceneSettings,
     floor: Floor | None,
 ) -> Ground:
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for camera, background, shift in zip(rig, backgrounds, bias, strict=True):
-        if background is None or camera.depth is None:
-            continue
-        surface = surface_of(
-            background.depth, camera.depth, cell_m=BACKGROUND_CELL_M, max_depth_m=MAX_DEPTH_M
-        )
-        points.append(apply(camera.master_from_depth, surface.points - shift * surface.rays))
-        normals.append(surface.normals @ camera.master_from_depth[:3, :3].T)
+    for c, surface in surfaces.items():
+        pose = rig[c].master_from_depth
+        points.append(apply(pose, surface.points - bias[c] * surface.rays))
+        normals.append(surface.normals @ pose[:3, :3].T)
     tolerance = settings.floor_tolerance_mm / 1000
     everything = np.concatenate(points)
     if floor is not None:
@@ -94,7 +96,7 @@ def _ground(
         source.gravity,
         tolerance_m=tolerance,
         # Every camera may see the same floor: count the area as if all of them did.
-        cell_m=BACKGROUND_CELL_M / np.sqrt(max(1, len(points) - 1)),
+        cell_m=BACKGROUND_CELL_M / np.sqrt(max(1, len(surfaces))),
     )
 
 
