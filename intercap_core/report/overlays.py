@@ -20,7 +20,7 @@ from intercap_core.rigid.render import Drawable, render_scene
 
 BODY_COLOUR = (0.42, 0.66, 0.92)
 OBJECT_COLOUR = (1.0, 0.62, 0.18)
-_OPACITY = 0.72
+_OPACITY = 0.62
 _HEIGHT_PX = 420
 _MARGIN = 0.10  # of the crop's size, around body and object
 _MIN_ASPECT, _MAX_ASPECT = 0.6, 1.6

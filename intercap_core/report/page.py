@@ -150,7 +150,7 @@ def _tiles(content: Content) -> list[dict[str, str]]:
         _tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"),
         _tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"),
         _tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"),
-        _tile("flagged", 100 * float(flagged.mean()), "%", f"{int(flagged.sum())} frames"),
+        _tile("flagged", 100 * float(flagged.mean()), "%", f"{int(flagged.sum())} not trusted"),
     ]
     return tiles
 

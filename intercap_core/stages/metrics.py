@@ -12,6 +12,7 @@ from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, MetricsSettings, ObjectEntry, SubjectEntry
 from intercap_core.detection.read import Detections
+from intercap_core.errors import UserError
 from intercap_core.metrics import body, contact, motion, object_pose
 from intercap_core.metrics import truth as truths
 from intercap_core.metrics.extrinsics import displacement
@@ -31,6 +32,8 @@ from intercap_core.schemas import (
     PERSON,
     SCENE,
 )
+
+_FOREIGN_TRUTH_M = 0.15  # clothing, noise and occlusion leave some 10 mm
 
 
 def run(
@@ -74,6 +77,7 @@ def run(
         )
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
         true_distance = values.pop("true_distance", None)
+        _check_truth(truth, values)
         values |= _motion(fitted_body, fitted_object, mesh, images.fps)
         values |= _flags(images, person, object_track, body_fit, joint)
         if known is not None:
@@ -140,20 +144,20 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
     with artefacts.read(joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
     unseen = ~images.available.any(1)
+    alone = ~joint_flags  # the joint stage repeats, in its words, what it was told of a frame
     reasons = merge_reasons(
         [
-            (np.asarray(unseen), "no images"),
+            (unseen, "no images"),
             (missing & ~unseen, "person seen in fewer than two views"),
-            (lost, "object lost"),
-            (disagree & ~lost, "forward and backward object tracks disagree"),
-            (failed, "body fit failed"),
-            (bridged & ~failed, "body filled in from neighbouring frames"),
+            (lost & alone, "object lost"),
+            (disagree & ~lost & alone, "object passes disagree"),
+            (failed & alone, "body fit failed"),
+            (bridged & ~failed & alone, "body filled in from neighbouring frames"),
         ]
     )
-    for t, flagged in enumerate(joint_flags):
+    for t in np.flatnonzero(joint_flags):
         said = joint_reasons[t] or "joint fit not trusted"
-        if flagged and said not in reasons[t]:
-            reasons[t] = f"{reasons[t]}; {said}" if reasons[t] else said
+        reasons[t] = f"{reasons[t]}; {said}" if reasons[t] else said
     return {"flagged": np.array([bool(r) for r in reasons]), "flag_reason": reasons}
 
 
@@ -168,6 +172,19 @@ def _extrinsics_errors(scene: artefacts.Artefact, truth: truths.Truth) -> Values
         "truth/extrinsics_before": displacement(scene["master_from_colour_start"], true, master),
         "truth/extrinsics_after": displacement(scene["master_from_colour"], true, master),
     }
+
+
+def _check_truth(path: Path | None, values: Values) -> None:
+    """The true body and object lie in the clouds, or the truth is of another recording."""
+    floor = [
+        values[f"truth/{key}_floor"] for key in ("body", "object") if f"truth/{key}_floor" in values
+    ]
+    apart = [np.nanmedian(v) for v in floor if np.isfinite(v).any()]
+    if apart and min(apart) > _FOREIGN_TRUTH_M:
+        raise UserError(
+            f"{path}: its body and object are {1e3 * min(apart):.0f} mm and more from the recorded "
+            "points, so it is the truth of another recording; make recording and truth again"
+        )
 
 
 class _Errors:
