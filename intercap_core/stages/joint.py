@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 
 # Contact is estimated, the energy descended, and so on: the first round moves the most.
 _ROUNDS = (6, 4, 3)
+_SETTLED = 0.1  # largest change of a contact probability after which nothing new is to be learnt
 _UNTRACKED_SIGMA = 0.5  # of the object's position where the track is lost, metres
 
 
@@ -133,8 +134,10 @@ def run(
             before = problem.equations(state).energy
         minimum = minimise(problem.equations, state, max_steps=rounds)
         state, steps = minimum.state, steps + minimum.steps
-        found = _contact(problem, state, contact, joint_sigma, object_sigma)
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
+        before_round, found = found, _contact(problem, state, contact, joint_sigma, object_sigma)
+        if np.abs(found.probability - before_round.probability).max() < _SETTLED:
+            break
     after = minimum.equations.energy
     flagged, reasons = _flags(failed, bridged, lost, disagree, problem, state)
     report = data.residuals(state)
