@@ -1,0 +1,46 @@
+"""The background behind people who stand still, noise and holes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.scene.background import MAX_SAMPLES, sample_sets, steady_background
+
+
+def test_someone_who_stands_still_most_of_the_time_is_not_background():
+    rng = np.random.default_rng(0)
+    images = rng.normal(3000, 3, (20, 4, 6)).astype(np.uint16)
+    images[:14, 1:3, 1:3] = rng.normal(1800, 3, (14, 2, 2))  # 70 % of the time in front
+    images[rng.random(images.shape) < 0.1] = 0
+    background = steady_background(images)
+    assert np.abs(background.depth.astype(int) - 3000).max() <= 8
+    assert not background.static[1:3, 1:3].any() and background.static[3].all()
+
+
+def test_single_wild_values_behind_the_wall_are_not_background():
+    images = np.full((20, 3, 3), 2500, np.uint16)
+    images[4] = 3900
+    images[9] = 3300
+    assert (steady_background(images).depth == 2500).all()
+
+
+def test_what_is_never_seen_or_never_steady_is_unknown():
+    images = np.zeros((10, 1, 3), np.uint16)
+    images[:, 0, 1] = np.arange(10) * 200 + 500
+    images[::5, 0, 2] = 1000
+    background = steady_background(images)
+    np.testing.assert_array_equal(background.depth, [[0, 0, 1000]])
+    np.testing.assert_array_equal(background.static, [[False, False, False]])
+
+
+def test_one_image_is_its_own_background():
+    image = np.array([[0, 700, 4000]], np.uint16)
+    np.testing.assert_array_equal(steady_background(image[None]).depth, image)
+
+
+def test_memory_is_bounded_by_the_sets_looked_at():
+    available = np.ones(3000, bool)
+    available[::2] = False
+    sets = sample_sets(available)
+    assert len(sets) == MAX_SAMPLES and (sets % 2 == 1).all() and sets[-1] > 2900
+    np.testing.assert_array_equal(sample_sets(np.array([True, False, True])), [0, 2])

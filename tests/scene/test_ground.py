@@ -1,0 +1,109 @@
+"""The floor among furniture, clutter and outliers; annotated floors; the z-up frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_capture import ring
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.errors import UserError
+from intercap_core.scene.ground import (
+    NO_GROUND,
+    annotated_ground,
+    fit_ground,
+    up_hint,
+    zup_from_master,
+)
+
+RIG, UP = ring()
+NO_GRAVITY = np.full((6, 3), np.nan)
+GRAVITY = np.einsum("cji,j->ci", RIG.master_from_colour[:, :3, :3], -UP[2, :3])
+CELL_M = 0.03
+
+
+def room(seed: int, table: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy points and normals, master frame: a floor, a larger table, a wall, outliers."""
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform(-1.5, 1.5, (6000, 2)), np.zeros(6000)])
+    parts, normals = [floor], [np.tile([0, 0, 1.0], (6000, 1))]
+    if table:
+        top = np.column_stack([rng.uniform(-1.5, 1.5, (9000, 2)), np.full(9000, 0.7)])
+        parts.append(top)
+        normals.append(np.tile([0, 0, 1.0], (9000, 1)))
+    wall = np.column_stack(
+        [np.full(5000, 1.8), rng.uniform(-2, 2, 5000), rng.uniform(0, 2.5, 5000)]
+    )
+    parts.append(wall)
+    normals.append(np.tile([-1.0, 0, 0], (5000, 1)))
+    clutter = rng.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.8) + (0, 0, 1.15)
+    parts.append(clutter)
+    directions = rng.normal(size=(3000, 3))
+    normals.append(directions)
+    points = np.concatenate(parts) + rng.normal(0, 0.003, (sum(map(len, parts)), 3))
+    facing = np.concatenate(normals) + rng.normal(0, 0.03, points.shape)
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    to_master = invert(UP)
+    return apply(to_master, points), facing @ to_master[:3, :3].T
+
+
+def errors(ground) -> tuple[float, float]:
+    angle = np.degrees(np.arccos(min(1.0, float(ground.normal @ UP[2, :3]))))
+    return angle, abs(float(apply(UP, ground.point[None])[0, 2]))
+
+
+@pytest.mark.parametrize("gravity", [GRAVITY, NO_GRAVITY], ids=["gravity", "no gravity"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_floor_not_the_larger_table_is_found(seed, gravity):
+    points, normals = room(seed)
+    ground = fit_ground(points, normals, RIG, gravity, tolerance_m=0.015, cell_m=CELL_M)
+    angle, offset = errors(ground)
+    assert ground.found and angle < 0.05 and offset < 0.0005
+    assert 5500 < ground.inliers < 6500 and 0.002 < ground.rms < 0.004
+
+
+def test_a_room_without_a_floor_in_sight_has_none():
+    points, normals = room(0)
+    height = apply(UP, points)[:, 2]
+    seen = (height > 0.2) & ((height < 0.6) | (height > 0.8))
+    found = fit_ground(points[seen], normals[seen], RIG, GRAVITY, tolerance_m=0.015, cell_m=CELL_M)
+    assert not found.found
+    empty = fit_ground(
+        np.zeros((0, 3)), np.zeros((0, 3)), RIG, GRAVITY, tolerance_m=0.015, cell_m=CELL_M
+    )
+    assert not empty.found and np.isnan(empty.normal).all()
+
+
+def test_up_is_measured_or_guessed_from_the_ring():
+    for gravity in (GRAVITY, NO_GRAVITY):
+        np.testing.assert_allclose(up_hint(RIG, gravity)[0], UP[2, :3], atol=1e-6)
+    one_wild = GRAVITY.copy()
+    one_wild[2] = -one_wild[2]
+    assert up_hint(RIG, one_wild)[0] @ UP[2, :3] > 0.97
+
+
+def test_annotated_points_override_and_must_span_a_plane():
+    points, _ = room(0)
+    floor = apply(invert(UP), np.array([[0.5, 0, 0.01], [-0.5, 0.5, 0.01], [0, -0.8, 0.01]]))
+    ground = annotated_ground(floor, points, RIG, NO_GRAVITY, tolerance_m=0.015)
+    angle, offset = errors(ground)
+    assert ground.source == "annotated" and angle < 1e-3 and abs(offset - 0.01) < 1e-9
+    assert ground.inliers > 5000
+    line = apply(invert(UP), np.array([[0, 0, 0.0], [0.5, 0, 0], [1.0, 0.001, 0]]))
+    with pytest.raises(UserError, match="lie on one line"):
+        annotated_ground(line, points, RIG, NO_GRAVITY, tolerance_m=0.015)
+
+
+def test_z_up_puts_the_floor_at_zero_under_the_middle():
+    points, normals = room(0)
+    ground = fit_ground(points, normals, RIG, GRAVITY, tolerance_m=0.015, cell_m=CELL_M)
+    transform = zup_from_master(ground, RIG, GRAVITY)
+    np.testing.assert_allclose(transform[:3, :3] @ transform[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(transform[:3, :3]) > 0
+    world = apply(invert(UP), np.array([[0, 0, 0.0], [0, 0, 1]]))
+    np.testing.assert_allclose(apply(transform, world), [[0, 0, 0], [0, 0, 1]], atol=0.002)
+    ahead = transform[:3, :3] @ [0, 0, 1]
+    assert abs(ahead[0]) < 1e-9 and ahead[1] > 0
+    without = zup_from_master(NO_GROUND, RIG, NO_GRAVITY)
+    np.testing.assert_allclose(without[:3, 3], 0, atol=1e-12)
+    assert without[2, :3] @ UP[2, :3] > 0.999

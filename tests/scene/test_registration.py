@@ -1,0 +1,150 @@
+"""Refinement of poses: derivatives, recovery, and what it must not break."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_capture import (
+    FURNITURE,
+    extrinsics_error,
+    perturbed,
+    ring,
+    room_depth,
+    to_millimetres,
+)
+from synthetic_people import seen_by, walking
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.detection.triangulation import triangulate
+from intercap_core.scene.body_constraints import BodyConstraint, BodyViews
+from intercap_core.scene.registration import Estimate, Registration
+from intercap_core.scene.surface import surface_of
+
+TRUTH, UP = ring()
+MIDDLE = apply(invert(UP), np.array([[0, 0, 0.8]]))[0]
+
+
+def surfaces(seed: int, bias_m: float = 0.0, boxes=FURNITURE, walls=3.6):
+    rng = np.random.default_rng(seed)
+    bias = rng.normal(0, bias_m, len(TRUTH)) if bias_m else np.zeros(len(TRUTH))
+    found = {}
+    for c, camera in enumerate(TRUTH):
+        depth = room_depth(camera, UP, boxes, walls)
+        image = to_millimetres(np.where(depth > 0, depth + bias[c], 0), rng, noise=0.3)
+        found[c] = surface_of(image, camera.depth, cell_m=0.03, max_depth_m=5.0)
+    return found, bias
+
+
+def start_of(rig) -> Estimate:
+    return Estimate(rig.master_from_colour.copy(), np.zeros(len(rig)))
+
+
+def views_of(seed: int, noise_px: float) -> BodyViews:
+    rng = np.random.default_rng(seed)
+    body = walking(10, np.array([-0.5, -0.4]), np.array([0.1, 0.08]), 0.1)[:, :25]
+    whole = np.zeros((10, 135, 3))
+    whole[:, :25] = body
+    keypoints = seen_by(whole, TRUTH, UP)[:, :, :25]
+    pixels = np.swapaxes(keypoints[..., :2], 1, 2).reshape(-1, 6, 2)
+    pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+    points = apply(invert(UP), body.reshape(-1, 3))
+    return BodyViews(pixels, np.ones(pixels.shape[:2]), points)
+
+
+def test_surfaces_lie_on_the_room_and_face_the_camera():
+    found, _ = surfaces(0)
+    for c, surface in found.items():
+        world = apply(UP @ TRUTH[c].master_from_depth, surface.points)
+        on_floor = np.abs(world[:, 2]) < 0.015
+        assert on_floor.mean() > 0.3
+        normals = surface.normals @ (UP @ TRUTH[c].master_from_depth)[:3, :3].T
+        assert np.median(normals[on_floor] @ [0, 0, 1]) > 0.99
+        assert ((surface.normals * surface.points).sum(1) < 0).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_furnished_room_brings_perturbed_cameras_back(seed):
+    found, _ = surfaces(seed, bias_m=0.002)
+    start = perturbed(TRUTH, np.random.default_rng(seed), 0.01, 0.3)
+    registration = Registration(start, found, 0)
+    refined = registration.solve(start_of(start), [])
+    before = extrinsics_error(start, TRUTH, MIDDLE)
+    after = extrinsics_error(start.moved(refined.poses), TRUTH, MIDDLE)
+    assert after[1:].mean() < 0.006 < 0.01 < before[1:].mean()
+    assert after.max() < 0.012
+    np.testing.assert_array_equal(refined.poses[0], start.master_from_colour[0])
+    residuals = registration.residuals(start_of(start)), registration.residuals(refined)
+    assert residuals[1].median.mean() < 0.5 * residuals[0].median.mean()
+
+
+def test_depth_bias_of_one_camera_is_found():
+    found, _ = surfaces(0)
+    biased = found[2]
+    shifted = type(biased)(biased.points + 0.006 * biased.rays, biased.normals, biased.rays)
+    refined = Registration(TRUTH, {**found, 2: shifted}, 0).solve(start_of(TRUTH), [])
+    others = np.delete(refined.bias, 2)
+    assert refined.bias[2] - others.mean() > 0.003
+    error = extrinsics_error(TRUTH.moved(refined.poses), TRUTH, MIDDLE)
+    assert error.max() < 0.005
+
+
+def test_the_body_ties_down_what_a_bare_floor_leaves_free():
+    found, _ = surfaces(1, boxes=np.zeros((0, 2, 3)), walls=None)
+    start = perturbed(TRUTH, np.random.default_rng(3), 0.01, 0.3)
+    registration = Registration(start, found, 0)
+    alone = registration.solve(start_of(start), [])
+    body = BodyConstraint(views_of(0, 3.0), TRUTH)
+    together = registration.solve(start_of(start), [body])
+    errors = [
+        extrinsics_error(start.moved(e.poses), TRUTH, MIDDLE)[1:].mean() for e in (alone, together)
+    ]
+    assert errors[1] < 0.008 and errors[1] < 0.6 * errors[0]
+
+
+def test_body_equations_are_the_derivatives_of_the_reprojection():
+    views = views_of(1, 2.0)
+    poses = perturbed(TRUTH, np.random.default_rng(0), 0.005, 0.2).master_from_colour
+    body = BodyConstraint(views, TRUTH)
+    body(poses)
+    residual, by_point, _, by_pose = body._linearised(poses)
+    step = 1e-6
+    for axis in range(6):
+        moved = poses.copy()
+        if axis < 3:
+            turn = Rotation.from_rotvec(step * np.eye(3)[axis]).as_matrix()
+            moved[:, :3, :3] = turn @ moved[:, :3, :3]
+        else:
+            moved[:, axis - 3, 3] += step
+        numeric = (body._linearised(moved)[0] - residual) / step
+        np.testing.assert_allclose(by_pose[..., axis], numeric, rtol=1e-3, atol=0.05)
+    body._points = body._points + np.array([step, 0, 0])
+    numeric = (body._linearised(poses)[0] - residual) / step
+    np.testing.assert_allclose(by_point[..., 0], numeric, rtol=1e-3, atol=0.05)
+
+
+def test_moving_all_cameras_together_costs_the_body_nothing():
+    views = views_of(2, 0.0)
+    matrix, gradient = BodyConstraint(views, TRUTH)(TRUTH.master_from_colour)
+    together = np.zeros((6, 6, 3))
+    together[:, 3:] = np.eye(3)  # every camera translated alike
+    motion = together.reshape(36, 3)
+    np.testing.assert_allclose(matrix @ motion, 0, atol=1e-3 * np.abs(matrix).max())
+    assert np.abs(gradient).max() < 1e-3 * np.abs(matrix).max() * 1e-3
+
+
+def test_triangulated_points_agree_with_the_constraints_own():
+    views = views_of(3, 1.0)
+    body = BodyConstraint(views, TRUTH)
+    body(TRUTH.master_from_colour)
+    found = triangulate(views.pixels, views.weights, TRUTH, max_error_px=20)
+    np.testing.assert_allclose(body._points, found.points, atol=0.002)
+
+
+def test_cameras_that_share_nothing_stay_where_they_were():
+    found, _ = surfaces(0)
+    start = perturbed(TRUTH, np.random.default_rng(1), 0.01, 0.3)
+    only = Registration(start, {3: found[3]}, 0)
+    refined = only.solve(start_of(start), [])
+    np.testing.assert_array_equal(refined.poses, start.master_from_colour)
+    assert len(only.residuals(refined).pairs) == 0

@@ -1,0 +1,137 @@
+"""Stage ``person``: the subject, its points, its masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_capture import ring
+from synthetic_people import seen_by, walking, write_detections
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.config import PersonSettings
+from intercap_core.detection import masks
+from intercap_core.errors import UserError
+from intercap_core.schemas import PERSON, SCENE
+from intercap_core.stages import person
+
+RIG, UP = ring()
+T = 8
+BODY = walking(T, np.array([-0.2, 0.1]), np.array([0.01, 0]))
+
+
+def write_scene(path: Path, rig: Rig, sets: int) -> Path:
+    attributes = {
+        "sequence": "test", "master": "k1", "fps": 15.0, "extrinsics_refined": False,
+        "ground_found": False, "ground_source": "none", "ground_rms": 0.0, "ground_inliers": 0,
+    }  # fmt: skip
+    count = len(rig)
+    with artefacts.write(path, SCENE, **attributes) as writer:
+        for key, values in rig.datasets().items():
+            writer.put(key, values)
+        writer.put("present", np.ones(count, bool))
+        writer.put("times", np.arange(sets) / 15)
+        for key in ("master_from_colour", "master_from_colour_start"):
+            writer.put(key, rig.master_from_colour)
+        for key in ("depth_bias", "time_offset"):
+            writer.put(key, np.zeros(count))
+        writer.put("slip", np.zeros((sets, count), int))
+        writer.put("pairs", np.zeros((0, 2), int))
+        for key in ("pair_points", "pair_residual_before", "pair_residual_after"):
+            writer.put(key, np.zeros(0, int))
+        writer.put("ground_point", np.full(3, np.nan))
+        writer.put("ground_normal", np.full(3, np.nan))
+        writer.put("zup_from_master", np.eye(4))
+    return path
+
+
+def silhouette(keypoints: np.ndarray, grow: int = 25) -> np.ndarray:
+    """A filled box around the body's points: all that matters here is what is inside."""
+    mask = np.zeros((1080, 1920), np.uint8)
+    low = np.clip(keypoints[:25, :2].min(0) - grow, 0, None).astype(int)
+    high = (keypoints[:25, :2].max(0) + grow).astype(int)
+    mask[low[1] : high[1], low[0] : high[0]] = 1
+    return mask
+
+
+@pytest.fixture(scope="module")
+def detected() -> np.ndarray:
+    keypoints = seen_by(BODY, RIG, UP)
+    keypoints[..., :2] += np.random.default_rng(0).normal(0, 3, keypoints[..., :2].shape)
+    return keypoints
+
+
+def run(tmp_path, people, candidates=None) -> Path:
+    person.run(
+        detections=write_detections(tmp_path / "detections.h5", RIG, people, candidates),
+        scene=write_scene(tmp_path / "scene.h5", RIG, T),
+        output=tmp_path / "person.h5",
+        settings=PersonSettings(),
+    )
+    return tmp_path / "person.h5"
+
+
+def test_points_views_and_flags(tmp_path, detected):
+    damaged = detected.copy()
+    damaged[3, 1, 4, :2] += 150  # one wrist, in one view
+    damaged[4, 2, 10, 2] = 0.1  # one knee that the detector does not believe
+    people = [[[damaged[t, c]] for c in range(6)] for t in range(T)]
+    people[6] = [[] for _ in range(6)]
+    people[7] = [[damaged[7, 0]], *[[] for _ in range(5)]]
+    with artefacts.read(run(tmp_path, people), PERSON) as found:
+        np.testing.assert_array_equal(found["missing"], [False] * 6 + [True] * 2)
+        np.testing.assert_array_equal(found["person"][:6], 0)
+        np.testing.assert_array_equal(found["person"][7], [0, -1, -1, -1, -1, -1])
+        truth = apply(invert(UP), BODY.reshape(-1, 3)).reshape(T, 135, 3)
+        error = np.linalg.norm(found["joints"] - truth, axis=-1)
+        assert np.median(error[:6]) < 0.01 and error[:6].max() < 0.03
+        assert np.isnan(error[6:]).all()
+        views = found["joint_views"]
+        assert views[3, 4] == 5 and views[4, 10] == 5 and (views[6:] == 0).all()
+        assert not found["inlier"][3, 1, 4] and not found["inlier"][4, 2, 10]
+        np.testing.assert_array_equal(found["inlier"].sum(1), views)
+        assert 2 < np.nanmedian(found["joint_error"]) < 6
+        assert (np.diff(found["mask_offsets"]) == 0).all() and len(
+            found["mask_offsets"]
+        ) == T * 6 + 1
+
+
+def test_masks_follow_the_points_not_the_label_or_the_order(tmp_path, detected):
+    people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
+    own = silhouette(detected[0, 0])
+    beside = np.roll(own, 600, axis=1)
+    everything = np.ones_like(own)
+    candidates = {
+        (0, 0): [("person", masks.encode(beside)), ("person", masks.encode(own))],
+        (0, 1): [("chair", masks.encode(silhouette(detected[0, 1])))],
+        (0, 2): [
+            ("person", masks.encode(everything)),
+            ("dog", masks.encode(silhouette(detected[0, 2]))),
+        ],
+        (0, 3): [("person", masks.encode(np.roll(silhouette(detected[0, 3]), 700, axis=1)))],
+    }
+    with artefacts.read(run(tmp_path, people, candidates), PERSON) as found:
+        chosen = artefacts.unpack_ragged(found["mask_offsets"], found["mask_rle"])
+    assert chosen[0] == candidates[0, 0][1][1]
+    assert chosen[1] == candidates[0, 1][0][1]
+    assert chosen[2] == candidates[0, 2][1][1]
+    assert chosen[3] == b"" and chosen[4] == b""
+
+
+def test_same_input_same_bytes(tmp_path, detected):
+    people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
+    first = run(tmp_path, people).read_bytes()
+    assert run(tmp_path, people).read_bytes() == first
+
+
+def test_nobody_and_other_captures_are_named(tmp_path, detected):
+    with pytest.raises(UserError, match="sequence test: no frame set has one person"):
+        run(tmp_path, [[[] for _ in range(6)] for _ in range(T)])
+    with pytest.raises(UserError, match="frame sets differ"):
+        run(tmp_path, [[[detected[0, c]] for c in range(6)] for _ in range(T - 1)])
+    people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
+    with pytest.raises(UserError, match=r"camera k1, frame 0, candidate 0 \(cup\).*re-run"):
+        run(tmp_path, people, {(0, 0): [("cup", b"11")]})

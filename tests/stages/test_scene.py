@@ -1,0 +1,108 @@
+"""Stage ``scene`` from artefact to artefact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_capture import (
+    FURNITURE,
+    extrinsics_error,
+    perturbed,
+    ring,
+    room_depth,
+    to_millimetres,
+    write_frames,
+)
+from synthetic_people import seen_by, walking, write_detections
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.config import SceneSettings
+from intercap_core.errors import UserError
+from intercap_core.schemas import SCENE
+from intercap_core.stages import scene
+
+TRUTH, UP = ring()
+MIDDLE = apply(invert(UP), np.array([[0, 0, 0.8]]))[0]
+T = 6
+
+
+def capture(
+    tmp_path: Path, rig: Rig, boxes=FURNITURE, walls: float | None = 3.6
+) -> dict[str, Path]:
+    rng = np.random.default_rng(0)
+    depths = []
+    for camera in TRUTH:
+        clean = room_depth(camera, UP, boxes, walls)
+        depths.append(np.stack([to_millimetres(clean, rng) for _ in range(T)]))
+    body = seen_by(walking(T, np.array([-0.3, -0.2]), np.array([0.1, 0.08]), 0.1), TRUTH, UP)
+    body[..., :2] += rng.normal(0, 3, body[..., :2].shape)
+    people = [[[body[t, c]] for c in range(len(TRUTH))] for t in range(T)]
+    return {
+        "frames": write_frames(tmp_path / "frames.h5", rig, num_sets=T, depths=depths),
+        "detections": write_detections(tmp_path / "detections.h5", TRUTH, people),
+        "output": tmp_path / "scene.h5",
+    }
+
+
+def test_cameras_floor_and_background_of_a_furnished_room(tmp_path):
+    start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
+    paths = capture(tmp_path, start)
+    scene.run(**paths, settings=SceneSettings(), floor=None)
+    rig = Rig.from_scene(paths["output"])
+    assert extrinsics_error(rig, TRUTH, MIDDLE)[1:].mean() < 0.006
+    with artefacts.read(paths["output"], SCENE) as found:
+        said = found.attributes
+        assert said["extrinsics_refined"] and said["ground_found"]
+        assert said["ground_source"] == "fitted" and said["ground_rms"] < 0.005
+        assert (found["pair_residual_after"] < found["pair_residual_before"]).all()
+        height = apply(UP, found["ground_point"][None])[0, 2]
+        assert abs(height) < 0.003 and found["ground_normal"] @ UP[2, :3] > np.cos(np.radians(0.2))
+        np.testing.assert_array_equal(found["master_from_colour_start"], start.master_from_colour)
+        background = found["cameras/k2/background"].astype(float) / 1000
+        truth = room_depth(TRUTH[1], UP, FURNITURE)
+        assert np.median(np.abs(background - truth)[truth > 0]) < 0.005
+    first = paths["output"].read_bytes()
+    scene.run(**paths, settings=SceneSettings(), floor=None)
+    assert paths["output"].read_bytes() == first
+
+
+def test_a_perfect_start_is_not_made_worse(tmp_path):
+    paths = capture(tmp_path, TRUTH)
+    scene.run(**paths, settings=SceneSettings(), floor=None)
+    assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.004
+
+
+def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
+    start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
+    paths = capture(tmp_path, start)
+    floor = apply(invert(UP), np.array([[0, 0, 0.005], [1, 0, 0.005], [0, 1, 0.005]]))
+    settings = SceneSettings(refine_extrinsics=False)
+    scene.run(**paths, settings=settings, floor=[tuple(p) for p in floor])
+    with artefacts.read(paths["output"], SCENE) as found:
+        assert not found.attributes["extrinsics_refined"] and len(found["pairs"]) == 0
+        assert found.attributes["ground_source"] == "annotated"
+        np.testing.assert_array_equal(found["master_from_colour"], start.master_from_colour)
+        np.testing.assert_allclose(apply(UP, found["ground_point"][None])[0, 2], 0.005, atol=1e-9)
+
+
+def test_without_depth_the_start_stays_and_there_is_no_floor(tmp_path):
+    paths = capture(tmp_path, TRUTH)
+    write_frames(paths["frames"], TRUTH, num_sets=T)
+    scene.run(**paths, settings=SceneSettings(), floor=None)
+    with artefacts.read(paths["output"], SCENE) as found:
+        assert not found.attributes["ground_found"]
+        assert np.isnan(found["ground_normal"]).all() and found.keys("cameras/") == []
+    assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.02
+
+
+def test_a_recording_without_images_and_a_floor_on_one_line_are_named(tmp_path):
+    paths = capture(tmp_path, TRUTH)
+    with pytest.raises(UserError, match="sequence test: annotation floor"):
+        scene.run(**paths, settings=SceneSettings(), floor=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
+    write_frames(paths["frames"], TRUTH, num_sets=T, colour_index=np.full((T, 6), -1))
+    with pytest.raises(UserError, match="no image of any camera"):
+        scene.run(**paths, settings=SceneSettings(), floor=None)
