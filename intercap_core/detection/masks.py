@@ -9,21 +9,12 @@ they are parsed and checked here first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from pycocotools import mask as coco_mask
 
 _ZERO = 48  # first character of the alphabet
 _LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
-
-
-class Window(NamedTuple):
-    """A mask (h, w) bool whose pixel [0, 0] is pixel (x0, y0) of the image."""
-
-    x0: int
-    y0: int
-    mask: np.ndarray
 
 
 class Runs:
@@ -85,16 +76,6 @@ class Runs:
         flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
         return np.ascontiguousarray(flat.reshape(self.width, self.height).T)
 
-    def decode_window(self) -> Window:
-        """The mask cropped to its :attr:`box`; an empty window where no pixel is set."""
-        x0, y0, width, height = self.box
-        first, last = x0 * self.height, (x0 + width) * self.height
-        ends = np.clip(self.ends, first, last)
-        lengths = np.diff(ends, prepend=first)
-        flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
-        columns = flat.reshape(width, self.height)[:, y0 : y0 + height]
-        return Window(x0, y0, np.ascontiguousarray(columns.T))
-
 
 def encode(mask: np.ndarray) -> bytes:
     """Encode a mask (H, W), any type, non-zero = set."""
@@ -141,16 +122,6 @@ def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) 
 def _compress(segmentation: object, height: int, width: int) -> bytes:
     made = coco_mask.frPyObjects(segmentation, height, width)
     return bytes((coco_mask.merge(made) if isinstance(made, list) else made)["counts"])
-
-
-def overlap(first: Sequence[bytes], second: Sequence[bytes], height: int, width: int) -> np.ndarray:
-    """IoU (A, B) float64 of checked masks of one image (A) and (B)."""
-    if not first or not second:
-        return np.zeros((len(first), len(second)))
-    a, b = (
-        [{"size": [height, width], "counts": rle} for rle in masks] for masks in (first, second)
-    )
-    return np.asarray(coco_mask.iou(a, b, [0] * len(b)))
 
 
 def _parse(rle: bytes) -> np.ndarray:

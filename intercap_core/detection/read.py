@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +30,7 @@ class Candidate:
 
     @cached_property
     def runs(self) -> Runs:
-        """The mask; see :class:`Runs` for reading pixels, windows and the area."""
+        """The mask; see :class:`Runs` for reading pixels, the box and the area."""
         width, height = self.image_size
         return Runs(self.rle, height, width)
 
@@ -58,7 +56,7 @@ class Detections:
 
     Everything is read at once: keypoints and RLE strings are a few MB a hundred sets.
     ``keypoints_found`` and ``candidates_found`` are (T, C) bool, ``image_sizes`` (C, 2) width and
-    height. Obtained from :meth:`open` or :meth:`load`.
+    height. Obtained from :meth:`load`.
     """
 
     def __init__(self, artefact: artefacts.Artefact) -> None:
@@ -70,13 +68,6 @@ class Detections:
         self.candidates_found = artefact["candidates_found"]
         self.notes = tuple(artefact.text("note"))
         self._tables = [_read_camera(artefact, name) for name in self.camera_names]
-
-    @classmethod
-    @contextlib.contextmanager
-    def open(cls, path: Path) -> Iterator[Detections]:
-        """Open the artefact; raises UserError as :func:`artefacts.read` does."""
-        with artefacts.read(path, DETECTIONS) as artefact:
-            yield cls(artefact)
 
     @classmethod
     def load(cls, path: Path) -> Detections:

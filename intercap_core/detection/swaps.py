@@ -1,8 +1,8 @@
 """Limbs whose left and right a detector exchanged, found by the views that disagree.
 
-A view's limb counts as exchanged when the point that other views agree on fits much better with
-the sides exchanged. Where the views that exchange are the majority, time tells: a limb that jumps
-to the other side and back was exchanged in all of them.
+A view's limb counts as exchanged when the points that the views agree on fit it much better with
+the sides exchanged. Each set stands alone: where most views exchange a limb at once, it is taken
+to be as they say.
 """
 
 from __future__ import annotations

@@ -68,21 +68,21 @@ def test_files_reach_the_sets_that_hold_their_image(tmp_path):
         sequence=entry(tmp_path, keypoints=keypoints, candidates=candidates),
         settings=DetectionsSettings(),
     )
-    with Detections.open(output) as read:
-        assert read.camera_names == ("k1", "k2") and read.num_sets == 4
-        np.testing.assert_array_equal(read.keypoints_found[:, 0], [True, True, False, False])
-        assert not read.keypoints_found[:, 1].any()
-        np.testing.assert_array_equal(read.candidates_found[:, 1], [True, True, False, False])
-        np.testing.assert_array_equal(read.people(1, 0)[:, 3, 0], [11, 12])
-        assert len(read.people(2, 0)) == len(read.people(3, 0)) == 0
-        found = read.candidates(1, 1)
-        assert [c.label for c in found] == ["person", "cup"] and [c.index for c in found] == [0, 1]
-        assert [c.runs.area for c in found] == [700, 900]
-        assert found[1].mask()[150, 305] and found[1].mask().sum() == 900
-        assert read.candidates(0, 1) == [] and read.candidates(0, 0) == []
-        assert "000000000002_keypoints.json" in read.notes[0]
-        assert "no candidates candidates/k1.json" in read.notes[0]
-        assert "keypoints/k2" in read.notes[1]
+    read = Detections.load(output)
+    assert read.camera_names == ("k1", "k2") and read.num_sets == 4
+    np.testing.assert_array_equal(read.keypoints_found[:, 0], [True, True, False, False])
+    assert not read.keypoints_found[:, 1].any()
+    np.testing.assert_array_equal(read.candidates_found[:, 1], [True, True, False, False])
+    np.testing.assert_array_equal(read.people(1, 0)[:, 3, 0], [11, 12])
+    assert len(read.people(2, 0)) == len(read.people(3, 0)) == 0
+    found = read.candidates(1, 1)
+    assert [c.label for c in found] == ["person", "cup"] and [c.index for c in found] == [0, 1]
+    assert [c.runs.area for c in found] == [700, 900]
+    assert found[1].mask()[150, 305] and found[1].mask().sum() == 900
+    assert read.candidates(0, 1) == [] and read.candidates(0, 0) == []
+    assert "000000000002_keypoints.json" in read.notes[0]
+    assert "no candidates candidates/k1.json" in read.notes[0]
+    assert "keypoints/k2" in read.notes[1]
     again = tmp_path / "again.h5"
     detections.run(
         frames=frames,
