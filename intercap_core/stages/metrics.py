@@ -143,7 +143,7 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
         failed, bridged = artefact["failed"], artefact["bridged"]
     with artefacts.read(joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
-    unseen = ~images.available.any(1)
+    unseen = np.asarray(~images.available.any(1))
     alone = ~joint_flags  # the joint stage repeats, in its words, what it was told of a frame
     reasons = merge_reasons(
         [
