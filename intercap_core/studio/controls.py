@@ -130,11 +130,12 @@ class Footwork:
             ankle[:, step.foot, :2] += share[:, None] * (np.array(step.place) - placed[step.foot])
             heading[:, step.foot] += share * (step.heading - turned[step.foot])
             length = float(np.linalg.norm(np.array(step.place) - placed[step.foot]))
-            roll = np.sin(np.pi * u) ** 2 * np.cos(np.pi * u) * min(1.0, length / 0.4)
-            pitch[:, step.foot] += 0.9 * roll * (u < 0.5) + 0.5 * roll * (u >= 0.5)
+            roll = np.sin(np.pi * u) ** 3 * np.cos(np.pi * u) * min(1.0, length / 0.4)
+            roll = np.where((u > 0) & (u < 1), roll * (0.9 + 0.25 * np.cos(np.pi * u)), 0)
+            pitch[:, step.foot] += roll
             lift = STEP_LIFT_M * min(1.0, 0.4 + length / 0.5) * np.sin(np.pi * u) ** 2
-            raised = SOLE_FRONT_M * np.sin(np.abs(pitch[:, step.foot])) * (np.abs(roll) > 0)
-            ankle[:, step.foot, 2] += lift + raised
+            # the ball or the heel stays above the floor as the foot rolls
+            ankle[:, step.foot, 2] += lift + SOLE_FRONT_M * roll**2 / np.hypot(roll, 0.12)
             placed[step.foot] = step.place
             turned[step.foot] = step.heading
         return ankle, heading, pitch

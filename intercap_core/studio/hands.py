@@ -20,7 +20,7 @@ from intercap_core.studio.subjects import Subject
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of the joints
 TISSUE_M = 0.0012  # a finger closes until its skin is pressed in by this much
-SCAN_DEG = 4.0
+SCAN_DEG = 5.0
 BISECTIONS = 8
 # Largest flexion of MCP, PIP, DIP, and of the thumb's CMC, MCP, IP, degrees (AAOS tables)
 LIMITS = {"finger": (85.0, 100.0, 65.0), "thumb": (35.0, 50.0, 65.0)}

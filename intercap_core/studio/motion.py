@@ -5,13 +5,13 @@ Headings turn about the stage's z axis; a person with heading 0 faces +x.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.studio.controls import Pose
+from intercap_core.studio.controls import Pose, ramp
 from intercap_core.studio.hands import Hand, HandShape
 from intercap_core.studio.skeleton import (
     Skeleton,
@@ -27,10 +27,11 @@ from intercap_core.studio.subjects import PosedSubject, Subject
 SIDES = ("left", "right")
 # How a bend of the trunk is shared along it, from the pelvis up
 TRUNK = {"pelvis": 0.30, "spine1": 0.20, "spine2": 0.20, "spine3": 0.30}
-ARM_REACH = 0.965  # of the arm's length; the trunk helps beyond
+ARM_REACH = 0.960  # of the arm's length; the trunk helps beyond
 ASSIST_STEPS = 8
 FOREARM_TWIST = 0.6  # share of the wrist's roll that the forearm takes
-LEG_REACH = 0.985
+LEG_REACH = 0.984
+SETTLE_M = 0.004  # over which the pelvis gives way where a leg is at its reach
 STAND = 0.990  # of the leg's length when standing
 _J = JOINT_INDEX
 
@@ -103,6 +104,19 @@ class Puppet:
         world[:, 40:55] = world[:, 21:22]
         return world
 
+    def settled(self, trunk: Trunk, ankle: np.ndarray) -> Trunk:
+        """The same trunk, lower where a leg could not reach its ankle (N, 2, 3)."""
+        rotation = self.trunk(trunk)[:, 0]
+        excess = np.full(len(trunk.pelvis), -np.inf)
+        for side, name in enumerate(SIDES):
+            hip = trunk.pelvis + rotation @ self.skeleton.bone("pelvis", f"{name}_hip")
+            far = np.linalg.norm(hip[:, :2] - ankle[:, side, :2], axis=1)
+            reach = np.sqrt(np.maximum((LEG_REACH * self.leg) ** 2 - far**2, 0.01))
+            excess = np.maximum(excess, hip[:, 2] - ankle[:, side, 2] - reach)
+        pelvis = trunk.pelvis.copy()
+        pelvis[:, 2] -= SETTLE_M * np.logaddexp(0, excess / SETTLE_M)
+        return replace(trunk, pelvis=pelvis)
+
     def legs(self, world: np.ndarray, pelvis: np.ndarray, ankle: np.ndarray, heading: np.ndarray,
              pitch: np.ndarray, splay: float = 0.12) -> None:  # fmt: skip
         """Set the legs for ankles (N, 2, 3), foot headings and pitch (N, 2), in place.
@@ -115,7 +129,7 @@ class Puppet:
             foot = facing(heading[:, side] + sign * splay)
             names = (f"{name}_hip", f"{name}_knee", f"{name}_ankle")
             pole = unit(world[:, 0, :, 2] * np.array([1, 1, 0.2])) + 1.5 * foot[:, :, 2]
-            upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, hinge)
+            upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, hinge, LEG_REACH)
             world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
             tilt = np.zeros((len(pelvis), 3))
             tilt[:, 0] = pitch[:, side]
@@ -188,11 +202,15 @@ class Puppet:
         shoulder = self.arm_root(world, pelvis, side)
         chest = world[:, _J["spine3"]]
         raised = np.broadcast_to(raised, len(pelvis))[:, None]
-        pole = -0.75 * chest[..., 2] + sign * (0.45 + raised) * chest[..., 0] - 0.5 * chest[..., 1]
+        # the elbow points back under a hanging arm, down and out before the chest
+        ahead = np.einsum("ni,ni->n", wrist.position - shoulder, chest[..., 2]) / self.arm
+        ahead = ramp(ahead, 0.0, 0.55)[:, None]
+        pole = -0.75 * (1 - ahead) * chest[..., 2] + sign * (0.45 + raised) * chest[..., 0]
+        pole = pole - (0.5 + 0.4 * ahead) * chest[..., 1]
         hand = self.hands[side]
         hinge = np.array([0.0, -sign, 0])
         names = (f"{name}_shoulder", f"{name}_elbow", f"{name}_wrist")
-        upper, lower = self.skeleton.limb(names, shoulder, wrist.position, pole, hinge)
+        upper, lower = self.skeleton.limb(names, shoulder, wrist.position, pole, hinge, LEG_REACH)
         forearm = unit(self.skeleton.bone(names[1], names[2]))
         roll = twist_angle(np.swapaxes(lower, -1, -2) @ wrist.rotation, forearm)
         lower = lower @ turn(FOREARM_TWIST * roll[:, None] * forearm)

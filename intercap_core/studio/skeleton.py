@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_INDEX, PARENTS
 
 REST_UP, REST_FORWARD = np.array([0.0, 1, 0]), np.array([0.0, 0, 1])
-REACH = 0.995  # of the limb's length: knees and elbows never lock
+# Shares of a limb's length: beyond the first, targets are met less and less far, up to the second,
+# so that knees and elbows never lock (where they would snap)
+REACH_FREE, REACH_MOST = 0.972, 0.994
 
 
 def unit(v: np.ndarray) -> np.ndarray:
@@ -82,17 +84,22 @@ class Skeleton:
         target: np.ndarray,
         pole: np.ndarray,
         rest_hinge: np.ndarray,
+        free: float = REACH_FREE,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Two bones from ``root`` to ``target``, both (N, 3), bent towards ``pole`` (N, 3).
 
         ``rest_hinge`` (3,) is the axis about which the joint bends in the T-pose. Returns the
-        rotations (N, 3, 3) of the upper and the lower bone. A target out of reach is met in
-        direction only.
+        rotations (N, 3, 3) of the upper and the lower bone. A target beyond ``free`` of the
+        limb's length is met in direction only.
         """
         upper, lower = self.bone(names[0], names[1]), self.bone(names[1], names[2])
         a, b = np.linalg.norm(upper), np.linalg.norm(lower)
         way = target - root
-        distance = np.clip(np.linalg.norm(way, axis=1), abs(a - b) * 1.02, REACH * (a + b))
+        wanted = np.linalg.norm(way, axis=1) / (a + b)
+        spare = REACH_MOST - free
+        beyond = np.maximum(wanted - free, 0)
+        wanted = np.minimum(wanted, free) + spare * -np.expm1(-beyond / spare)
+        distance = np.maximum(wanted, abs(a - b) / (a + b) * 1.02) * (a + b)
         along = unit(way)
         out = unit(pole - along * (along * pole).sum(1, keepdims=True))
         cosine = (a * a + distance**2 - b * b) / (2 * a * distance)

@@ -73,7 +73,7 @@ class CupDrink(Interaction):
         hand, surface = self.puppet.hands[RIGHT], self.thing.surface
         open_shape = shape((10, 12, 6), (0, 4, 6), 48, 3)
         best = (-np.inf, open_shape, np.zeros(5), np.eye(4))
-        for azimuth in np.radians((62.0, 80.0)):
+        for azimuth in np.radians((62.0, 78.0)):
             # where the fingers point in the stage: forward, turned to the left by what is left
             fingers = np.array([np.sin(azimuth), np.cos(azimuth), -0.10])
             fingers /= np.linalg.norm(fingers)
@@ -82,7 +82,7 @@ class CupDrink(Interaction):
             skin = hand.skin(hand.local(open_shape)[None])[0] @ rotation.T
             centre = skin[hand.palm_ids].mean(0) + 0.028 * fingers
             low_end = skin[:, 2].min()
-            for along in (-0.005, 0.008):
+            for along in (0.0,):
                 place = self.rest[:3, 3] - centre - along * fingers
                 place[2] = top + TABLE_GAP_M - low_end
                 near, far = 0.0, 0.12
@@ -234,7 +234,7 @@ class CupDrink(Interaction):
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet = self.puppet
-        trunk = self._trunk(times)
+        trunk, feet = self._trunk(times), self.footwork.feet(times)
         world = puppet.trunk(trunk)
         at_table = plateau(times, 0.4, 0.85, 1.1, 1.5) + plateau(times, 2.1, 2.4, 2.7, 3.0)
         near = plateau(times, 0.4, 0.85, 1.02, 1.4)
@@ -243,10 +243,10 @@ class CupDrink(Interaction):
                 RIGHT: (self._right_wrist(world, trunk.pelvis, times), at_table),
                 LEFT: (self._left_wrist(world, trunk.pelvis, times), near),
             }
-            trunk = puppet.assist(trunk, targets)
+            trunk = puppet.settled(puppet.assist(trunk, targets), feet[0])
             world = puppet.trunk(trunk)
         pelvis = trunk.pelvis
-        puppet.legs(world, pelvis, *self.footwork.feet(times))
+        puppet.legs(world, pelvis, *feet)
         drink = plateau(times, 1.2, 1.7, 2.0, 2.4)
         puppet.arm_to(world, pelvis, RIGHT, self._right_wrist(world, pelvis, times), 0.1 * drink)
         puppet.arm_to(world, pelvis, LEFT, self._left_wrist(world, pelvis, times))

@@ -19,7 +19,7 @@ from intercap_core.studio.motion import LEG_REACH, Trunk
 from intercap_core.studio.skeleton import local_rotations, unit
 
 RIGHT, LEFT = 1, 0
-SIT_S, SEATED_S, RISE_S, RISEN_S = 0.72, 1.42, 2.10, 2.86
+SIT_S, SEATED_S, RISE_S, RISEN_S = 0.68, 1.50, 2.10, 2.90
 PRESSED_M = 0.014  # flesh gives way by this much on the seat
 HOVER_M = (0.006, 0.016)
 TOUCH_M = 0.0006  # how deep the palm presses the seat
@@ -52,8 +52,8 @@ class StoolSit(Interaction):
         self.hover = rng.uniform(*HOVER_M)
         self.seated_height = self.seat_top + 0.12
         self._sit()
-        self.palm_place = self._palm_on_seat(RIGHT, -TOUCH_M)
-        self.hover_place = self._palm_on_seat(LEFT, self.hover)
+        self.palm_place = self._palm_on_seat()
+        self.hover_place = self._beside_seat()
 
     def _sit(self) -> None:
         """Lower the pelvis until the flesh is pressed in by ``PRESSED_M``."""
@@ -77,23 +77,43 @@ class StoolSit(Interaction):
                 high = middle
         self.seated_height = high
 
-    def _palm_on_seat(self, side: int, gap: float) -> np.ndarray:
-        """A flat hand above the edge of the seat, ``gap`` away (negative: pressed)."""
-        hand, sign = self.puppet.hands[side], (1.0, -1.0)[side]
-        fingers = unit(np.array([0.12, sign * 0.62, -0.55]))
-        palm = unit(np.array([0.08, sign * 0.38, -0.90]))
-        rotation = self.puppet.wrist_rotation(side, fingers, palm)
-        knuckles = rotation @ hand.knuckles.mean(0)
-        place = np.array([-0.05, sign * 0.152, self.seat_top + 0.10]) - knuckles
-        low, high = -0.15, 0.10
+    def _palm_on_seat(self) -> np.ndarray:
+        """The right hand flat on the edge of the seat, lightly pressed."""
+        hand = self.puppet.hands[RIGHT]
+        fingers = unit(np.array([0.12, -0.62, -0.55]))
+        palm = unit(np.array([0.08, -0.38, -0.90]))
+        rotation = self.puppet.wrist_rotation(RIGHT, fingers, palm)
+        place = np.array([-0.02, -0.16, self.seat_top + 0.10]) - rotation @ hand.knuckles.mean(0)
+        return self._approached(RIGHT, FLAT, rotation, place, np.array([0, 0, 1.0]), -TOUCH_M)
+
+    def _beside_seat(self) -> np.ndarray:
+        """The left hand hanging beside the seat's rim, ``hover`` away."""
+        hand = self.puppet.hands[LEFT]
+        fingers, palm = unit(np.array([0.15, 0.10, -1.0])), np.array([0.0, -1.0, -0.1])
+        rotation = self.puppet.wrist_rotation(LEFT, fingers, palm)
+        place = np.array([0.02, 0.20, self.seat_top - 0.02]) - rotation @ hand.knuckles.mean(0)
+        return self._approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), self.hover)
+
+    def _approached(
+        self,
+        side: int,
+        hand_shape: HandShape,
+        rotation: np.ndarray,
+        place: np.ndarray,
+        away: np.ndarray,
+        gap: float,
+    ) -> np.ndarray:
+        """A wrist (4, 4) moved along ``away`` from ``place`` until the hand is ``gap`` from the
+        stool (negative: pressed)."""
+        low, high = -0.15, 0.12
         for _ in range(18):
             middle = (low + high) / 2
-            pose = invert(self.seat) @ transform(rotation, place + np.array([0, 0, middle]))
-            if hand.gap(FLAT, self.thing.surface, pose) < gap:
+            pose = invert(self.seat) @ transform(rotation, place + middle * away)
+            if self.puppet.hands[side].gap(hand_shape, self.thing.surface, pose) < gap:
                 low = middle
             else:
                 high = middle
-        return transform(rotation, place + np.array([0, 0, high]))
+        return transform(rotation, place + high * away)
 
     def _trunk(self, times: np.ndarray, *, still: bool = False) -> Trunk:
         track = self.pelvis_track(times)
@@ -101,17 +121,19 @@ class StoolSit(Interaction):
         shift = self.weight_shift(times) * (0.0 if still else 1.0)
         # the hips go back before they go down, and up before they come forward
         down = ramp(times, SIT_S, SEATED_S) - ramp(times, RISE_S, RISEN_S)
-        back = ramp(times, SIT_S - 0.05, SEATED_S - 0.22)
+        back = ramp(times, SIT_S - 0.12, SEATED_S - 0.30)
         back -= ramp(times, RISE_S + 0.16, RISEN_S + 0.05)
-        lean = plateau(times, SIT_S - 0.05, SIT_S + 0.38, SEATED_S - 0.15, SEATED_S + 0.15)
+        lean = plateau(times, SIT_S - 0.12, SIT_S + 0.36, SEATED_S - 0.20, SEATED_S + 0.20)
         lean = lean + plateau(times, RISE_S - 0.30, RISE_S + 0.05, RISE_S + 0.30, RISEN_S)
-        feel = plateau(times, 0.75, 1.1, 1.2, 1.45)
+        feel = plateau(times, 0.72, 1.16, 1.30, 1.75)
         pelvis = track[:, :3] + shift * (1 - down)[:, None]
         pelvis[:, 0] += back * (0.005 - pelvis[:, 0])
         pelvis[:, 1] *= 1 - 0.7 * down
         pelvis[:, 2] += down * (self.seated_height - pelvis[:, 2])
         bend = 0.6 * sway[:, :3] * (1 - 0.7 * down)[:, None]
-        bend[:, 0] += 0.05 + 0.62 * lean - 0.10 * down
+        bend[:, 0] += 0.05 + 0.60 * lean + 0.10 * feel - 0.10 * down
+        bend[:, 2] += 0.30 * feel
+        bend[:, 1] -= 0.12 * feel
         head = 1.3 * sway[:, 3:]
         head[:, 0] += 0.10 + 0.25 * lean + 0.15 * feel
         head[:, 1] -= 0.3 * feel
@@ -135,38 +157,45 @@ class StoolSit(Interaction):
         count = len(times)
         swing = 0.06 * bump(times, 0, 0.5) * (1, -1)[side] + self.arm_swing(times)[:, side]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
-        place = (self.hover_place, self.palm_place)[side]
-        start, touch, leave = ((0.90, 1.16, 1.22), (0.88, 1.14, 1.24))[side]
-        above = place.copy()
-        above[:3, 3] += (0.02, (0.06, -0.06)[side], 0.12)
-        wrist = idle.towards(Pose.still(above, count), ramp(times, start - 0.2, touch - 0.10))
-        wrist = wrist.towards(Pose.still(place, count), ramp(times, touch - 0.22, touch))
-        wrist = wrist.towards(Pose.still(above, count), ramp(times, leave, leave + 0.16))
         thigh = self._on_thigh(world, pelvis, side)
-        wrist = wrist.towards(thigh, ramp(times, leave + 0.08, SEATED_S + 0.20))
-        return wrist.towards(idle, ramp(times, RISE_S + 0.10, RISEN_S + 0.05))
+        rising = ramp(times, RISE_S + 0.10, RISEN_S + 0.05)
+        place = (self.hover_place, self.palm_place)[side]
+        aside = place.copy()
+        if side == LEFT:  # hangs beside the seat while sitting
+            aside[:3, 3] += (0.0, 0.07, 0.06)
+            wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.9, SEATED_S))
+            wrist = wrist.towards(Pose.still(place, count), ramp(times, 1.38, 1.66))
+            wrist = wrist.towards(Pose.still(aside, count), ramp(times, 1.92, 2.15))
+            return wrist.towards(idle, rising)
+        aside[:3, 3] += (0.0, -0.05, 0.11)
+        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.72, 1.10))
+        wrist = wrist.towards(Pose.still(place, count), ramp(times, 0.94, 1.20))
+        wrist = wrist.towards(Pose.still(aside, count), ramp(times, 1.30, 1.48))
+        return wrist.towards(thigh, ramp(times, 1.36, 1.74)).towards(idle, rising)
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet = self.puppet
-        trunk = self._trunk(times)
+        feet = self.footwork.feet(times)
+        trunk = puppet.settled(self._trunk(times), feet[0])
         world = puppet.trunk(trunk)
-        puppet.legs(world, trunk.pelvis, *self.footwork.feet(times))
-        feel = plateau(times, 0.98, 1.14, 1.24, 1.42)
+        puppet.legs(world, trunk.pelvis, *feet)
+        feel = plateau(times, 0.90, 1.20, 1.30, 1.60)
+        hanging = plateau(times, 1.3, 1.6, 1.95, 2.25)
         for _ in range(2):
-            targets = {
-                side: (self._wrist(world, trunk.pelvis, times, side), feel)
-                for side in (LEFT, RIGHT)
-            }
-            trunk = puppet.assist(trunk, targets)
+            right = self._wrist(world, trunk.pelvis, times, RIGHT)
+            left = self._wrist(world, trunk.pelvis, times, LEFT)
+            trunk = puppet.assist(trunk, {RIGHT: (right, feel), LEFT: (left, hanging)})
+            trunk = puppet.settled(trunk, feet[0])
             world = puppet.trunk(trunk)
-            puppet.legs(world, trunk.pelvis, *self.footwork.feet(times))
+            puppet.legs(world, trunk.pelvis, *feet)
         pelvis = trunk.pelvis
         for side in (LEFT, RIGHT):
             puppet.arm_to(world, pelvis, side, self._wrist(world, pelvis, times, side), 0.15)
-            keys: list[tuple[np.ndarray, HandShape]] = [
-                (ramp(times, 0.6, 0.9), FLAT),
-                (ramp(times, 1.3, 1.7), RELAXED),
-            ]
-            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, keys))
+        keys: list[tuple[np.ndarray, HandShape]] = [
+            (ramp(times, 0.7, 1.05), FLAT),
+            (ramp(times, 1.4, 1.8), RELAXED),
+        ]
+        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, keys))
+        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
         pose = np.broadcast_to(self.seat, (len(times), 4, 4)).copy()
         return Performance(world, pelvis, pose)

@@ -35,8 +35,8 @@ class SuitcaseCarry(Interaction):
         rng, puppet = self.rng, self.puppet
         side_way = -(puppet.hip_width + 0.235 + rng.uniform(0, 0.02))
         height = self.thing.standing_height
-        start, turned = 0.02 + rng.normal(0, 0.01), np.pi + rng.normal(0, 0.03, 2)
-        self.taken = upright(start, side_way, height, turned[0])
+        ahead, turned = 0.02 + rng.normal(0, 0.01), np.pi + rng.normal(0, 0.03, 2)
+        self.taken = upright(ahead, side_way, height, turned[0])
         stride = 0.43 + 0.05 * rng.random()
         self.put = upright(2 * stride - 0.02, side_way - 0.02, height, turned[1])
         self.lift = rng.uniform(*LIFT_M)
@@ -142,16 +142,17 @@ class SuitcaseCarry(Interaction):
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet = self.puppet
-        trunk = self._trunk(times)
+        trunk, feet = self._trunk(times), self.footwork.feet(times)
         world = puppet.trunk(trunk)
         needs = plateau(times, 0.5, 0.95, 2.6, 2.95)
         for _ in range(2):
             right = self._right_wrist(world, trunk.pelvis, times)
             trunk = puppet.assist(trunk, {RIGHT: (right, needs)})
+            trunk = puppet.settled(trunk, feet[0])
             world = puppet.trunk(trunk)
         pelvis = trunk.pelvis
         right = self._right_wrist(world, pelvis, times)
-        puppet.legs(world, pelvis, *self.footwork.feet(times))
+        puppet.legs(world, pelvis, *feet)
         puppet.arm_to(world, pelvis, RIGHT, right)
         swing = -0.10 * bump(times, 0.0, 0.5) + 0.14 * bump(times, 1.2, 1.7)
         left = puppet.idle_wrist(world, pelvis, LEFT, swing + self.arm_swing(times)[:, 1])

@@ -1,0 +1,155 @@
+"""What the scripts promise: real contact, no sinking in, feet that stand, objects that rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.errors import UserError
+from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.studio.hands import OPEN, Hand, shape
+from intercap_core.studio.skeleton import REACH_FREE, Skeleton, turn
+from intercap_core.studio.stage import Moment, Stage
+from intercap_core.studio.subjects import Subject
+from intercap_core.studio.truth import region_contact
+
+# interaction: object, subject, seed, regions that touch, frames (first, last) of the contact at 15
+# fps, times in which the object rests
+CASES = {
+    "suitcase_carry": ("suitcase", "s01", 11, {"right_hand"}, (17, 36), (0.0, 1.05)),
+    "cup_drink": ("cup", "s02", 12, {"right_hand", "mouth"}, (17, 36), (0.0, 1.05)),
+    "stool_sit": ("stool", "s05", 13, {"seat", "right_hand"}, (22, 30), (0.0, 2.9)),
+}
+
+
+Entry = Callable[[str], ObjectEntry]
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def played(request: pytest.FixtureRequest, object_entry: Entry) -> tuple[str, Stage, Moment]:
+    name = request.param
+    thing, subject, seed, *_ = CASES[name]
+    capture = StudioCapture(interaction=name, subject=subject, seed=seed, frames=45)
+    stage = Stage(capture, StudioSettings(captures={}, cameras=2), object_entry(thing))
+    return name, stage, stage.at(stage.set_times)
+
+
+def signed_distance(stage: Stage, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    return stage.thing.surface.signed_distance((points - pose[:3, 3]) @ pose[:3, :3])
+
+
+def test_nothing_enters_the_object(played: tuple[str, Stage, Moment]) -> None:
+    _, stage, moment = played
+    for t in range(2, stage.frames, 5):
+        for surface in (moment.body[t], moment.clothed[t]):
+            distance = signed_distance(stage, surface, moment.stage_from_object[t])
+            inside = distance[distance < 0]
+            assert inside.size == 0 or -inside.mean() < 0.002
+
+
+def test_expected_regions_touch_for_long(played: tuple[str, Stage, Moment]) -> None:
+    name, stage, moment = played
+    expected, (first, last) = CASES[name][3:5]
+    contact = region_contact(stage, moment)
+    touching = {r for r, on in zip(CONTACT_REGIONS, contact.T, strict=True) if on.any()}
+    assert expected <= touching
+    assert contact[first:last].any(1).all()
+    assert not contact[:5].any()
+
+
+def test_planted_feet_do_not_slide_or_sink(played: tuple[str, Stage, Moment]) -> None:
+    _, stage, moment = played
+    ankle, _, pitch = stage.interaction.footwork.feet(stage.set_times)
+    height = stage.puppet.ankle_height
+    for side, joint in enumerate((7, 8)):
+        planted = (ankle[:, side, 2] < height[side] + 1e-6) & (np.abs(pitch[:, side]) < 1e-6)
+        steps = np.diff(moment.joints[:, joint], axis=0)[planted[:-1] & planted[1:]]
+        assert np.abs(steps).max() < 0.0005
+    lowest = moment.body[..., 2].min(1)
+    assert lowest.min() > -0.006  # a heel may dip a little as the foot rolls
+    assert np.median(np.abs(lowest)) < 0.002
+
+
+def test_a_resting_object_does_not_move(played: tuple[str, Stage, Moment]) -> None:
+    name, stage, moment = played
+    start, end = CASES[name][5]
+    resting = (stage.set_times >= start) & (stage.set_times <= end)
+    poses = moment.stage_from_object[resting]
+    assert np.abs(poses - poses[0]).max() < 1e-12
+    lowest = (stage.thing.vertices @ moment.stage_from_object[-1, 2, :3]).min()
+    if name != "cup_drink":
+        assert abs(lowest + moment.stage_from_object[-1, 2, 3]) < 1e-6
+
+
+def test_object_and_hand_move_together_without_a_jump(played: tuple[str, Stage, Moment]) -> None:
+    _, stage, _ = played
+    times = np.arange(0, 3, 0.01)
+    performed = stage.interaction.perform(times)
+    speed = np.linalg.norm(np.diff(performed.stage_from_object[:, :3, 3], axis=0), axis=1) / 0.01
+    assert speed.max() < 2.5
+    joints = stage.puppet.skeleton.forward(performed.world, performed.pelvis)
+    assert np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() / 0.01 < 4.5
+    assert np.linalg.norm(np.diff(joints, 2, axis=0), axis=-1).max() / 1e-4 < 100  # m/s^2
+
+
+def test_a_longer_recording_is_slower_and_a_short_one_shows_the_highlight(
+    object_entry: Entry,
+) -> None:
+    thing, subject, seed, *_ = CASES["stool_sit"]
+    speeds = []
+    for frames in (45, 90):
+        capture = StudioCapture(interaction="stool_sit", subject=subject, seed=seed, frames=frames)
+        stage = Stage(capture, StudioSettings(captures={}, cameras=1), object_entry(thing))
+        script = stage.interaction.script_times(stage.set_times, stage.duration)
+        speeds.append(np.diff(script)[0] * 15)
+    assert speeds == pytest.approx([1.0, 0.5])
+    short = stage.interaction.script_times(np.array([0.0, 0.2]), 0.2)
+    assert short[0] <= stage.interaction.highlight <= short[1]
+
+
+def test_wrong_object_or_subject_is_refused(object_entry: Entry) -> None:
+    settings = StudioSettings(captures={}, cameras=1)
+    capture = StudioCapture(interaction="cup_drink", subject="s01", seed=1, frames=3)
+    with pytest.raises(UserError, match="needs object 'cup'"):
+        Stage(capture, settings, object_entry("stool"))
+    nobody = capture.model_copy(update={"subject": "nobody"})
+    with pytest.raises(UserError, match="no subject 'nobody'"):
+        Stage(nobody, settings, object_entry("cup"))
+
+
+def test_limb_reaches_its_target_and_bends_to_the_pole() -> None:
+    skeleton = Skeleton(Subject.load("s03").rest_joints)
+    rng = np.random.default_rng(0)
+    names = ("left_hip", "left_knee", "left_ankle")
+    length = skeleton.length(*names)
+    root = rng.normal(size=(50, 3))
+    direction = rng.normal(size=(50, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    target = root + direction * rng.uniform(0.4, REACH_FREE, (50, 1)) * length
+    pole = rng.normal(size=(50, 3))
+    upper, lower = skeleton.limb(names, root, target, pole, np.array([1.0, 0, 0]))
+    knee = root + upper @ skeleton.bone(*names[:2])
+    end = knee + lower @ skeleton.bone(*names[1:])
+    np.testing.assert_allclose(end, target, atol=1e-9)
+    across = pole - direction * (pole * direction).sum(1, keepdims=True)
+    assert (((knee - root) * across).sum(1) > 0).all()
+    np.testing.assert_allclose(np.linalg.det(upper), 1, atol=1e-9)
+
+
+def test_fingers_flex_towards_the_palm() -> None:
+    for side in (0, 1):
+        hand = Hand(Subject.load("s04"), side)
+        fist = shape((60, 70, 40), (20, 20, 20), 40)
+        open_tips, fist_tips = (
+            hand.skin(hand.local(h)[None])[0][hand.moved[1][2]].mean(0) for h in (OPEN, fist)
+        )
+        assert (fist_tips - open_tips) @ hand.palm > 0.01
+        assert (fist_tips - open_tips) @ hand.out < -0.02
+
+
+def test_turn_is_a_rotation_about_its_vector() -> None:
+    vector = np.array([0.3, -0.2, 0.9])
+    np.testing.assert_allclose(turn(vector) @ vector, vector, atol=1e-12)
