@@ -22,6 +22,8 @@ from intercap_core.step import SEQUENCE_STAGES
 
 POLL_SECONDS = 0.5
 COLUMNS = (*SEQUENCE_STAGES, "export")
+DRY_RUN = {"-n", "--dry-run", "--dryrun"}
+LAST_LINES = 15
 AGGREGATES = ("report.html", "summary.json")
 
 
@@ -42,12 +44,16 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
     project = load_project(settings)
     console = Console(stderr=True)
     command = snakemake_command(settings, cores=cores, arguments=arguments)
+    if DRY_RUN & set(arguments):
+        return subprocess.call(command)
     watcher = Watcher(project, console)
     status = run_watched(command, watcher, console)
     failures = watcher.failures()
     for name, words in failures.items():
         console.print(f"[red]{name}[/red] {words}", highlight=False, soft_wrap=True)
     if status and not failures:
+        lines = watcher.transcript.read_text(encoding="utf-8").splitlines()
+        console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
         raise UserError(f"the workflow stopped; its whole output is in {watcher.transcript}")
     bad = sorted({name.split(":")[0] for name in failures} & set(project.sequences))
     if bad and len(bad) < len(project.sequences) and not arguments:
@@ -59,7 +65,7 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
         )
         run_watched(command, Watcher(project, console), console)
     report = project.results / "report.html"
-    if report.is_file() and "-n" not in arguments:
+    if report.is_file():
         console.print(f"report: {report.resolve()}", highlight=False, soft_wrap=True)
     return status
 
