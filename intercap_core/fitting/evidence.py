@@ -68,8 +68,18 @@ class Evidence:
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
 
-    def look(self, problem: BodyProblem, *, hands: bool = False, face: bool = False) -> None:
-        """Set E_J up at the current solution: which keypoints, their sigma in pixels, shifts."""
+    def look(
+        self,
+        problem: BodyProblem,
+        *,
+        hands: bool = False,
+        face: bool = False,
+        widened: float = 1.0,
+    ) -> None:
+        """Set E_J up at the problem's bodies: which keypoints, their sigma in pixels, shifts.
+
+        ``widened`` multiplies sigma, and with it the error from which a keypoint is an outlier.
+        """
         seen, frames = self.seen, self.frames
         problem.keypoints = self.keypoints(hands=hands, face=face)
         chosen = problem.keypoints.index
@@ -79,7 +89,7 @@ class Evidence:
         lenses = self._tensor(seen.rig.colour_parameters)
         z = points[:, None] @ pose[:, 2, :3, None]
         z = z[..., 0] + pose[:, 2, 3][:, None]
-        sigma = self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
+        sigma = widened * self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
         problem.views = Views(
             self._tensor(seen.keypoints[at]),
             self._tensor(seen.confidence[at]),

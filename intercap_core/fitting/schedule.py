@@ -22,6 +22,8 @@ from intercap_core.solve.levenberg_marquardt import Solution, minimise
 
 _START_SIGMA = 0.04
 _REACH_M = (0.10, 0.06, 0.05)
+_WRISTS = ("left_wrist", "right_wrist")
+_WIDENED = (5.0, 2.0)  # how much the keypoints' sigma is widened while the hands find their place
 _TURN_WORSE = 1.5  # frames whose cost exceeds the median by this are tried facing the other way
 
 
@@ -239,13 +241,20 @@ class Fitter:
         return solution
 
     def _extremities(self, problem: BodyProblem, *, hands: bool, face: bool) -> None:
-        """Fingers, jaw and expression alone, on a body that stays; the cloud waits."""
-        evidence = self.evidence
+        """Wrists, fingers, jaw and expression, on a body that else stays.
+
+        The cloud waits. Hands start far off, as nothing has turned the wrists yet: at first no
+        keypoint counts as an outlier.
+        """
         columns = columns_of(self.model, hands=hands, face=face, betas=False)
         fixed = columns_of(self.model, hands=False, face=False, betas=False)
+        wrists = [3 * JOINT_INDEX[joint] + axis for joint in _WRISTS for axis in range(3)]
+        fixed = fixed[~torch.isin(fixed, torch.tensor(wrists, device=fixed.device))]
         kept = (problem.columns, problem.rows, problem.one_shape, problem.fit_shared)
         problem.columns = columns[~torch.isin(columns, fixed)]
         problem.rows, problem.one_shape, problem.fit_shared = None, False, False
-        evidence.look(problem, hands=hands, face=face)
-        self._minimise(problem, 8)
+        for widened in _WIDENED:
+            self.evidence.look(problem, hands=hands, face=face, widened=widened)
+            self._minimise(problem, 6)
+        self.evidence.look(problem, hands=hands, face=face)
         problem.columns, problem.rows, problem.one_shape, problem.fit_shared = kept
