@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -22,6 +23,16 @@ DATA_FOLDERS = ("data", "templates")
 WHOLE = "*"  # stands for every name of a module
 
 
+@dataclass(frozen=True)
+class _Statement:
+    """A top-level statement of a module, without docstrings."""
+
+    content: bytes  # its syntax tree as text
+    defines: frozenset[str]  # names that it binds; empty where it acts in another way
+    uses: frozenset[str]  # names that it mentions, those inside text too
+    imports: tuple[tuple[str, str], ...]  # (module, name) pairs, anywhere inside it
+
+
 def code_digest(module: str, *, root: Path = ROOT) -> str:
     """Digest of all code and data that ``module`` (e.g. "stages.joint") reaches.
 
@@ -31,8 +42,8 @@ def code_digest(module: str, *, root: Path = ROOT) -> str:
     reached = modules_reached(module, root=root)
     for name in sorted(reached):
         state.update(name.encode())
-        for node in _used(name, reached[name], root):
-            state.update(ast.dump(node).encode())
+        for statement in _used(name, reached[name], root):
+            state.update(statement.content)
     for folder in sorted({_path(name, root).parent for name in reached}):
         for path in _data_files(folder):
             state.update(path.relative_to(root).as_posix().encode())
@@ -58,36 +69,48 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
         if used in known or WHOLE in known:
             continue
         reached[name] = frozenset({WHOLE}) if used == WHOLE else known | {used}
-        for node in _used(name, reached[name], root):
-            waiting.extend(_imports(node, name, root))
+        for statement in _used(name, reached[name], root):
+            waiting.extend(statement.imports)
     return reached
 
 
-def _path(module: str, root: Path) -> Path:
-    relative = Path(*module.split(".")[1:])
-    package = root / relative / "__init__.py"
-    return package if package.is_file() else (root / relative).with_suffix(".py")
-
-
-def _parents(module: str) -> list[str]:
-    """The packages that importing ``module`` imports first."""
-    parts = module.split(".")
-    return [".".join(parts[:count]) for count in range(1, len(parts))]
-
-
-def _exists(module: str, root: Path) -> bool:
-    return (module == PACKAGE or module.startswith(f"{PACKAGE}.")) and _path(module, root).is_file()
+def _used(module: str, names: frozenset[str], root: Path) -> list[_Statement]:
+    """The module's statements that take part when ``names`` are imported from it, in order."""
+    path = _path(module, root)
+    statements = _statements(module, path, path.stat().st_mtime_ns, root)
+    if WHOLE in names:
+        return list(statements)
+    chosen: set[int] = set()
+    wanted = set(names)
+    while True:
+        found = {
+            index
+            for index, statement in enumerate(statements)
+            if not statement.defines or statement.defines & wanted
+        } - chosen
+        if not found:
+            return [statements[index] for index in sorted(chosen)]
+        chosen |= found
+        for index in found:
+            wanted |= statements[index].uses
 
 
 @cache
-def _statements(path: Path, mtime_ns: int) -> tuple[ast.stmt, ...]:
-    """Top-level statements of a module, without docstrings."""
+def _statements(module: str, path: Path, mtime_ns: int, root: Path) -> tuple[_Statement, ...]:
     tree = ast.parse(path.read_bytes(), str(path))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
             node.body = [entry for entry in body if not _is_text(entry)]  # type: ignore[attr-defined]
-    return tuple(tree.body)
+    return tuple(
+        _Statement(
+            ast.dump(node).encode(),
+            frozenset(_defines(node)),
+            frozenset(_uses(node)),
+            tuple(_imports(node, module, root)),
+        )
+        for node in tree.body
+    )
 
 
 def _is_text(node: ast.AST) -> bool:
@@ -98,27 +121,7 @@ def _is_text(node: ast.AST) -> bool:
     )
 
 
-def _used(module: str, names: frozenset[str], root: Path) -> list[ast.stmt]:
-    """The module's statements that take part when ``names`` are imported from it, in order."""
-    path = _path(module, root)
-    statements = _statements(path, path.stat().st_mtime_ns)
-    if WHOLE in names:
-        return list(statements)
-    defined = [_defines(statement) for statement in statements]
-    chosen: set[int] = set()
-    wanted = set(names)
-    while True:
-        found = {i for i, its in enumerate(defined) if not its or its & wanted} - chosen
-        if not found:
-            return [statements[i] for i in sorted(chosen)]
-        chosen |= found
-        for i in found:
-            wanted |= {n.id for n in ast.walk(statements[i]) if isinstance(n, ast.Name)}
-            wanted |= _quoted_names(statements[i])
-
-
 def _defines(statement: ast.stmt) -> set[str]:
-    """Names that a top-level statement binds; empty where it acts in another way."""
     if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         return {statement.name}
     if isinstance(statement, ast.Assign | ast.AnnAssign):
@@ -129,19 +132,17 @@ def _defines(statement: ast.stmt) -> set[str]:
     return set()
 
 
-def _quoted_names(statement: ast.stmt) -> set[str]:
-    """Names inside annotations that are written as text, e.g. ``-> "Config"``."""
-    return {
-        node.value
-        for node in ast.walk(statement)
-        if isinstance(node, ast.Constant)
-        and isinstance(node.value, str)
-        and node.value.isidentifier()
-    }
+def _uses(statement: ast.stmt) -> set[str]:
+    names = set()
+    for node in ast.walk(statement):
+        if isinstance(node, ast.Name):
+            names.add(node.id)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            names.add(node.value)  # an annotation may be written as text
+    return names
 
 
 def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
-    """(module, name) pairs of the package that ``node`` imports, anywhere inside it."""
     found: list[tuple[str, str]] = []
     for inner in ast.walk(node):
         if isinstance(inner, ast.Import):
@@ -167,6 +168,22 @@ def _absolute(node: ast.ImportFrom, module: str, root: Path) -> str:
         package = package[:-1]
     package = package[: len(package) - (node.level - 1)]
     return ".".join([*package, *([node.module] if node.module else [])])
+
+
+def _path(module: str, root: Path) -> Path:
+    relative = Path(*module.split(".")[1:])
+    package = root / relative / "__init__.py"
+    return package if package.is_file() else (root / relative).with_suffix(".py")
+
+
+def _exists(module: str, root: Path) -> bool:
+    return (module == PACKAGE or module.startswith(f"{PACKAGE}.")) and _path(module, root).is_file()
+
+
+def _parents(module: str) -> list[str]:
+    """The packages that importing ``module`` imports first."""
+    parts = module.split(".")
+    return [".".join(parts[:count]) for count in range(1, len(parts))]
 
 
 def _data_files(folder: Path) -> list[Path]:

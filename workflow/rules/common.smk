@@ -122,9 +122,12 @@ def settings_of(stage):
     return digest(getattr(SETTINGS, stage))
 
 
+digest_of_code = functools.cache(code_digest)
+
+
 def code_of(stage):
-    """Param: digest of the core modules that the stage reaches."""
-    return lambda wildcards: code_digest(f"stages.{stage}")
+    """Param: digest of the core modules that the stage reaches; the same for every sequence."""
+    return lambda wildcards: digest_of_code(f"stages.{stage}")
 
 
 def annotation_of(*sections):

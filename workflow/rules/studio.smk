@@ -30,7 +30,7 @@ rule studio:
     params:
         settings=capture_of,
         object=tracked_object,
-        code=lambda wildcards: code_digest("studio.capture"),
+        code=lambda wildcards: digest_of_code("studio.capture"),
     message:
         "{wildcards.sequence}: making a virtual recording"
     script:
