@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import trimesh
@@ -14,13 +15,11 @@ from intercap_core.body.model import BodyModel
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.transforms import rigid
 from intercap_core.metrics.heatmaps import SurfaceHeat
-from intercap_core.report.overlays import encode_jpeg
-from intercap_core.report.shading import Painted, draw
+from intercap_core.report.shading import Painted, Picture, draw
 
 # From no contact to the map's maximum, sRGB: grey skin, yellow, red, dark red
 COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
 _STOP_AT = (0.0, 0.25, 0.6, 1.0)
-_BACKGROUND = (0.965, 0.968, 0.975)
 _FAR = 40.0  # distance in sizes of what is shown: nearly parallel rays
 _MAX_EDGE_M = 0.012  # an object's mesh is refined to this before values are put on it
 _KERNEL_M = 0.006  # deviation of the kernel that spreads the surface points' values
@@ -30,10 +29,10 @@ _ARMS_DOWN = 1.0  # rad, of each shoulder from the T-pose
 
 @dataclass(frozen=True, eq=False)
 class HeatPicture:
-    """``jpeg`` bytes with a caption."""
+    """``png`` bytes, transparent around what is drawn, with a caption."""
 
     caption: str
-    jpeg: bytes
+    png: bytes
     width: int
     height: int
 
@@ -116,5 +115,13 @@ def _look(
     lens = Intrinsics(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
     pose = rigid(turn, np.array([0, 0, distance]) - middle)
     picture = draw([Painted(vertices, faces, paint, pose)], lens)
-    background = np.broadcast_to(np.array(_BACKGROUND, np.float32), (size[1], size[0], 3))
-    return HeatPicture(caption, encode_jpeg(picture.over(background)), *size)
+    return HeatPicture(caption, encode_png(picture), *size)
+
+
+def encode_png(picture: Picture) -> bytes:
+    """PNG with transparency."""
+    alpha = picture.alpha[..., None]
+    straight = picture.rgb / np.maximum(alpha, 1e-6)
+    bgra = np.concatenate([straight[..., ::-1], alpha], 2)
+    pixels = np.rint(np.clip(bgra, 0, 1) * 255).astype(np.uint8)
+    return cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()

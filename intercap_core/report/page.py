@@ -280,8 +280,9 @@ def _counted(count: int, what: str) -> str:
 
 
 def _embedded(picture: HeatPicture | Overlay, caption: str) -> dict[str, Any]:
+    kind, data = ("jpeg", picture.jpeg) if isinstance(picture, Overlay) else ("png", picture.png)
     return {
-        "data": base64.b64encode(picture.jpeg).decode(),
+        "data": f"image/{kind};base64,{base64.b64encode(data).decode()}",
         "width": picture.width,
         "height": picture.height,
         "caption": caption,

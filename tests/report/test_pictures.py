@@ -86,16 +86,17 @@ def test_object_heat_shows_on_the_side_that_is_touched() -> None:
     ball = trimesh.creation.icosphere(2, 0.1)
     points = trimesh.creation.icosphere(4, 0.1).vertices
     side = np.array([0.8, -0.9, 0.5]) / np.linalg.norm([0.8, -0.9, 0.5])
-    likelihood = (points @ side > 0.08).astype(float)
+    likelihood = (points @ side > 0.09).astype(float)
     heat = SurfaceHeat(points, likelihood, 10)
     one, other = heat_pictures.object_pictures(
         np.asarray(ball.vertices), np.asarray(ball.faces), heat, 1.0
     )
     seen, hidden = (
-        cv2.imdecode(np.frombuffer(p.jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
+        cv2.imdecode(np.frombuffer(p.png, np.uint8), cv2.IMREAD_UNCHANGED).astype(int)
         for p in (one, other)
     )
-    assert seen.shape == (one.height, one.width, 3)
+    assert seen.shape == (one.height, one.width, 4)
+    assert seen[2, 2, 3] == 0 and seen[one.height // 2, one.width // 2, 3] == 255
     red = seen[..., 2] - seen[..., 0]  # BGR
     assert red[one.height // 2, one.width // 2] > 40
     assert (hidden[..., 2] - hidden[..., 0]).max() < 25
