@@ -30,7 +30,7 @@ NUM_BETAS, NUM_EXPRESSION = 10, 10
 # A body whose keypoints are this far off, in the median, is not the person's.
 _BAD_RESIDUAL_M = 0.06
 # A bridged joint is off by what people move meanwhile: at walking pace, at most an arm's length.
-_BRIDGED_SPEED = 0.5
+_BRIDGED_SPEED = 1.0
 _BRIDGED_SIGMA_RANGE = (0.03, 0.5)
 
 
