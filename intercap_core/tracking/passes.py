@@ -18,18 +18,18 @@ from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit, MotionPrior, assess, fit_pose
-from intercap_core.tracking.search import own_turns, rank_frames, same_pose, search
+from intercap_core.tracking.search import own_turns, plausibility, rank_frames, same_pose, search
 
 log = logging.getLogger(__name__)
 
-SEED_CONFIDENCE = 0.70  # good enough to stop looking for a better seed frame
-SEED_FRAMES = 4  # frames searched for the seed, more while nothing is found
+SEED_CONFIDENCE = 0.65  # good enough to stop looking for a better seed frame
+SEED_FRAMES = 3  # frames searched for the seed, more while nothing is found
 SEED_FRAMES_MAX = 10
 HYPOTHESES = 5  # of the seed frame, compared over its neighbours
 HYPOTHESIS_MARGIN = 0.80  # of the best confidence
 HYPOTHESIS_FRAMES = 3  # on each side
 TURNS = 12  # about each axis, by which the whole track may be wrong
-TURN_FRAMES, TURN_RIVALS = 8, 4  # frames and turned tracks that are compared by fitting
+TURN_FRAMES, TURN_RIVALS = 8, 5  # frames and turned tracks that are compared by fitting
 TURN_GAIN = 0.003  # of the mean score, for which the track is turned
 LOST_SCORE = 0.20
 DOUBT = 0.55  # of the usual score: below, a search may find better
@@ -164,13 +164,13 @@ class Tracker:
             return rivals[0]
         totals = []
         for rival in rivals:
-            total = [rival.confidence]
+            total = [self._plausibility(rival)]
             for frames in (
                 range(seed_frame + 1, min(seed_frame + 1 + HYPOTHESIS_FRAMES, self._count)),
                 range(seed_frame - 1, max(seed_frame - 1 - HYPOTHESIS_FRAMES, -1), -1),
             ):
                 following = self._pass(frames, self._result(rival), may_search=False)
-                total += [result.fit.confidence for _, result in following]
+                total += [self._plausibility(result.fit) for _, result in following]
             totals.append(float(np.mean(total)))
         return rivals[int(np.argmax(totals))]
 
@@ -194,7 +194,7 @@ class Tracker:
         turns = own_turns(self._mesh, TURNS)
         few = frames[:: max(1, len(frames) // 4)]
         first = [
-            np.mean([self._assess(t, track[t].fit.pose @ turn).score for t in few])
+            np.mean([self._plausibility(self._assess(t, track[t].fit.pose @ turn)) for t in few])
             for turn in turns
         ]
         rivals = [turns[i] for i in np.argsort(first, kind="stable")[::-1][:TURN_RIVALS]]
@@ -203,7 +203,7 @@ class Tracker:
             fits = []
             for t in frames:
                 start = track[t].fit.pose @ turn
-                fits.append(self._fit(t, start, MotionPrior(start)).score)
+                fits.append(self._plausibility(self._fit(t, start, MotionPrior(start))))
             totals.append(float(np.mean(fits)))
         best = int(np.argmax(totals[1:]))
         if totals[1 + best] < totals[0] + TURN_GAIN:
@@ -211,6 +211,9 @@ class Tracker:
         start = track[seed_frame].fit.pose @ rivals[best]
         fit = self._fit(seed_frame, start, MotionPrior(start))
         return None if same_pose(self._mesh, fit.pose, track[seed_frame].fit.pose) else fit
+
+    def _plausibility(self, fit: Fit) -> float:
+        return plausibility(fit, self._up)
 
     # --- one pass -----------------------------------------------------------------------------
 

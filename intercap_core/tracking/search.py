@@ -30,6 +30,8 @@ MAX_GROUPS = 3
 GOOD_ENOUGH = 0.55  # confidence above which less likely groups are not searched
 NEAR_TURNS = 12  # turns about each axis of the best pose that are compared with it
 TURNS_FITTED = 4
+STANDING_BONUS = 0.03  # of confidence
+STANDING_COSINE = float(np.cos(np.radians(12)))
 MIN_POINTS = 15  # of a candidate's cloud
 SAME_POSE_M, SAME_POSE_DEG = 0.02, 12.0
 PERSON_LABELS = frozenset({"person"})
@@ -56,7 +58,7 @@ def search(
     background_term: bool,
     near: np.ndarray | None = None,
 ) -> list[Fit]:
-    """Fitted hypotheses of the pose, the best score first; none where nothing is detected.
+    """Fitted hypotheses of the pose, the most plausible first; none where nothing is detected.
 
     ``labels`` are the detector classes that the object may be given (empty: any but a person);
     ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
@@ -89,10 +91,10 @@ def search(
             )
             for start in compared[:FITTED]
         ]
-    found.sort(key=lambda fit: -fit.confidence)
+    found.sort(key=lambda fit: -plausibility(fit, up))
     if found and not mesh.symmetry.sphere:
         found += _turned(mesh, views, found[0], labels, min_overlap, background_term)
-        found.sort(key=lambda fit: -fit.confidence)
+        found.sort(key=lambda fit: -plausibility(fit, up))
     kept: list[Fit] = []
     for fit in found:
         if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):
@@ -176,6 +178,17 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
         rest[frame] = False
         distance = np.minimum(distance, np.abs(np.arange(count) - frame))
     return order
+
+
+def plausibility(fit: Fit, up: np.ndarray | None) -> float:
+    """A fit's confidence, and a little more where the object stands as it does when let go.
+
+    Decides between poses that the images hardly tell apart: a mug is seldom upside down.
+    """
+    if up is None:
+        return fit.confidence
+    upright = float(fit.pose[:3, 2] @ up) / float(np.linalg.norm(up))
+    return fit.confidence + (STANDING_BONUS if upright > STANDING_COSINE else 0.0)
 
 
 def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
