@@ -50,6 +50,18 @@ def test_nothing_enters_the_object(played: tuple[str, Stage, Moment]) -> None:
             assert inside.size == 0 or -inside.mean() < 0.002
 
 
+def test_flesh_is_pressed_in_by_no_more_than_it_gives(played: tuple[str, Stage, Moment]) -> None:
+    """Before the tissue gives way: millimetres at a hand, a centimetre and a half on a seat."""
+    name, stage, _ = played
+    performed = stage.interaction.perform(np.arange(0.0, 3.0, 0.12))
+    skin = stage.puppet.skin(performed.world, performed.pelvis).vertices
+    deepest = min(
+        signed_distance(stage, points, pose).min()
+        for points, pose in zip(skin, performed.stage_from_object, strict=True)
+    )
+    assert -deepest < (0.018 if name == "stool_sit" else 0.006)
+
+
 def test_expected_regions_touch_for_long(played: tuple[str, Stage, Moment]) -> None:
     name, stage, moment = played
     expected, (first, last) = CASES[name][3:5]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
@@ -17,12 +19,14 @@ from intercap_core.studio.interactions.base import (
     upright,
 )
 from intercap_core.studio.motion import LEG_REACH, Trunk
-from intercap_core.studio.skeleton import turn
+from intercap_core.studio.skeleton import turn, unit
 
 RIGHT, LEFT = 1, 0
 LIMITS = {"finger": (75.0, 95.0, 60.0), "thumb": (40.0, 50.0, 60.0)}
 ATTACH_S, RELEASE_S = 1.06, 2.50
 PLINTH_OF_HEIGHT = 0.565  # its top, as a share of the person's height
+PALM_PRESSED_M = 0.001
+FINGER_MEETS_M = 0.002
 LIP_GAP_M = 0.0008  # the rim rests this close to the lips
 TABLE_GAP_M = 0.004  # the hand stays this far above the plinth
 HOVER_M = (0.007, 0.018)  # how near the other hand comes without touching
@@ -69,37 +73,41 @@ class CupDrink(Interaction):
     # --- places found on the person's own surface ------------------------------------------
 
     def _grasp(self, top: float) -> None:
-        """The palm against the wall, then fingers and thumb around it."""
-        hand, surface = self.puppet.hands[RIGHT], self.thing.surface
-        open_shape = shape((10, 12, 6), (0, 4, 6), 48, 3)
-        best = (-np.inf, open_shape, np.zeros(5), np.eye(4))
-        for azimuth in np.radians((62.0, 78.0)):
-            # where the fingers point in the stage: forward, turned to the left by what is left
-            fingers = np.array([np.sin(azimuth), np.cos(azimuth), -0.10])
-            fingers /= np.linalg.norm(fingers)
-            palm = np.array([-np.cos(azimuth), np.sin(azimuth), 0.0])
-            rotation = self.puppet.wrist_rotation(RIGHT, fingers, palm)
-            skin = hand.skin(hand.local(open_shape)[None])[0] @ rotation.T
-            centre = skin[hand.palm_ids].mean(0) + 0.028 * fingers
-            low_end = skin[:, 2].min()
-            for along in (0.0,):
-                place = self.rest[:3, 3] - centre - along * fingers
-                place[2] = top + TABLE_GAP_M - low_end
-                near, far = 0.0, 0.12
-                for _ in range(16):
-                    middle = (near + far) / 2
-                    pose = invert(self.rest) @ transform(rotation, place - middle * palm)
-                    if hand.gap(open_shape, surface, pose) < -0.0010:
-                        near = middle
-                    else:
-                        far = middle
-                pose = invert(self.rest) @ transform(rotation, place - far * palm)
-                closed, gaps = hand.close(open_shape, LIMITS, surface, pose)
-                skin_gap = -np.clip(gaps, 0.0, 0.03).sum() - 0.02 * abs(along)
-                if skin_gap > best[0]:
-                    best = (skin_gap, closed, gaps, pose)
-        _, self.grip_shape, self.grip_gaps, self.object_from_wrist = best
-        self.open_shape = open_shape
+        """The palm against the wall, then fingers and thumb around it; of several openings of the
+        hand the first in which all fingers meet the wall, else the best."""
+        best = -np.inf
+        for opposition, azimuth in product((48.0, 30.0, 62.0), np.radians((62.0, 78.0, 50.0))):
+            open_shape = shape((10, 12, 6), (0, 4, 6), opposition, 3)
+            pose = self._palm_to_wall(open_shape, azimuth, top)
+            closed, gaps = self.puppet.hands[RIGHT].close(
+                open_shape, LIMITS, self.thing.surface, pose
+            )
+            score = -np.clip(gaps, 0, 0.03).sum()
+            if score > best:
+                best, self.open_shape, self.grip_shape = score, open_shape, closed
+                self.grip_gaps, self.object_from_wrist = gaps, pose
+            if gaps.max() < FINGER_MEETS_M:
+                return
+
+    def _palm_to_wall(self, open_shape: HandShape, azimuth: float, top: float) -> np.ndarray:
+        """object_from_wrist (4, 4): the open hand just above the plinth's ``top``, fingers turned
+        left of ahead by ``azimuth`` rad, brought to the wall until it touches."""
+        hand = self.puppet.hands[RIGHT]
+        fingers = unit(np.array([np.sin(azimuth), np.cos(azimuth), -0.10]))
+        palm = np.array([-np.cos(azimuth), np.sin(azimuth), 0.0])
+        rotation = self.puppet.wrist_rotation(RIGHT, fingers, palm)
+        skin = hand.skin(hand.local(open_shape)[None])[0] @ rotation.T
+        place = self.rest[:3, 3] - skin[hand.palm_ids].mean(0) - 0.028 * fingers
+        place[2] = top + TABLE_GAP_M - skin[:, 2].min()
+        near, far = 0.0, 0.12
+        for _ in range(14):
+            middle = (near + far) / 2
+            pose = invert(self.rest) @ transform(rotation, place - middle * palm)
+            if hand.gap(open_shape, self.thing.surface, pose) < -PALM_PRESSED_M:
+                near = middle
+            else:
+                far = middle
+        return invert(self.rest) @ transform(rotation, place - far * palm)
 
     def _drinking_place(self) -> None:
         """head_from_cup (4, 4): the rim against the lips, tilted; rest axes at the head joint."""

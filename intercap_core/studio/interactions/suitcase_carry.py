@@ -111,7 +111,7 @@ class SuitcaseCarry(Interaction):
         swing = 0.10 * bump(times, 0.35, 0.9) + self.arm_swing(times)[:, 0]
         idle = self.puppet.idle_wrist(world, pelvis, RIGHT, swing)
         first, last = self.taken @ self.object_from_wrist, self.put @ self.object_from_wrist
-        aside = np.array([0.0, -0.075, -0.012])
+        aside = np.array([0.0, -0.085, 0.0])
         before, after = first.copy(), last.copy()
         before[:3, 3] += aside
         after[:3, 3] += aside
