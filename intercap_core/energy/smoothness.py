@@ -5,13 +5,19 @@ depends on the vertices only through their mean and covariance, so six points wi
 give the same energy. E_S uses the same differences of the body's joints where the paper uses the
 latent velocities of LEMO's network, whose weights are not free. Both are made robust: a start, a
 stop or an impact is an outlier of smooth motion, and is paid for once instead of smeared.
+
+A third term knows that a sequential fit's errors last: calibration, clothing and a mask's errors are
+the same in the next frame, so what the joint fit corrects must change slowly, up to the fit's own
+jitter. Without it contact that comes and goes would shake a fit that was steady.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-STENCIL = (1.0, -2.0, 1.0)  # of frames t-1, t, t+1
+ACCELERATION = (1.0, -2.0, 1.0)  # of frames t-1, t, t+1
+RATE = (-1.0, 1.0)  # of frames t, t+1
+_FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)
 
 
 def accelerations(points: np.ndarray, fps: float) -> np.ndarray:
@@ -24,6 +30,16 @@ def robust(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
     ``scale``, linear above."""
     root = np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
     return 1.0 / root, float(scale**2 * (root - 1.0).sum())
+
+
+def jitter(points: np.ndarray) -> float:
+    """Standard deviation, in metres, of noise that is independent from frame to frame in points
+    (T, N, 3), from the median size of fourth differences: motion itself hardly has any."""
+    if len(points) < len(_FOURTH):
+        return 0.0
+    count = len(points) - len(_FOURTH) + 1
+    fourth = sum(factor * points[k : k + count] for k, factor in enumerate(_FOURTH))
+    return float(1.4826 * np.median(np.abs(fourth)) / np.sqrt(np.square(_FOURTH).sum()))
 
 
 def moment_points(vertices: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from intercap_core.energy.smoothness import STENCIL
 from intercap_core.refine.state import SIZE
 from intercap_core.solve.banded import BandedSystem
 
@@ -62,29 +61,29 @@ class NormalEquations:
             0.5 * float((weights * residuals**2).sum()) if energy is None else energy,
         )
 
-    def add_accelerations(
+    def add_differences(
         self,
         term: str,
         columns: slice,
+        stencil: tuple[float, ...],
         jacobian: np.ndarray,
         weights: np.ndarray,
         residuals: np.ndarray,
-        scale: float,
         energy: float,
     ) -> None:
-        """Add second differences of rows: ``jacobian`` (T, N, m) of the rows' values, ``weights``
-        (T-2, N), ``residuals`` (T-2, N) and ``energy`` of their differences times ``scale``."""
-        if len(jacobian) < 3:
-            self.energy.setdefault(term, 0.0)
-            return
-        count = len(jacobian) - 2
-        parts = [jacobian[k : k + count] * (STENCIL[k] * scale) for k in range(3)]
-        weighted = [(part * weights[..., None]).transpose(0, 2, 1) for part in parts]
-        for k in range(3):
-            at = slice(k, k + count)
-            self.bands[0][at, columns, columns] += weighted[k] @ parts[k]
-            self.gradient[at, columns] += (weighted[k] @ residuals[..., None])[..., 0]
-        for k in range(2):
-            self.bands[1][k : k + count, columns, columns] += weighted[k + 1] @ parts[k]
-        self.bands[2][:count, columns, columns] += weighted[2] @ parts[0]
+        """Add differences of rows over neighbouring frames.
+
+        ``stencil`` (w+1,) factors of frames t .. t+w; ``jacobian`` (T, N, m) of the rows' values;
+        ``weights`` and ``residuals`` (T-w, N) and ``energy`` of their differences.
+        """
+        count = len(jacobian) + 1 - len(stencil)
         self.energy[term] = self.energy.get(term, 0.0) + energy
+        if count < 1:
+            return
+        parts = [jacobian[k : k + count] * factor for k, factor in enumerate(stencil)]
+        weighted = [(part * weights[..., None]).transpose(0, 2, 1) for part in parts]
+        for k, rows in enumerate(weighted):
+            self.gradient[k : k + count, columns] += (rows @ residuals[..., None])[..., 0]
+            for j in range(k + 1):
+                # frame t + k against frame t + j, stored with the earlier one
+                self.bands[k - j][j : j + count, columns, columns] += rows @ parts[j]

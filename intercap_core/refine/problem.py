@@ -34,6 +34,11 @@ VERTICES_PER_MEASUREMENT = 10.0
 BODY_ACCELERATION = 6.0
 FINGER_ACCELERATION = 10.0
 OBJECT_ACCELERATION = 6.0
+# How fast a sequential fit's lasting errors change: a random walk, metres in one second.
+BODY_DRIFT = 0.010
+OBJECT_DRIFT = 0.004
+# Neighbouring points move as one: so many of them are one measurement of a correction.
+POINTS_PER_MOTION = {"body_drift": 2.0, "object_drift": 2.0}
 ROBUST_FACTOR = 2.0  # accelerations beyond so many sigmas count as a start, a stop or an impact
 _FIRST_FINGER = 25
 
@@ -50,8 +55,9 @@ class Ground:
 class Problem:
     """All that equation 6 needs beside the state.
 
-    ``data`` add E_B and E_O to the equations; ``probability`` (T, R) that each region
-    touches (Q); ``floor`` is None where none was seen.
+    ``start`` is the sequential fits' state, ``body_known`` and ``object_known`` (T,) the frames in
+    which they are believed. ``data`` add E_B and E_O to the equations; ``probability`` (T, R) that
+    each region touches (Q); ``floor`` is None where none was seen.
     """
 
     model: BodyModel
@@ -63,11 +69,20 @@ class Problem:
     floor: Ground | None
     fps: float
     settings: JointSettings
+    start: State
+    body_known: np.ndarray
+    object_known: np.ndarray
 
     def __post_init__(self) -> None:
         self._moments = smoothness.moment_points(self.mesh.vertices)
         fingers = np.arange(55) >= _FIRST_FINGER
         self._joint_sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
+        parameters = self.start.parameters(self.model)
+        joints = self.model(parameters, vertex_ids=np.array([0])).joints
+        self._start_joints = joints.double().cpu().numpy()
+        self._start_object, _ = smoothness.points_by_object(
+            self._moments, self.start.rotation, self.start.translation
+        )
 
     def equations(self, state: State) -> NormalEquations:
         """Linearise every term at ``state``."""
@@ -151,15 +166,45 @@ class Problem:
         weight, energy = smoothness.robust(acceleration, ROBUST_FACTOR)
         weight = np.repeat(weight * self.settings.body_smoothness, 3, axis=1)
         jacobian = lin.full()[..., :BODY].double().cpu().numpy()
-        jacobian = jacobian / self._joint_sigma[:, None, None]
-        out.add_accelerations(
+        out.add_differences(
             "body_motion",
             slice(0, BODY),
-            jacobian.reshape(frames, -1, BODY),
+            smoothness.ACCELERATION,
+            (jacobian * (self.fps**2 / self._joint_sigma[:, None, None])).reshape(frames, -1, BODY),
             weight,
             acceleration.reshape(frames - 2, -1),
-            self.fps**2,
             energy * self.settings.body_smoothness,
+        )
+        self._add_drift(
+            "body_drift", slice(0, BODY), joints, self._start_joints, jacobian, BODY_DRIFT,
+            self.body_known, out,
+        )  # fmt: skip
+
+    def _add_drift(
+        self,
+        term: str,
+        columns: slice,
+        points: np.ndarray,
+        start: np.ndarray,
+        jacobian: np.ndarray,
+        drift: float,
+        known: np.ndarray,
+        out: NormalEquations,
+    ) -> None:
+        """Corrections of points (T, N, 3) against the sequential fit's change slowly."""
+        frames, count = points.shape[:2]
+        sigma = np.hypot(drift / np.sqrt(self.fps), smoothness.jitter(start[known]))
+        change = np.diff(points - start, axis=0).reshape(frames - 1, -1) / sigma
+        pairs = known[1:] & known[:-1]
+        weight = np.repeat(pairs[:, None] / POINTS_PER_MOTION[term], 3 * count, axis=1)
+        out.add_differences(
+            term,
+            columns,
+            smoothness.RATE,
+            jacobian.reshape(frames, 3 * count, -1) / sigma,
+            weight,
+            change,
+            0.5 * float((weight * change**2).sum()),
         )
 
     def _object_motion_and_ground(self, state: State, out: NormalEquations) -> None:
@@ -172,15 +217,19 @@ class Problem:
             acceleration = smoothness.accelerations(points, self.fps) / OBJECT_ACCELERATION
             weight, energy = smoothness.robust(acceleration, ROBUST_FACTOR)
             weight = np.repeat(weight * self.settings.object_smoothness, 3, axis=1)
-            out.add_accelerations(
+            out.add_differences(
                 "object_motion",
                 OBJECT,
-                jacobian.reshape(frames, -1, 6) / OBJECT_ACCELERATION,
+                smoothness.ACCELERATION,
+                jacobian.reshape(frames, -1, 6) * (self.fps**2 / OBJECT_ACCELERATION),
                 weight,
                 acceleration.reshape(frames - 2, -1),
-                self.fps**2,
                 energy * self.settings.object_smoothness,
             )
+            self._add_drift(
+                "object_drift", OBJECT, points, self._start_object, jacobian, OBJECT_DRIFT,
+                self.object_known, out,
+            )  # fmt: skip
         if self.floor is not None:
             moved = state.translation[:, None] + np.einsum(
                 "tij,nj->tni", state.rotation, self.mesh.vertices

@@ -122,6 +122,9 @@ def run(
         floor=floor,
         fps=fps,
         settings=settings,
+        start=start,
+        body_known=~failed,
+        object_known=~lost,
     )
 
     state, steps = start, 0

@@ -7,6 +7,7 @@ import trimesh
 from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
 from intercap_core.contact.patches import contact_patches
+from intercap_core.energy import smoothness
 from intercap_core.refine.bridge import bridge_poses
 from intercap_core.refine.equations import NormalEquations
 from intercap_core.refine.minimise import minimise
@@ -63,7 +64,9 @@ def _state(model: BodyModel, gap: float) -> State:
     return State(body, state.betas, state.expression, state.rotation, np.tile(below, (FRAMES, 1)))
 
 
-def _problem(model, box, state, *, data=(), floor=None, touching=()) -> Problem:
+def _problem(
+    model, box, state, *, data=(), floor=None, touching=(), known=None, start=None
+) -> Problem:
     patches = contact_patches(model)
     probability = np.zeros((len(state), len(CONTACT_REGIONS)))
     probability[:, list(touching)] = 1
@@ -77,6 +80,9 @@ def _problem(model, box, state, *, data=(), floor=None, touching=()) -> Problem:
         floor=floor,
         fps=15.0,
         settings=JointSettings(),
+        start=start or state,
+        body_known=np.ones(len(state), bool),
+        object_known=np.ones(len(state), bool) if known is None else known,
     )
 
 
@@ -128,7 +134,7 @@ def test_a_lost_frame_is_carried_by_its_neighbours(model, box):
     wrong = line.copy()
     wrong[2] += [0.1, 0.1, 0]
     start = State(state.body, state.betas, state.expression, state.rotation, wrong)
-    problem = _problem(model, box, start, data=(_hold(start, 0.01), tracked.add))
+    problem = _problem(model, box, start, data=(_hold(start, 0.01), tracked.add), known=~lost)
     minimum = minimise(problem.equations, start, max_steps=10)
     np.testing.assert_allclose(minimum.state.translation[2], line[2], atol=0.004)
 
@@ -162,3 +168,22 @@ def test_bridging_takes_the_straight_way():
     known = np.array([True, False, False, True, False])
     _, moved = bridge_poses(rotation, translation, known)
     np.testing.assert_allclose(moved[:, 0], [0, 0.1, 0.2, 0.3, 0.3])
+
+
+def test_a_passing_pull_does_not_shake_a_steady_track(model, box):
+    """One frame of contact moves the neighbours along instead of kicking its own frame."""
+    state = _state(model, 0.010)
+    tracked = _tracked(state, 0.01, np.zeros(FRAMES, bool))
+    problem = _problem(model, box, state, data=(_hold(state, 0.001), tracked.add))
+    problem.probability[2, LEFT_HAND] = 1
+    moved = minimise(problem.equations, state, max_steps=8).state.translation - state.translation
+    assert np.abs(np.diff(moved, axis=0)).max() < 0.002
+
+
+def test_jitter_is_the_noise_of_a_smooth_motion():
+    rng = np.random.default_rng(5)
+    t = np.arange(200)[:, None, None] / 30
+    smooth = np.concatenate([np.sin(t), np.cos(1.3 * t), t], axis=2)
+    noisy = smooth + rng.normal(scale=0.003, size=smooth.shape)
+    assert smoothness.jitter(noisy) == pytest.approx(0.003, rel=0.2)
+    assert smoothness.jitter(smooth) < 1e-5
