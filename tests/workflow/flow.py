@@ -19,10 +19,10 @@ class Flow:
     """The copy's folder and which settings are run."""
 
     folder: Path
-    settings: str = "config/test/config.yaml"
+    settings: str
 
     @classmethod
-    def copy(cls, folder: Path) -> Flow:
+    def copy(cls, folder: Path, settings: str = "config/test/config.yaml") -> Flow:
         """Copy what a run needs; compiled caches come along."""
         for name in COPIED:
             source = ROOT / name
@@ -30,7 +30,7 @@ class Flow:
                 shutil.copytree(source, folder / name)
             else:
                 shutil.copy2(source, folder / name)
-        return cls(folder)
+        return cls(folder, settings)
 
     @property
     def results(self) -> Path:
@@ -45,8 +45,8 @@ class Flow:
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run Snakemake in the folder, with the folder's own package."""
         command = [
-            *(sys.executable, "-m", "snakemake", "--cores", "2"),
-            *("--configfile", self.settings, *arguments),
+            *(sys.executable, "-m", "snakemake", "--configfile", self.settings),
+            *("--cores", "2", *arguments),
         ]
         return subprocess.run(
             command,

@@ -76,8 +76,10 @@ def without_calibration(*cameras: str) -> Break:
         for camera in cameras:
             path = folder / f"{camera}.mkv"
             data = path.read_bytes()
-            assert b"calibration.json" in data
-            path.write_bytes(data.replace(b"calibration.json", b"calibratiox.json"))
+            for name in (b"calibration.json", b"K4A_CALIBRATION_FILE"):
+                assert name in data
+                data = data.replace(name, name[:-1] + b"X")
+            path.write_bytes(data)
 
     return rename_attachment
 
@@ -109,7 +111,6 @@ def test_one_bad_camera_is_survived_and_flagged(
     [
         (without_calibration("k1", "k2", "k3"), ["no camera in", "calibration"]),
         (lambda folder: [p.unlink() for p in folder.glob("*.mkv")], ["no recording k1.mkv"]),
-        (shutil.rmtree, ["no such folder of recordings"]),
         (lambda folder: (folder / "calibration.json").unlink(), ["calibration.json"]),
         (lambda folder: (folder / "calibration.json").write_text("{"), ["calibration.json"]),
     ],
