@@ -60,13 +60,16 @@ def contact_probability(
 
 
 def _distance_evidence(motion: RegionMotion) -> np.ndarray:
-    """Log odds of the distance: normal around the surface against anywhere within reach."""
-    touching = -0.5 * np.square(motion.distance / motion.sigma) - np.log(
-        motion.sigma * np.sqrt(2 * np.pi)
-    )
+    """Log odds of the distance: normal around the surface against anywhere within reach.
+
+    A region inside the object touches it: depth is error. Where the distance is hardly known, both
+    are equally wide and nothing is learnt.
+    """
+    distance = np.maximum(motion.distance, 0.0)
+    free = np.log(_FREE_RANGE + np.sqrt(2 * np.pi) * motion.sigma)
+    touching = -0.5 * np.square(distance / motion.sigma) - np.log(motion.sigma * np.sqrt(2 * np.pi))
     # An error of some millimetres beyond the stated one must not be impossible.
-    touching = np.logaddexp(touching, np.log(0.01 / _FREE_RANGE))
-    return touching - np.log(1 / _FREE_RANGE)
+    return np.logaddexp(touching, np.log(0.01) - free) + free
 
 
 def _motion_evidence(motion: RegionMotion) -> np.ndarray:

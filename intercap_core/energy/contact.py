@@ -9,6 +9,8 @@ the other two along. The paper's gate Q_t is the probability that the region tou
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 # A vertex counts in its patch, and a patch in its region, by how much farther it is than the
@@ -20,39 +22,54 @@ REACH = 0.02
 TOLERANCE = 0.002
 
 
+@dataclass(frozen=True)
+class Shares:
+    """How contact is spread over a body: ``area`` (T, N) weights that sum to one in each patch, and
+    ``gate`` (T, P) how much each patch takes part in its region's contact."""
+
+    area: np.ndarray
+    gate: np.ndarray
+
+
+def shares(distance: np.ndarray, patch_of: np.ndarray, region_of_patch: np.ndarray) -> Shares:
+    """Spread contact at signed distances ``distance`` (T, N) to the object, metres.
+
+    ``patch_of`` (N,) patch of each vertex, ``region_of_patch`` (P,). Taken once in a round and then
+    held, so that the energy below has the derivative that its weights state.
+    """
+    area = np.zeros_like(distance)
+    nearest = np.empty((len(distance), len(region_of_patch)))
+    for patch in range(len(region_of_patch)):
+        members = np.flatnonzero(patch_of == patch)
+        d = distance[:, members]
+        nearest[:, patch] = np.maximum(d.min(axis=1), 0.0)
+        near = _closeness(np.maximum(d - nearest[:, [patch]], 0.0))
+        area[:, members] = near / near.sum(axis=1, keepdims=True)
+    of_region = np.stack(
+        [nearest[:, region_of_patch == region].min(axis=1) for region in region_of_patch], axis=1
+    )
+    return Shares(area, _closeness(nearest - of_region))
+
+
 def term(
-    distance: np.ndarray,
-    patch_of: np.ndarray,
-    region_of_patch: np.ndarray,
-    probability: np.ndarray,
+    distance: np.ndarray, patch_of: np.ndarray, spread: Shares, probability: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Residuals (T, N) in metres, weights (T, N) and energy (m^2) of all contact vertices.
 
-    ``distance`` (T, N) signed distances to the object, metres; ``patch_of`` (N,) patch of each
-    vertex; ``region_of_patch`` (P,); ``probability`` (T, R) that the region touches. One patch in
-    one frame has the energy q rho(s) / 2, with q the region's probability times the patch's share
-    in it, s the mean square residual over the patch's nearest area and Geman-McClure's
+    ``distance`` (T, N) signed distances to the object, metres; ``probability`` (T, P) that each
+    patch's region touches. One patch in one frame has the energy q rho(s) / 2, with q probability
+    times gate, s the mean square residual over the patch's area and Geman-McClure's
     rho(s) = R^2 s / (R^2 + s), R = ``REACH``; its weights are q rho'(s) spread over that area.
     """
     residual = np.sign(distance) * np.maximum(np.abs(distance) - TOLERANCE, 0.0)
-    weight = np.zeros_like(distance)
-    energy = 0.0
-    patches = [np.flatnonzero(patch_of == patch) for patch in range(len(region_of_patch))]
-    nearest = np.stack([np.maximum(distance[:, ids].min(axis=1), 0.0) for ids in patches], axis=1)
-    for patch, members in enumerate(patches):
-        region = region_of_patch[patch]
-        gate = probability[:, region]
-        if not gate.any():
-            continue
-        away = nearest[:, patch] - nearest[:, region_of_patch == region].min(axis=1)
-        gate = (gate * _closeness(away))[:, None]
-        area = _closeness(np.maximum(distance[:, members] - nearest[:, [patch]], 0.0))
-        area /= area.sum(axis=1, keepdims=True)
-        square = (area * np.square(residual[:, members])).sum(axis=1, keepdims=True)
-        robust = REACH**2 / (REACH**2 + square)
-        weight[:, members] = gate * area * robust**2
-        energy += 0.5 * float((gate * square * robust).sum())
-    return residual, weight, energy
+    square = np.zeros_like(probability)
+    contribution = spread.area * np.square(residual)
+    for patch in range(probability.shape[1]):
+        square[:, patch] = contribution[:, patch_of == patch].sum(axis=1)
+    gate = probability * spread.gate
+    robust = REACH**2 / (REACH**2 + square)
+    weight = spread.area * (gate * robust**2)[:, patch_of]
+    return residual, weight, 0.5 * float((gate * square * robust).sum())
 
 
 def _closeness(away: np.ndarray) -> np.ndarray:

@@ -29,6 +29,10 @@ class Proximity:
     normals: np.ndarray
     by_object: np.ndarray
 
+    def at(self, index: np.ndarray) -> Proximity:
+        """The same for the points ``index`` (M,) alone."""
+        return Proximity(self.distance[:, index], self.normals[:, index], self.by_object[:, index])
+
 
 def proximity(
     field: DistanceField, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray

@@ -6,9 +6,9 @@ give the same energy. E_S uses the same differences of the body's joints where t
 latent velocities of LEMO's network, whose weights are not free. Both are made robust: a start, a
 stop or an impact is an outlier of smooth motion, and is paid for once instead of smeared.
 
-A third term knows that a sequential fit's errors last: calibration, clothing and a mask's errors are
-the same in the next frame, so what the joint fit corrects must change slowly, up to the fit's own
-jitter. Without it contact that comes and goes would shake a fit that was steady.
+A third term knows that a sequential fit's errors last: calibration, clothing and a mask's errors
+are the same in the next frame, so what the joint fit corrects must change slowly, up to the fit's
+own jitter. Without it contact that comes and goes would shake a fit that was steady.
 """
 
 from __future__ import annotations
@@ -32,14 +32,18 @@ def robust(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
     return 1.0 / root, float(scale**2 * (root - 1.0).sum())
 
 
-def jitter(points: np.ndarray) -> float:
+def jitter(points: np.ndarray, known: np.ndarray) -> float:
     """Standard deviation, in metres, of noise that is independent from frame to frame in points
-    (T, N, 3), from the median size of fourth differences: motion itself hardly has any."""
-    if len(points) < len(_FOURTH):
-        return 0.0
+    (T, N, 3), from the median size of fourth differences: motion itself hardly has any. Only runs
+    of ``known`` (T,) frames count; 0 where there is none of five."""
     count = len(points) - len(_FOURTH) + 1
-    fourth = sum(factor * points[k : k + count] for k, factor in enumerate(_FOURTH))
-    return float(1.4826 * np.median(np.abs(fourth)) / np.sqrt(np.square(_FOURTH).sum()))
+    if count < 1:
+        return 0.0
+    whole = np.all([known[k : k + count] for k in range(len(_FOURTH))], axis=0)
+    if not whole.any():
+        return 0.0
+    fourth = np.sum([f * points[k : k + count] for k, f in enumerate(_FOURTH)], axis=0)
+    return float(1.4826 * np.median(np.abs(fourth[whole])) / np.sqrt(np.square(_FOURTH).sum()))
 
 
 def moment_points(vertices: np.ndarray) -> np.ndarray:

@@ -15,24 +15,30 @@ log = logging.getLogger(__name__)
 
 _DAMPING = 1e-3
 _MAX_TURN, _MAX_SHIFT = 0.5, 0.1  # of one step: rad, metres
-_CONVERGED = 2e-3  # relative decrease of the energy
+_CONVERGED = 0.03  # a step that gains less than this share of what the round has gained ends it
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where the energy was left, the equations there, and the number of accepted steps."""
+    """Where the energy was left, the equations there, the number of accepted steps, and whether
+    the last one gained little."""
 
     state: State
     equations: NormalEquations
     steps: int
+    converged: bool
 
 
 def minimise(
     linearise: Callable[[State], NormalEquations], state: State, *, max_steps: int
 ) -> Minimum:
-    """Descend from ``state`` by at most ``max_steps`` steps, each accepted only if the energy,
-    correspondences and visibility refreshed, becomes less."""
-    damping, accepted = _DAMPING, 0
+    """Descend from ``state`` by at most ``max_steps`` steps, each accepted only if the energy
+    becomes less.
+
+    Progress is measured against the round's own, since most of the energy is noise that no state
+    explains.
+    """
+    damping, accepted, gained, converged = _DAMPING, 0, 0.0, False
     here = linearise(state)
     for _ in range(max_steps):
         step = here.step(damping)
@@ -42,15 +48,17 @@ def minimise(
         trial = state.moved(_limited(step))
         there = linearise(trial)
         log.info("energy %.4g -> %.4g (damping %.0e)", here.total, there.total, damping)
-        if there.total >= here.total:
+        if not there.total < here.total:
             damping *= 10
             continue
-        decrease = (here.total - there.total) / max(here.total, 1e-12)
+        gain = here.total - there.total
+        gained += gain
         state, here, accepted = trial, there, accepted + 1
         damping = max(damping / 5, 1e-6)
-        if decrease < _CONVERGED:
+        if gain < _CONVERGED * gained:
+            converged = True
             break
-    return Minimum(state, here, accepted)
+    return Minimum(state, here, accepted, converged)
 
 
 def _limited(step: np.ndarray) -> np.ndarray:

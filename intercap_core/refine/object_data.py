@@ -1,8 +1,8 @@
 """E_O in the joint energy: the images' evidence on the object's pose, frame by frame.
 
 The tracker ends at the minimum of equation 1 with that energy's curvature there. Around it E_O is
-the quadratic form of the two, so the joint fit needs no second look at the images; a frame that
-the tracker does not believe has no say.
+the quadratic form of the two, so the joint fit needs no second look at the images. A frame that the
+tracker does not believe stays near where it was bridged unless contact and its neighbours pull.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ from intercap_core.refine.state import OBJECT, State
 
 # The tracker's views share calibration errors, so its minimum is never surer than this.
 _FLOOR = np.repeat([np.radians(0.3), 0.002], 3)
+_BRIDGED = np.repeat([0.5, 0.15], 3)  # rad, metres
+# Where two passes ended apart, it is nearly always in the turn (on which side a handle is).
+_DISAGREE = np.repeat([np.radians(10.0), 0.002], 3)
 
 
 @dataclass(frozen=True)
 class TrackedPoses:
     """``rotation`` (T, 3, 3), ``translation`` (T, 3) and ``information`` (T, 6, 6), the inverse
-    covariance of (turn on the left, shift); zero where the track is lost."""
+    covariance of (turn on the left, shift)."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -35,12 +38,15 @@ class TrackedPoses:
         translation: np.ndarray,
         covariance: np.ndarray,
         lost: np.ndarray,
+        disagree: np.ndarray,
     ) -> TrackedPoses:
-        """Take over an object track; ``covariance`` (T, 6, 6), ``lost`` (T,)."""
-        information = np.zeros_like(covariance)
-        for t in np.flatnonzero(~lost & np.isfinite(covariance).all(axis=(1, 2))):
-            information[t] = np.linalg.inv(covariance[t] + np.diag(_FLOOR**2))
-        return cls(rotation, translation, information)
+        """Take over an object track whose lost frames are bridged; ``covariance`` (T, 6, 6),
+        ``lost`` and ``disagree`` (T,)."""
+        known = ~lost & np.isfinite(covariance).all(axis=(1, 2))
+        total = np.where(known[:, None, None], covariance, 0.0)
+        floor = np.where(disagree[:, None], np.hypot(_FLOOR, _DISAGREE), _FLOOR)
+        total += np.eye(6) * np.where(known[:, None], floor, _BRIDGED)[:, None, :] ** 2
+        return cls(rotation, translation, np.linalg.inv(total))
 
     def add(self, state: State, out: NormalEquations) -> None:
         """Add E_O at ``state``."""

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
 from intercap_core.contact.patches import Patches
 from intercap_core.energy import contact, ground, penetration, smoothness
 from intercap_core.energy.proximity import Proximity, proximity
 from intercap_core.refine.equations import NormalEquations
+from intercap_core.refine.skin import Skin
 from intercap_core.refine.state import BODY, OBJECT, SIZE, State
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
@@ -74,6 +74,7 @@ class Problem:
     object_known: np.ndarray
 
     def __post_init__(self) -> None:
+        self.skin = Skin.watch(self.model, self.patches)
         self._moments = smoothness.moment_points(self.mesh.vertices)
         fingers = np.arange(55) >= _FIRST_FINGER
         self._joint_sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
@@ -83,6 +84,7 @@ class Problem:
         self._start_object, _ = smoothness.points_by_object(
             self._moments, self.start.rotation, self.start.translation
         )
+        self.refresh(self.start)
 
     def equations(self, state: State) -> NormalEquations:
         """Linearise every term at ``state``."""
@@ -94,49 +96,66 @@ class Problem:
         self._object_motion_and_ground(state, out)
         return out
 
+    def refresh(self, state: State) -> None:
+        """Take anew which vertices carry the contact and on how many the object stands."""
+        near = self.proximity(state)[1].distance[:, self.skin.patch]
+        self._spread = contact.shares(near, self.patches.patch, self.patches.region_of_patch)
+        if self.floor is not None:
+            below = (
+                ground.residuals(self._object_at(state), self.floor.point, self.floor.normal) < 0
+            )
+            self._standing = np.maximum(below.sum(axis=1, keepdims=True), 4)
+
     def proximity(self, state: State) -> tuple[np.ndarray, Proximity]:
-        """Patch vertices (T, N, 3) in the master frame, and their distance to the object."""
+        """Skin vertices (T, N, 3) in the master frame, and their distance to the object."""
         with torch.no_grad():
-            body = self.model(state.parameters(self.model), vertex_ids=self.patches.vertices)
+            body = self.model(state.parameters(self.model), vertex_ids=self.skin.vertices)
         points = body.vertices.double().cpu().numpy()
         return points, proximity(self.field, points, state.rotation, state.translation)
 
     def _near_object(self, state: State, out: NormalEquations) -> None:
         """E_C and E_P, and E_G of the same vertices."""
-        lin = self.model.linearise(state.parameters(self.model), vertex_ids=self.patches.vertices)
-        points = lin.vertices.double().cpu().numpy()
-        near = proximity(self.field, points, state.rotation, state.translation)
-        touch, touch_weight, touch_energy = contact.term(
-            near.distance, self.patches.patch, self.patches.region_of_patch, self.probability
+        points, near = self.proximity(state)
+        probability = self.probability[:, self.patches.region_of_patch]
+        at_patch = near.distance[:, self.skin.patch]
+        touch, weight, energy = contact.term(
+            at_patch, self.patches.patch, self._spread, probability
         )
         scale = self.settings.contact_weight / CONTACT_SIGMA**2
-        self._add_coupled(
-            "contact", lin, near, touch, touch_weight * scale, touch_energy * scale, out
-        )
-        deep, deep_weight = penetration.weights(near.distance, self.patches.share)
+        residual, touching = np.zeros_like(near.distance), np.zeros_like(near.distance)
+        residual[:, self.skin.patch], touching[:, self.skin.patch] = touch, weight * scale
+        self._add_coupled("contact", state, near, residual, touching, energy * scale, out)
+        deep, inside = penetration.weights(near.distance, self.skin.share)
         scale = self.settings.penetration_weight / PENETRATION_SIGMA**2 / VERTICES_PER_MEASUREMENT
-        self._add_coupled("penetration", lin, near, deep, deep_weight * scale, None, out)
+        self._add_coupled("penetration", state, near, deep, inside * scale, None, out)
         if self.floor is not None:
             height = ground.residuals(points, self.floor.point, self.floor.normal)
-            weight = np.where(height < 0, self.patches.share, 0.0)
-            weight *= self.settings.ground_weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
+            below = np.where(height < 0, self.skin.share, 0.0)
+            below *= self.settings.ground_weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
+            active = np.flatnonzero(below.any(axis=0))
             normal = np.broadcast_to(self.floor.normal, points.shape)
-            active = np.flatnonzero(weight.any(axis=0))
-            rows = self._body_rows(lin, normal, active)
-            out.add_rows("ground", slice(0, BODY), rows, weight[:, active], height[:, active])
+            rows = self._body_rows(state, normal, active)
+            out.add_rows("ground", slice(0, BODY), rows, below[:, active], height[:, active])
 
-    def _body_rows(self, lin: Linearisation, normals: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Rows (T, A, 168) of n^T d point / d body for the points ``index`` (A,)."""
-        directions = torch.as_tensor(
-            np.ascontiguousarray(normals), dtype=lin.points.dtype, device=lin.points.device
+    def _body_rows(self, state: State, normals: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Rows (T, A, 168) of n^T d point / d body for the skin vertices ``index`` (A,), with
+        ``normals`` (T, N, 3) of all."""
+        if not len(index):
+            return np.zeros((len(state), 0, BODY))
+        lin = self.model.linearise(
+            state.parameters(self.model), vertex_ids=self.skin.vertices[index]
         )
-        rows = lin.along(directions[:, :, None])[:, :, 0, :BODY]
-        return rows[:, torch.as_tensor(index)].double().cpu().numpy()
+        directions = torch.as_tensor(
+            np.ascontiguousarray(normals[:, index]),
+            dtype=lin.points.dtype,
+            device=lin.points.device,
+        )
+        return lin.along(directions[:, :, None])[:, :, 0, :BODY].double().cpu().numpy()
 
     def _add_coupled(
         self,
         term: str,
-        lin: Linearisation,
+        state: State,
         near: Proximity,
         residual: np.ndarray,
         weight: np.ndarray,
@@ -145,13 +164,15 @@ class Problem:
     ) -> None:
         """Rows that move with both the body and the object."""
         index = np.flatnonzero(weight.any(axis=0))
-        if not len(index):
-            out.energy.setdefault(term, 0.0)
-            return
         rows = np.concatenate(
-            [self._body_rows(lin, near.normals, index), near.by_object[:, index]], axis=2
+            [self._body_rows(state, near.normals, index), near.by_object[:, index]], axis=2
         )
         out.add_rows(term, slice(0, SIZE), rows, weight[:, index], residual[:, index], energy)
+
+    def _object_at(self, state: State) -> np.ndarray:
+        """The object's vertices (T, V, 3) in the master frame."""
+        turned = np.einsum("tij,nj->tni", state.rotation, self.mesh.vertices)
+        return turned + state.translation[:, None]
 
     def _body_motion(self, state: State, out: NormalEquations) -> None:
         """E_S on the 55 joints."""
@@ -193,7 +214,8 @@ class Problem:
     ) -> None:
         """Corrections of points (T, N, 3) against the sequential fit's change slowly."""
         frames, count = points.shape[:2]
-        sigma = np.hypot(drift / np.sqrt(self.fps), smoothness.jitter(start[known]))
+        noise = smoothness.jitter(start, known)
+        sigma = np.sqrt(drift**2 / self.fps + 2 * noise**2)
         change = np.diff(points - start, axis=0).reshape(frames - 1, -1) / sigma
         pairs = known[1:] & known[:-1]
         weight = np.repeat(pairs[:, None] / POINTS_PER_MOTION[term], 3 * count, axis=1)
@@ -231,12 +253,10 @@ class Problem:
                 self.object_known, out,
             )  # fmt: skip
         if self.floor is not None:
-            moved = state.translation[:, None] + np.einsum(
-                "tij,nj->tni", state.rotation, self.mesh.vertices
-            )
+            moved = self._object_at(state)
             height = ground.residuals(moved, self.floor.point, self.floor.normal)
-            # the object stands on few vertices: its lowest ones count as one measurement
-            weight = (height < 0) / np.maximum((height < 0).sum(axis=1, keepdims=True), 1)
+            # the object stands on few vertices: together they count as one measurement
+            weight = (height < 0) / self._standing
             weight = weight * self.settings.ground_weight / GROUND_SIGMA**2
             rows = ground.by_object(moved, state.translation, self.floor.normal)
             out.add_rows("ground", OBJECT, rows, weight, height)

@@ -89,7 +89,7 @@ def run(
         failed, bridged = body["failed"], body["bridged"]
         lost, disagree = track["lost"], track["disagree"]
         tracked = TrackedPoses.from_track(
-            track["rotation"], track["translation"], track["covariance"], lost
+            start.rotation, start.translation, track["covariance"], lost, disagree
         )
         object_sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
         object_sigma = np.where(lost | ~np.isfinite(object_sigma), _UNTRACKED_SIGMA, object_sigma)
@@ -133,13 +133,15 @@ def run(
     for rounds in _ROUNDS:
         problem.probability = found.probability
         data.refresh(state)
+        problem.refresh(state)
         if not before:
             before = problem.equations(state).energy
         minimum = minimise(problem.equations, state, max_steps=rounds)
         state, steps = minimum.state, steps + minimum.steps
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
         before_round, found = found, _contact(problem, state, contact, joint_sigma, object_sigma)
-        if np.abs(found.probability - before_round.probability).max() < _SETTLED:
+        change = np.abs(found.probability - before_round.probability).max()
+        if minimum.converged and change < _SETTLED:
             break
     after = minimum.equations.energy
     flagged, reasons = _flags(failed, bridged, lost, disagree, problem, state)
@@ -211,8 +213,8 @@ def _contact(
     points, near = problem.proximity(state)
     motion = region_motion(
         problem.patches,
-        points,
-        near,
+        points[:, problem.skin.patch],
+        near.at(problem.skin.patch),
         state.rotation,
         state.translation,
         joint_sigma,

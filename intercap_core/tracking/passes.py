@@ -105,7 +105,8 @@ class Tracker:
         else:
             seed_frame, seed = self._find_seed()
         one = self._both_ways(seed_frame, seed)
-        turned = self._turned_seed(seed_frame, one)
+        # who annotates a pose knows on which side the handle is
+        turned = self._turned_seed(seed_frame, one) if initial is None else None
         if turned is not None:
             one = self._both_ways(seed_frame, turned)
         last = self._count - 1

@@ -72,3 +72,15 @@ def test_annotation_is_certain_inside_and_undecided_at_its_ends():
     assert evidence[30, 0] > 5 and evidence[5, 0] < -5
     assert abs(evidence[20, 0]) < 1 and abs(evidence[39, 0]) < 1
     assert (evidence[:, 1] < -5).all()
+
+
+def test_not_knowing_where_the_object_is_does_not_refute_a_grasp():
+    sigma = np.full((60, 1), 0.012)
+    sigma[20:50] = 0.5
+    motion = _motion(np.zeros((60, 1)), 0.0, 0.0)
+    motion = RegionMotion(motion.distance, motion.slip, motion.object_speed, sigma)
+    assert (contact_probability(motion, FPS) > 0.5).all()
+
+
+def test_a_hand_deep_in_the_object_touches_it():
+    assert (contact_probability(_motion(np.full((30, 1), -0.04), 0.0, 0.0), FPS) > 0.9).all()

@@ -57,39 +57,43 @@ def test_distance_derivatives_match_finite_differences():
         assert (np.abs(numeric - near.normals[..., axis]) < 2e-3).mean() > 0.9
 
 
+def _contact(distance, patch_of, region_of_patch, probability):
+    distance, patch_of = np.array(distance), np.array(patch_of)
+    spread = contact.shares(distance, patch_of, np.array(region_of_patch))
+    return contact.term(distance, patch_of, spread, np.array(probability))
+
+
 def test_contact_weights_of_a_touching_patch_sum_to_its_probability():
-    distance = np.array([[0.0, 0.001, 0.2, 0.0]])
-    patch_of, region_of_patch = np.array([0, 0, 0, 1]), np.array([0, 1])
-    _, weight, _ = contact.term(distance, patch_of, region_of_patch, np.array([[0.8, 0.3]]))
+    _, weight, _ = _contact([[0.0, 0.001, 0.2, 0.0]], [0, 0, 0, 1], [0, 1], [[0.8, 0.3]])
     assert weight[0, :3].sum() == pytest.approx(0.8)
     assert weight[0, 3] == pytest.approx(0.3)
     assert weight[0, 2] < 1e-6
 
 
 def test_a_far_patch_gives_up():
-    one = np.array([0])
-    _, near, _ = contact.term(np.array([[0.005]]), one, one, np.array([[1.0]]))
-    _, far, _ = contact.term(np.array([[0.2]]), one, one, np.array([[1.0]]))
+    _, near, _ = _contact([[0.005]], [0], [0], [[1.0]])
+    _, far, _ = _contact([[0.2]], [0], [0], [[1.0]])
     assert near.sum() > 0.9 and far.sum() < 0.01
 
 
 def test_a_finger_off_the_handle_is_left_alone_while_the_palm_holds_it():
-    distance = np.array([[0.001, 0.025]])
-    _, weight, _ = contact.term(distance, np.array([0, 1]), np.array([0, 0]), np.array([[1.0]]))
+    _, weight, _ = _contact([[0.001, 0.025]], [0, 1], [0, 0], [[1.0, 1.0]])
     assert weight[0, 0] == pytest.approx(1.0) and weight[0, 1] < 0.01
 
 
 def test_contact_weights_are_the_derivative_of_its_energy():
-    one, sure = np.array([0]), np.array([[1.0]])
-
-    def at(d: float) -> tuple[float, float, float]:
-        residual, weight, energy = contact.term(np.array([[d]]), one, one, sure)
-        return float(residual[0, 0]), float(weight[0, 0]), energy
-
-    for d in (0.004, 0.012, 0.03):
-        residual, weight, _ = at(d)
-        numeric = (at(d + 1e-6)[2] - at(d - 1e-6)[2]) / 2e-6
-        assert weight * residual == pytest.approx(numeric, rel=1e-4)
+    distance = RNG.uniform(-0.005, 0.03, size=(3, 12))
+    patch_of = np.repeat([0, 1, 2], 4)
+    spread = contact.shares(distance, patch_of, np.array([0, 0, 1]))
+    probability = RNG.uniform(size=(3, 3))
+    residual, weight, _ = contact.term(distance, patch_of, spread, probability)
+    for t, n in ((0, 1), (1, 5), (2, 11)):
+        step = np.zeros_like(distance)
+        step[t, n] = 1e-7
+        up = contact.term(distance + step, patch_of, spread, probability)[2]
+        down = contact.term(distance - step, patch_of, spread, probability)[2]
+        numeric = (up - down) / 2e-7
+        assert (weight * residual)[t, n] == pytest.approx(numeric, rel=1e-4, abs=1e-10)
 
 
 def test_only_depth_beyond_the_tolerance_is_paid_for():

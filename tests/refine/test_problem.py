@@ -88,7 +88,8 @@ def _problem(
 
 def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
     covariance = np.repeat(np.eye(6)[None] * sigma**2, len(state), axis=0)
-    return TrackedPoses.from_track(state.rotation, state.translation, covariance, lost)
+    agree = np.zeros_like(lost)
+    return TrackedPoses.from_track(state.rotation, state.translation, covariance, lost, agree)
 
 
 def test_contact_closes_a_gap_between_hand_and_object(model, box):
@@ -98,7 +99,7 @@ def test_contact_closes_a_gap_between_hand_and_object(model, box):
         model, box, state, data=(_hold(state, 0.02), tracked.add), touching=[LEFT_HAND]
     )
     _, near = problem.proximity(state)
-    hand = problem.patches.region == LEFT_HAND
+    hand = problem.skin.patch[problem.patches.region == LEFT_HAND]
     minimum = minimise(problem.equations, state, max_steps=8)
     _, after = problem.proximity(minimum.state)
     assert near.distance[:, hand].min() > 0.011
@@ -185,5 +186,5 @@ def test_jitter_is_the_noise_of_a_smooth_motion():
     t = np.arange(200)[:, None, None] / 30
     smooth = np.concatenate([np.sin(t), np.cos(1.3 * t), t], axis=2)
     noisy = smooth + rng.normal(scale=0.003, size=smooth.shape)
-    assert smoothness.jitter(noisy) == pytest.approx(0.003, rel=0.2)
-    assert smoothness.jitter(smooth) < 1e-5
+    assert smoothness.jitter(noisy, np.ones(200, bool)) == pytest.approx(0.003, rel=0.2)
+    assert smoothness.jitter(smooth, np.ones(200, bool)) < 1e-5
