@@ -10,7 +10,7 @@ CORES ?= 0
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
-EXTRAS := workflow,test,dev
+EXTRAS := workflow,slurm,test,dev
 
 .PHONY: demo test lint ruff-check ruff-format snakefmt mypy snakemake-lint evaluate bench docs \
     environment clean
