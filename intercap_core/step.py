@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from intercap_core import artefacts, schemas
 from intercap_core.errors import UserError
 from intercap_core.job import last_failure
 from intercap_core.project import Project
@@ -23,6 +24,27 @@ SEQUENCE_STAGES = (
     "metrics",
 )
 
+# The artefacts that a stage reads: known here so that they are checked before its imports.
+READS: dict[str, tuple[str, ...]] = {
+    "frames": (),
+    "detections": ("frames",),
+    "scene": ("frames", "detections"),
+    "person": ("detections", "scene"),
+    "object_track": ("frames", "scene", "detections", "person"),
+    "body_fit": ("frames", "scene", "person"),
+    "joint": ("frames", "scene", "person", "object_track", "body_fit"),
+    "metrics": (
+        "frames",
+        "scene",
+        "detections",
+        "person",
+        "object_track",
+        "body_fit",
+        "joint",
+    ),
+    "export": ("joint", "scene"),
+}
+
 
 def run_step(
     stage: str,
@@ -35,9 +57,11 @@ def run_step(
     """Call ``intercap_core.stages.<stage>.run`` with what its signature asks for.
 
     ``inputs`` are the artefacts by the name of the stage that wrote them; ``output`` is an artefact
-    or, for the export, a folder. Raises UserError where the stage finds a fault in the input.
+    or, for the export, a folder. Raises UserError where an input is missing, unreadable or of
+    another sequence, and where the stage finds a fault in it.
     """
     annotation = project.annotation(sequence)
+    _check_inputs(stage, sequence, inputs)
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
     row = project.sequences[sequence]
     known: dict[str, Any] = {
@@ -57,6 +81,18 @@ def run_step(
         "contact": annotation.contact,
     }
     run(**{name: known[name] for name in inspect.signature(run).parameters})
+
+
+def _check_inputs(stage: str, sequence: str, inputs: Mapping[str, Path]) -> None:
+    known = {s.name: s for s in vars(schemas).values() if isinstance(s, artefacts.Schema)}
+    for name in READS[stage]:
+        with artefacts.read(inputs[name], known[name]) as source:
+            found = source.attributes["sequence"]
+        if found != sequence:
+            raise UserError(
+                f"{inputs[name]}: holds sequence {found!r}, expected {sequence!r}; delete it and "
+                f"re-run stage {name!r} for sequence {sequence!r}"
+            )
 
 
 def run_studio(project: Project, sequence: str) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import resource
 import subprocess
 import sys
@@ -14,7 +16,7 @@ import pytest
 from intercap_core import artefacts
 from intercap_core.cli import STAGES
 from intercap_core.schemas import DETECTIONS
-from intercap_core.step import SEQUENCE_STAGES
+from intercap_core.step import READS, SEQUENCE_STAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -66,6 +68,13 @@ def test_the_commands_are_the_stages() -> None:
     assert tuple(STAGES) == (*SEQUENCE_STAGES, "export")
 
 
+@pytest.mark.parametrize("stage", STAGES)
+def test_what_a_stage_reads_is_what_its_arguments_say(stage: str) -> None:
+    run = importlib.import_module(f"intercap_core.stages.{stage}").run
+    asked = inspect.signature(run).parameters
+    assert set(READS[stage]) == set(asked) & set(SEQUENCE_STAGES)
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -84,7 +93,9 @@ def test_a_mistake_is_one_line_and_status_one(arguments: tuple[str, ...], says: 
     assert done.stderr.count("\n") == 1
 
 
-def test_check_names_every_fault_of_every_sequence(tmp_path: Path) -> None:
+@pytest.fixture
+def small_project(tmp_path: Path) -> Path:
+    """A folder with a project of one good sequence and two that lack files."""
     (tmp_path / "cup.ply").touch()
     (tmp_path / "config.yaml").write_text("dataset: trial\n")
     (tmp_path / "subjects.tsv").write_text("subject\tgender\ns01\tmale\n")
@@ -97,7 +108,11 @@ def test_check_names_every_fault_of_every_sequence(tmp_path: Path) -> None:
     (tmp_path / "rec" / "k1.mkv").touch()
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
-    done = intercap("check", "config.yaml", folder=tmp_path)
+    return tmp_path
+
+
+def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
+    done = intercap("check", "config.yaml", folder=small_project)
     assert done.returncode == 1
     assert "1 of 3 sequences are ready" in done.stdout
     problems = done.stderr.splitlines()
@@ -141,3 +156,15 @@ def test_inspect_finds_damage(detections: Path) -> None:
     assert done.returncode == 1
     assert "'camera_names' is damaged" in done.stderr
     assert "re-run stage 'detections'" in done.stderr
+
+
+def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path, detections: Path) -> None:
+    place = small_project / "results" / "trial" / "good"
+    place.mkdir(parents=True)
+    detections.rename(place / "detections.h5")
+    done = intercap("person", "config.yaml", "good", folder=small_project)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "error: results/trial/good/detections.h5: holds sequence 'one', expected 'good'; "
+        "delete it and re-run stage 'detections' for sequence 'good'\n"
+    )
