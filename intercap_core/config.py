@@ -7,24 +7,42 @@ JSON schemas in ``config/schemas/`` are generated from these models.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from intercap_core.schemas import CONTACT_REGIONS
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=80)]
+MAX_POSITION_M = 50.0  # a capture volume is some metres wide
+MIN_FLOOR_WIDTH_M = 0.01  # floor points this close to one line give no plane
+
+
+def _metres(value: float) -> float:
+    if abs(value) >= MAX_POSITION_M:
+        raise ValueError(
+            f"positions are in metres, below {MAX_POSITION_M:.0f}; this looks like millimetres"
+        )
+    return value
+
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=80)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 Vector3 = tuple[float, float, float]
+Metres = Annotated[float, AfterValidator(_metres)]
+Position = tuple[Metres, Metres, Metres]
+FrameNumber = Annotated[int, Field(ge=0, strict=True)]
 RegionName = Literal[CONTACT_REGIONS]  # type: ignore[valid-type]
 
 
 class Model(BaseModel):
-    """Base of every settings model: unknown keys are mistakes, values do not change."""
+    """Base of every settings model: unknown keys are mistakes, numbers finite, values fixed."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
+    )
 
 
 # --- settings by stage -----------------------------------------------------------------------
@@ -267,7 +285,7 @@ class ContinuousSymmetry(Model):
 
     axis: Vector3
     """Unit axis in the mesh's frame."""
-    offset: Vector3 = (0.0, 0.0, 0.0)
+    offset: Position = (0.0, 0.0, 0.0)
     """A point on the axis, metres."""
 
 
@@ -312,9 +330,9 @@ class ContactInterval(Model):
 
     part: RegionName
     """Contact region of the body."""
-    start: Annotated[int, Field(ge=0)]
+    start: FrameNumber
     """First frame set in contact, from 0."""
-    end: Annotated[int, Field(gt=0)]
+    end: Annotated[int, Field(gt=0, strict=True)]
     """First frame set after the contact."""
 
     @model_validator(mode="after")
@@ -327,12 +345,29 @@ class ContactInterval(Model):
 class InitialObjectPose(Model):
     """The object's pose in one frame, in the master camera's frame."""
 
-    frame: Annotated[int, Field(ge=0)] = 0
+    frame: FrameNumber = 0
     """Frame set of the pose."""
     rotation_vector: Vector3
     """Axis times angle of master_from_object, radians."""
-    translation: Vector3
+    translation: Position
     """Of the mesh's origin, metres."""
+
+
+def _width(points: tuple[Position, ...]) -> float:
+    """Largest distance of a point from the line through the first one and the one furthest off."""
+    first = points[0]
+    far = max(points, key=lambda point: math.dist(first, point))
+    length = math.dist(first, far)
+    if length == 0:
+        return 0.0
+    along = [(b - a) / length for a, b in zip(first, far, strict=True)]
+
+    def beside(point: Position) -> float:
+        offset = [b - a for a, b in zip(first, point, strict=True)]
+        shift = sum(a * b for a, b in zip(along, offset, strict=True))
+        return math.dist(offset, [shift * a for a in along])
+
+    return max(map(beside, points))
 
 
 class Annotation(Model):
@@ -342,15 +377,17 @@ class Annotation(Model):
     """Frames in which body parts touch the object; absent = find them."""
     object_pose: InitialObjectPose | None = None
     """Where the object is in one frame; absent = search."""
-    floor: tuple[Vector3, ...] | None = None
+    floor: tuple[Position, ...] | None = None
     """Three or more points of the floor, master camera frame, metres; absent = fit."""
-    drop_frames: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    drop_frames: tuple[FrameNumber, ...] = ()
     """Frame sets to treat as not recorded."""
 
     @model_validator(mode="after")
     def _floor_points(self) -> Annotation:
         if self.floor is not None and len(self.floor) < 3:
             raise ValueError(f"floor has {len(self.floor)} points, a plane needs 3 or more")
+        if self.floor is not None and _width(self.floor) < MIN_FLOOR_WIDTH_M:
+            raise ValueError("the floor points lie on one line; a plane needs one beside it")
         return self
 
     def check_frames(self, count: int) -> str | None:

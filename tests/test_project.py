@@ -88,6 +88,19 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         settings("dataset: x\njoint: {contact_weight: -1}\n"),
         ["config.yaml", "joint.contact_weight", "greater than or equal to 0", "-1"],
     ),
+    (settings("dataset: -x\n"), ["config.yaml", "dataset", "'-x'"]),
+    (
+        settings("dataset: x\njoint: {contact_weight: .inf}\n"),
+        ["config.yaml", "joint.contact_weight", "finite", "inf"],
+    ),
+    (
+        settings("dataset: x\nmetrics: {contact_mm: .nan}\n"),
+        ["config.yaml", "metrics.contact_mm", "finite", "nan"],
+    ),
+    (
+        objects("cup: {mesh: cup.ply, symmetry: {continuous: [{axis: [0, 0, .nan]}]}}\n"),
+        ["objects.yaml", "symmetry.continuous.0.axis.2", "finite"],
+    ),
     (settings("dataset: x\nexclude: [three]\n"), ["exclude", "'three'"]),
     (
         settings("dataset: x\nbody_models: {female: SMPLX_FEMALE.npz}\n"),
@@ -160,7 +173,22 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ("contact:\n- {part: left_hand, start: 9, end: 3}\n", ["contact.0", "reversed", "9", "3"]),
         ("contact:\n- {part: elbow, start: 1, end: 3}\n", ["contact.0.part", "'elbow'"]),
         ("contact:\n- {part: seat, start: -1, end: 3}\n", ["contact.0.start", "-1"]),
+        ("contact:\n- {part: seat, start: true, end: 3}\n", ["contact.0.start", "True"]),
+        ("contact:\n- {part: seat, start: 0, end: '3'}\n", ["contact.0.end", "'3'"]),
+        ("contact:\n- {part: seat, start: 0, end: 3.0}\n", ["contact.0.end", "3.0"]),
+        ("drop_frames: [true]\n", ["drop_frames.0", "True"]),
         ("floor: [[0, 0, 1], [1, 0, 1]]\n", ["floor", "2 points"]),
+        ("floor: [[0, 0, 1], [1, 0, 1], [2, 0, 1]]\n", ["on one line"]),
+        ("floor: [[0, 0, 1], [0, 0, 1], [0, 0, 1]]\n", ["on one line"]),
+        ("floor: [[0, 0, 1], [900, 0, 1], [0, 1, 1]]\n", ["floor.1.0", "millimetres", "900"]),
+        (
+            "object_pose: {frame: 0, rotation_vector: [0, .nan, 0], translation: [0, 0, 1]}\n",
+            ["object_pose.rotation_vector.1", "finite"],
+        ),
+        (
+            "object_pose: {frame: 0, rotation_vector: [0, 0, 0], translation: [0, 0, 2400]}\n",
+            ["object_pose.translation.2", "millimetres"],
+        ),
         ("object_pose: {frame: 0, translation: [0, 0, 1]}\n", ["rotation_vector", "required"]),
         ("drop_frames: [x]\n", ["drop_frames.0", "'x'"]),
         ("flor: []\n", ["flor", "not permitted"]),
