@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.config import BodyModels, ExportSettings, ObjectEntry, SubjectEntry
+from intercap_core.errors import UserError
 from intercap_core.export import amass, bop, glb, intercap
 from intercap_core.export.motion import Motion, read_motion
 from intercap_core.export.readme import readme
@@ -32,11 +35,15 @@ def run(
     settings: ExportSettings,
     output: Path,
 ) -> None:
-    """Write the chosen formats into the folder ``output``, replacing what is there.
+    """Write the chosen formats into the folder ``output``, replacing an earlier export there.
 
-    The manifest ``export.json`` is written last: a folder without it is not finished. Raises
-    UserError where an artefact or the object's mesh is missing or broken.
+    The folder appears whole or not at all: it is filled under a temporary name beside its own,
+    and an earlier export goes only when the new one is complete. Raises UserError where an
+    artefact or the object's mesh is missing or broken, and where ``output`` holds anything but an
+    export.
     """
+    output = Path(output)
+    _check_replaceable(output)
     mesh = ObjectMesh.load(object_)
     with artefacts.read(scene, SCENE) as setting:
         rig = Rig.from_artefact(setting)
@@ -45,23 +52,55 @@ def run(
     motion = read_motion(joint, fps, body_models, subject.gender)
     z_up = settings.frame == "z-up"
     viewed = motion.moved(zup_from_master, Z_UP) if z_up else motion
-    if output.exists():
-        shutil.rmtree(output)
-    output.mkdir(parents=True)
     formats = sorted(set(settings.formats))
-    for name in formats:
-        if name == "intercap":
-            (output / "intercap").mkdir()
-            intercap.write(output / "intercap" / "res.pkl", motion)
-        elif name == "amass":
-            amass.write(output / "amass", viewed)
-        elif name == "bop":
-            bop.write(output / "bop", motion, rig, mesh, bop.object_id(object_.mesh))
-        else:
-            (output / "glb").mkdir()
-            glb.write(output / "glb" / f"{motion.sequence}.glb", viewed, mesh, z_up=z_up)
-    (output / "README.txt").write_text(readme(motion, viewed, mesh, formats), encoding="utf-8")
-    _write_manifest(output, motion, viewed, formats)
+    with _replaced(output) as folder:
+        for name in formats:
+            if name == "intercap":
+                (folder / "intercap").mkdir()
+                intercap.write(folder / "intercap" / "res.pkl", motion)
+            elif name == "amass":
+                amass.write(folder / "amass", viewed)
+            elif name == "bop":
+                bop.write(folder / "bop", motion, rig, mesh, bop.object_id(object_.mesh))
+            else:
+                (folder / "glb").mkdir()
+                glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, z_up=z_up)
+        (folder / "README.txt").write_text(readme(motion, viewed, mesh, formats), encoding="utf-8")
+        _write_manifest(folder, motion, viewed, formats)
+
+
+def _check_replaceable(output: Path) -> None:
+    if output.is_dir():
+        if any(output.iterdir()) and not (output / MANIFEST).is_file():
+            raise UserError(
+                f"{output}: the folder is neither empty nor an earlier export (it has no "
+                f"{MANIFEST}); name a new or empty folder, or clear this one yourself"
+            )
+    elif output.exists() or output.is_symlink():
+        raise UserError(f"{output}: is a file, expected a folder to export into; name another")
+
+
+@contextlib.contextmanager
+def _replaced(output: Path) -> Iterator[Path]:
+    """An empty folder that takes the place of ``output`` when the block ends without an error."""
+    output = output.resolve()
+    part = output.with_name(f".{output.name}.{os.getpid()}.part")
+    old = output.with_name(f".{output.name}.{os.getpid()}.old")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        yield part
+        if output.exists():
+            output.rename(old)
+        try:
+            part.rename(output)
+        except OSError:
+            if old.exists():
+                old.rename(output)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _write_manifest(output: Path, motion: Motion, viewed: Motion, formats: Sequence[str]) -> None:

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts, safe_pickle
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import ExportSettings, Symmetry
+from intercap_core.errors import UserError
 from intercap_core.export import bop
 from intercap_core.export.motion import read_motion
 from intercap_core.rigid.symmetry import SymmetryGroup
@@ -330,8 +331,39 @@ def test_same_input_same_bytes_and_old_files_go(
     out = tmp_path / "again"
     out.mkdir()
     (out / "old.txt").write_text("left by an earlier version")
+    (out / export.MANIFEST).write_text("{}")
     _run(capture, out)
+    assert [p.name for p in tmp_path.iterdir()] == ["again"]
     names = sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     for name in names:
         assert (out / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_only_an_export_is_replaced(capture: fitted.Capture, tmp_path: Path) -> None:
+    home, file = tmp_path / "home", tmp_path / "notes.txt"
+    home.mkdir()
+    for path in (file, home / "thesis.txt"):
+        path.write_text("years of work")
+    for path, words in ((home, "neither empty nor an earlier export"), (file, "is a file")):
+        with pytest.raises(UserError, match=words) as caught:
+            _run(capture, path)
+        assert str(path) in str(caught.value)
+    assert file.read_text() == (home / "thesis.txt").read_text() == "years of work"
+
+
+def test_an_export_that_fails_leaves_the_earlier_one(
+    capture: fitted.Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / export.MANIFEST).write_text("earlier")
+
+    def full(*_: Any) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(export.intercap, "write", full)
+    with pytest.raises(OSError, match="no space"):
+        _run(capture, out, formats=("intercap",))
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MANIFEST]
+    assert (out / export.MANIFEST).read_text() == "earlier"
