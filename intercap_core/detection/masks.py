@@ -14,6 +14,7 @@ import numpy as np
 from pycocotools import mask as coco_mask
 
 _ZERO = 48  # first character of the alphabet
+_FARTHEST_CORNER = 1e5  # px from the image's corner; the C code counts every pixel of an edge
 _LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
 
 
@@ -97,9 +98,10 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
         raise ValueError("its counts are not a list of whole numbers")
     if lengths.size and lengths.min() < 0:
         raise ValueError(f"its counts hold {int(lengths.min())}, expected 0 or more")
-    if int(lengths.sum()) != height * width:
+    filled = sum(int(n) for n in lengths)  # of Python's integers, which do not wrap
+    if filled != height * width:
         raise ValueError(
-            f"its runs hold {int(lengths.sum())} pixels, expected {height * width} "
+            f"its runs hold {filled} pixels, expected {height * width} "
             f"({width} x {height}, the colour image)"
         )
     return _compress({"size": [height, width], "counts": [int(n) for n in lengths]}, height, width)
@@ -108,12 +110,18 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
 def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
     """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
 
-    Raises ValueError where one has fewer than three corners or a value that is not finite.
+    Raises ValueError where one has fewer than three corners, or a value that is not finite or
+    farther than 1e5 px from the image's corner.
     """
     for polygon in polygons:
         values = np.asarray(polygon, np.float64)
         if values.ndim != 1 or len(values) < 6 or len(values) % 2 or not np.isfinite(values).all():
             raise ValueError("a polygon is not a list of three or more finite x, y corners")
+        if np.abs(values).max() > _FARTHEST_CORNER:
+            raise ValueError(
+                f"a polygon has a coordinate {values[np.abs(values).argmax()]:.6g}, expected "
+                f"pixels of the image ({width} x {height})"
+            )
     if not polygons:
         return encode(np.zeros((height, width), np.uint8))
     return _compress([[float(v) for v in p] for p in polygons], height, width)

@@ -86,6 +86,8 @@ def test_labels_scores_boxes_and_order(tmp_path):
         ({"segmentation": {"size": SIZE, "counts": [1, 2]}}, "runs hold 3"),
         ({"segmentation": {"size": SIZE, "counts": None}}, "no segmentation"),
         ({"segmentation": [[1, 2, 3]]}, "corners"),
+        ({"segmentation": [[1, 2, 1e9, 4, 5, 6]]}, "coordinate 1e.09"),
+        ({"segmentation": [[1, 2, float("nan"), 4, 5, 6]]}, "corners"),
         ({"score": "high"}, "score"),
         ({"score": None}, "score"),
         ({"bbox": [1, 2]}, "bbox"),

@@ -86,7 +86,10 @@ def test_any_bytes_either_fill_the_image_or_are_refused(rle):
     assert runs.decode().sum() == runs.area
 
 
-@pytest.mark.parametrize("counts", [[3, "a"], [1.5, 1], [-1, 21], [3, 4], [[1], [2]]])
+@pytest.mark.parametrize(
+    "counts",
+    [[3, "a"], [1.5, 1], [-1, 21], [3, 4], [[1], [2]], [2**63, 2**63 + 20], [10**400]],
+)
 def test_uncompressed_counts_that_are_wrong(counts):
     with pytest.raises(ValueError):
         masks.from_counts(counts, 4, 5)
@@ -96,3 +99,9 @@ def test_uncompressed_counts_that_are_wrong(counts):
 def test_polygons_that_are_wrong(polygon):
     with pytest.raises(ValueError, match="corners"):
         masks.from_polygons([polygon], 4, 5)
+
+
+@pytest.mark.parametrize("value", [1e9, -1e9, 1e300, 100001.0])
+def test_polygons_far_outside_the_image(value):
+    with pytest.raises(ValueError, match="pixels of the image"):
+        masks.from_polygons([[1, 2, value, 4, 5, 6]], 4, 5)
