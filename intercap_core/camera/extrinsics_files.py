@@ -13,6 +13,8 @@ import numpy as np
 from intercap_core.camera.transforms import invert, is_rigid, rigid
 from intercap_core.errors import UserError
 
+MAX_DISTANCE_M = 100.0  # from the file's origin; farther: the file is in millimetres
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]+")  # names datasets and files
 RELEASE_NAME = re.compile(r"Color(?:_(\d+))?\.json")
 
 
@@ -64,19 +66,30 @@ def _read_rig_file(path: Path) -> Extrinsics:
     for name, entry in cameras.items():
         try:
             pose = np.array(entry["master_from_camera"], np.float64)
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             pose = np.zeros(0)
+        if not CAMERA_NAME.fullmatch(name):
+            raise UserError(
+                f"{path}: camera {name!r} has a name that no file can have, expected letters, "
+                "digits, '_' and '-'; rename it"
+            )
         if not is_rigid(pose):
             raise UserError(
                 f"{path}: camera {name!r} has no rigid 4x4 'master_from_camera' (rows of rotation "
                 "and translation in metres, last row 0 0 0 1); correct it"
             )
+        _check_distance(path, f"camera {name!r}", pose[:3, 3])
         poses[name] = pose
     return _relative_to(master, poses)
 
 
 def _read_release_folder(folder: Path) -> Extrinsics:
-    matches = {p: RELEASE_NAME.fullmatch(p.name) for p in folder.iterdir()}
+    try:
+        matches = {p: RELEASE_NAME.fullmatch(p.name) for p in folder.iterdir()}
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot be read ({error.strerror}); check its permissions"
+        ) from None
     files = {int(m.group(1) or 1): p for p, m in matches.items() if m}
     if 1 not in files:
         raise UserError(
@@ -88,13 +101,28 @@ def _read_release_folder(folder: Path) -> Extrinsics:
         content = _read_json(path)
         try:
             turn, shift = (np.array(content[k], np.float64).reshape(3) for k in ("R", "T"))
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise UserError(
                 f"{path}: expected a rotation vector 'R' and a translation 'T' of three numbers "
                 "each; correct it"
             ) from None
+        if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+            raise UserError(
+                f"{path}: 'R' or 'T' holds a value that is not a finite number; calibrate this "
+                "camera again"
+            )
+        _check_distance(path, "the camera", shift)
         poses[f"k{number}"] = invert(rigid(_rotation_matrix(turn), shift))
     return _relative_to("k1", poses)
+
+
+def _check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
+    distance = float(np.abs(shift).max())
+    if distance > MAX_DISTANCE_M:
+        raise UserError(
+            f"{path}: {camera} has a translation of {distance:.4g} m, expected at most "
+            f"{MAX_DISTANCE_M:.0f} m, so it is likely in millimetres; write it in metres"
+        )
 
 
 def _relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
@@ -117,10 +145,10 @@ def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: is not valid JSON ({error}); correct it") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected names and values, found {type(content).__name__}")
