@@ -27,10 +27,18 @@ def _metres(value: float) -> float:
     return value
 
 
+def _not_reserved(name: str) -> str:
+    if name in RESERVED_SEQUENCES:
+        raise ValueError("this name is taken by a folder of the results; choose another one")
+    return name
+
+
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=80)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
+RESERVED_SEQUENCES = ("recordings", "tables")  # folders beside those of the sequences
 Vector3 = tuple[float, float, float]
+SequenceName = Annotated[Name, AfterValidator(_not_reserved)]
 Metres = Annotated[float, AfterValidator(_metres)]
 Position = tuple[Metres, Metres, Metres]
 FrameNumber = Annotated[int, Field(ge=0, strict=True)]
@@ -253,7 +261,7 @@ class Config(Model):
 class SequenceEntry(Model):
     """One row of sequences.tsv."""
 
-    sequence: Name
+    sequence: SequenceName
     """Name of the sequence; letters, digits, _ and - only."""
     subject: Name
     """Row of subjects.tsv."""

@@ -7,7 +7,7 @@ import csv
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,7 +62,7 @@ class Project:
         path = self.annotation_path(sequence)
         if not path.exists():
             return Annotation()
-        annotation = _parse(Annotation, read_yaml(path) or {}, str(path), "annotation")
+        annotation = _parse(Annotation, _or_empty(read_yaml(path)), str(path), "annotation")
         with contextlib.suppress(artefacts.Unreadable):
             with artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source:
                 count = len(source["times"])
@@ -77,7 +77,7 @@ class Project:
         Raises UserError where the file is not YAML.
         """
         path = self.annotation_path(sequence)
-        values = (read_yaml(path) or {}) if path.exists() else {}
+        values = read_yaml(path) if path.exists() else {}
         return {k: v for k, v in values.items() if v} if isinstance(values, dict) else {}
 
     def annotation_made(self, sequence: str) -> bool:
@@ -99,9 +99,12 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     naming the file, row and field of the first mistake.
     """
     path = Path(path)
-    values = read_yaml(path) or {}
+    values = _or_empty(read_yaml(path))
     if not isinstance(values, dict):
-        raise UserError(f"{path}: expected names and values, found {type(values).__name__}")
+        raise UserError(
+            f"{path}: expected names and values, found {type(values).__name__}; "
+            "config/README.md lists them"
+        )
     config = _parse(Config, _merged(values, overrides or {}), str(path), "setting")
     subjects_table = tidy(path.parent / config.subjects)
     subjects = {row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject")}
@@ -189,19 +192,42 @@ def tidy(path: Path) -> Path:
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 
+class _Loader(yaml.SafeLoader):
+    """The safe loader, which refuses a key that a mapping has twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{key.value!r} is given twice", key.start_mark
+                )
+            seen.add((key.tag, str(key.value)))
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path) -> Any:
     """Load YAML with the safe loader; raises UserError where it is missing or malformed."""
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such file; check the path") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except RecursionError:
+        raise UserError(f"{path}: not valid YAML (nested too deeply); correct it") from None
+    except (yaml.YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "not text"
+        problem = getattr(error, "problem", None)
+        if problem is None:
+            problem = "not text in UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
         raise UserError(f"{path}: not valid YAML{where} ({problem}); correct it") from None
+
+
+def _or_empty(values: Any) -> Any:
+    """What a YAML file holds, where an empty file holds no entries."""
+    return {} if values is None else values
 
 
 def digest(value: BaseModel | Any) -> str:
@@ -214,13 +240,15 @@ def digest(value: BaseModel | Any) -> str:
 
 def _parse(model: type[M], values: Any, where: str, what: str) -> M:
     if not isinstance(values, dict):
-        raise UserError(f"{where}: expected names and values, found {type(values).__name__}")
+        raise UserError(f"{where}: expected names and values, found {values!r:.60}; correct it")
     try:
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in first["loc"]) or "(the whole entry)"
         message = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "string_pattern_mismatch":
+            message = "a name has letters, digits, _ and - only, and does not start with -"
         found = first.get("input")
         shown = "" if isinstance(found, dict) else f", found {found!r}"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
@@ -229,7 +257,7 @@ def _parse(model: type[M], values: Any, where: str, what: str) -> M:
 
 def _read_table(path: Path, model: type[M], key: str) -> list[M]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError):
         raise UserError(
             f"{path}: not a readable text file; check the path in the settings"
@@ -240,6 +268,7 @@ def _read_table(path: Path, model: type[M], key: str) -> list[M]:
         if line.strip() and not line.startswith("#")
     ]
     reader = csv.DictReader((line for _, line in numbered), delimiter="\t", quoting=csv.QUOTE_NONE)
+    _check_header(path, numbered[0][0] if numbered else 1, reader.fieldnames or (), model)
     rows: list[M] = []
     seen: dict[str, int] = {}
     for (number, _), record in zip(numbered[1:], reader, strict=True):
@@ -255,10 +284,35 @@ def _read_table(path: Path, model: type[M], key: str) -> list[M]:
     return rows
 
 
+def _check_header(path: Path, line: int, found: Sequence[str], model: type[BaseModel]) -> None:
+    fields = model.model_fields
+    required = [name for name, field in fields.items() if field.is_required()]
+    problems = [
+        *(f"column {name!r} is missing" for name in required if name not in found),
+        *(f"column {name!r} is given twice" for name in fields if found.count(name) > 1),
+        *(f"column {name!r} is not known" for name in found if name not in fields),
+    ]
+    if problems:
+        optional = [name for name in fields if name not in required]
+        more = f" and, where wanted, {', '.join(optional)}" if optional else ""
+        raise UserError(
+            f"{path}, line {line}: {problems[0]}; the header has {', '.join(required)}{more}: "
+            "use tabs between them"
+        )
+
+
 def _read_objects(path: Path) -> dict[str, ObjectEntry]:
-    values = read_yaml(path) or {}
+    values = _or_empty(read_yaml(path))
     if not isinstance(values, dict):
-        raise UserError(f"{path}: expected object names and entries")
+        raise UserError(
+            f"{path}: expected object names and entries, found {type(values).__name__}; correct it"
+        )
+    for name, entry in values.items():
+        if not isinstance(entry, dict | None):
+            raise UserError(
+                f"{path}, object {name!r}: expected fields such as 'mesh: cup.ply', found "
+                f"{entry!r:.60}; correct it"
+            )
     return {
         name: _absolute(
             _parse(

@@ -135,9 +135,41 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         ["sequences.tsv", "line 4", "'one'", "line 2"],
     ),
     (
-        rows("one\tx\n", header="sequence\tpeople\n"),
-        ["sequences.tsv", "line 2", "column"],
+        rows("one\tx\n", header="# x\nsequence\tpeople\n"),
+        ["sequences.tsv", "line 2", "column 'subject' is missing", "sequence, subject", "tabs"],
     ),
+    (
+        rows("one s01 cup r c\n", header=HEADER.replace("\t", " ")),
+        ["sequences.tsv", "line 1", "column 'sequence' is missing", "use tabs"],
+    ),
+    (
+        rows("one\ts01\tcup\tr\tc\td\n", header=HEADER.rstrip() + "\tsubject\n"),
+        ["sequences.tsv", "line 1", "column 'subject' is given twice"],
+    ),
+    (
+        rows("one\ts01\tcup\tr\tc\td\n", header=HEADER.rstrip() + "\tpeople\n"),
+        ["sequences.tsv", "line 1", "column 'people' is not known", "keypoints"],
+    ),
+    (rows("", header=""), ["sequences.tsv", "line 1", "'sequence' is missing"]),
+    (rows("tables\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "'tables'", "choose"]),
+    (rows("recordings\ts01\tcup\tr\tc\n"), ["line 2", "'recordings'", "choose another"]),
+    (rows("a b\ts01\tcup\tr\tc\n"), ["line 2", "letters, digits, _ and - only", "'a b'"]),
+    (
+        settings("dataset: x\njoint: {}\njoint: {}\n"),
+        ["config.yaml", "line 3", "'joint' is given twice"],
+    ),
+    (
+        settings("dataset: x\njoint:\n  ground_weight: 1\n  ground_weight: 2\n"),
+        ["config.yaml", "line 4", "'ground_weight' is given twice"],
+    ),
+    (settings("[" * 5000), ["config.yaml", "nested too deeply"]),
+    (settings("dataset: 2001-99-99\n"), ["config.yaml", "not valid YAML", "month"]),
+    (settings("false\n"), ["config.yaml", "expected names and values"]),
+    (objects("cup: 3\n"), ["objects.yaml", "object 'cup'", "mesh", "found 3"]),
+    (objects("cup: false\n"), ["objects.yaml", "object 'cup'", "found False"]),
+    (objects("cup: [mesh]\n"), ["objects.yaml", "object 'cup'", "found ['mesh']"]),
+    (objects("cup:\n"), ["objects.yaml", "object 'cup'", "mesh", "required"]),
+    (objects("cup: {mesh: a.ply}\ncup: {mesh: b.ply}\n"), ["line 2", "'cup' is given twice"]),
     (
         lambda folder: (folder / "subjects.tsv").write_text("subject\tgender\ns01\tF\n"),
         ["subjects.tsv", "line 2", "'s01'", "gender", "'F'"],
@@ -194,6 +226,9 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ("flor: []\n", ["flor", "not permitted"]),
         ("contact: [\n", ["not valid YAML"]),
         ("- 1\n", ["expected names and values"]),
+        ("false\n", ["expected names and values", "False"]),
+        ("0\n", ["expected names and values", "0"]),
+        ("[]\n", ["expected names and values", "[]"]),
     ],
 )
 def test_a_broken_annotation_is_told_and_stops_nobody_else(
@@ -206,6 +241,18 @@ def test_a_broken_annotation_is_told_and_stops_nobody_else(
         project.annotation("one")
     for part in ["annotations/one.yaml", *says]:
         assert part in str(raised.value)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing yet\n", "{}\n"])
+def test_an_empty_annotation_says_nothing(folder: Path, text: str) -> None:
+    (folder / "annotations" / "one.yaml").write_text(text)
+    assert load_project(Path("config.yaml")).annotation("one") == Annotation()
+
+
+def test_tables_may_start_with_a_byte_order_mark(folder: Path) -> None:
+    table = folder / "subjects.tsv"
+    table.write_text(table.read_text(), encoding="utf-8-sig")
+    assert set(load_project(Path("config.yaml")).subjects) == {"s01", "s02"}
 
 
 def test_annotation_past_the_end(folder: Path) -> None:
