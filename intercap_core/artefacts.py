@@ -305,13 +305,19 @@ class Artefact:
 def schema_name(path: Path) -> str:
     """Which schema a file says it holds; raises Unreadable where it is no artefact."""
     path = Path(path)
+    if path.is_dir():
+        raise Unreadable(f"{path}: is a folder, expected an .h5 file; name one that a stage wrote")
     if not path.is_file():
         raise Unreadable(f"{path}: there is no such file; check the path")
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
-            return str(file.attrs["schema"])
-    except (OSError, RuntimeError, KeyError):
-        raise Unreadable(f"{path}: not an artefact of this program, or damaged") from None
+            name = file.attrs["schema"]
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+        raise Unreadable(
+            f"{path}: not an artefact of this program, or cut or damaged; name an .h5 file that a "
+            "stage wrote, or delete this one and re-run its stage"
+        ) from None
+    return str(name)
 
 
 @contextlib.contextmanager
@@ -323,6 +329,8 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
     """
     path = Path(path)
     again = f"re-run stage '{schema.stage}' for this sequence"
+    if path.is_dir():
+        raise Unreadable(f"{path}: is a folder, expected an .h5 file; delete it and {again}")
     if not path.is_file():
         raise Unreadable(f"{path}: there is no such file; {again}")
     try:
@@ -334,7 +342,7 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
     with file:
         try:
             _validate(file, path, schema, again)
-        except (OSError, RuntimeError, KeyError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
             raise Unreadable(f"{path}: its contents are damaged; delete it and {again}") from error
         yield Artefact(file, path, schema)
 
@@ -343,13 +351,18 @@ def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> None:
     found = str(file.attrs.get("schema", "none"))
     if found != schema.name:
         raise Unreadable(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
-    version = int(file.attrs.get("schema_version", 0))
+    version = file.attrs.get("schema_version", 0)
+    if not isinstance(version, int | np.integer):
+        raise Unreadable(
+            f"{path}: attribute 'schema_version' is {version!r}, expected a whole number; {again}"
+        )
     if version != schema.version:
         raise Unreadable(
             f"{path}: schema {schema.name!r} has version {version}, this program reads version "
             f"{schema.version}; {again}"
         )
-    if not bool(file.attrs.get("complete", False)):
+    complete = file.attrs.get("complete", False)
+    if not isinstance(complete, bool | np.bool_) or not complete:
         raise Unreadable(f"{path}: was never finished (no 'complete' mark); delete it and {again}")
     for name in schema.attributes:
         if name not in file.attrs:
@@ -373,6 +386,8 @@ def _check_dataset(
     path: Path,
     again: str,
 ) -> None:
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+        raise Unreadable(f"{path}: {key!r} holds no values, expected a dataset; {again}")
     text = declared.dtype == "str"
     if (text and dataset.dtype.kind != "S") or (
         not text and dataset.dtype != np.dtype(declared.dtype)

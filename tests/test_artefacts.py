@@ -144,6 +144,20 @@ def edit(change):
     return apply
 
 
+def put_instead(file: h5py.File, key: str, *, group: bool) -> None:
+    """A group, or a dataset without a shape."""
+    del file[key]
+    if group:
+        file.create_group(key)
+    else:
+        file[key] = h5py.Empty("bool")
+
+
+def replace_by_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
@@ -157,6 +171,14 @@ def edit(change):
         (edit(lambda file: file.attrs.__setitem__("schema_version", 2)), "version 2"),
         (edit(lambda file: file.attrs.__delitem__("sequence")), "attribute 'sequence' is missing"),
         (edit(lambda file: file.__delitem__("names")), "dataset 'names' is missing"),
+        (replace_by_folder, "is a folder"),
+        (edit(lambda file: file.attrs.__setitem__("schema_version", "abc")), "'abc', expected a"),
+        (edit(lambda file: file.attrs.__setitem__("schema_version", [3, 3])), "a whole number"),
+        (edit(lambda file: file.attrs.__setitem__("schema", [1.0, 2.0])), "holds schema"),
+        (edit(lambda file: file.attrs.__setitem__("complete", [True, True])), "never finished"),
+        (edit(lambda file: file.attrs.__setitem__("complete", "no")), "never finished"),
+        (edit(lambda file: put_instead(file, "good", group=True)), "'good' holds no values"),
+        (edit(lambda file: put_instead(file, "good", group=False)), "'good' holds no values"),
     ],
 )
 def test_a_broken_artefact_is_told_in_one_sentence(tmp_path: Path, damage, says: str) -> None:
@@ -171,6 +193,25 @@ def test_a_broken_artefact_is_told_in_one_sentence(tmp_path: Path, damage, says:
     assert str(path) in message
     assert "re-run stage 'trial_stage'" in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (replace_by_folder, "is a folder"),
+        (lambda path: path.unlink(), "there is no such file"),
+        (lambda path: path.write_bytes(path.read_bytes()[:900]), "cut or damaged"),
+        (lambda path: path.write_bytes(b""), "cut or damaged"),
+        (edit(lambda file: file.attrs.__delitem__("schema")), "not an artefact"),
+    ],
+)
+def test_a_file_whose_schema_cannot_be_told(tmp_path: Path, damage, says: str) -> None:
+    path = tmp_path / "trial.h5"
+    write_trial(path)
+    damage(path)
+    with pytest.raises(Unreadable, match=says) as raised:
+        artefacts.schema_name(path)
+    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
 
 
 def test_rows_are_streamed(tmp_path: Path) -> None:
