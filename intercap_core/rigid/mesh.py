@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 MAX_EXTENT_M = 5.0  # larger: the file is in millimetres (the smallest object is 95 mm high)
 MIN_EXTENT_M = 0.01
+MIN_FILLED = 1e-8  # share of its bounding cube that a body fills; less is a flat sheet
 MAX_OPEN_EDGES = 0.05  # share of edges with one face, above which inside and outside mean nothing
 
 
@@ -53,6 +54,7 @@ class ObjectMesh:
         mesh = _read(path)
         _check_size(path, mesh)
         mesh, new_id = _repair(path, mesh)
+        _check_volume(path, mesh)
         try:
             symmetry = SymmetryGroup.from_settings(entry.symmetry)
         except ValueError as error:
@@ -188,6 +190,16 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
         )
 
 
+def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    volume = float(mesh.volume) if len(mesh.faces) else 0.0
+    if not volume > MIN_FILLED * extent**3:
+        raise UserError(
+            f"{path}: encloses {volume:.3g} m^3 at {extent:.3g} m of length, expected a body with "
+            "thickness; export a closed surface instead of a flat sheet"
+        )
+
+
 def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndarray]:
     """Return a consistent mesh and each file vertex's new id (V_file,)."""
     new_id = np.arange(len(mesh.vertices))
@@ -248,17 +260,21 @@ def _contact_vertices(path: Path | None, count: int) -> np.ndarray | None:
     else:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, UnicodeDecodeError):
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+        except (ValueError, RecursionError):
             raise UserError(
                 f"{path}: not a JSON list of vertex ids; write it as [0, 1, ...]"
             ) from None
     if isinstance(values, set | frozenset):
-        values = sorted(values)
+        values = list(values)
     try:
         ids = np.asarray(values)
-    except ValueError:
+    except (ValueError, TypeError, OverflowError):
         ids = np.empty(0, object)
-    whole = ids.dtype.kind in "iu" or (ids.dtype.kind == "f" and np.array_equal(ids, ids.round()))
+    whole = ids.dtype.kind in "iu" or (
+        ids.dtype.kind == "f" and bool(np.isfinite(ids).all()) and np.array_equal(ids, ids.round())
+    )
     if ids.ndim != 1 or len(ids) == 0 or not whole:
         raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
     if ids.min() < 0 or ids.max() >= count:
@@ -272,10 +288,13 @@ def _contact_vertices(path: Path | None, count: int) -> np.ndarray | None:
 
 def _from_npz(path: Path) -> Any:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            raise ValueError("it is a single array")
+        with loaded as file:
             names = file.files
             return file["contact_vertices" if "contact_vertices" in names else names[0]]
-    except (OSError, ValueError, IndexError) as error:
+    except Exception as error:  # a damaged archive can raise nearly anything
         raise UserError(
             f"{path}: not a readable .npz of vertex ids ({error}); save it again"
         ) from None

@@ -1,5 +1,6 @@
 """Bad meshes and lists get one sentence that names the file and the next step."""
 
+import io
 import json
 import logging
 import os
@@ -59,6 +60,12 @@ def _half_open(path):
     return _write(loose, path)
 
 
+def _flat(path):
+    ball = _ball()
+    ball.vertices[:, 2] *= 1e-9
+    return _write(ball, path)
+
+
 def _garbage(path):
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n1 2")
     return path
@@ -73,6 +80,7 @@ def _garbage(path):
         (_millimetres, "millimetres"),
         (_tiny, "unit is the metre"),
         (_half_open, "no inside"),
+        (_flat, "flat sheet"),
         (_garbage, "export"),
     ],
 )
@@ -135,12 +143,56 @@ def test_small_faults_are_repaired(tmp_path, caplog, harm):
         ("[0.5]", "not a list"),
         ("[[1], [2, 3]]", "not a list"),
         ("[1, 2", "not a JSON list"),
+        ("", "not a JSON list"),
+        ("[" * 100000, "not a JSON list"),
+        ("[1, Infinity]", "not a list"),
+        ("[1, NaN]", "not a list"),
+        ('["a"]', "not a list"),
+        ("[1" + "0" * 400 + "]", "not a list"),
     ],
 )
 def test_bad_contact_lists_are_refused(tmp_path, text, words):
     mesh = _write(_ball(), tmp_path / "thing.ply")
     contact = tmp_path / "thing.contact.json"
     contact.write_text(text)
+    with pytest.raises(UserError, match=words) as caught:
+        ObjectMesh.load(_entry(mesh, contact_vertices=contact))
+    assert str(contact) in str(caught.value)
+
+
+def _npz(**arrays):
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _npy(values):
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("c.npz", b"", "not a readable .npz"),
+        ("c.npz", b"no archive", "not a readable .npz"),
+        ("c.npz", _npz(contact_vertices=np.arange(9))[:-30], "not a readable .npz"),
+        ("c.npz", _npz(), "not a readable .npz"),
+        ("c.npz", _npy(np.arange(9)), "a single array"),
+        ("c.npz", _npz(contact_vertices=np.array(["a"])), "not a list"),
+        ("c.npz", _npz(contact_vertices=np.array(3)), "not a list"),
+        ("c.pkl", pickle.dumps({"a": 1}), "not a list"),
+        ("c.pkl", pickle.dumps({1, "a"}), "not a list"),
+        ("c.pkl", pickle.dumps({None, (1, 2)}), "not a list"),
+        ("c.pkl", pickle.dumps(3), "not a list"),
+        ("c.pkl", pickle.dumps(None), "not a list"),
+    ],
+)
+def test_bad_contact_archives_are_refused(tmp_path, name, data, words):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    contact = tmp_path / name
+    contact.write_bytes(data)
     with pytest.raises(UserError, match=words) as caught:
         ObjectMesh.load(_entry(mesh, contact_vertices=contact))
     assert str(contact) in str(caught.value)
@@ -174,12 +226,20 @@ class _Attack:
         return os.system, ("touch should_not_exist",)
 
 
+class _Huge:
+    def __reduce__(self):
+        return np.ndarray, ((1 << 33,),)
+
+
 class _Evaluate:
     def __reduce__(self):
         return eval, ("1 + 1",)
 
 
-@pytest.mark.parametrize("value", [_Attack(), [np.arange(3), _Evaluate()], {"a": Path("x")}])
+@pytest.mark.parametrize(
+    "value",
+    [_Attack(), [np.arange(3), _Evaluate()], {"a": Path("x")}, range(3), slice(3), 1j, _Huge()],
+)
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 def test_pickles_that_call_anything_are_refused(tmp_path, monkeypatch, value, protocol):
     monkeypatch.chdir(tmp_path)
