@@ -31,6 +31,7 @@ _CLASSES = (
     "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
+_LARGEST_ID = 2**31 - 1
 _UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 COCO_NAMES: dict[int, str] = dict(
     zip([i for i in range(1, 91) if i not in _UNUSED_IDS], _CLASSES, strict=True)
@@ -85,11 +86,17 @@ def read_candidates(path: Path, *, width: int, height: int, min_score: float) ->
     for index, entry in enumerate(entries):
         where = f"{path}, entry {index}"
         if not isinstance(entry, dict) or type(entry.get("image_id")) is not int:
+            found = entry.get("image_id") if isinstance(entry, dict) else entry
             raise UserError(
                 f"{where}: image_id must be the whole number of a colour image, found "
-                f"{entry.get('image_id') if isinstance(entry, dict) else entry!r}"
+                f"{_short(found)}"
             )
         image = entry["image_id"]
+        if not 0 <= image <= _LARGEST_ID:
+            raise UserError(
+                f"{where}: image_id must be the number of a colour image from 0, found "
+                f"{_short(image)}; write the candidates of this camera again"
+            )
         score = _score(entry, where)
         if score < min_score:
             continue
@@ -111,10 +118,10 @@ def _instance(
         box = runs.box
     try:
         x, y, w, h = (float(v) for v in box)
-    except (TypeError, ValueError):
-        raise UserError(f"{where}: bbox is {box!r}, expected x, y, width, height") from None
+    except (TypeError, ValueError, OverflowError):
+        raise UserError(f"{where}: bbox is {_short(box)}, expected x, y, width, height") from None
     if not all(math.isfinite(v) for v in (x, y, w, h)):
-        raise UserError(f"{where}: bbox is {box!r}, expected finite numbers")
+        raise UserError(f"{where}: bbox is {_short(box)}, expected finite numbers")
     return Instance(_label(entry, names, where), score, (x, y, w, h), rle)
 
 
@@ -129,7 +136,13 @@ def _segmentation(value: Any, where: str, width: int, height: int) -> bytes:
             )
         counts = value.get("counts")
         if isinstance(counts, str):
-            return counts.encode("utf-8")
+            try:
+                return counts.encode("utf-8")
+            except UnicodeEncodeError:
+                raise UserError(
+                    f"{where}: its RLE holds characters that COCO's alphabet does not have; write "
+                    "the candidates of this camera again"
+                ) from None
         value = counts
         if isinstance(counts, list):
             return _checked(masks.from_counts, counts, where, width, height)
@@ -149,32 +162,53 @@ def _checked(make: Any, value: list[Any], where: str, width: int, height: int) -
 
 def _score(entry: dict[str, Any], where: str) -> float:
     score = entry.get("score", 1.0)
-    if isinstance(score, bool) or not isinstance(score, int | float) or not math.isfinite(score):
-        raise UserError(f"{where}: score is {score!r}, expected a number")
-    return float(score)
+    try:
+        value = float(score) if type(score) in (int, float) else math.nan
+    except OverflowError:
+        value = math.inf
+    if not math.isfinite(value):
+        raise UserError(f"{where}: score is {_short(score)}, expected a number")
+    return value
 
 
 def _label(entry: dict[str, Any], names: dict[int, str], where: str) -> str:
     for key in ("category_name", "category", "label"):
         if isinstance(entry.get(key), str):
-            return str(entry[key])
+            return _text(entry[key], where)
     number = entry.get("category_id")
     if type(number) is not int:
         raise UserError(f"{where}: has neither category_id nor category_name")
-    return names.get(number, f"category {number}")
+    return names.get(number, f"category {_short(number)}")
+
+
+def _text(value: str, where: str) -> str:
+    try:
+        value.encode("utf-8")
+    except UnicodeEncodeError:
+        raise UserError(
+            f"{where}: the category's name {value!r:.80} is not valid text; write the candidates "
+            "of this camera again"
+        ) from None
+    return value
+
+
+def _short(value: Any) -> str:
+    """A found value in words of bounded length."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:60]}... ({len(text)} characters)"
 
 
 def _categories(values: Any, path: Path) -> dict[int, str]:
     try:
-        return {int(v["id"]): str(v["name"]) for v in values}
-    except (TypeError, KeyError, ValueError):
+        return {int(v["id"]): _text(str(v["name"]), str(path)) for v in values}
+    except (TypeError, KeyError, ValueError, OverflowError):
         raise UserError(f"{path}: 'categories' must list objects with id and name") from None
 
 
 def _image_ids(values: Any, path: Path) -> frozenset[int]:
     try:
         return frozenset(int(v["id"]) for v in values)
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, OverflowError):
         raise UserError(f"{path}: 'images' must list objects with id") from None
 
 

@@ -99,7 +99,7 @@ def _points(values: Any, count: int, where: str) -> np.ndarray:
     try:
         # None stands for NaN in JSON that was written by careful libraries.
         points = np.array([np.nan if v is None else v for v in values], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UserError(f"{where} holds something that is not a number; write it again") from None
     if points.ndim != 1:
         raise UserError(f"{where} holds lists, expected one flat list of {3 * count} numbers")

@@ -93,6 +93,16 @@ def test_labels_scores_boxes_and_order(tmp_path):
         ({"bbox": [1, 2]}, "bbox"),
         ({"bbox": [1, 2, 3, float("nan")]}, "bbox"),
         ({"category_id": None}, "category_id"),
+        ({"image_id": float("inf")}, "image_id.*inf"),
+        ({"image_id": -1}, "image_id.*-1"),
+        ({"image_id": 10**400}, "image_id.*401 characters"),
+        ({"score": 10**400}, "score is 1000"),
+        ({"score": float("inf")}, "score is inf"),
+        ({"bbox": [1, 2, 3, 10**400]}, "bbox"),
+        ({"segmentation": {"size": SIZE, "counts": [10**400]}}, "whole numbers"),
+        ({"segmentation": {"size": SIZE, "counts": "\ud800"}}, "alphabet"),
+        ({"segmentation": [[10**400] * 6]}, "entry 1"),
+        ({"category_name": "\ud800"}, "not valid text"),
     ],
 )
 def test_wrong_entries_are_named(tmp_path, change, words):
@@ -102,7 +112,19 @@ def test_wrong_entries_are_named(tmp_path, change, words):
 
 
 @pytest.mark.parametrize(
-    "content", ["", "{", "3", "{}", '{"annotations": [], "categories": 3}', '["x"]']
+    "content",
+    [
+        "",
+        "{",
+        "3",
+        "{}",
+        '{"annotations": [], "categories": 3}',
+        '["x"]',
+        '{"annotations": [], "images": [{"id": Infinity}]}',
+        '{"annotations": [], "categories": [{"id": Infinity, "name": "a"}]}',
+        '{"annotations": [], "categories": [{"id": 1, "name": "\\ud800"}]}',
+        "[" * 100000,
+    ],
 )
 def test_wrong_files_are_named(tmp_path, content):
     with pytest.raises(UserError, match=r"k1\.json"):

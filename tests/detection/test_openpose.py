@@ -73,6 +73,8 @@ def test_values_that_are_not_finite_lose_their_confidence(tmp_path):
         ({"people": [[1, 2]]}, r"people\[0\]"),
         ({"people": [person() | {"pose_keypoints_2d": [0.0] * 54}]}, "54 numbers, expected 75"),
         ({"people": [person() | {"pose_keypoints_2d": ["x"] * 75}]}, "not a number"),
+        ({"people": [person() | {"pose_keypoints_2d": [10**400] * 75}]}, "not a number"),
+        ({"people": [person() | {"pose_keypoints_2d": [{}] * 75}]}, "not a number"),
         ({"people": [person() | {"pose_keypoints_2d": [[1.0, 2.0]] * 75}]}, "one flat list"),
         ({"people": [person() | {"face_keypoints_2d": "no"}]}, "expected 210"),
     ],
