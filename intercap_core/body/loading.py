@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ _REQUIRED = (
     "dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords",
 )  # fmt: skip
 _SMPLX_SHAPE_COLUMNS = 300  # a full file's expression starts here
+_HEIGHT_M = (0.3, 3.0)  # from a newborn to more than the tallest person
 _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the open body"
 
 
@@ -63,9 +63,9 @@ def load_body_file(path: Path | None, num_betas: int, num_expression: int) -> Bo
         joint_regressor=arrays["J_regressor"].astype(np.float64),
         weights=arrays["weights"] / arrays["weights"].sum(1, keepdims=True, dtype=np.float64),
         hand_mean=np.stack([arrays["hands_meanl"], arrays["hands_meanr"]]).astype(np.float64),
-        hand_components=np.stack(
-            [arrays["hands_componentsl"], arrays["hands_componentsr"]]
-        ).astype(np.float64),
+        hand_components=np.stack([arrays["hands_componentsl"], arrays["hands_componentsr"]]).astype(
+            np.float64
+        ),
         hand_deviation=_hand_deviation(arrays),
         landmark_faces=arrays["lmk_faces_idx"].astype(np.int64),
         landmark_barycentric=arrays["lmk_bary_coords"].astype(np.float64),
@@ -88,11 +88,16 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             if not hasattr(file, "files"):
                 raise ValueError("a single array")
             return {name: file[name] for name in file.files if name in wanted}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+    except Exception as error:  # a damaged archive can raise nearly anything
         raise UserError(f"Body file {path} is no readable npz ({error}): {_HINT}.") from error
 
 
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    for name, values in arrays.items():
+        if values.dtype.kind not in "iuf":
+            raise UserError(
+                f"Body file {path} has {name} of type {values.dtype}; expected numbers: {_HINT}."
+            )
     tree = arrays.get("kintree_table")
     joints = tree.shape[-1] if tree is not None and tree.ndim == 2 else None
     if joints in (24, 52):
@@ -112,7 +117,7 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
             f"Body file {path} lacks {what}{', '.join(missing)}): expected a complete SMPL-X file; "
             f"{_HINT}."
         )
-    vertices = arrays["v_template"].shape[0]
+    vertices = len(arrays["v_template"]) if arrays["v_template"].ndim else 0
     shapes = {
         "v_template": (vertices, 3),
         "f": (None, 3),
@@ -142,15 +147,47 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
             f"Body file {path} has posedirs of shape {posedirs.shape}; expected "
             f"({vertices}, 3, 486): {_HINT}."
         )
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise UserError(f"Body file {path} has values in {name} that are not finite: {_HINT}.")
     # The root's parent is stored as -1, or as the same bits unsigned
     if tuple(int(p) for p in tree[0, 1:]) != PARENTS[1:]:  # type: ignore[index]
         raise UserError(
             f"Body file {path} has another joint tree than SMPL-X: its joints are in another "
             f"order; {_HINT}."
         )
-    for name in ("v_template", "shapedirs", "J_regressor", "weights"):
-        if not np.isfinite(arrays[name]).all():
-            raise UserError(f"Body file {path} has values in {name} that are not finite: {_HINT}.")
+    _check_values(path, arrays)
+
+
+def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """What shapes do not tell: indices within their tables, weights that add up, metres."""
+    vertices, faces = len(arrays["v_template"]), len(arrays["f"])
+    if not vertices or not faces:
+        raise UserError(
+            f"Body file {path} has {vertices} vertices and {faces} faces; expected a body: {_HINT}."
+        )
+    for name, count, what in (
+        ("f", vertices, "vertices"),
+        ("lmk_faces_idx", faces, "faces"),
+        ("dynamic_lmk_faces_idx", faces, "faces"),
+    ):
+        lowest, highest = arrays[name].min(), arrays[name].max()
+        if lowest < 0 or highest >= count:
+            raise UserError(
+                f"Body file {path} names number {int(lowest if lowest < 0 else highest)} in "
+                f"{name}; expected 0 to {count - 1}, as it has {count} {what}: {_HINT}."
+            )
+    if arrays["weights"].sum(1, dtype=np.float64).min() <= 0:
+        raise UserError(
+            f"Body file {path} has a vertex whose weights are zero or negative; expected a sum "
+            f"of 1: {_HINT}."
+        )
+    height = float(np.ptp(arrays["v_template"][:, 1].astype(np.float64)))
+    if not _HEIGHT_M[0] <= height <= _HEIGHT_M[1]:
+        raise UserError(
+            f"Body file {path} has a body {height:.4g} m tall; expected {_HEIGHT_M[0]} to "
+            f"{_HEIGHT_M[1]} m with y up (is it in millimetres?): {_HINT}."
+        )
 
 
 def _directions(

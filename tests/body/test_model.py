@@ -189,6 +189,28 @@ BAD_FILES: dict[str, tuple[Callable[[dict], dict], str]] = {
     ),
     "nan": (lambda a: a | {"v_template": a["v_template"] * np.nan}, "not finite"),
     "columns": (lambda a: a | {"shapedirs": a["shapedirs"][:, :, :12]}, "6 shape"),
+    "millimetres": (lambda a: a | {"v_template": a["v_template"] * 1000}, "millimetres"),
+    "tiny": (lambda a: a | {"v_template": a["v_template"] / 100}, "m tall"),
+    "scalar template": (lambda a: a | {"v_template": np.array(1.0)}, "v_template of shape"),
+    "no vertices": (
+        lambda a: (
+            a
+            | {name: a[name][:0] for name in ("v_template", "shapedirs", "weights")}
+            | {"J_regressor": a["J_regressor"][:, :0]}
+        ),
+        "0 vertices",
+    ),
+    "no faces": (lambda a: a | {"f": a["f"][:0]}, "0 faces"),
+    "text": (lambda a: a | {"weights": np.full(a["weights"].shape, "a")}, "weights of type"),
+    "objects": (lambda a: a | {"weights": np.array([None])}, "no readable npz"),
+    "scalar tree": (lambda a: a | {"kintree_table": np.array(3)}, "kintree_table of shape"),
+    "face": (lambda a: a | {"f": a["f"] + np.uint32(1)}, "names number 13492 in f"),
+    "negative face": (lambda a: a | {"f": a["f"].astype(np.int64) - 1}, "names number -1 in f"),
+    "landmark": (lambda a: a | {"lmk_faces_idx": a["lmk_faces_idx"] + 10**6}, "lmk_faces_idx"),
+    "infinite mean": (lambda a: a | {"hands_meanl": a["hands_meanl"] * np.inf}, "hands_meanl"),
+    "infinite tree": (lambda a: a | {"kintree_table": np.full((2, 55), np.inf)}, "kintree_table"),
+    "deviation": (lambda a: a | {"hands_deviationl": np.full(45, np.nan)}, "not finite"),
+    "no weight": (lambda a: a | {"weights": a["weights"] * 0}, "sum of 1"),
 }
 
 
