@@ -60,13 +60,14 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     Example: intercap check config/demo/config.yaml
     """
     from intercap_core.project import load_project
-    from intercap_core.project_check import faults_of_sequences
+    from intercap_core.project_check import check_device, faults_of_sequences
 
     project = load_project(settings)
+    check_device(project)
     faults = faults_of_sequences(project)
     for fault in faults:
         typer.echo(f"problem: {fault}", err=True)
-    good = len(project.sequences) - len({fault.sequence for fault in faults})
+    good = len(project.sequences) - len({fault.sequence for fault in faults} - {""})
     typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
     if faults:
         raise typer.Exit(1)

@@ -3,41 +3,118 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.project import Project
+from intercap_core.project import Project, tidy
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with one sequence."""
+    """What is wrong with one sequence, or with a file that belongs to none ("")."""
 
     sequence: str
     message: str
 
     def __str__(self) -> str:
-        return f"sequence {self.sequence!r}: {self.message}"
+        return f"sequence {self.sequence!r}: {self.message}" if self.sequence else self.message
+
+
+def check_device(project: Project) -> None:
+    """Raise UserError where the settings ask for a device that this machine does not have."""
+    if project.config.device == "cpu":
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        raise UserError(
+            f"{project.path}: device is {project.config.device}, but PyTorch finds no such device "
+            "here; set device: cpu, or run on a machine that has one"
+        )
 
 
 def faults_of_sequences(project: Project) -> list[Fault]:
-    """Check every sequence's annotation and that its files are there; recordings are not opened.
+    """Check what every sequence needs: annotation, files, mesh, poses, the heads of recordings.
 
-    Recordings that the studio is to make are not missed.
+    Recordings that the studio is to make are not missed; images are not read.
     """
-    faults = []
+    meshes = {
+        name: _fault_of_mesh(project, name)
+        for name in {row.object for row in project.sequences.values()}
+    }
+    faults = _annotations_of_nobody(project)
     for name, row in project.sequences.items():
         try:
             project.annotation(name)
         except UserError as error:
             faults.append(Fault(name, str(error)))
+        mesh = meshes[row.object]
+        if mesh is not None:
+            faults.append(Fault(name, mesh))
         if project.recordings_made(name) is not None:
             continue
-        if not row.recordings.is_dir():
-            faults.append(Fault(name, f"there is no folder {row.recordings} of recordings"))
-        elif not any(row.recordings.glob("*.mkv")):
-            faults.append(Fault(name, f"{row.recordings} holds no <camera>.mkv"))
-        for column in ("calibration", "keypoints", "candidates", "truth"):
-            path = getattr(row, column)
-            if path is not None and not path.exists():
-                faults.append(Fault(name, f"column {column} says {path}, which is not there"))
+        faults += [Fault(name, message) for message in _faults_of_files(row)]
     return faults
+
+
+def _annotations_of_nobody(project: Project) -> list[Fault]:
+    folder = tidy(project.path.parent / project.config.annotations)
+    named = {f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
+    return [
+        Fault("", f"{path}: no sequence has this annotation's name; rename it to <sequence>.yaml")
+        for path in sorted(folder.glob("*.y*ml"))
+        if path.name not in named
+    ]
+
+
+def _fault_of_mesh(project: Project, name: str) -> str | None:
+    from intercap_core.rigid.mesh import ObjectMesh
+
+    try:
+        ObjectMesh.load(project.objects[name])
+    except UserError as error:
+        return str(error)
+    return None
+
+
+def _faults_of_files(row: SequenceEntry) -> list[str]:
+    faults = []
+    recordings = sorted(row.recordings.glob("*.mkv")) if row.recordings.is_dir() else []
+    if not row.recordings.is_dir():
+        faults.append(f"there is no folder {row.recordings} of recordings")
+    elif not recordings:
+        faults.append(f"{row.recordings} holds no <camera>.mkv")
+    for column in ("calibration", "keypoints", "candidates", "truth"):
+        path = getattr(row, column)
+        if path is not None and not path.exists():
+            faults.append(f"column {column} says {path}, which is not there")
+    faults += [message for path in recordings for message in _faults_of_recording(path)]
+    if row.calibration.exists():
+        faults += _faults_of_poses(row.calibration, recordings)
+    return faults
+
+
+def _faults_of_recording(path: Path) -> list[str]:
+    from intercap_core.capture.k4a import Recording
+
+    try:
+        with Recording(path) as recording:
+            recording.camera(path.stem)
+    except UserError as error:
+        return [str(error)]
+    return []
+
+
+def _faults_of_poses(calibration: Path, recordings: list[Path]) -> list[str]:
+    from intercap_core.camera.extrinsics_files import read_extrinsics
+
+    try:
+        known = read_extrinsics(calibration).master_from_colour
+    except UserError as error:
+        return [str(error)]
+    return [
+        f"{calibration}: has no pose of {path.stem}, which {path} records; add the camera"
+        for path in recordings
+        if path.stem not in known
+    ]

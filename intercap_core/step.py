@@ -12,6 +12,7 @@ from intercap_core import artefacts, schemas
 from intercap_core.errors import UserError
 from intercap_core.job import last_failure
 from intercap_core.project import Project
+from intercap_core.project_check import check_device
 
 SEQUENCE_STAGES = (
     "frames",
@@ -45,6 +46,8 @@ READS: dict[str, tuple[str, ...]] = {
     "export": ("joint", "scene"),
 }
 
+FITS = ("body_fit", "joint")  # run on the device that the settings name
+
 
 def run_step(
     stage: str,
@@ -62,6 +65,8 @@ def run_step(
     """
     annotation = project.annotation(sequence)
     _check_inputs(stage, sequence, inputs)
+    if stage in FITS:
+        check_device(project)
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
     row = project.sequences[sequence]
     known: dict[str, Any] = {

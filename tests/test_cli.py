@@ -9,14 +9,24 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
+import trimesh
 
 from intercap_core import artefacts
+from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Camera
 from intercap_core.cli import STAGES
+from intercap_core.errors import UserError
+from intercap_core.project import load_project
+from intercap_core.project_check import check_device, faults_of_sequences
 from intercap_core.schemas import DETECTIONS
 from intercap_core.step import READS, SEQUENCE_STAGES
+from intercap_core.studio.calibration import write_calibration
+from intercap_core.studio.mkv import MkvWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -93,19 +103,34 @@ def test_a_mistake_is_one_line_and_status_one(arguments: tuple[str, ...], says: 
     assert done.stderr.count("\n") == 1
 
 
+def write_recording(path: Path) -> None:
+    """A recording of one camera whose head is right, with one image."""
+    modes = {"colour_mode": "720P", "depth_mode": "NFOV_2X2BINNED"}
+    colour = Intrinsics(1280, 720, 612.0, 612.0, 640.0, 360.0, np.zeros(8))
+    depth = Intrinsics(320, 288, 252.0, 252.0, 160.0, 144.0, np.zeros(8), 1.5)
+    camera = Camera(path.stem, colour, depth, np.eye(4), np.eye(4))
+    content = write_calibration(camera, serial="1", **modes)
+    jpeg = cv2.imencode(".jpg", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()
+    with MkvWriter(path, calibration_json=content, fps=30, serial="1", **modes) as writer:
+        writer.write_colour(jpeg, 1000)
+        writer.write_depth(np.ones((288, 320), np.uint16), 1000)
+
+
 @pytest.fixture
 def small_project(tmp_path: Path) -> Path:
     """A folder with a project of one good sequence and two that lack files."""
-    (tmp_path / "cup.ply").touch()
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cup.ply")
+    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", {"k1": np.eye(4)}))
     (tmp_path / "config.yaml").write_text("dataset: trial\n")
     (tmp_path / "subjects.tsv").write_text("subject\tgender\ns01\tmale\n")
     (tmp_path / "objects.yaml").write_text("cup: {mesh: cup.ply}\n")
     (tmp_path / "sequences.tsv").write_text(
         "sequence\tsubject\tobject\trecordings\tcalibration\n"
-        "good\ts01\tcup\trec\tcup.ply\nbad\ts01\tcup\tnone\tnone.json\nempty\ts01\tcup\t.\tcup.ply\n"
+        "good\ts01\tcup\trec\trig.json\nbad\ts01\tcup\tnone\tnone.json\n"
+        "empty\ts01\tcup\t.\trig.json\n"
     )
     (tmp_path / "rec").mkdir()
-    (tmp_path / "rec" / "k1.mkv").touch()
+    write_recording(tmp_path / "rec" / "k1.mkv")
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
     return tmp_path
@@ -119,6 +144,44 @@ def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
     assert len(problems) == 4
     assert sum("'bad'" in line for line in problems) == 3
     assert "'empty'" in problems[-1]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "says"),
+    [
+        ("rec/k1.mkv", "", "sequence 'good': rec/k1.mkv: "),
+        ("rec/k2.mkv", None, "sequence 'good': rig.json: has no pose of k2"),
+        ("rig.json", "{}", "sequence 'good': rig.json: expected 'master'"),
+        ("cup.ply", "a mesh", "sequence 'good': cup.ply: "),
+        ("annotations/godo.yaml", "", "problem: annotations/godo.yaml: no sequence has this"),
+        ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
+    ],
+)
+def test_ready_means_that_the_files_can_be_used(
+    small_project: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    content: str | None,
+    says: str,
+) -> None:
+    monkeypatch.chdir(small_project)
+    project = load_project(Path("config.yaml"), {"exclude": ["bad", "empty"]})
+    assert faults_of_sequences(project) == []
+    if content is None:
+        write_recording(Path(file))
+    else:
+        Path(file).write_text(content)
+    (fault,) = faults_of_sequences(project)
+    assert says in f"problem: {fault}"
+    assert "\n" not in str(fault)
+
+
+def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_project)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    check_device(load_project(Path("config.yaml")))
+    with pytest.raises(UserError, match=r"config\.yaml: device is cuda, .* set device: cpu"):
+        check_device(load_project(Path("config.yaml"), {"device": "cuda"}))
 
 
 @pytest.fixture
