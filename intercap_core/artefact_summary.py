@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from intercap_core import artefacts, schemas
@@ -25,18 +26,22 @@ def print_summary(path: Path, *, verify: bool = False) -> None:
     console = Console()
     with artefacts.read(path, schema) as source:
         for key, value in sorted(source.attributes.items()):
-            console.print(f"[bold]{key}[/bold]  {value}", highlight=False)
+            console.print(f"[bold]{escape(key)}[/bold]  {escape(str(value))}", highlight=False)
         table = Table("dataset", "shape", "type", "units", "frame", "set", "what", box=None)
         for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
             shape, dtype, units, frame = source.describe(key)
+            try:
+                doc = schema.field_of(key).doc
+            except KeyError:
+                doc = "(not part of this schema)"
             count = ""
-            if dtype == "bool":
+            if dtype == "bool" and shape:
                 count = str(int(np.count_nonzero(source[key])))
-            elif verify:
+            elif verify and shape:
                 source[key]
-            doc = schema.field_of(key).doc
-            shown = " x ".join(map(str, shape))
-            table.add_row(key, shown, dtype, "" if units == "1" else units, frame, count, doc)
+            unit = "" if units == "1" else units
+            cells = (key, " x ".join(map(str, shape)), dtype, unit, frame, count, doc)
+            table.add_row(*map(escape, cells))
         console.print(table)
         if verify:
             console.print("every dataset was read and its checksum is right")

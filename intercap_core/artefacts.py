@@ -293,7 +293,7 @@ class Artefact:
         return (
             dataset.shape,
             "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
-            str(dataset.attrs["units"]),
+            str(dataset.attrs.get("units", "")),
             str(dataset.attrs.get("frame", "")),
         )
 

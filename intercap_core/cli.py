@@ -50,7 +50,7 @@ app = typer.Typer(
 DEFAULT_SETTINGS = Path("config/config.yaml")
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
 SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
-Cores = Annotated[int, typer.Option(help="Processor cores to use; 0 = all.")]
+Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all.")]
 
 
 @app.command(rich_help_panel=WHOLE)
@@ -118,6 +118,7 @@ def evaluate(
     """
     from intercap_core.evaluation import evaluate as run_evaluation
 
+    _check_output(output, replace_any=True)
     raise typer.Exit(run_evaluation(settings, output, cores=cores))
 
 
@@ -135,6 +136,7 @@ def bench(
     """
     from intercap_core.benchmark import measure
 
+    _check_output(output, replace_any=True)
     measure(settings, output, cores=cores)
 
 
@@ -159,7 +161,9 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         output: Annotated[
             Path | None, typer.Option(help="Where to write; else the project's own place.")
         ] = None,
-        threads: Annotated[int, typer.Option(help="Threads of the numerical libraries.")] = 1,
+        threads: Annotated[
+            int, typer.Option(min=1, help="Threads of the numerical libraries.")
+        ] = 1,
     ) -> None:
         _prepare(threads)
         from intercap_core.project import load_project
@@ -168,6 +172,8 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         project = load_project(settings)
         name = _known(project.sequences, sequence)
         written = output or project.artefact(name, stage)
+        if stage != "export":
+            _check_output(written, replace_any=output is None)
         inputs = {other: project.artefact(name, other) for other in SEQUENCE_STAGES}
         run_step(stage, project, name, inputs=inputs, output=written)
         typer.echo(written)
@@ -221,6 +227,33 @@ def _prepare(threads: int = 1) -> None:
     set_threads(threads)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     logging.getLogger("intercap_core").setLevel(logging.INFO)
+
+
+def _check_output(path: Path, *, replace_any: bool) -> None:
+    """Refuse what cannot be written, before hours of work; a file that is no artefact is kept."""
+    import tempfile
+
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder, expected a file to write; name another output")
+    if path.exists() and not replace_any:
+        from intercap_core import artefacts
+
+        try:
+            artefacts.schema_name(path)
+        except artefacts.Unreadable:
+            raise UserError(
+                f"{path}: exists and is not an artefact, so it is not replaced; name another "
+                "output or delete it"
+            ) from None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}), expected a folder that takes files; "
+            "name another output"
+        ) from None
 
 
 def _known(sequences: dict, name: str) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from intercap_core.errors import UserError
@@ -50,14 +51,14 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
     status = run_watched(command, watcher, console)
     failures = watcher.failures()
     for name, words in failures.items():
-        console.print(f"[red]{name}[/red] {words}", highlight=False, soft_wrap=True)
+        console.print(f"[red]{escape(name)}[/red] {escape(words)}", highlight=False, soft_wrap=True)
     if status and not failures:
         lines = watcher.transcript.read_text(encoding="utf-8").splitlines()
         console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
         raise UserError(f"the workflow stopped; its whole output is in {watcher.transcript}")
     bad = sorted({name.split(":")[0] for name in failures} & set(project.sequences))
     if bad and len(bad) < len(project.sequences) and not arguments:
-        console.print(f"the report leaves out {', '.join(bad)}", highlight=False)
+        console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
         targets = [str(project.results / name) for name in AGGREGATES]
         excluded = ",".join([*project.config.exclude, *bad])
         command = snakemake_command(
@@ -66,7 +67,8 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
         run_watched(command, Watcher(project, console), console)
     report = project.results / "report.html"
     if report.is_file():
-        console.print(f"report: {report.resolve()}", highlight=False, soft_wrap=True)
+        words = f"report: {report.resolve()}"
+        console.print(words, highlight=False, markup=False, soft_wrap=True)
     return status
 
 
@@ -143,14 +145,19 @@ class Watcher:
             return "[dim]kept[/dim]" if there else "[dim]-[/dim]"
         if job.state == "running":
             return "[yellow]runs[/yellow]"
-        return f"[green]{job.words}[/green]" if job.state == "finished" else "[red]failed[/red]"
+        return (
+            f"[green]{escape(job.words)}[/green]"
+            if job.state == "finished"
+            else "[red]failed[/red]"
+        )
 
     def tell(self) -> None:
         """Print each job once, when it has ended; for terminals that cannot redraw."""
         for name, job in self.jobs().items():
             if job.state != "running" and name not in self._told:
                 self._told.add(name)
-                self._console.print(f"{name}: {job.state} {job.words}", highlight=False)
+                words = f"{name}: {job.state} {job.words}"
+                self._console.print(words, highlight=False, markup=False)
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:

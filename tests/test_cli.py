@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import io
 import resource
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from rich.console import Console
 
 from intercap_core import artefacts
 from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
@@ -23,12 +25,15 @@ from intercap_core.cli import STAGES
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 from intercap_core.project_check import check_device, faults_of_sequences
+from intercap_core.run import Watcher
 from intercap_core.schemas import DETECTIONS
 from intercap_core.step import READS, SEQUENCE_STAGES
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
 
 ROOT = Path(__file__).resolve().parents[1]
+
+SCENE = ("scene", "config/demo/config.yaml", "cup_drink_s02")
 
 
 def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -91,6 +96,11 @@ def test_what_a_stage_reads_is_what_its_arguments_say(stage: str) -> None:
         (("check", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
         (("joint", "config/demo/config.yaml", "nobody"), "there is no sequence 'nobody'"),
         (("studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
+        ((*SCENE, "--output", "README.md"), "README.md: exists and is not an artefact"),
+        ((*SCENE, "--output", "docs"), "docs: is a folder, expected a file"),
+        ((*SCENE, "--output", "README.md/a.h5"), "README.md/a.h5: cannot be written ("),
+        ((*SCENE, "--output", "/proc/a.h5"), "/proc/a.h5: cannot be written ("),
+        (("evaluate", "--output", "/proc/a.json"), "/proc/a.json: cannot be written ("),
         (("inspect", "README.md"), "README.md: not an artefact"),
         (("inspect", "nowhere.h5"), "nowhere.h5: there is no such file"),
     ],
@@ -101,6 +111,13 @@ def test_a_mistake_is_one_line_and_status_one(arguments: tuple[str, ...], says: 
     assert says in done.stderr
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("threads", ["0", "-1"])
+def test_threads_are_one_or_more(threads: str) -> None:
+    done = intercap(*SCENE, "--threads", threads)
+    assert done.returncode == 2
+    assert "--threads" in done.stderr
 
 
 def write_recording(path: Path) -> None:
@@ -208,6 +225,17 @@ def test_inspect_says_what_a_file_holds(detections: Path) -> None:
     assert "checksum is right" in done.stdout
 
 
+def test_inspect_shows_what_looks_like_markup_and_what_is_not_declared(detections: Path) -> None:
+    with h5py.File(detections, "r+") as file:
+        file.attrs["sequence"] = "[/one] [red]two"
+        file["extra"] = np.ones(3)
+        file["scalar"] = True
+    done = intercap("inspect", str(detections), "--verify")
+    assert done.returncode == 0, done.stderr
+    assert "sequence  [/one] [red]two" in done.stdout
+    assert done.stdout.count("(not part of this schema)") == 2
+
+
 def test_inspect_finds_damage(detections: Path) -> None:
     with h5py.File(detections) as file:
         offset = file["camera_names"].id.get_chunk_info(0).byte_offset
@@ -231,3 +259,16 @@ def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path, detect
         "error: results/trial/good/detections.h5: holds sequence 'one', expected 'good'; "
         "delete it and re-run stage 'detections' for sequence 'good'\n"
     )
+
+
+def test_reasons_that_look_like_markup_are_shown_as_they_are(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    words = io.StringIO()
+    watcher = Watcher(load_project(Path("config.yaml")), Console(file=words, width=200))
+    log = Path("logs/trial/good/scene.log")
+    log.parent.mkdir(parents=True)
+    log.write_text("12:00:00 failed: a[/b] has [3] points\n")
+    watcher.tell()
+    assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
