@@ -272,3 +272,19 @@ def test_reasons_that_look_like_markup_are_shown_as_they_are(
     log.write_text("12:00:00 failed: a[/b] has [3] points\n")
     watcher.tell()
     assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
+
+
+def test_real_recordings_below_the_results_are_never_made(small_project: Path) -> None:
+    place = small_project / "results" / "trial" / "recordings" / "good"
+    place.parent.mkdir(parents=True)
+    (small_project / "rec").rename(place)
+    (small_project / "rig.json").rename(place / "calibration.json")
+    (small_project / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\n"
+        "good\ts01\tcup\tresults/trial/recordings/good"
+        "\tresults/trial/recordings/good/calibration.json\n"
+    )
+    done = intercap("run", "config.yaml", "--", "--dry-run", folder=small_project)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "good: reading and synchronising" in done.stdout
+    assert "virtual recording" not in done.stdout

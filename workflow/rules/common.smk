@@ -25,6 +25,8 @@ def _load():
 PROJECT = _load()
 SETTINGS = PROJECT.config
 SEQUENCES = list(PROJECT.sequences)
+VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
+NOTHING = "(?!)"  # a pattern that no text matches
 RESULTS = PROJECT.results.as_posix()
 LOGS = PROJECT.logs.as_posix()
 BENCHMARKS = f"benchmarks/{SETTINGS.dataset}"

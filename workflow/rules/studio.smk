@@ -2,7 +2,7 @@ _recordings = f"{RESULTS}/recordings/{{sequence}}"
 
 
 rule studio:
-    """Make one virtual recording whose truth is known."""
+    """Make one virtual recording whose truth is known; never claims a real one."""
     input:
         object=object_files,
     output:
@@ -21,6 +21,8 @@ rule studio:
         f"{LOGS}/{{sequence}}/studio.log",
     benchmark:
         f"{BENCHMARKS}/{{sequence}}/studio.tsv"
+    wildcard_constraints:
+        sequence="|".join(map(re.escape, VIRTUAL)) or NOTHING,
     conda:
         ENVIRONMENT
     threads: 1
