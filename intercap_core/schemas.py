@@ -208,9 +208,17 @@ BODY_FIT = Schema(
         ),
         "failed": Field(("T",), "bool", "no believable fit in this frame"),
         "bridged": Field(("T",), "bool", "filled in from its neighbours"),
-        "keypoint_offsets": Field(("25", "3"), "float32", "detector's keypoint minus the body's, in the frame of its bone", "m", "bone"),
+        "keypoint_offsets": Field(
+            ("25", "3"),
+            "float32",
+            "detector's keypoint minus the body's, in the frame of its bone",
+            "m",
+            "bone",
+        ),
         "keypoint_sigma": Field(("135",), "float32", "what is left of a keypoint's error", "m"),
-        "covering": Field(("G",), "float32", "logarithm of each covering's thickness over its usual one"),
+        "covering": Field(
+            ("G",), "float32", "logarithm of each covering's thickness over its usual one"
+        ),
         "covering_noise": Field(("G",), "float32", "spread of the clouds about each covering", "m"),
     },
 )

@@ -1,6 +1,6 @@
 """Render docs/pictures/studio_*.jpg: what the studio's cameras see, and grasps from close by.
 
-    python tools/studio_pictures.py suitcase_carry s01 11 suitcase
+python tools/studio_pictures.py suitcase_carry s01 11 suitcase
 """
 
 from __future__ import annotations

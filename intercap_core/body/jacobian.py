@@ -31,9 +31,9 @@ def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
     """Rest points (B,N,3) after shape (B,S) and the pose blend shapes of local (B,55,3,3)."""
     batch, count = shape.shape[0], selection.template.shape[0]
     size = selection.directions.shape[-1]
-    points = selection.template + (
-        shape @ selection.directions.reshape(-1, size).T
-    ).reshape(batch, count, 3)
+    points = selection.template + (shape @ selection.directions.reshape(-1, size).T).reshape(
+        batch, count, 3
+    )
     if selection.posedirs is not None:
         eye = torch.eye(3, dtype=local.dtype, device=local.device)
         feature = (local[:, 1:] - eye).reshape(batch, -1)
@@ -183,8 +183,7 @@ def linearise(
 
     bones = selection.bones
     parts = (
-        torch.einsum("bnkij,bnj->bnki", posed.rotations[:, bones], points)
-        + posed.offsets[:, bones]
+        torch.einsum("bnkij,bnj->bnki", posed.rotations[:, bones], points) + posed.offsets[:, bones]
     )
     turns = torch.einsum("nlk,bnki->bnli", selection.below, parts)
     turns = turns - selection.below.sum(2)[..., None] * posed.joints[:, selection.chain]
@@ -211,5 +210,3 @@ def linearise(
         rest = torch.einsum("nija,bjca->bnijc", tables, change)
         correctives = (matrix @ rest.reshape(batch, count, 3, -1)).reshape(rest.shape)
     return Linearisation(placed, turns, frames, shape, correctives, selection)
-
-

@@ -111,9 +111,7 @@ def joint_shape_derivatives(posed: PosedJoints, directions: Tensor) -> tuple[Ten
     """directions (55,3,S) of the rest joints -> d joints and d offsets, each (B,55,3,S)."""
     device = directions.device
     batch = posed.rotations.shape[0]
-    moved = torch.empty(
-        batch, *directions.shape, dtype=posed.rotations.dtype, device=device
-    )
+    moved = torch.empty(batch, *directions.shape, dtype=posed.rotations.dtype, device=device)
     moved[:, 0] = directions[0]
     for level in _LEVELS:
         own, parent = level.own.to(device), level.parents.to(device)

@@ -252,9 +252,7 @@ class BodyModel:
         """Rest points (B,N,3), posed joints, axis-angle (B,55,3)."""
         batch = params.batch
         axis_angle = params.full_pose()
-        shape = torch.cat(
-            [params.betas.expand(batch, -1), params.expression.expand(batch, -1)], 1
-        )
+        shape = torch.cat([params.betas.expand(batch, -1), params.expression.expand(batch, -1)], 1)
         if shape.shape[1] != self.num_betas + self.num_expression:
             raise ValueError(
                 f"expected {self.num_betas} betas and {self.num_expression} expression "
@@ -278,6 +276,4 @@ def _regions(file: BodyFile, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
 
 def with_hand_mean(model: BodyModel, params: BodyParameters) -> BodyParameters:
     """The parameters with both hands in the model's mean pose."""
-    return replace(
-        params, left_hand_pose=model.hand_mean[:1], right_hand_pose=model.hand_mean[1:]
-    )
+    return replace(params, left_hand_pose=model.hand_mean[:1], right_hand_pose=model.hand_mean[1:])

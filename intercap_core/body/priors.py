@@ -89,9 +89,9 @@ def rest_pose(vector: Tensor) -> DiagonalRows:
     only hold what nothing has seen.
     """
     columns = torch.arange(3, 75, device=vector.device)
-    table = torch.deg2rad(
-        torch.tensor(REST_SPREAD_DEG, dtype=vector.dtype, device=vector.device)
-    )[1:25].reshape(-1, 2)
+    table = torch.deg2rad(torch.tensor(REST_SPREAD_DEG, dtype=vector.dtype, device=vector.device))[
+        1:25
+    ].reshape(-1, 2)
     residuals = (vector[:, 3:75] - table[:, 0]) / table[:, 1]
     return DiagonalRows(residuals, (1 / table[:, 1]).expand_as(residuals), columns)
 

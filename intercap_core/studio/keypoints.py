@@ -144,9 +144,7 @@ class Detector:
         one = np.ones((self.frames, 1))
         shared = noise.rng("people")
         common = noise.process(shared, self.frames, 1, MISS_S)[:, 0]
-        missed = noise.episodes(
-            rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.3
-        )[:, 0]
+        missed = noise.episodes(rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.3)[:, 0]
         common = noise.process(shared, self.frames, 1, BYSTANDER_S)[:, 0]
         bystander = noise.episodes(
             rng, self.frames, one * BYSTANDER_PROBABILITY, common, BYSTANDER_S, 0.4

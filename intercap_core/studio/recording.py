@@ -97,9 +97,7 @@ class Kinect:
                 writer.write_depth(depth, self.device_time_us(t))
                 hidden[t] = _hidden(scene, colour_view, points[t])
                 seen[t], whole[t] = self._object_pixels(cast, colour_view, surfaces[1])
-                truth = Labels(
-                    cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1)
-                )
+                truth = Labels(cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1))
                 for result in masks.candidates(t, truth):
                     candidates.append({"image_id": number, **result})
         self._write_candidates(folder, candidates)

@@ -106,7 +106,9 @@ class DepthSensor:
         lost[rows[gone], columns[gone]] = True
         r, c = rows[flying], columns[flying]
         depth = depth.copy()
-        depth[r, c] += share[flying] * (far[r, c] - near[r, c]) * np.where(
-            depth[r, c] - near[r, c] < far[r, c] - depth[r, c], 1, -1
+        depth[r, c] += (
+            share[flying]
+            * (far[r, c] - near[r, c])
+            * np.where(depth[r, c] - near[r, c] < far[r, c] - depth[r, c], 1, -1)
         )
         return depth, lost

@@ -176,9 +176,7 @@ def _corner_matrix(faces: bytes, count: int, num_vertices: int) -> csr_matrix:
     """(V,F) matrix that adds each face's vector to its three vertices."""
     corners = np.frombuffer(faces, np.int64).reshape(count, 3)
     columns = np.repeat(np.arange(count), 3)
-    return csr_matrix(
-        (np.ones(3 * count), (corners.ravel(), columns)), shape=(num_vertices, count)
-    )
+    return csr_matrix((np.ones(3 * count), (corners.ravel(), columns)), shape=(num_vertices, count))
 
 
 def _normalised(barycentric: np.ndarray) -> np.ndarray:

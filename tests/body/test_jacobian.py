@@ -78,9 +78,7 @@ def test_normal_equations_are_those_of_the_dense_rows(
     residuals = torch.randn(shape, generator=generator, dtype=torch.float64)
     hessian, gradient = lin.normal_equations(directions, weights, residuals)
     rows = lin.along(directions)
-    assert torch.allclose(
-        rows, torch.einsum("bnrc,bncp->bnrp", directions, lin.full()), atol=1e-12
-    )
+    assert torch.allclose(rows, torch.einsum("bnrc,bncp->bnrp", directions, lin.full()), atol=1e-12)
     weighted = rows * weights[..., None]
     expected = torch.einsum("bnrp,bnrq->bpq", weighted, rows)
     assert torch.allclose(hessian, expected, atol=1e-9)

@@ -71,9 +71,7 @@ def images(path: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return colour, depth
 
 
-def test_same_arguments_same_bytes(
-    capture: Path, tmp_path: Path, object_entry: Entry
-) -> None:
+def test_same_arguments_same_bytes(capture: Path, tmp_path: Path, object_entry: Entry) -> None:
     again = make(tmp_path / "again", object_entry("stool"))
     first, second = ((p / "capture.json").read_bytes() for p in (capture, again))
     assert first == second

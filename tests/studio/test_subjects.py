@@ -55,9 +55,13 @@ def test_a_pose_means_the_same_as_on_the_fitted_body(person: Subject, body: Body
     pose = np.zeros((1, 165))
     pose[0, [48, 51, 55, 12, 1]] = [0.3, -0.2, -1.2, 1.1, 0.7]
     truth = person.skin(pose, np.zeros((1, 3))).joints[0]
-    ours = body.forward(
-        body.parameters(torch.as_tensor(np.c_[pose, np.zeros((1, 23))], dtype=torch.float32))
-    ).joints[0].numpy()
+    ours = (
+        body.forward(
+            body.parameters(torch.as_tensor(np.c_[pose, np.zeros((1, 23))], dtype=torch.float32))
+        )
+        .joints[0]
+        .numpy()
+    )
     for a, b in ((16, 18), (18, 20), (17, 19), (1, 4), (4, 7), (28, 29)):
         u, w = truth[b] - truth[a], ours[b] - ours[a]
         assert u @ w / np.linalg.norm(u) / np.linalg.norm(w) > np.cos(np.radians(3))

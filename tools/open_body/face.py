@@ -115,7 +115,7 @@ def _nose(front: _Front, eye_y: float) -> tuple[np.ndarray, np.ndarray]:
     ys = eye_y - np.arange(0, 0.07, _STEP)
     _, _, z = front.cast(np.zeros(1), ys)
     tip = int(z[: round(0.06 / _STEP)].argmax())
-    below = z[tip:tip + round(0.022 / _STEP)]
+    below = z[tip : tip + round(0.022 / _STEP)]
     # Below the tip the profile falls steeply and then runs down the lip: the bend between
     sub = tip + int((below < below.min() + 0.2 * (below[0] - below.min())).argmax())
     bridge = np.c_[np.zeros(4), np.linspace(ys[0], ys[tip], 4)]
@@ -145,7 +145,7 @@ def _mouth(front: _Front, source: Source, nose_y: float) -> np.ndarray:
     def seam(share: float) -> float:
         i = column(share)
         rows = np.flatnonzero(lip[:, i])
-        jump = np.diff(jaw[rows[0]:rows[-1] + 1, i])
+        jump = np.diff(jaw[rows[0] : rows[-1] + 1, i])
         return ys[rows[0] + int(jump.argmax())] - _STEP / 2
 
     def edge(share: float, upper: bool) -> tuple[float, float]:
@@ -182,8 +182,11 @@ def _contours(template: np.ndarray, source: Source, eye_y: float) -> tuple[np.nd
     one_face[source.faces[::-1].ravel()] = np.repeat(np.arange(len(source.faces))[::-1], 3)
     angles = np.pi + np.pi * np.arange(17) / 16
     centre_z = template[chosen, 2].mean()
-    twin = chosen[np.linalg.norm(
-        template[chosen][:, None] * [-1, 1, 1] - template[chosen][None], axis=2).argmin(1)]
+    twin = chosen[
+        np.linalg.norm(
+            template[chosen][:, None] * [-1, 1, 1] - template[chosen][None], axis=2
+        ).argmin(1)
+    ]
     out_face = np.zeros((79, 17), np.int64)
     out_bary = np.zeros((79, 17, 3))
     for row in range(40):

@@ -50,7 +50,7 @@ def posed(model: BodyModel, **angles: tuple[float, float, float]) -> BodyParamet
         k = JOINT_INDEX[name]
         target = params.jaw_pose if name == "jaw" else params.body_pose
         column = 0 if name == "jaw" else 3 * (k - 1)
-        target[0, column:column + 3] = torch.tensor(angle)
+        target[0, column : column + 3] = torch.tensor(angle)
     return params
 
 

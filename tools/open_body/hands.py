@@ -73,7 +73,7 @@ def hand_pose(angles: np.ndarray, joints: np.ndarray, tips: np.ndarray) -> np.nd
     source_row = {"index": 0, "middle": 1, "ring": 2, "pinky": 3}
     away = {"index": 1.0, "middle": 0.0, "ring": -1.0, "pinky": -1.0}  # sign of z
     for f, finger in enumerate(FINGERS):
-        chain = np.vstack([joints[25 + 3 * f:28 + 3 * f], tips[f]])
+        chain = np.vstack([joints[25 + 3 * f : 28 + 3 * f], tips[f]])
         bones = np.diff(chain, axis=0)
         if finger == "thumb":
             palmar, flex, mcp, ip = angles[16:20]

@@ -112,6 +112,7 @@ def keypoint_vertices(
     vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, tips: np.ndarray
 ) -> dict[str, int]:
     """Vertex id of each of `POINT_NAMES`; tips (10,3) ends of the finger bones."""
+
     def furthest(mask: np.ndarray, direction: np.ndarray) -> int:
         score = np.where(mask, vertices @ direction, -np.inf)
         return int(score.argmax())

@@ -79,7 +79,8 @@ def _closest(
         best = np.linalg.norm(own - points[i], axis=1).argmin()
         face[i] = near[best]
         bary[i] = trimesh.triangles.points_to_barycentric(
-            triangles[best:best + 1], own[best:best + 1])[0]
+            triangles[best : best + 1], own[best : best + 1]
+        )[0]
     return face, np.clip(bary, 0, 1) / np.clip(bary, 0, 1).sum(1, keepdims=True)
 
 

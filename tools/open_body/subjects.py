@@ -32,6 +32,7 @@ DRIVERS = ("left_elbow", "right_elbow", "left_knee", "right_knee", "left_hip", "
 
 def _phenotypes(rng: np.random.Generator) -> dict[str, np.ndarray]:
     """A dozen people: half of them women, 20 to 60 years, spread over build and stature."""
+
     def spread(low: float, high: float) -> np.ndarray:
         return rng.permutation(low + (high - low) * (np.arange(_COUNT) + rng.random(_COUNT))
                                / _COUNT)  # fmt: skip
@@ -75,11 +76,11 @@ def _identities(source: Source, space: shape_space.ShapeSpace, rng: np.random.Ge
     wanted = rng.permutation(np.linspace(*_IDENTITY_MM, _COUNT + 2)[1:-1])
     bodies, measured = [], []
     for i in range(_COUNT):
-        person = {k: v[i:i + 1] for k, v in people.items()}
+        person = {k: v[i : i + 1] for k, v in people.items()}
         low, high = 0.0, 3.0
         for _ in range(9):  # bisect the strength of the local changes
             strength = (low + high) / 2
-            change = {k: np.clip(strength * v[i:i + 1], -1, 1) for k, v in local.items()}
+            change = {k: np.clip(strength * v[i : i + 1], -1, 1) for k, v in local.items()}
             body = shape_space.t_posed(source, source.coefficients(person, change))
             rms = _residual_mm(space, body[0][0], area)
             low, high = (strength, high) if rms < wanted[i] else (low, strength)
@@ -206,8 +207,10 @@ def bake(source: Source, path: Path) -> None:
     back = np.stack([retopology.at(on_mesh[i], mesh.faces, mesh.back_face, mesh.back_bary)
                      for i in range(_COUNT)])  # fmt: skip
     gap = 1e3 * np.linalg.norm(back - vertices, axis=2)
-    print(f"subjects: {len(template)} vertices, {len(mesh.faces)} faces; mapped back to the fitted "
-          f"topology within {gap.mean():.2f} mm (p99 {np.percentile(gap, 99):.2f})")
+    print(
+        f"subjects: {len(template)} vertices, {len(mesh.faces)} faces; mapped back to the fitted "
+        f"topology within {gap.mean():.2f} mm (p99 {np.percentile(gap, 99):.2f})"
+    )
     height = np.ptp(vertices[:, :, 1], axis=1)
     for i in range(_COUNT):
         print(f"  s{i + 1:02d} {'female' if people['gender'][i] > 0.5 else 'male':6s} "

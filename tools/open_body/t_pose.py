@@ -49,8 +49,13 @@ def _about(axis: np.ndarray, angle: float) -> np.ndarray:
 def _twist(rotation: np.ndarray, axis: np.ndarray) -> float:
     """Angle of the rotation's part about `axis`."""
     q_w = np.sqrt(max(1 + np.trace(rotation), 1e-12)) / 2
-    q_v = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
-                    rotation[1, 0] - rotation[0, 1]]) / (4 * q_w)
+    q_v = np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    ) / (4 * q_w)
     return 2 * float(np.arctan2(q_v @ _unit(axis), q_w))
 
 
@@ -59,7 +64,7 @@ def world_rotations(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
     rotations = np.tile(np.eye(3), (55, 1, 1))
     for side, flip in (("left", 1.0), ("right", -1.0)):
         mirror = np.array([flip, 1, 1])
-        at = {n[len(side) + 1:]: joints[i] for n, i in _ID.items() if n.startswith(side)}
+        at = {n[len(side) + 1 :]: joints[i] for n, i in _ID.items() if n.startswith(side)}
 
         def put(name: str, rotation: np.ndarray, side: str = side) -> None:
             rotations[_ID[f"{side}_{name}"]] = rotation

@@ -210,9 +210,7 @@ class CupDrink(Interaction):
         ease = (1 - pour)[:, None, None] * np.eye(3)[0] * self.tilt * 0.85
         loose = cup.copy()
         loose[:, :3, :3] = cup[:, :3, :3] @ turn(ease[:, 0])
-        loose[:, :3, 3] += (1 - pour)[:, None] * (
-            head[:, :3, :3] @ np.array([0.0, -0.035, 0.055])
-        )
+        loose[:, :3, 3] += (1 - pour)[:, None] * (head[:, :3, :3] @ np.array([0.0, -0.035, 0.055]))
         at_lips = loose @ grip
         drinking = Pose(at_lips[:, :3, 3], at_lips[:, :3, :3])
         lift = np.array([0.0, 0, 0.05])

@@ -126,8 +126,8 @@ class SuitcaseCarry(Interaction):
         position[:, 1] += share * (last[1, 3] - first[1, 3])
         position[:, 2] += 0.006 * np.sin(2 * np.pi * times / 0.41)
         tilt = np.zeros((count, 3))
-        tilt[:, 1] = 0.05 * np.sin(2 * np.pi * (times - 1.2) / 0.82) * plateau(
-            times, 1.2, 1.5, 1.9, 2.2
+        tilt[:, 1] = (
+            0.05 * np.sin(2 * np.pi * (times - 1.2) / 0.82) * plateau(times, 1.2, 1.5, 1.9, 2.2)
         )
         between = Pose.still(first, count).towards(Pose.still(last, count), share)
         carried = Pose(position, turn(tilt) @ between.rotation)
