@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -161,15 +162,17 @@ class Watcher:
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:
-    """Run a command, its output to the watcher's transcript; returns the exit status."""
+    """Run a command, its output to the watcher's transcript; returns the exit status.
+
+    Where this process is interrupted or told to end, so is the command, and it is waited for.
+    """
     watcher.transcript.parent.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "NO_COLOR": "1"}
     with open(watcher.transcript, "w", encoding="utf-8") as transcript:
         process = subprocess.Popen(
-            command,
-            stdout=transcript,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "NO_COLOR": "1"},
+            command, stdout=transcript, stderr=subprocess.STDOUT, env=environment
         )
+        told_to_end = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
             with _display(watcher, console) as refresh:
                 while process.poll() is None:
@@ -177,8 +180,12 @@ def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> i
                     refresh()
                 refresh()
         except KeyboardInterrupt:
-            process.wait()  # Snakemake got the same signal and ends its jobs
-            raise SystemExit(130) from None
+            raise SystemExit(130) from None  # Snakemake has got the same signal
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
+            signal.signal(signal.SIGTERM, told_to_end)
     return process.returncode
 
 
