@@ -156,24 +156,6 @@ def reprojection(
     return PointTerm(cost, gradient, (weighted @ by_point).sum(1))
 
 
-def reprojection_cost(
-    points: Tensor,
-    observed: Tensor,
-    confidence: Tensor,
-    sigma: Tensor,
-    lenses: Tensor,
-    colour_from_master: Tensor,
-    *,
-    scale: float,
-    shift: Tensor | None = None,
-) -> Tensor:
-    """The cost (B,) of :func:`reprojection` alone."""
-    residual = pixel_residuals(points, observed, lenses, colour_from_master, shift=shift)
-    residual = torch.where(confidence[..., None] > 0, residual / sigma[..., None], 0)
-    rho = geman_mcclure((residual**2).sum(-1), scale).rho
-    return 0.5 * (confidence * rho).sum((1, 2))
-
-
 def pixel_residuals(
     points: Tensor,
     observed: Tensor,
