@@ -84,7 +84,7 @@ DETECTIONS = Schema(
 
 SCENE = Schema(
     name="scene",
-    version=1,
+    version=2,
     stage="scene",
     attributes={
         "sequence": "sequence name",
@@ -108,7 +108,9 @@ SCENE = Schema(
         "pair_residual_before": Field(("P",), "float32", "median point-to-plane distance at the start, held-out points", "m"),
         "pair_residual_after": Field(("P",), "float32", "the same after refinement", "m"),
         "time_offset": Field(("C",), "float64", "exposure later than the set's time by this much", "s"),
-        "slip": Field(("T", "C"), "int32", "whole frames this camera is late by, in this set"),
+        "time_offset_sigma": Field(("C",), "float64", "stated standard deviation of time_offset; NaN = not estimated", "s"),
+        "slip": Field(("T", "C"), "int32", "whole frames by which this set's image is older than its device time says"),
+        "image_of": Field(("T", "C"), "int32", "set whose image of this camera shows this set's moment, -1 = none does"),
         "ground_point": Field(("3",), "float64", "a point of the floor; NaN where none", "m", "master"),
         "ground_normal": Field(("3",), "float64", "unit normal, up; NaN where none", "1", "master"),
         "zup_from_master": Field(("4", "4"), "float64", "gravity-aligned, z up, ground at z = 0", "m", "z-up"),

@@ -81,6 +81,25 @@ def nearest_images(sets_us: np.ndarray, times_us: np.ndarray, max_skew_us: float
     return index
 
 
+def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
+    """Return the set (T, C) int32 whose image of each camera shows the moment of each set.
+
+    ``slip`` (T, C): the image of set t shows the moment of set t - slip; ``available`` (T, C): the
+    set holds an image of the camera. Where two images show one moment, the one that slipped less
+    is taken; -1 = none does.
+    """
+    shown = np.full(slip.shape, -1, np.int32)
+    sets = len(slip)
+    for camera in range(slip.shape[1]):
+        images = np.flatnonzero(available[:, camera])
+        late = slip[images, camera]
+        moments = images - late
+        order = np.argsort(-np.abs(late), kind="stable")  # what slipped least is written last
+        order = order[(moments[order] >= 0) & (moments[order] < sets)]
+        shown[moments[order], camera] = images[order]
+    return shown
+
+
 def _nearest(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
     """Return the position of the target nearest to each value; of two equally near the first."""
     right = np.clip(np.searchsorted(sorted_targets, values), 1, max(1, len(sorted_targets) - 1))

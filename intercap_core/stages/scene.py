@@ -11,6 +11,7 @@ from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
+from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import SceneSettings
 from intercap_core.detection.read import Detections
 from intercap_core.errors import UserError
@@ -135,7 +136,10 @@ def _write(
         writer.put("pair_residual_before", before.median)
         writer.put("pair_residual_after", after.median)
         writer.put("time_offset", np.zeros(len(rig)))
-        writer.put("slip", np.zeros((source.num_sets, len(rig)), np.int32))
+        writer.put("time_offset_sigma", np.full(len(rig), np.nan))
+        slip = np.zeros((source.num_sets, len(rig)), np.int32)
+        writer.put("slip", slip)
+        writer.put("image_of", images_of_moments(slip, source.available))
         writer.put("ground_point", ground.point)
         writer.put("ground_normal", ground.normal)
         writer.put("zup_from_master", zup_from_master(ground, rig, source.gravity))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from intercap_core.capture.synchronise import nearest_images, synchronise
+from intercap_core.capture.synchronise import images_of_moments, nearest_images, synchronise
 
 PERIOD = 33_333
 SKEW = 8_000
@@ -122,3 +122,13 @@ def test_every_image_finds_its_tick_whatever_is_lost(kept, jitter, seed):
     for camera, numbers in enumerate(truth):
         expected = [numbers.index(n) if n in numbers else -1 for n in seen]
         assert table.index[:, camera].tolist() == expected
+
+
+def test_a_slipped_image_is_found_at_the_moment_that_it_shows():
+    slip = np.zeros((8, 2), np.int32)
+    slip[3:6, 1] = 2  # sets 3, 4, 5 show the moments 1, 2, 3 again
+    available = np.ones((8, 2), bool)
+    available[1, 1] = False  # its own image is missing: the slipped one stands in
+    shown = images_of_moments(slip, available)
+    assert shown[:, 0].tolist() == list(range(8))
+    assert shown[:, 1].tolist() == [0, 3, 2, 5, -1, -1, 6, 7]
