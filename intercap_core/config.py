@@ -43,6 +43,7 @@ Metres = Annotated[float, AfterValidator(_metres)]
 Position = tuple[Metres, Metres, Metres]
 FrameNumber = Annotated[int, Field(ge=0, strict=True)]
 RegionName = Literal[CONTACT_REGIONS]  # type: ignore[valid-type]
+LayoutName = Literal["k4a", "intercap", "behave", "plain"]
 
 
 class Model(BaseModel):
@@ -268,7 +269,10 @@ class SequenceEntry(Model):
     object: Name
     """Key of objects.yaml."""
     recordings: Path
-    """Folder that holds <camera>.mkv files."""
+    """Folder of the recordings, one file or folder for each camera."""
+    layout: LayoutName = "k4a"
+    """How the recordings are laid out: Azure Kinect files, InterCap's or BEHAVE's release, or plain
+    images and videos; see docs/recordings.md."""
     calibration: Path
     """Camera poses: a rig JSON file, or a folder of Color*.json files as InterCap released."""
     keypoints: Path | None = None

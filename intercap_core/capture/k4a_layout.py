@@ -1,0 +1,75 @@
+"""Layout ``k4a``: one Azure Kinect recording a camera, ``<camera>.mkv``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.camera.extrinsics_files import read_extrinsics
+from intercap_core.capture.k4a import Recording, imu_samples
+from intercap_core.capture.source import CameraRecording, Image, Layout
+from intercap_core.config import SequenceEntry
+
+
+class KinectLayout(Layout):
+    """``<camera>.mkv`` files, and camera poses as :func:`read_extrinsics` reads them."""
+
+    def __init__(self, sequence: SequenceEntry) -> None:
+        super().__init__(sequence)
+        self.extrinsics = read_extrinsics(sequence.calibration)
+        self.names = sorted(path.stem for path in sequence.recordings.glob("*.mkv"))
+
+    def open(self, name: str) -> KinectRecording:
+        """Open ``<name>.mkv``; raises UserError as :class:`Recording` does."""
+        path = self.sequence.recordings / f"{name}.mkv"
+        return KinectRecording(path, name, self.extrinsics.master_from_colour[name])
+
+
+class KinectRecording(CameraRecording):
+    """One Azure Kinect recording; lenses are those of the calibration that it holds."""
+
+    def __init__(self, path: Path, name: str, pose: np.ndarray) -> None:
+        self._recording = Recording(path)
+        info = self._recording.info
+        try:
+            camera = self._recording.camera(name, pose)
+        except BaseException:
+            self._recording.close()
+            raise
+        super().__init__(
+            path, camera, fps=info.fps, serial=info.serial, depth_delay_us=info.depth_delay_us
+        )
+        self.truncated = info.truncated
+
+    def close(self) -> None:
+        """Close the file."""
+        self._recording.close()
+
+    def images(self) -> Iterator[Image]:
+        """Colour packets as recorded, depth without loss; gravity from the accelerometer."""
+        counts = {"colour": 0, "depth": 0}
+        acceleration, samples = np.zeros(3), 0
+        for packet in self._recording.packets():
+            if packet.kind == "imu":
+                values = imu_samples(packet.content)[:, :3]
+                acceleration += values.sum(axis=0)
+                samples += len(values)
+                continue
+            counts[packet.kind] += 1
+            content: bytes | np.ndarray = packet.content
+            if packet.kind == "depth":
+                content = self._recording.depth_image(packet.content)
+            yield Image(packet.kind, packet.device_time_us, content)
+        if self.truncated:
+            self.notes.append(
+                f"the file is cut off: {counts['colour']} colour and {counts['depth']} depth "
+                "images could be read"
+            )
+        if self._recording.broken_packets:
+            self.notes.append(f"{self._recording.broken_packets} damaged packets left out")
+        rotation = self._recording.colour_from_accelerometer()
+        if samples and rotation is not None and np.linalg.norm(acceleration) > 0:
+            # At rest the sensor feels the floor's push, which is up.
+            self.gravity = rotation @ (-acceleration / np.linalg.norm(acceleration))

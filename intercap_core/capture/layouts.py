@@ -1,0 +1,46 @@
+"""The layouts of recordings by the name that the table of sequences gives them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from intercap_core.capture.source import Layout
+from intercap_core.config import LayoutName, SequenceEntry
+from intercap_core.errors import UserError
+
+# What the workflow watches, below the folder of recordings. Folders stand for the images in them:
+# their times change when an image comes or goes, and a sequence has thousands of images.
+INPUTS: dict[LayoutName, tuple[str, ...]] = {
+    "k4a": ("*.mkv",),
+    "intercap": ("Frames_Cam*/*",),
+    "behave": (".", "t*"),
+    "plain": ("*", "*/colour", "*/depth"),
+}
+
+
+def input_files(sequence: SequenceEntry) -> list[Path]:
+    """The files and folders whose change asks for the frames anew; empty without recordings."""
+    folder = sequence.recordings
+    if not folder.is_dir():
+        return []
+    found = {p for glob in INPUTS[sequence.layout] if glob != "." for p in folder.glob(glob)}
+    return sorted(found | ({folder} if "." in INPUTS[sequence.layout] else set()))
+
+
+def open_layout(sequence: SequenceEntry) -> Layout:
+    """Open the recordings of one sequence in the layout that its row names.
+
+    Raises UserError where there is no such folder, and as the layout does.
+    """
+    if not sequence.recordings.is_dir():
+        raise UserError(
+            f"{sequence.recordings}: sequence {sequence.sequence!r} has no such folder of "
+            "recordings; correct 'recordings' in the table of sequences"
+        )
+    # Imports inside, one a layout: the workflow sees what the stage reaches, each loads its own.
+    match sequence.layout:
+        case "k4a":
+            from intercap_core.capture.k4a_layout import KinectLayout
+
+            return KinectLayout(sequence)
+    raise UserError(f"sequence {sequence.sequence!r}: layout {sequence.layout!r} has no reader")
