@@ -19,8 +19,9 @@ from intercap_core.schemas import FRAMES
 class Frames:
     """An open frames artefact. ``t`` is a set (0 <= t < T), ``c`` a camera's index in the rig."""
 
-    def __init__(self, artefact: artefacts.Artefact) -> None:
+    def __init__(self, artefact: artefacts.Artefact, image_of: np.ndarray | None = None) -> None:
         self._artefact = artefact
+        self._image_of = image_of
         self._offsets: dict[int, np.ndarray] = {}
 
     @classmethod
@@ -29,6 +30,21 @@ class Frames:
         """Open for a ``with`` block; raises UserError as :func:`artefacts.read` does."""
         with artefacts.read(path, FRAMES) as artefact:
             yield cls(artefact)
+
+    def showing(self, image_of: np.ndarray) -> Frames:
+        """The same images by the moment that they show: ``t`` is then a moment, not a set.
+
+        ``image_of`` (T, C) of the scene artefact: the set whose image of each camera shows each
+        moment, -1 = none. Raises UserError where it is of another recording.
+        """
+        if image_of.shape != self._colour_index.shape:
+            sets, cameras = self._colour_index.shape
+            raise UserError(
+                f"{self._artefact.path}: holds {sets} frame sets of {cameras} cameras, the scene "
+                f"artefact {image_of.shape[0]} of {image_of.shape[1]}; re-run stage 'scene' for "
+                f"sequence {self.sequence!r}"
+            )
+        return Frames(self._artefact, image_of)
 
     @cached_property
     def rig(self) -> Rig:
@@ -67,11 +83,17 @@ class Frames:
 
     @cached_property
     def _colour_index(self) -> np.ndarray:
-        return self._artefact["colour_index"]
+        return self._by_moment(self._artefact["colour_index"], -1)
 
     @cached_property
     def _depth_index(self) -> np.ndarray:
-        return self._artefact["depth_index"]
+        return self._by_moment(self._artefact["depth_index"], -1)
+
+    def _by_moment(self, values: np.ndarray, none: float) -> np.ndarray:
+        if self._image_of is None:
+            return values
+        found = np.take_along_axis(values, np.maximum(self._image_of, 0), 0)
+        return np.where(self._image_of < 0, values.dtype.type(none), found)
 
     @property
     def colour_available(self) -> np.ndarray:
@@ -91,7 +113,7 @@ class Frames:
     @cached_property
     def skew_s(self) -> np.ndarray:
         """(T, C) float32: image's device time minus the set's time, seconds, NaN = none."""
-        return self._artefact["skew"]
+        return self._by_moment(self._artefact["skew"], np.nan)
 
     @cached_property
     def gravity(self) -> np.ndarray:

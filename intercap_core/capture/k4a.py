@@ -1,6 +1,7 @@
 """Reader of Azure Kinect MKV recordings, without the Azure Kinect SDK.
 
-Images come out as recorded: colour as JPEG packets, depth as the packets' own big-endian bytes.
+Images come out as recorded: colour as JPEG packets (or raw, in the modes that record so), depth
+as the packets' own big-endian bytes.
 Device time = block time + ``K4A_START_OFFSET_NS``, whole microseconds. Sources for the tags and
 tracks: https://learn.microsoft.com/azure/kinect-dk/record-file-format and the SDK's reader (MIT).
 """
@@ -26,12 +27,13 @@ from intercap_core.camera.k4a_calibration import (
     read_calibration,
 )
 from intercap_core.camera.rig import Camera
+from intercap_core.capture.encoded import RAW_FORMATS, encoded_size
 from intercap_core.errors import UserError
 
 TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
 CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"
 IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+PASSIVE_INFRARED = "PASSIVE_IR"  # the depth camera as an infrared one: it measures no depth
 _EBML_MAGIC = b"\x1a\x45\xdf\xa3"
 _SEGMENT_ID = b"\x18\x53\x80\x67"
 
@@ -49,9 +51,13 @@ class Packet(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """What the head of a recording says. ``depth_mode`` is None where no depth was recorded."""
+    """What the head of a recording says. ``depth_mode`` is None where no depth was recorded.
+
+    ``colour_format`` is MJPG or one of :data:`RAW_FORMATS`.
+    """
 
     colour_mode: str
+    colour_format: str
     depth_mode: str | None
     fps: float
     serial: str
@@ -67,7 +73,7 @@ class Recording:
     """One open recording; use as a context manager.
 
     Raises UserError, naming the file, for a file that is missing, empty or no Matroska file, and
-    for one without a colour track in MJPG, a calibration, or a mode that the SDK knows. A file
+    for one without a colour track, a calibration, or with a mode that the SDK does not know. A file
     that was cut off opens as long as its head is whole: ``info.truncated`` then says so.
     """
 
@@ -111,14 +117,10 @@ class Recording:
     def packets(self) -> Iterator[Packet]:
         """Yield every packet in the file's order, one at a time: memory does not grow.
 
-        A packet that cannot be an image (a JPEG without its start or end, depth of another size) is
+        A packet that cannot be an image (a JPEG without its start or end, raw of another size) is
         left out and counted in ``broken_packets``. A file that was cut off ends early, without an
         error. Call once.
         """
-        depth_bytes = 0
-        if self.info.depth_mode is not None:
-            width, height = DEPTH_MODES[self.info.depth_mode].size
-            depth_bytes = 2 * width * height
         streams = [self._container.streams[index] for index in self._streams]
         demuxed = self._container.demux(streams)
         while True:
@@ -133,13 +135,22 @@ class Recording:
                 continue  # the mark at the end of each track
             kind = self._streams[packet.stream_index]
             content = bytes(packet)
-            if (kind == "colour" and not _is_whole_jpeg(content)) or (
-                kind == "depth" and len(content) != depth_bytes
-            ):
+            if not self._is_whole(kind, content):
                 self.broken_packets += 1
                 continue
             time_us = round(packet.pts * packet.time_base * 1_000_000)
             yield Packet(kind, time_us + self.info.start_offset_us, content)
+
+    def _is_whole(self, kind: Kind, content: bytes) -> bool:
+        if kind == "colour" and self.info.colour_format == "MJPG":
+            return encoded_size(content) is not None
+        if kind == "colour":
+            width, height = COLOUR_MODES[self.info.colour_mode].size
+            return len(content) == round(width * height * RAW_FORMATS[self.info.colour_format])
+        if kind == "depth" and self.info.depth_mode is not None:
+            width, height = DEPTH_MODES[self.info.depth_mode].size
+            return len(content) == 2 * width * height
+        return kind == "imu"
 
     def depth_image(self, content: bytes) -> np.ndarray:
         """Turn a depth packet into (H, W) uint16, millimetres, 0 = invalid, lossless."""
@@ -190,14 +201,10 @@ class Recording:
                 f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
                 "colour; record with k4arecorder and the colour camera on"
             )
-        if colour.codec_context.name != "mjpeg":
-            raise UserError(
-                f"{self.path}: colour is recorded as {colour.codec_context.name}, expected MJPG; "
-                "record in an MJPG colour mode (k4arecorder's 720p, 1080p, ... without _NV12/_YUY2)"
-            )
         return RecordingInfo(
             colour_mode=self._mode("colour", colour, "K4A_COLOR_MODE", COLOUR_MODES),
-            depth_mode=self._mode("depth", depth, "K4A_DEPTH_MODE", DEPTH_MODES) if depth else None,
+            colour_format=self._colour_format(colour),
+            depth_mode=self._depth_mode(depth),
             fps=float(colour.average_rate or 30),
             serial=self._container.metadata.get("K4A_DEVICE_SERIAL_NUMBER", ""),
             start_offset_us=self._microseconds("K4A_START_OFFSET_NS"),
@@ -207,6 +214,22 @@ class Recording:
             calibration=self._calibration(),
             truncated=truncated,
         )
+
+    def _colour_format(self, colour: Any) -> str:
+        four_cc = colour.codec_context.codec_tag.upper()
+        if colour.codec_context.name == "mjpeg":
+            return "MJPG"
+        if four_cc in RAW_FORMATS:
+            return four_cc
+        raise UserError(
+            f"{self.path}: colour is recorded as {four_cc or colour.codec_context.name}, expected "
+            f"MJPG, {', '.join(RAW_FORMATS)}; record in one of k4arecorder's colour modes"
+        )
+
+    def _depth_mode(self, depth: Any) -> str | None:
+        if depth is None or depth.metadata.get("K4A_DEPTH_MODE") == PASSIVE_INFRARED:
+            return None
+        return self._mode("depth", depth, "K4A_DEPTH_MODE", DEPTH_MODES)
 
     def _mode(self, kind: str, stream: Any, tag: str, known: dict[str, Any]) -> str:
         """The mode's name: the one whose image has the track's size (no two modes share it)."""
@@ -239,13 +262,6 @@ class Recording:
             f"{self.path}: holds no {CALIBRATION_NAME}; attach the device's own (mkvpropedit "
             f"--attachment-name {CALIBRATION_NAME} --add-attachment FILE) or record again"
         )
-
-
-def _is_whole_jpeg(content: bytes) -> bool:
-    """Tell whether start and end of a JPEG are there; zero bytes may follow the end."""
-    return content.startswith(JPEG_START) and (
-        content.endswith(JPEG_END) or content.rstrip(b"\0").endswith(JPEG_END)
-    )
 
 
 def imu_samples(content: bytes) -> np.ndarray:

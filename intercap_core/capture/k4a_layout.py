@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.camera.extrinsics_files import read_extrinsics
+from intercap_core.camera.k4a_calibration import COLOUR_MODES
+from intercap_core.capture.encoded import JPEG_QUALITY, bgr_of_raw, jpeg_of
 from intercap_core.capture.k4a import Recording, imu_samples
 from intercap_core.capture.source import CameraRecording, Image, Layout
 from intercap_core.config import SequenceEntry
@@ -48,7 +50,11 @@ class KinectRecording(CameraRecording):
         self._recording.close()
 
     def images(self) -> Iterator[Image]:
-        """Colour packets as recorded, depth without loss; gravity from the accelerometer."""
+        """Colour packets as recorded, depth without loss; gravity from the accelerometer.
+
+        Raw colour is stored as JPEG, with a note: as recorded it would be ten times the bytes.
+        """
+        info = self._recording.info
         counts = {"colour": 0, "depth": 0}
         acceleration, samples = np.zeros(3), 0
         for packet in self._recording.packets():
@@ -61,7 +67,15 @@ class KinectRecording(CameraRecording):
             content: bytes | np.ndarray = packet.content
             if packet.kind == "depth":
                 content = self._recording.depth_image(packet.content)
+            elif info.colour_format != "MJPG":
+                size = COLOUR_MODES[info.colour_mode].size
+                content = jpeg_of(bgr_of_raw(packet.content, info.colour_format, size))
             yield Image(packet.kind, packet.device_time_us, content)
+        if info.colour_format != "MJPG":
+            self.notes.append(
+                f"colour was recorded as {info.colour_format} and is stored as JPEG of quality "
+                f"{JPEG_QUALITY}"
+            )
         if self.truncated:
             self.notes.append(
                 f"the file is cut off: {counts['colour']} colour and {counts['depth']} depth "

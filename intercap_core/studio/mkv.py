@@ -20,6 +20,8 @@ from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
 
 TIMECODE_SCALE_NS = 1000  # block times are microseconds
 CLUSTER_SPAN_US = 30_000  # a block's time is a signed 16-bit number of microseconds in its cluster
+ColourFormat = Literal["MJPG", "NV12", "YUY2", "BGRA"]
+_COLOUR_BITS = {"MJPG": 24, "NV12": 12, "YUY2": 16, "BGRA": 32}  # a pixel, as the SDK writes them
 WiredSyncMode = Literal["STANDALONE", "MASTER", "SUBORDINATE"]
 
 _EBML, _SEGMENT, _SEEK_HEAD, _VOID = 0x1A45DFA3, 0x18538067, 0x114D9B74, 0xEC
@@ -79,11 +81,13 @@ class MkvWriter:
         subordinate_delay_ns: int = 0,
         with_ir: bool = False,
         with_imu: bool = False,
+        colour_format: ColourFormat = "MJPG",
     ) -> None:
         if fps not in (5, 15, 30):
             raise ValueError(f"fps is {fps}, the device records at 5, 15 or 30")
         if start_offset_ns % TIMECODE_SCALE_NS:
             raise ValueError(f"start_offset_ns {start_offset_ns} is not a whole microsecond")
+        self._colour_format = colour_format
         self._colour_size = COLOUR_MODES[colour_mode].size
         self._depth_size = DEPTH_MODES[depth_mode].size if depth_mode else None
         self._start_us = start_offset_ns // TIMECODE_SCALE_NS
@@ -120,9 +124,9 @@ class MkvWriter:
 
     # --- what goes in -----------------------------------------------------------------------
 
-    def write_colour(self, jpeg: bytes, device_time_us: int) -> None:
-        """Add one JPEG image."""
-        self._write("COLOR", jpeg, device_time_us)
+    def write_colour(self, image: bytes, device_time_us: int) -> None:
+        """Add one JPEG image, or the bytes of a raw one where ``colour_format`` is raw."""
+        self._write("COLOR", image, device_time_us)
 
     def write_depth(self, depth: np.ndarray, device_time_us: int) -> None:
         """Add one depth image (H, W) uint16, millimetres, 0 = invalid."""
@@ -175,7 +179,7 @@ class MkvWriter:
         """Tags of tracks and attachment: name -> (value, what it is about)."""
         tags = {
             "K4A_COLOR_TRACK": (str(self._uid("COLOR")), "COLOR"),
-            "K4A_COLOR_MODE": (f"MJPG_{colour_mode}", "COLOR"),
+            "K4A_COLOR_MODE": (f"{self._colour_format}_{colour_mode}", "COLOR"),
         }
         if depth_mode:
             tags["K4A_DEPTH_TRACK"] = (str(self._uid("DEPTH")), "DEPTH")
@@ -242,11 +246,12 @@ class MkvWriter:
         if name == "IMU":
             return _element(0xAE, entry + _text(0x86, "S_K4A/IMU"))
         if name == "COLOR":
-            (width, height), four_cc, bits = self._colour_size, b"MJPG", 24
+            (width, height), bits = self._colour_size, _COLOUR_BITS[self._colour_format]
+            four_cc = self._colour_format.encode()
         else:
             assert self._depth_size is not None
             (width, height), four_cc, bits = self._depth_size, b"b16g", 16
-        image_bytes = width * height * 2 if bits == 16 else 0
+        image_bytes = 0 if four_cc == b"MJPG" else width * height * bits // 8
         header = struct.pack(
             "<IiiHH4sIiiII", 40, width, height, 1, bits, four_cc, image_bytes, 0, 0, 0, 0
         )

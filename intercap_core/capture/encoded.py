@@ -1,0 +1,73 @@
+"""Colour images as files in memory: JPEG or PNG as recorded, never decoded on the way through.
+
+JPEG: ITU-T T.81, annex B; PNG: RFC 2083.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; about 1 grey level of error
+RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
+_NO_FRAME_HEADERS = (0xC4, 0xC8, 0xCC)  # among C0..CF: tables, reserved, arithmetic conditioning
+
+
+def encoded_size(content: bytes) -> tuple[int, int] | None:
+    """Return width and height of a JPEG or PNG file; None for what is no whole file of these.
+
+    The end must be there (zero bytes may follow a JPEG's); what lies between is not looked at.
+    """
+    if content.startswith(PNG_START):
+        whole = content.endswith(PNG_END) and len(content) >= 33
+        return struct.unpack(">II", content[16:24]) if whole else None
+    if not content.startswith(JPEG_START):
+        return None
+    if not content.endswith(JPEG_END) and not content.rstrip(b"\0").endswith(JPEG_END):
+        return None
+    return _jpeg_size(content)
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int] | None:
+    """Walk the segments up to the frame header, which holds the size."""
+    at = 2
+    while at + 9 <= len(content) and content[at] == 0xFF:
+        marker = content[at + 1]
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME_HEADERS:
+            height, width = struct.unpack(">HH", content[at + 5 : at + 9])
+            return width, height
+        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+    return None
+
+
+def jpeg_of(image: np.ndarray) -> bytes:
+    """Encode (H, W, 3) uint8 BGR, for recordings whose colour cannot be copied."""
+    import cv2
+
+    done, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise ValueError(f"an image of {image.shape} {image.dtype} cannot be stored as JPEG")
+    return content.tobytes()
+
+
+def bgr_of_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.ndarray:
+    """Return (H, W, 3) uint8 BGR of a raw image of ``size`` (width, height).
+
+    ``pixel_format`` is one of :data:`RAW_FORMATS`; YUV is BT.601 with limited range, as the Azure
+    Kinect's own viewer takes it. Raises ValueError for another number of bytes.
+    """
+    import cv2
+
+    width, height = size
+    shape, code = {
+        "NV12": ((height * 3 // 2, width), cv2.COLOR_YUV2BGR_NV12),
+        "YUY2": ((height, width, 2), cv2.COLOR_YUV2BGR_YUY2),
+        "BGRA": ((height, width, 4), cv2.COLOR_BGRA2BGR),
+    }[pixel_format]
+    return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(shape), code)
