@@ -49,7 +49,7 @@ def write_rig_file(path: Path, extrinsics: Extrinsics) -> None:
 
 
 def _read_rig_file(path: Path) -> Extrinsics:
-    content = _read_json(path)
+    content = read_json(path)
     master = content.get("master")
     cameras = content.get("cameras")
     if not isinstance(cameras, dict) or not cameras or not isinstance(master, str):
@@ -98,7 +98,7 @@ def _read_release_folder(folder: Path) -> Extrinsics:
         )
     poses = {}
     for number, path in sorted(files.items()):
-        content = _read_json(path)
+        content = read_json(path)
         try:
             turn, shift = (np.array(content[k], np.float64).reshape(3) for k in ("R", "T"))
         except (KeyError, TypeError, ValueError, OverflowError):
@@ -143,7 +143,8 @@ def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file of names and values; raises UserError where it is none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:

@@ -43,4 +43,12 @@ def open_layout(sequence: SequenceEntry) -> Layout:
             from intercap_core.capture.k4a_layout import KinectLayout
 
             return KinectLayout(sequence)
+        case "intercap":
+            from intercap_core.capture.intercap import ReleaseLayout
+
+            return ReleaseLayout(sequence)
+        case "behave":
+            from intercap_core.capture.behave import BehaveLayout
+
+            return BehaveLayout(sequence)
     raise UserError(f"sequence {sequence.sequence!r}: layout {sequence.layout!r} has no reader")
