@@ -1,0 +1,167 @@
+"""A capture with fewer cameras, less depth, less colour or fewer detections than it was made with.
+
+Works on the artefacts of any capture, synthetic or recorded: each is copied by its schema, the T
+and C axes cut, so that the stages behind it can be run on rigs that nobody recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts, schemas
+from intercap_core.artefacts import Artefact, Schema, Writer, pack_ragged, unpack_ragged
+
+STAGES = {
+    s.name: s for s in (schemas.FRAMES, schemas.DETECTIONS, schemas.SCENE, schemas.PERSON)
+}  # fmt: skip
+_OF_DEPTH_LENS = {
+    "depth_size": 0,
+    "depth_intrinsics": np.nan,
+    "depth_distortion": np.nan,
+    "depth_metric_radius": np.nan,
+    "colour_from_depth": np.nan,
+}
+_RAGGED = (
+    ("people_offsets", ("people",)),
+    ("candidate_offsets", ("candidate_labels", "candidate_scores", "candidate_boxes")),
+)
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """What is left of a capture; None = everything, camera names otherwise.
+
+    ``sets``: the first so many. ``depth``: cameras that keep theirs. ``images_until``: the set from
+    which a camera has no more images. ``keypoints``, ``candidates``: cameras with detections.
+    """
+
+    cameras: Collection[str] | None = None
+    sets: int | None = None
+    depth: Collection[str] | None = None
+    images_until: Mapping[str, int] | None = None
+    keypoints: Collection[str] | None = None
+    candidates: Collection[str] | None = None
+
+    def apply(self, paths: Mapping[str, Path], folder: Path) -> dict[str, Path]:
+        """Write the reduced artefacts of ``paths`` (by stage) into ``folder``; others are left."""
+        folder.mkdir(parents=True, exist_ok=True)
+        return {
+            stage: self._copy(paths[stage], schema, folder / f"{stage}.h5")
+            for stage, schema in STAGES.items()
+            if stage in paths
+        }
+
+    def _copy(self, source: Path, schema: Schema, path: Path) -> Path:
+        with artefacts.read(source, schema) as old:
+            names = old.text("camera_names")
+            kept = [c for c, n in enumerate(names) if self.cameras is None or n in self.cameras]
+            attributes = {name: old.attributes[name] for name in schema.attributes}
+            digest = str(old.attributes["settings_digest"])
+            with artefacts.write(path, schema, settings_digest=digest, **attributes) as new:
+                for key in old.keys():  # noqa: SIM118 (not a dict)
+                    if "/" not in key:
+                        new.put(key, self._values(old, key, names, kept))
+                for c in kept:
+                    self._copy_camera(old, new, names[c])
+        return path
+
+    def _values(
+        self, old: Artefact, key: str, names: list[str], kept: list[int]
+    ) -> np.ndarray | list[str]:
+        """A whole dataset with its T and C axes cut and what is taken away blanked out."""
+        if key in ("mask_offsets", "mask_rle"):
+            return self._masks(old, names, kept)[key == "mask_rle"]
+        if key in ("pairs", "pair_points", "pair_residual_before", "pair_residual_after"):
+            return old[key][:0]
+        values = old[key].copy()
+        dims = old._schema.field_of(key).dims
+        for c, name in enumerate(names):
+            if key in _OF_DEPTH_LENS and not _has(self.depth, name):
+                values[c] = _OF_DEPTH_LENS[key]
+            if key == "depth_index" and not _has(self.depth, name):
+                values[:, c] = -1
+            until = (self.images_until or {}).get(name)
+            if until is not None and key in ("depth_index", "colour_index", "image_of"):
+                values[until:, c] = -1
+            if until is not None and key in ("keypoints_found", "candidates_found"):
+                values[until:, c] = False
+            if key == "keypoints_found" and not _has(self.keypoints, name):
+                values[:, c] = False
+            if key == "candidates_found" and not _has(self.candidates, name):
+                values[:, c] = False
+        for axis, dim in enumerate(dims):
+            if dim == "T" and self.sets is not None:
+                values = values.take(np.arange(min(self.sets, values.shape[axis])), axis)
+            elif dim == "C":
+                values = values.take(kept, axis)
+        return list(values) if values.dtype == object else values
+
+    def _masks(
+        self, old: Artefact, names: list[str], kept: list[int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        masks = unpack_ragged(old["mask_offsets"], old["mask_rle"])
+        total = len(masks) // len(names) if self.sets is None else self.sets
+        until = self.images_until or {}
+        return pack_ragged(
+            [
+                masks[t * len(names) + c] if t < until.get(names[c], total) else b""
+                for t in range(total)
+                for c in kept
+            ]
+        )
+
+    def _copy_camera(self, old: Artefact, new: Writer, name: str) -> None:
+        group = f"cameras/{name}"
+        keys = [key for key in old.keys(f"{group}/") if key.count("/") == 2]
+        if f"{group}/people_offsets" in keys:
+            self._copy_detections(old, new, name)
+            return
+        for key in keys:
+            part = key.rsplit("/", 1)[1]
+            if part in ("depth", "depth_time", "background") and not _has(self.depth, name):
+                continue
+            if part == "depth":
+                rows = new.stream(key, old.describe(key)[0][1:])
+                for row in range(self._num_images(old, name, "depth_index")):
+                    rows.append(old.rows(key, slice(row, row + 1)))
+            elif part == "depth_time":
+                new.put(key, old[key][: self._num_images(old, name, "depth_index")])
+            elif part == "colour":
+                end = old[f"{group}/colour_offsets"][self._num_images(old, name, "colour_index")]
+                new.put(key, old.rows(key, slice(0, int(end))))
+            elif part == "colour_offsets":
+                new.put(key, old[key][: self._num_images(old, name, "colour_index") + 1])
+            elif part == "colour_time":
+                new.put(key, old[key][: self._num_images(old, name, "colour_index")])
+            else:
+                new.put(key, old[key])
+
+    def _num_images(self, old: Artefact, name: str, index: str) -> int:
+        """Images of a camera that the kept sets need."""
+        column = old.text("camera_names").index(name)
+        return int(old[index][: self.sets, column].max(initial=-1)) + 1
+
+    def _copy_detections(self, old: Artefact, new: Writer, name: str) -> None:
+        group = f"cameras/{name}"
+        until = (self.images_until or {}).get(name)
+        for (key, parts), wanted in zip(_RAGGED, (self.keypoints, self.candidates), strict=True):
+            offsets = old[f"{group}/{key}"][: None if self.sets is None else self.sets + 1].copy()
+            if until is not None:
+                offsets[until + 1 :] = offsets[until]
+            if not _has(wanted, name):
+                offsets[:] = 0
+            new.put(f"{group}/{key}", offsets)
+            end = int(offsets[-1])
+            for part in parts:
+                new.put(f"{group}/{part}", old[f"{group}/{part}"][:end])
+        starts = old[f"{group}/rle_offsets"][: end + 1]
+        new.put(f"{group}/rle_offsets", starts)
+        new.put(f"{group}/rle", old[f"{group}/rle"][: int(starts[-1])])
+
+
+def _has(cameras: Collection[str] | None, name: str) -> bool:
+    return cameras is None or name in cameras
