@@ -7,42 +7,25 @@ not grow with the length of the recordings, apart from 8 bytes an image for its 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.extrinsics_files import Extrinsics, read_extrinsics
+from intercap_core.camera.extrinsics_files import Extrinsics
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera, Rig
-from intercap_core.capture.k4a import Recording, imu_samples
+from intercap_core.capture.clocks import WRONG, best_epoch, drift_us, epochs
+from intercap_core.capture.extract import View, extract
+from intercap_core.capture.layouts import open_layout
 from intercap_core.capture.synchronise import SetTable, nearest_images, synchronise
 from intercap_core.config import FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.schemas import FRAMES
 
-COLOUR_BUFFER_BYTES = 4 << 20
-
-
-@dataclass
-class _View:
-    """What is known of one camera: its lenses, the times of its images, and what is wrong."""
-
-    name: str
-    camera: Camera | None = None
-    fps: float = 0.0
-    colour_times: list[int] = field(default_factory=list)  # device time, microseconds
-    depth_times: list[int] = field(default_factory=list)  # device time, microseconds
-    depth_delay_us: int = 0
-    gravity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
-    truncated: bool = False
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def present(self) -> bool:
-        return self.camera is not None and bool(self.colour_times)
+MIN_DRIFT_US = 1000.0  # less than the exposure of one image
 
 
 def run(
@@ -54,22 +37,27 @@ def run(
 ) -> None:
     """Write the frames artefact of one sequence.
 
-    Reads ``<camera>.mkv`` in the sequence's folder of recordings, and the camera poses of its
-    calibration. A camera without a readable recording or without a pose is kept with
-    ``present`` = False and a note; so are shortened recordings. The frame of the poses stays that
-    of the calibration's master, also where the master's own recording is missing. Sets listed in
-    ``frames_to_drop`` get no image. Raises UserError where no camera (or none with depth) can be
-    used, and for an unreadable calibration or a set to drop that is not there.
+    Reads the sequence's recordings in the layout that its row names. A camera without a usable
+    recording or without a pose is kept with ``present`` = False and a note; what else is degraded
+    is noted too. The frame of the poses stays that of the calibration's master, also where the
+    master's own recording is missing. Sets listed in ``frames_to_drop`` get no image. Raises
+    UserError where no camera can be used, and for an unreadable calibration or a set to drop that
+    is not there.
     """
-    extrinsics = read_extrinsics(sequence.calibration)
-    names = _camera_names(sequence, extrinsics)
+    layout = open_layout(sequence)
+    extrinsics = layout.extrinsics
+    known = list(extrinsics.master_from_colour)
+    names = known + [name for name in layout.names if name not in known]
     with artefacts.write(output, FRAMES, settings_digest=digest(settings)) as writer:
-        views = [_extract(name, sequence, extrinsics, writer) for name in names]
+        views = [extract(name, layout, writer) for name in names]
+        _note_same_devices(views)
         _require_usable(views, sequence)
-        clock = _clock_of(views, names.index(extrinsics.master))
+        master = names.index(extrinsics.master)
+        _straighten_clocks(views, master)
+        clock = _clock_of(views, master)
         _set_aside_other_clocks(views, clock)
         table, depth_index = _frame_sets(views, clock, settings)
-        _note_shortcomings(views, table)
+        _note_shortcomings(views, table, clock)
         dropped = _dropped(len(table.times_us), frames_to_drop, sequence)
         colour_index, depth_index = (
             np.where(dropped[:, None], -1, index) for index in (table.index, depth_index)
@@ -94,132 +82,109 @@ def run(
         )
 
 
-def _camera_names(sequence: SequenceEntry, extrinsics: Extrinsics) -> list[str]:
-    """All cameras that have a pose, in the calibration's order, then those with a file alone."""
-    folder = sequence.recordings
-    if not folder.is_dir():
-        raise UserError(
-            f"{folder}: sequence {sequence.sequence!r} has no such folder of recordings; correct "
-            "'recordings' in the table of sequences"
+def _note_same_devices(views: list[View]) -> None:
+    """Say where two recordings are of one device; set the second aside where they are one."""
+    for first, second in combinations([view for view in views if view.present], 2):
+        if first.source is None or second.source is None or not second.present:
+            continue
+        files = f"{first.source.name} and {second.source.name}"
+        copied = first.fingerprint == second.fingerprint and np.array_equal(
+            first.colour_times, second.colour_times
         )
-    known = list(extrinsics.master_from_colour)
-    return known + sorted({path.stem for path in folder.glob("*.mkv")} - set(known))
+        if copied:
+            for view in (first, second):
+                view.notes.append(f"{files} hold the same images: {second.name} is set aside")
+            second.camera = None
+        elif first.serial and first.serial == second.serial:
+            for view in (first, second):
+                view.notes.append(
+                    f"{files} have the same serial number {first.serial}: check which camera each "
+                    "was recorded with"
+                )
 
 
-def _extract(
-    name: str, sequence: SequenceEntry, extrinsics: Extrinsics, writer: artefacts.Writer
-) -> _View:
-    """Copy one recording's images into the artefact."""
-    view = _View(name)
-    path = sequence.recordings / f"{name}.mkv"
-    pose = extrinsics.master_from_colour.get(name)
-    if pose is None:
-        view.notes.append(f"no pose in {sequence.calibration.name}; add the camera there")
-        return view
-    if not path.exists():
-        view.notes.append(f"no recording {path.name}")
-        return view
-    try:
-        with Recording(path) as recording:
-            view.camera = recording.camera(name, pose)
-            _copy_images(recording, view, writer)
-    except UserError as error:
-        view.notes.append(str(error).replace(f"{sequence.recordings}/", ""))
-        view.camera = None
-    return view
-
-
-def _copy_images(recording: Recording, view: _View, writer: artefacts.Writer) -> None:
-    info = recording.info
-    view.fps, view.depth_delay_us = info.fps, info.depth_delay_us
-    group = f"cameras/{view.name}"
-    colour = writer.stream(f"{group}/colour")
-    depth = None
-    if view.camera is not None and view.camera.depth is not None:
-        lens = view.camera.depth
-        depth = writer.stream(f"{group}/depth", (lens.height, lens.width))
-    offsets, buffer = [0], bytearray()
-    acceleration, samples = np.zeros(3), 0
-    for packet in recording.packets():
-        if packet.kind == "colour":
-            view.colour_times.append(packet.device_time_us)
-            offsets.append(offsets[-1] + len(packet.content))
-            buffer += packet.content
-            if len(buffer) >= COLOUR_BUFFER_BYTES:
-                colour.append(np.frombuffer(bytes(buffer), np.uint8))
-                buffer.clear()
-        elif packet.kind == "depth" and depth is not None:
-            view.depth_times.append(packet.device_time_us)
-            depth.append(recording.depth_image(packet.content)[None])
-        elif packet.kind == "imu":
-            values = imu_samples(packet.content)[:, :3]
-            acceleration += values.sum(axis=0)
-            samples += len(values)
-    colour.append(np.frombuffer(bytes(buffer), np.uint8))
-    writer.put(f"{group}/colour_offsets", offsets)
-    writer.put(f"{group}/colour_time", np.array(view.colour_times, np.int64))
-    if depth is not None:
-        writer.put(f"{group}/depth_time", np.array(view.depth_times, np.int64))
-    else:
-        view.notes.append("no depth track")
-    if info.truncated:
-        view.truncated = True
-        view.notes.append(
-            f"the file is cut off: {len(view.colour_times)} colour and {len(view.depth_times)} "
-            "depth images could be read"
-        )
-    elif not view.colour_times:
-        view.notes.append("holds no colour image")
-    if recording.broken_packets:
-        view.notes.append(f"{recording.broken_packets} damaged packets left out")
-    rotation = recording.colour_from_accelerometer()
-    if samples and rotation is not None and np.linalg.norm(acceleration) > 0:
-        # At rest the sensor feels the floor's push, which is up.
-        view.gravity = rotation @ (-acceleration / np.linalg.norm(acceleration))
-
-
-def _require_usable(views: list[_View], sequence: SequenceEntry) -> None:
+def _require_usable(views: list[View], sequence: SequenceEntry) -> None:
     reasons = "; ".join(f"{view.name}: {', '.join(view.notes)}" for view in views if view.notes)
     if not any(view.present for view in views):
         raise UserError(
             f"sequence {sequence.sequence!r}: no camera in {sequence.recordings} can be used "
-            f"({reasons}); put the recordings there as <camera>.mkv"
-        )
-    if not any(view.present and view.depth_times for view in views):
-        raise UserError(
-            f"sequence {sequence.sequence!r}: no camera in {sequence.recordings} has depth "
-            f"({reasons}); record with a depth mode"
+            f"({reasons}); put the recordings there as docs/recordings.md says"
         )
 
 
-def _clock_of(views: list[_View], master: int) -> int:
-    """The camera whose images define the sets: the master, or the first that is there."""
-    if views[master].present:
-        return master
-    clock = next(index for index, view in enumerate(views) if view.present)
-    views[master].notes.append(f"frame sets follow {views[clock].name}")
+def _straighten_clocks(views: list[View], master: int) -> None:
+    """Where a device's clock was reset, keep the stretch of its images in the others' time."""
+    present = [view for view in views if view.present]
+    stretches = {view.name: epochs(view.colour_times) for view in present}
+    straight = [view for view in present if stretches[view.name].max() == 0]
+    if not straight:
+        straight = [views[master] if views[master].present else present[0]]
+        _keep_one_stretch(straight[0], stretches[straight[0].name], straight[0].colour_times)
+    reference = np.concatenate([view.usable_times for view in straight])
+    for view in present:
+        _keep_one_stretch(view, stretches[view.name], reference)
+
+
+def _keep_one_stretch(view: View, stretch: np.ndarray, reference_us: np.ndarray) -> None:
+    first, last = int(reference_us.min()), int(reference_us.max())
+    kept = best_epoch(view.colour_times, stretch, first, last)
+    resets = int(stretch.max())
+    wrong = int((stretch == WRONG).sum())
+    if wrong:
+        view.notes.append(f"{wrong} images with device times out of order left out")
+    if resets:
+        others = int(((stretch != kept) & (stretch != WRONG)).sum())
+        view.notes.append(
+            f"its device times jump back {resets} times: {others} images outside the stretch of "
+            f"{int((stretch == kept).sum())} in the other cameras' time left out"
+        )
+    view.colour_usable &= stretch == kept
+    if not len(view.depth_times):
+        return
+    depth = epochs(view.depth_times)
+    if depth.max() != resets:
+        kept = best_epoch(view.depth_times, depth, *view.usable_times[[0, -1]].tolist())
+    view.depth_usable &= depth == kept
+
+
+def _overlap(view: View, other: View) -> bool:
+    """Whether two cameras recorded at the same time, by their device times."""
+    period_us = 1e6 / view.fps
+    mine, others = view.usable_times, other.usable_times
+    return bool(others.min() <= mine.max() + period_us and others.max() >= mine.min() - period_us)
+
+
+def _clock_of(views: list[View], master: int) -> int:
+    """The camera whose images define the sets: the one with which the most overlap in time.
+
+    Of equals the master, or the first that is there.
+    """
+    present = [index for index, view in enumerate(views) if view.present]
+    company = {i: sum(_overlap(views[i], views[other]) for other in present) for i in present}
+    clock = max(present, key=lambda index: (company[index], index == master))
+    if clock != master:
+        views[master].notes.append(f"frame sets follow {views[clock].name}")
     return clock
 
 
-def _set_aside_other_clocks(views: list[_View], clock: int) -> None:
+def _set_aside_other_clocks(views: list[View], clock: int) -> None:
     """A device that ran without the sync cable counts from its own start: of no use here."""
-    period_us = 1e6 / views[clock].fps
-    first, last = min(views[clock].colour_times), max(views[clock].colour_times)
-    for view in views:
-        if not view.present:
+    for view in [view for view in views if view.present]:
+        if _overlap(views[clock], view):
             continue
-        if min(view.colour_times) > last + period_us or max(view.colour_times) < first - period_us:
-            view.notes.append(
-                f"its device times ({min(view.colour_times) / 1e6:.1f} to "
-                f"{max(view.colour_times) / 1e6:.1f} s) do not overlap those of "
-                f"{views[clock].name} ({first / 1e6:.1f} to {last / 1e6:.1f} s); connect the sync "
-                "cables and record again"
-            )
-            view.camera = None
+        mine, other = (
+            times[[0, -1]] / 1e6 for times in (view.usable_times, views[clock].usable_times)
+        )
+        view.notes.append(
+            f"its device times ({mine[0]:.1f} to {mine[1]:.1f} s) do not overlap those of "
+            f"{views[clock].name} ({other[0]:.1f} to {other[1]:.1f} s); connect the sync cables "
+            "and record again"
+        )
+        view.camera = None
 
 
 def _frame_sets(
-    views: list[_View], clock: int, settings: FramesSettings
+    views: list[View], clock: int, settings: FramesSettings
 ) -> tuple[SetTable, np.ndarray]:
     """Return the table of colour images and the index (T, C) of the depth images beside them."""
     max_skew_us = settings.max_skew_ms * 1000
@@ -229,17 +194,31 @@ def _frame_sets(
             f"settings: frames.max_skew_ms is {settings.max_skew_ms}, the recordings have "
             f"{views[clock].fps:g} frames a second; choose less than {period_us / 2000:.1f}"
         )
-    times = [np.array(view.colour_times if view.present else [], np.int64) for view in views]
+    no_images = np.zeros(0, np.int64)
+    times = [view.usable_times if view.present else no_images for view in views]
     table = synchronise(times, period_us=period_us, max_skew_us=max_skew_us, master=clock)
     depth_index = np.full(table.index.shape, -1, np.int32)
     for camera, view in enumerate(views):
-        if view.present:
-            undelayed = np.array(view.depth_times, np.int64) - view.depth_delay_us
-            depth_index[:, camera] = nearest_images(table.times_us, undelayed, max_skew_us)
+        if not view.present:
+            continue
+        has = table.index[:, camera] >= 0
+        table.index[has, camera] = np.flatnonzero(view.colour_usable)[table.index[has, camera]]
+        undelayed = view.depth_times[view.depth_usable] - view.depth_delay_us
+        index = nearest_images(table.times_us, undelayed, max_skew_us)
+        has = index >= 0
+        depth_index[has, camera] = np.flatnonzero(view.depth_usable)[index[has]]
     return table, depth_index
 
 
-def _note_shortcomings(views: list[_View], table: SetTable) -> None:
+def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
+    period_us = 1e6 / views[clock].fps
+    gaps = table.gaps(period_us)
+    if gaps:
+        lost = sum(length for _, length in gaps)
+        views[clock].notes.append(
+            f"no camera has an image for {lost} periods in {len(gaps)} places, the first after "
+            f"frame set {gaps[0][0]}"
+        )
     for camera, view in enumerate(views):
         if not view.present:
             continue
@@ -248,6 +227,12 @@ def _note_shortcomings(views: list[_View], table: SetTable) -> None:
             view.notes.append(f"{table.unmatched[camera]} images fit no frame set")
         if not len(seen):
             continue
+        drift = drift_us(table.times_us, table.skew_us[:, camera])
+        if abs(drift) > MIN_DRIFT_US:
+            view.notes.append(
+                f"its clock runs away from {views[clock].name}'s by {drift / 1e3:.1f} "
+                "ms over the recording"
+            )
         holes = int(seen[-1] - seen[0] + 1 - len(seen))
         early = len(table.times_us) - 1 - int(seen[-1])
         if holes:
@@ -271,7 +256,7 @@ def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry)
     return dropped
 
 
-def _camera_or_placeholder(view: _View, views: list[_View], extrinsics: Extrinsics) -> Camera:
+def _camera_or_placeholder(view: View, views: list[View], extrinsics: Extrinsics) -> Camera:
     """The camera, or for one that is absent a stand-in without depth that keeps the C axis whole.
 
     The stand-in has the image size of a camera that is there and a plain lens; ``present`` says

@@ -172,10 +172,11 @@ def test_a_recording_without_depth_is_colour_alone(tmp_path):
 
 def test_a_damaged_jpeg_is_left_out_and_counted(tmp_path):
     path = tmp_path / "k1.mkv"
+    jpeg = cv2.imencode(".jpg", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()
     with MkvWriter(
         path, calibration_json=b"{}", colour_mode="720P", depth_mode=None, fps=30, serial="1"
     ) as writer:
-        for time_us, content in enumerate([b"\xff\xd8ok\xff\xd9\0\0", b"\xff\xd8cut", b"noise"]):
+        for time_us, content in enumerate([jpeg + b"\0\0", jpeg[:-2], b"noise"]):
             writer.write_colour(content, time_us * 40_000)
     with Recording(path) as recording:
         assert [p.device_time_us for p in recording.packets()] == [0]

@@ -162,7 +162,7 @@ def test_a_camera_without_file_pose_or_readable_head_is_kept_and_flagged(capture
         assert frames.rig[1].depth is None
         assert not frames.available[:, 1:].any()
     notes = notes_of(output)
-    assert "no recording k2.mkv" in notes["k2"]
+    assert "no recording of k2" in notes["k2"]
     assert "k3.mkv: is not a Matroska file" in notes["k3"]
     assert "no pose in rig.json" in notes["k4"]
     assert str(capture.recordings) not in notes["k3"]  # an artefact holds no path of a machine
@@ -191,10 +191,19 @@ def test_a_cut_recording_gives_what_it_holds(capture):
 def test_a_camera_without_depth_gives_colour(capture):
     record(capture.recordings, 2, range(6), depth=False)
     output = run(capture)
-    assert "no depth track" in notes_of(output)["k3"]
+    assert "has no depth" in notes_of(output)["k3"]
     with Frames.open(output) as frames:
         assert frames.rig[2].depth is None and frames.depth(0, 2) is None
         assert frames.colour_jpeg(0, 2) == jpeg_at(2, 0)
+
+
+def test_a_rig_without_depth_gives_colour(capture):
+    for camera in range(3):
+        record(capture.recordings, camera, range(3), depth=False)
+    output = run(capture)
+    assert all("has no depth" in note for note in notes_of(output).values())
+    with Frames.open(output) as frames:
+        assert frames.colour_available.all() and not frames.depth_available.any()
 
 
 def test_a_device_with_a_clock_of_its_own_is_set_aside(capture):
@@ -212,12 +221,6 @@ def drop_too_far(capture):
 def nothing_readable(capture):
     for path in capture.recordings.glob("*.mkv"):
         path.write_bytes(b"")
-    return run(capture)
-
-
-def no_depth_at_all(capture):
-    for camera in range(3):
-        record(capture.recordings, camera, range(3), depth=False)
     return run(capture)
 
 
@@ -252,7 +255,6 @@ def too_wide_a_window(capture):
     [
         (drop_too_far, "drop_frames holds 6, the recording has frame sets 0 to 5"),
         (nothing_readable, "'s1': no camera in .* can be used .*k2: k2.mkv: is empty"),
-        (no_depth_at_all, "no camera in .* has depth"),
         (no_folder, "no such folder"),
         (master_unknown, "master 'k9' is none of the cameras"),
         (pose_not_rigid, "camera 'k2' has no rigid 4x4"),
