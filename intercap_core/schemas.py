@@ -120,26 +120,26 @@ SCENE = Schema(
 
 PERSON = Schema(
     name="person",
-    version=1,
+    version=2,
     stage="person",
     attributes={"sequence": "sequence name"},
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
-        "person": Field(("T", "C"), "int32", "index among the image's people, -1 = not seen"),
-        "keypoints": Field(("T", "C", "135", "3"), "float32", "the subject's x, y, confidence; 0 = not seen", "px", "colour image"),
-        "joints": Field(("T", "135", "3"), "float32", "triangulated keypoints; NaN = too few views", "m", "master"),
+        "person": Field(("T", "C"), "int32", "index among the people of the image that shows this moment (image_of of the scene), -1 = not seen"),
+        "keypoints": Field(("T", "C", "135", "3"), "float32", "the subject's x, y, confidence in the image that shows this moment, as exposed (time_offset of the scene later); 0 = not seen", "px", "colour image"),
+        "joints": Field(("T", "135", "3"), "float32", "triangulated keypoints at the set's time; NaN = too few views", "m", "master"),
         "joint_views": Field(("T", "135"), "int8", "views that agree on the point"),
         "joint_error": Field(("T", "135"), "float32", "RMS reprojection error of those views", "px"),
         "inlier": Field(("T", "C", "135"), "bool", "this view agrees on the point"),
         "missing": Field(("T",), "bool", "the subject was found in fewer than two views"),
         "mask_offsets": Field(("M+1",), "int64", "start of each mask's RLE, in the order of (T, C)"),
-        "mask_rle": Field(("B",), "uint8", "COCO compressed RLE of the person, empty = no mask"),
+        "mask_rle": Field(("B",), "uint8", "COCO compressed RLE of the person in the image that shows this moment, empty = no mask"),
     },
 )  # fmt: skip
 
 OBJECT_TRACK = Schema(
     name="object_track",
-    version=1,
+    version=2,
     stage="object_track",
     attributes={
         "sequence": "sequence name",
@@ -151,7 +151,7 @@ OBJECT_TRACK = Schema(
         "camera_names": Field(("C",), "str", "one name a camera"),
         "rotation": Field(("T", "3", "3"), "float64", "master_from_object", "1", "master"),
         "translation": Field(("T", "3"), "float64", "master_from_object, of the mesh's origin", "m", "master"),
-        "candidate": Field(("T", "C"), "int32", "candidate kept in each view, -1 = none"),
+        "candidate": Field(("T", "C"), "int32", "candidate kept in the image of each view that shows this moment, -1 = none"),
         "overlap": Field(("T", "C"), "float32", "IoU of the kept candidate and the visible render; NaN = none"),
         "depth_residual": Field(("T", "C"), "float32", "median |depth residual|; NaN = none", "m"),
         "silhouette_residual": Field(("T", "C"), "float32", "median contour distance; NaN = none", "px"),
@@ -227,7 +227,7 @@ BODY_FIT = Schema(
 
 JOINT = Schema(
     name="joint",
-    version=1,
+    version=2,
     stage="joint",
     attributes={
         "sequence": "sequence name",
@@ -267,6 +267,10 @@ TRUTH = Schema(
         "ground_offset": "n . x + d = 0 of the floor, metres",
         "fps": "frame sets a second",
     },
+    optional_attributes={
+        "room": "furnished, or bare: a floor and nothing else",
+        "faults": "what was broken on purpose, camera by camera; empty where nothing was",
+    },
     fields={
         "times": Field(("T",), "float64", "time of each set since the first", "s"),
         "body_vertices": Field(("T", "Vt", "3"), "float32", "skin without clothing, the truth's own mesh", "m", "master"),
@@ -286,6 +290,8 @@ TRUTH = Schema(
         "master_from_colour": Field(("C", "4", "4"), "float64", "true extrinsics", "m", "master"),
         "time_offset": Field(("C",), "float64", "true exposure offset", "s"),
         "slip": Field(("T", "C"), "int32", "whole frames late"),
+        "recorded": Field(("T", "C"), "bool", "the camera recorded an image whose device time is this set's", optional=True),
+        "depth_recorded": Field(("T", "C"), "bool", "and depth that is not empty", optional=True),
         "ground_normal": Field(("3",), "float64", "true floor normal, up", "1", "master"),
         "body_visible": Field(("T", "Vt"), "bool", "some camera truly sees the vertex (of the clothed body)"),
         "object_visible": Field(("T", "Vo"), "bool", "some camera truly sees the vertex"),

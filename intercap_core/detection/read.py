@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.detection.masks import Runs
+from intercap_core.errors import UserError
 from intercap_core.schemas import DETECTIONS
 
 
@@ -68,12 +70,36 @@ class Detections:
         self.candidates_found = artefact["candidates_found"]
         self.notes = tuple(artefact.text("note"))
         self._tables = [_read_camera(artefact, name) for name in self.camera_names]
+        self._image_of: np.ndarray | None = None
 
     @classmethod
     def load(cls, path: Path) -> Detections:
         """Read the artefact and close it; raises UserError as :func:`artefacts.read` does."""
         with artefacts.read(path, DETECTIONS) as artefact:
             return cls(artefact)
+
+    def showing(self, image_of: np.ndarray) -> Detections:
+        """The same detections by the moment that their images show: ``t`` is then a moment.
+
+        ``image_of`` (T, C) of the scene artefact: the set whose image of each camera shows each
+        moment, -1 = none. Raises UserError where it is of another recording.
+        """
+        if image_of.shape != self.keypoints_found.shape:
+            sets, cameras = self.keypoints_found.shape
+            raise UserError(
+                f"{self.path}: holds {sets} frame sets of {cameras} cameras, the scene artefact "
+                f"{image_of.shape[0]} of {image_of.shape[1]}; re-run stages 'detections' and "
+                f"'scene' for sequence {self.sequence!r}"
+            )
+        moments = copy(self)
+        moments._image_of = image_of
+        shown, at = image_of >= 0, np.maximum(image_of, 0)
+        moments.keypoints_found = shown & np.take_along_axis(self.keypoints_found, at, 0)
+        moments.candidates_found = shown & np.take_along_axis(self.candidates_found, at, 0)
+        return moments
+
+    def _image(self, t: int, c: int) -> int:
+        return t if self._image_of is None else int(self._image_of[t, c])
 
     @property
     def num_sets(self) -> int:
@@ -82,13 +108,17 @@ class Detections:
 
     def people(self, t: int, c: int) -> np.ndarray:
         """Keypoints (P, 135, 3) float32 of the image's people: x, y, confidence."""
-        table = self._tables[c]
-        return table.people[table.people_offsets[t] : table.people_offsets[t + 1]]
+        table, image = self._tables[c], self._image(t, c)
+        if image < 0:
+            return table.people[:0]
+        return table.people[table.people_offsets[image] : table.people_offsets[image + 1]]
 
     def candidates(self, t: int, c: int) -> list[Candidate]:
         """The image's segmentation candidates, in the order that the artefact holds them."""
-        table = self._tables[c]
-        first, last = table.candidate_offsets[t : t + 2]
+        table, image = self._tables[c], self._image(t, c)
+        if image < 0:
+            return []
+        first, last = table.candidate_offsets[image : image + 2]
         width, height = (int(n) for n in self.image_sizes[c])
         return [
             Candidate(

@@ -138,11 +138,11 @@ class Evidence:
 
     def _shift(self, points: Tensor) -> Tensor | None:
         """How far points (N,...,3) move until each camera exposes: (N,C,...,3), or None."""
-        delay = self.seen.delay[self.frames]
+        delay = self.seen.time_offset
         if not np.any(delay) or len(self.frames) < 2:
             return None
         velocity = np.gradient(points.double().cpu().numpy(), self.seen.times[self.frames], axis=0)
-        return self._tensor(delay)[:, :, None, None] * self._tensor(velocity)[:, None]
+        return self._tensor(delay)[:, None, None] * self._tensor(velocity)[:, None]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
         """Noise of each group of keypoints from its residuals: 1.48 median absolute deviation."""

@@ -33,7 +33,8 @@ class Observations:
 
     keypoints (T,C,K,2) px and confidence (T,C,K), 0 = not seen; joints (T,K,3) triangulated, master
     frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none;
-    delay (T,C) s, exposure later than the set; times (T,) s.
+    image_of (T,C): the set whose image of each camera shows each frame, -1 = none; times (T,) s;
+    time_offset (C,) s: each camera exposes later than the frame's time by this much.
     """
 
     sequence: str
@@ -45,7 +46,8 @@ class Observations:
     masks: list[bytes]
     background: list[np.ndarray | None]
     depth_bias: np.ndarray
-    delay: np.ndarray
+    image_of: np.ndarray
+    time_offset: np.ndarray
     times: np.ndarray
 
     @property
@@ -69,7 +71,7 @@ def read_observations(scene: Path, person: Path) -> Observations:
         rig = Rig.from_artefact(read)
         sequence = str(read.attributes["sequence"])
         times = read["times"]
-        delay = read["time_offset"] + read["slip"] / float(read.attributes["fps"])
+        image_of, time_offset = read["image_of"], read["time_offset"]
         depth_bias = read["depth_bias"]
         keys = set(read.keys("cameras/"))
         background = [
@@ -94,7 +96,7 @@ def read_observations(scene: Path, person: Path) -> Observations:
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
         sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks,
-        background, depth_bias, delay, times,
+        background, depth_bias, image_of, time_offset, times,
     )  # fmt: skip
 
 
@@ -117,11 +119,7 @@ def person_clouds(
 ) -> Iterator[PersonCloud | None]:
     """The cloud of every frame in order, about ``count`` points each; None = no depth, no mask."""
     with Frames.open(frames) as reader:
-        if reader.num_sets != seen.num_frames:
-            raise UserError(
-                f"{frames}: has {reader.num_sets} frame sets, expected {seen.num_frames} as in the "
-                "scene artefact; re-run stage 'scene' for this sequence"
-            )
+        reader = reader.showing(seen.image_of)
         for t in range(seen.num_frames):
             yield _fused(reader, seen, t, count, device)
 

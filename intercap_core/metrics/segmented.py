@@ -26,17 +26,6 @@ class ViewMasks:
     object_: Runs | None
 
 
-def shown_set(slip: np.ndarray, t: int, c: int) -> int | None:
-    """The frame set whose image of camera ``c`` shows moment ``t``; None where none does.
-
-    ``slip`` (T, C): image of set s was taken ``slip[s, c]`` frames late and shows s + slip.
-    """
-    first = max(0, t - 8)
-    near = np.arange(first, min(len(slip), t + 9))
-    match = near[near + slip[near, c] == t]
-    return int(match[0]) if len(match) else None
-
-
 def segmented_points(
     depth: np.ndarray, camera: Camera, masks: ViewMasks, near: np.ndarray, bias_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +78,9 @@ def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarr
 class SegmentedClouds:
     """Person's and object's points of every frame, over all views.
 
+    ``frames`` are read by the moment that their images show (:meth:`Frames.showing`);
     ``person_masks`` (T, C) of COCO RLE bytes, empty = none; ``candidate_masks`` the same of the
-    candidate that the object's track kept; ``slip`` (T, C) and ``depth_bias`` (C,) of the scene.
+    candidate that the object's track kept; ``depth_bias`` (C,) of the scene.
     """
 
     def __init__(
@@ -99,28 +89,23 @@ class SegmentedClouds:
         rig: Rig,
         person_masks: list[list[bytes]],
         candidate_masks: list[list[bytes]],
-        slip: np.ndarray,
         depth_bias: np.ndarray,
     ) -> None:
         self._frames = frames
         self._rig = rig
         self._masks = (person_masks, candidate_masks)
-        self._slip = slip
         self._bias = depth_bias
 
     def at(self, t: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points of person and object (N, 3) of frame ``t``, near the meshes' points (M, 3)."""
         person, object_ = [], []
         for c, camera in enumerate(self._rig):
-            shown = shown_set(self._slip, t, c)
-            if shown is None:
-                continue
-            depth = self._frames.depth(shown, c)
+            depth = self._frames.depth(t, c)
             if depth is None:
                 continue
             colour = camera.colour
             runs = [
-                Runs(masks[shown][c], colour.height, colour.width) if masks[shown][c] else None
+                Runs(masks[t][c], colour.height, colour.width) if masks[t][c] else None
                 for masks in self._masks
             ]
             bias = float(self._bias[c])

@@ -124,7 +124,10 @@ def choose_cameras(fit: Fit, rig: Rig, frames: Sequence[int], count: int) -> lis
 def overlays(
     images: Frames, rig: Rig, fit: Fit, cameras: Sequence[int], frames: Sequence[int]
 ) -> list[Overlay]:
-    """Pictures in the order of cameras, then frames; an image that is missing is left out."""
+    """Pictures in the order of cameras, then frames; an image that is missing is left out.
+
+    ``images`` are those that show each frame's moment (:meth:`Frames.showing`).
+    """
     result = []
     bodies = {t: fit.body(t) for t in frames}
     for c in cameras:

@@ -124,12 +124,13 @@ def _detail(
         parameters = read_parameters(joint)
         model = load_model(body_models, subjects[measured.subject].gender, parameters)
         fit = Fit(model, parameters, joint["rotation"], joint["translation"], mesh)
-    rig = Rig.from_scene(paths.scene)
+    with artefacts.read(paths.scene, SCENE) as scene:
+        rig, image_of = Rig.from_artefact(scene), scene["image_of"]
     chosen = choose_frames(measured.values["object_visible_to_cloud"], settings.frames)
     cameras = choose_cameras(fit, rig, chosen, settings.cameras)
     try:
         with Frames.open(paths.frames) as images:
-            return Detail(name, overlays(images, rig, fit, cameras, chosen))
+            return Detail(name, overlays(images.showing(image_of), rig, fit, cameras, chosen))
     except UserError as error:  # one image that does not decode must not cost the whole report
         log.warning("%s: no overlays: %s", name, error)
         return Detail(name, [], str(error))

@@ -64,6 +64,7 @@ def run(
     with contextlib.ExitStack() as stack:
         images = stack.enter_context(Frames.open(frames))
         setting = stack.enter_context(artefacts.read(scene, SCENE))
+        images = images.showing(setting["image_of"])
         clouds = _clouds(images, setting, detections, person, object_track)
         known = None
         if truth is not None:
@@ -106,7 +107,7 @@ def run(
 def _clouds(
     images: Frames, scene: artefacts.Artefact, detections: Path, person: Path, object_track: Path
 ) -> SegmentedClouds:
-    found = Detections.load(detections)
+    found = Detections.load(detections).showing(scene["image_of"])
     with artefacts.read(object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]
     with artefacts.read(person, PERSON) as people:
@@ -122,7 +123,6 @@ def _clouds(
         Rig.from_artefact(scene),
         person_masks,
         candidates,
-        scene["slip"],
         scene["depth_bias"],
     )
 

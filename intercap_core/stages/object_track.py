@@ -27,7 +27,7 @@ TRACKING_FACES = 600  # of the mesh that is rendered; kept within 0.5 mm of the 
 
 
 class _Recording:
-    """The views of every frame set, read from the artefacts when asked for."""
+    """The views of every moment, read from the artefacts when asked for."""
 
     def __init__(
         self,
@@ -37,13 +37,12 @@ class _Recording:
         person: Path,
         diameter_m: float,
     ) -> None:
-        self._frames = frames
-        self._detections = detections
         rig = Rig.from_scene(scene)
         with artefacts.read(scene, SCENE) as artefact:
             present = artefact["present"]
             bias = artefact["depth_bias"]
-            self._slip = artefact["slip"]
+            self._frames = frames.showing(artefact["image_of"])
+            self._detections = detections.showing(artefact["image_of"])
             self.up = artefact["zup_from_master"][2, :3].copy()
         with artefacts.read(person, PERSON) as artefact:
             masks = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
@@ -55,43 +54,27 @@ class _Recording:
             for c in self.cameras
         ]
 
-    def image_of(self, t: int, c: int) -> int:
-        """The set whose image of camera c shows the moment of set t, -1 where there is none."""
-        source = t - int(self._slip[t, c])
-        if not 0 <= source < self._frames.num_sets or not self._frames.available[source, c]:
-            return -1
-        return source
-
     def views(self, t: int) -> list[View]:
-        """What each usable camera shows of set t."""
+        """What each usable camera shows of moment t."""
         found = []
         for c, geometry in zip(self.cameras, self._geometry, strict=True):
-            source = self.image_of(t, c)
-            if source < 0:
-                found.append(View.build(geometry, None, b"", []))
-                continue
             candidates = [
                 (candidate.index, candidate.label, candidate.score, candidate.rle)
-                for candidate in self._detections.candidates(source, c)
+                for candidate in self._detections.candidates(t, c)
             ]
-            found.append(
-                View.build(
-                    geometry, self._frames.depth(source, c), self._masks[source][c], candidates
-                )
-            )
+            depth = self._frames.depth(t, c)
+            found.append(View.build(geometry, depth, self._masks[t][c], candidates))
         return found
 
     def labels(self) -> list[list[list[str]]]:
         """Labels [T][usable cameras][candidates] of what was detected."""
-        result = []
-        for t in range(self._frames.num_sets):
-            row = []
-            for c in self.cameras:
-                source = self.image_of(t, c)
-                found = self._detections.candidates(source, c) if source >= 0 else []
-                row.append([candidate.label for candidate in found])
-            result.append(row)
-        return result
+        return [
+            [
+                [candidate.label for candidate in self._detections.candidates(t, c)]
+                for c in self.cameras
+            ]
+            for t in range(self._frames.num_sets)
+        ]
 
 
 def run(

@@ -30,13 +30,14 @@ def run(*, detections: Path, scene: Path, output: Path, settings: PersonSettings
     found = Detections.load(detections)
     with artefacts.read(scene, SCENE) as source:
         rig = Rig.from_artefact(source)
-        times = source["times"]
+        times, image_of = source["times"], source["image_of"]
     if rig.names != found.camera_names or len(times) != found.num_sets:
         raise UserError(
             f"{detections} and {scene}: cameras or frame sets differ ({len(found.camera_names)} "
             f"cameras, {found.num_sets} sets against {len(rig)} and {len(times)}); re-run stages "
             "'detections' and 'scene' for this sequence"
         )
+    found = found.showing(image_of)
     person = find_subject(found, rig, times, min_confidence=settings.min_confidence)
     keypoints = subject_keypoints(found, person)
     keypoints, points = triangulate_people(

@@ -10,7 +10,6 @@ from intercap_core.metrics import body, contact, flags, motion, object_pose, pen
 from intercap_core.metrics.clouds import Cloud, sample_surface, vertex_to_cloud, visible_to_cloud
 from intercap_core.metrics.extrinsics import displacement, rig_centre
 from intercap_core.metrics.proximity import PosedObject, Sight, distance_to_body, face_normals
-from intercap_core.metrics.segmented import shown_set
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -284,8 +283,3 @@ def test_flags_join_reasons_and_runs() -> None:
     reasons = flags.merge_reasons([(first, "a"), (second, "b")])
     assert reasons == ["a", "a; b", "b", "", "a"]
     assert flags.ranges(["a", "a", "", "b", "a", "a"]) == [(0, 1, "a"), (3, 3, "b"), (4, 5, "a")]
-
-
-def test_a_slipped_image_is_taken_from_the_set_that_shows_the_moment() -> None:
-    slip = np.array([[0], [0], [1], [1], [0]])
-    assert [shown_set(slip, t, 0) for t in range(5)] == [0, 1, None, 2, 3]

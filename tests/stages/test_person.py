@@ -38,7 +38,9 @@ def write_scene(path: Path, rig: Rig, sets: int) -> Path:
             writer.put(key, rig.master_from_colour)
         for key in ("depth_bias", "time_offset"):
             writer.put(key, np.zeros(count))
+        writer.put("time_offset_sigma", np.full(count, np.nan))
         writer.put("slip", np.zeros((sets, count), int))
+        writer.put("image_of", np.arange(sets)[:, None].repeat(count, 1))
         writer.put("pairs", np.zeros((0, 2), int))
         for key in ("pair_points", "pair_residual_before", "pair_residual_after"):
             writer.put(key, np.zeros(0, int))
