@@ -1,0 +1,48 @@
+"""Velocities from positions of single frames, some of which are wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+MAX_GAP_S = 0.25  # positions farther apart in time say little about the velocity between
+LIMIT = 2.0  # of the slower one-sided difference, beyond which the other one is a jump
+
+
+def limited_velocity(
+    positions: np.ndarray,
+    times: np.ndarray,
+    *,
+    max_speed: float,
+    known: np.ndarray | None = None,
+) -> np.ndarray:
+    """Central differences (T, ..., D) of ``positions`` (T, ..., D) by ``times`` (T,), seconds.
+
+    One wrong position between right ones makes one of its neighbours' one-sided differences large:
+    a velocity is no longer than ``LIMIT`` times the shorter of the two (van Leer's limiter of
+    slopes, 1977, for vectors), nor than ``max_speed``. Positions that are not ``known`` (T, ...)
+    have velocity 0 and are nobody's neighbour; with one neighbour the one-sided difference counts.
+    """
+    known = np.isfinite(positions).all(-1) if known is None else known
+    if len(times) < 2:
+        return np.zeros(positions.shape)
+    step = np.diff(times).reshape(-1, *[1] * (positions.ndim - 1))
+    both = known[1:] & known[:-1] & (step[..., 0] < MAX_GAP_S)
+    slope = np.where(both[..., None], np.diff(np.where(known[..., None], positions, 0), axis=0), 0)
+    slope = slope / step
+    none, still = np.zeros((1, *both.shape[1:]), bool), np.zeros((1, *slope.shape[1:]))
+    ahead, behind = np.concatenate([slope, still]), np.concatenate([still, slope])
+    has_ahead, has_behind = np.concatenate([both, none]), np.concatenate([none, both])
+    after, before = np.concatenate([step, step[-1:]]), np.concatenate([step[:1], step])
+    central = (before * ahead + after * behind) / (before + after)
+    longest = LIMIT * np.minimum(_length(ahead), _length(behind))
+    central = _shortened(central, longest)
+    two = (has_ahead & has_behind)[..., None]
+    return _shortened(np.where(two, central, ahead + behind), max_speed)
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _shortened(vectors: np.ndarray, longest: np.ndarray | float) -> np.ndarray:
+    return vectors * np.minimum(1.0, longest / np.maximum(_length(vectors), 1e-12))
