@@ -78,9 +78,9 @@ def _read_rig_file(path: Path) -> Extrinsics:
                 f"{path}: camera {name!r} has no rigid 4x4 'master_from_camera' (rows of rotation "
                 "and translation in metres, last row 0 0 0 1); correct it"
             )
-        _check_distance(path, f"camera {name!r}", pose[:3, 3])
+        check_distance(path, f"camera {name!r}", pose[:3, 3])
         poses[name] = pose
-    return _relative_to(master, poses)
+    return relative_to(master, poses)
 
 
 def _read_release_folder(folder: Path) -> Extrinsics:
@@ -111,12 +111,13 @@ def _read_release_folder(folder: Path) -> Extrinsics:
                 f"{path}: 'R' or 'T' holds a value that is not a finite number; calibrate this "
                 "camera again"
             )
-        _check_distance(path, "the camera", shift)
-        poses[f"k{number}"] = invert(rigid(_rotation_matrix(turn), shift))
-    return _relative_to("k1", poses)
+        check_distance(path, "the camera", shift)
+        poses[f"k{number}"] = invert(rigid(rotation_matrix(turn), shift))
+    return relative_to("k1", poses)
 
 
-def _check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
+def check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
+    """Raise UserError where a translation (3,) is too far for metres."""
     distance = float(np.abs(shift).max())
     if distance > MAX_DISTANCE_M:
         raise UserError(
@@ -125,7 +126,7 @@ def _check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
         )
 
 
-def _relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
+def relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
     """Express the poses in the master's frame; exactly the identity for the master itself."""
     master_from_world = invert(world_from_camera[master])
     poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
@@ -133,7 +134,7 @@ def _relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extri
     return Extrinsics(master, poses)
 
 
-def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
     """Rodrigues' formula: rotation vector (3,), radians, to matrix (3, 3)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:

@@ -1,0 +1,263 @@
+"""Calibration files in OpenCV's terms: lenses, depth lenses and poses of all cameras of a rig.
+
+JSON or YAML, by hand or as ``cv2.FileStorage`` writes it; docs/recordings.md shows an example.
+A lens has 4, 5 or 8 distortion coefficients in OpenCV's order (k1, k2, p1, p2[, k3[, k4, k5, k6]]);
+a pose is R, T of x_camera = R x_world + T, metres.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from intercap_core.camera.extrinsics_files import (
+    CAMERA_NAME,
+    Extrinsics,
+    check_distance,
+    relative_to,
+    rotation_matrix,
+)
+from intercap_core.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
+from intercap_core.camera.transforms import invert, is_rigid, rigid
+from intercap_core.errors import UserError
+
+SUFFIXES = (".json", ".yaml", ".yml")
+COEFFICIENTS = (4, 5, 8)
+ALIGNED = "aligned"
+MAX_OFF_CENTRE = 0.25  # of the image's width or height, of a principal point; 0.03 is usual
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedCamera:
+    """One camera of the file; ``fps`` None = not stated; times are in seconds."""
+
+    colour: Intrinsics
+    depth: Intrinsics | None = None
+    colour_from_depth: np.ndarray | None = None
+    fps: float | None = None
+    time_offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A whole file: cameras by name, and their poses."""
+
+    cameras: dict[str, CalibratedCamera]
+    extrinsics: Extrinsics
+
+
+def read_opencv_calibration(path: Path) -> Calibration:
+    """Read a calibration file, or a folder with one file a camera, ``<camera>.json|yaml|yml``.
+
+    Raises UserError naming file, camera and field where something is missing or impossible.
+    """
+    path = Path(path)
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+        content: dict[str, Any] = {"cameras": {file.stem: _load(file) for file in files}}
+    else:
+        content = _load(path)
+    entries = content.get("cameras")
+    if not isinstance(entries, dict) or not entries:
+        raise UserError(
+            f"{path}: expected 'cameras' with an entry for each camera (or a folder of files, one "
+            "a camera); docs/recordings.md shows one"
+        )
+    master = content.get("master", next(iter(entries)))
+    if master not in entries:
+        raise UserError(
+            f"{path}: master {master!r} is none of the cameras ({', '.join(map(str, entries))}); "
+            "correct the name or add the camera"
+        )
+    fps = _positive(content, "fps", f"{path}")
+    cameras, poses = {}, {}
+    for name, entry in entries.items():
+        where = f"{path}: camera {name!r}"
+        if not isinstance(entry, dict) or not CAMERA_NAME.fullmatch(str(name)):
+            raise UserError(
+                f"{where}: expected a name of letters, digits, '_' and '-', and fields such as "
+                "camera_matrix; correct it"
+            )
+        cameras[str(name)] = _camera(entry, where, fps)
+        poses[str(name)] = _pose(entry, where, path, is_master=name == master)
+    return Calibration(cameras, relative_to(str(master), poses))
+
+
+def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:
+    """Make a lens of ``size`` (width, height) from a matrix (3, 3) and 4, 5 or 8 coefficients.
+
+    Its metric radius ends where the distortion turns back, so that nothing outside the view is
+    projected into the image. Raises UserError, beginning with ``where``, for what is no lens.
+    """
+    k, d = _numbers(matrix, where, "camera_matrix"), _numbers(coefficients, where, "distortion")
+    d = d.ravel()
+    if d.size not in COEFFICIENTS:
+        more = (
+            "; thin prism and tilt are not supported: calibrate with CALIB_RATIONAL_MODEL alone"
+            if d.size in (12, 14)
+            else ""
+        )
+        raise UserError(
+            f"{where}: distortion_coefficients has {d.size} numbers, expected 4, 5 or 8{more}"
+        )
+    plain = k.shape == (3, 3) and k[0, 1] == 0 and k[1, 0] == 0 and (k[2] == [0, 0, 1]).all()
+    if not plain or min(k[0, 0], k[1, 1]) <= 0:
+        raise UserError(
+            f"{where}: camera_matrix is no [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; "
+            "correct it"
+        )
+    if (np.abs(k[:2, 2] / size - 0.5) > MAX_OFF_CENTRE).any():
+        raise UserError(
+            f"{where}: the principal point {k[0, 2]:.0f}, {k[1, 2]:.0f} is that of images of about "
+            f"{2 * k[0, 2]:.0f}x{2 * k[1, 2]:.0f}, image_size is {size[0]}x{size[1]}; give the "
+            "calibration of this resolution"
+        )
+    distortion = np.concatenate([d, np.zeros(8 - d.size)])
+    arguments = (*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], distortion)
+    turn = turning_radius(distortion)
+    corners = np.array([[0, 0], [size[0], 0], [0, size[1]], size]) - 0.5
+    widest = np.linalg.norm(Intrinsics(*arguments, turn).unproject(corners)[:, :2], axis=1).max()
+    return Intrinsics(*arguments, min(turn, max(1.1 * float(widest), DEFAULT_METRIC_RADIUS)))
+
+
+def turning_radius(distortion: np.ndarray) -> float:
+    """Return the radius up to which a point farther out is also imaged farther out.
+
+    ``distortion`` (8,). The radial part of OpenCV's model, r d(r^2), must grow and stay finite;
+    5 where it does so over all of 80 degrees.
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = distortion
+    radius = np.linspace(0, 5, 50001)
+    s = radius * radius
+    below = 1 + s * (k4 + s * (k5 + s * k6))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        image = radius * (1 + s * (k1 + s * (k2 + s * k3))) / below
+    bad = np.flatnonzero((np.diff(image) <= 0) | (below[1:] <= 0) | ~np.isfinite(image[1:]))
+    return float(radius[max(1, bad[0])] if len(bad) else radius[-1])
+
+
+def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
+    colour = _lens(entry, where)
+    offset = _numbers(entry.get("time_offset", 0.0), where, "time_offset")
+    if offset.size != 1:
+        raise UserError(f"{where}: time_offset is {offset.tolist()}, expected seconds; correct it")
+    depth = entry.get("depth")
+    lens, between = None, None
+    if depth == ALIGNED:
+        lens, between = colour, np.eye(4)
+    elif isinstance(depth, dict):
+        lens = _lens(depth, f"{where}, depth")
+        between = _numbers(depth.get("colour_from_depth"), where, "depth.colour_from_depth")
+        if not is_rigid(between):
+            raise UserError(
+                f"{where}: depth.colour_from_depth is no rigid 4x4 transform (x_colour = R x_depth "
+                "+ t, metres, last row 0 0 0 1); correct it"
+            )
+    elif depth is not None:
+        raise UserError(
+            f"{where}: depth is {depth!r:.40}, expected {ALIGNED!r} or a lens with "
+            "colour_from_depth; correct it"
+        )
+    own = _positive(entry, "fps", where)
+    return CalibratedCamera(colour, lens, between, own or fps, float(offset.ravel()[0]))
+
+
+def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
+    for key in ("camera_matrix", "distortion_coefficients"):
+        if key not in entry:
+            raise UserError(f"{where}: has no {key}; add it")
+    size = entry.get("image_size", [entry.get("image_width"), entry.get("image_height")])
+    numbers = _numbers(size, where, "image_size").ravel()
+    if numbers.size != 2 or (numbers < 1).any() or (numbers != numbers.round()).any():
+        raise UserError(f"{where}: image_size is {size!r:.60}, expected width and height in pixels")
+    width, height = (int(number) for number in numbers)
+    return opencv_lens(
+        (width, height), entry["camera_matrix"], entry["distortion_coefficients"], where
+    )
+
+
+def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> np.ndarray:
+    """World from camera (4, 4)."""
+    turn, shift = (entry.get(a, entry.get(b)) for a, b in (("R", "rvec"), ("T", "tvec")))
+    if turn is None and shift is None and is_master:
+        return np.eye(4)
+    if turn is None or shift is None:
+        raise UserError(
+            f"{where}: has no pose; add R (3x3, or a rotation vector) and T with x_camera = R "
+            "x_world + T, metres"
+        )
+    r, t = _numbers(turn, where, "R"), _numbers(shift, where, "T").ravel()
+    r = rotation_matrix(r.ravel()) if r.size == 3 else r
+    if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
+        raise UserError(
+            f"{where}: R is no rotation (3x3, or a vector of 3) or T no vector of 3; correct it"
+        )
+    check_distance(path, f"camera {where.rpartition(' ')[2]}", t)
+    return invert(rigid(r, t))
+
+
+def _numbers(value: Any, where: str, field: str) -> np.ndarray:
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.full(1, np.nan)
+    if not np.isfinite(numbers).all():
+        raise UserError(f"{where}: {field} is {value!r:.60}, expected finite numbers; correct it")
+    return numbers
+
+
+def _positive(entry: dict[str, Any], field: str, where: str) -> float | None:
+    value = entry.get(field)
+    if value is None:
+        return None
+    number = _numbers(value, where, field)
+    if number.size != 1 or number.ravel()[0] <= 0:
+        raise UserError(f"{where}: {field} is {value!r:.60}, expected one positive number")
+    return float(number.ravel()[0])
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, which also knows OpenCV's matrices."""
+
+
+def _matrix(entry: dict[Any, Any]) -> Any:
+    """Rows of a matrix as ``cv2.FileStorage`` writes it."""
+    try:
+        return np.array(entry["data"], np.float64).reshape(entry["rows"], entry["cols"]).tolist()
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _yaml_matrix(loader: yaml.SafeLoader, node: Any) -> Any:
+    return _matrix(loader.construct_mapping(node, deep=True))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _yaml_matrix)
+
+
+def _json_object(entry: dict[str, Any]) -> Any:
+    return _matrix(entry) if entry.get("type_id") == "opencv-matrix" else entry
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not text in UTF-8"
+        raise UserError(f"{path}: cannot be read ({reason}); check the path") from None
+    try:
+        if path.suffix.lower() == ".json":
+            content = json.loads(text, object_hook=_json_object)
+        else:  # OpenCV's first line, %YAML:1.0, is none of YAML's own
+            content = yaml.load(text.removeprefix("%YAML:1.0"), _Loader)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        problem = getattr(error, "problem", None) or getattr(error, "msg", None) or "nested"
+        raise UserError(f"{path}: is not valid JSON or YAML ({problem}); correct it") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected names and values, found {type(content).__name__}")
+    return content
