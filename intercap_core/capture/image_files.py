@@ -5,6 +5,7 @@ Depth here lies on the colour image's pixel grid, so that both have one lens.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -15,14 +16,11 @@ import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
+from intercap_core.capture.encoded import PNG_END, PNG_START, encoded_size
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.errors import UserError
 
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB\x60\x82"
 GREY_TYPE = 0  # PNG colour type of one channel
-# Start-of-frame markers hold the size; C4, C8 and CC in their range are other tables.
-_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 class DamagedImage(Exception):
@@ -37,32 +35,12 @@ class Shot(NamedTuple):
     depth: Path | None
 
 
-def jpeg_size(content: bytes) -> tuple[int, int]:
-    """Return width and height that the head of a JPEG states, without decoding it.
-
-    Raises :class:`DamagedImage` where there is none.
-    """
-    if not content.startswith(JPEG_START):
-        raise DamagedImage("is no JPEG")
-    at = 2
-    while at + 9 <= len(content) and content[at] == 0xFF:
-        marker = content[at + 1]
-        if marker == 0xFF:  # padding
-            at += 1
-            continue
-        if marker in _SIZE_MARKERS:
-            height, width = struct.unpack_from(">HH", content, at + 5)
-            return width, height
-        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
-    raise DamagedImage("is a JPEG without a size in its head")
-
-
-def read_jpeg(path: Path, size: tuple[int, int]) -> bytes:
-    """Return a whole JPEG file of ``size`` as it is; raises :class:`DamagedImage`."""
+def read_colour(path: Path, size: tuple[int, int]) -> bytes:
+    """Return a whole JPEG or PNG file of ``size`` as it is; raises :class:`DamagedImage`."""
     content = _read(path)
-    found = jpeg_size(content)
-    if not content.rstrip(b"\0").endswith(JPEG_END):
-        raise DamagedImage("is cut off")
+    found = encoded_size(content)
+    if found is None:
+        raise DamagedImage("is no whole JPEG")
     _check_size(found, size)
     return content
 
@@ -74,7 +52,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
     """
     content = _read(path)
     _check_depth_head(content, size)
-    if not content.rstrip(b"\0").endswith(PNG_END):
+    if not content.endswith(PNG_END):
         raise DamagedImage("is cut off")
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint16 or image.shape != size[::-1]:
@@ -107,12 +85,12 @@ def _read(path: Path, length: int = -1) -> bytes:
 
 
 def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
-    """Return width and height of the first JPEG that states them; None where none does."""
+    """Return width and height of the first whole image; None where none does."""
     for path in paths:
-        try:
-            return jpeg_size(_read(path))
-        except DamagedImage:
-            continue
+        with contextlib.suppress(DamagedImage):
+            size = encoded_size(_read(path))
+            if size is not None:
+                return size
     return None
 
 
@@ -121,7 +99,7 @@ class AlignedRecording(CameraRecording):
 
     ``shots`` are in order of time. A camera none of whose depth files is a 16-bit PNG of the
     colour image's size is one without depth, with a note. Raises UserError, naming ``source``,
-    where no colour file is as large as the lens says.
+    where there is no colour file at all.
     """
 
     def __init__(
@@ -136,8 +114,8 @@ class AlignedRecording(CameraRecording):
     ) -> None:
         self._shots, self._size = shots, (lens.width, lens.height)
         fault = self._fault_of_depth()
-        depth = None if fault else lens
-        camera = Camera(name, lens, depth, None if fault else np.eye(4), pose)
+        aligned = not fault and any(shot.depth for shot in shots)
+        camera = Camera(name, lens, lens if aligned else None, np.eye(4) if aligned else None, pose)
         super().__init__(source, camera, fps=fps)
         if fault:
             self.notes.append(fault)
@@ -145,7 +123,7 @@ class AlignedRecording(CameraRecording):
             raise UserError(f"{source}: holds no colour image; copy this camera's images again")
 
     def _fault_of_depth(self) -> str:
-        """Why the camera has no depth; empty where some file's head is as it must be."""
+        """What is wrong with all depth files; empty where some file's head is as it must be."""
         fault = ""
         for path in (shot.depth for shot in self._shots if shot.depth is not None):
             try:
@@ -153,7 +131,7 @@ class AlignedRecording(CameraRecording):
                 return ""
             except DamagedImage as error:
                 fault = fault or f"no depth used: {path.name} {error}"
-        return fault or "no depth images"
+        return fault
 
     def images(self) -> Iterator[Image]:
         """Colour files as they are, depth decoded; damaged ones are left out and counted."""
@@ -162,7 +140,7 @@ class AlignedRecording(CameraRecording):
         for time_us, colour, depth in self._shots:
             if colour is not None:
                 try:
-                    yield Image("colour", time_us, read_jpeg(colour, self._size))
+                    yield Image("colour", time_us, read_colour(colour, self._size))
                 except DamagedImage as error:
                     damaged.append(f"{colour.name} {error}")
             if self.camera.depth is None:
