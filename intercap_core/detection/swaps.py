@@ -28,8 +28,8 @@ def triangulate_people(
 ) -> tuple[np.ndarray, Triangulation]:
     """Triangulate the subject, exchanging sides where views say so.
 
-    ``keypoints`` (T, C, 135, 3) x, y, confidence. Returns them with limbs exchanged back, and the
-    triangulation of T * 135 points, set by set.
+    ``keypoints`` (T, C, 135, 3 or more): x, y, confidence, and whatever else goes with a point.
+    Returns them with limbs exchanged back, and the triangulation of T * 135 points, set by set.
     """
     keypoints = keypoints.copy()
     found = _triangulate(keypoints, rig, min_confidence, max_error_px)
@@ -50,8 +50,8 @@ def exchange(
     min_confidence: float,
     max_error_px: float,
 ) -> int:
-    """Exchange in place the limbs of ``keypoints`` (T, C, 135, 3) that fit ``points`` (T, 135, 3)
-    much better the other way; return how many."""
+    """Exchange in place the limbs of ``keypoints`` (T, C, 135, 3 or more) that fit ``points``
+    (T, 135, 3) much better the other way; return how many."""
     sets, views = keypoints.shape[:2]
     known = np.isfinite(points[..., 0])
     pixels = reproject(np.nan_to_num(points.reshape(-1, 3), nan=1.0), rig)
@@ -90,6 +90,7 @@ def _cost(
 def _triangulate(
     keypoints: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
 ) -> Triangulation:
-    by_point = np.swapaxes(keypoints, 1, 2).reshape(-1, len(rig), 3).astype(np.float64)
+    points = np.swapaxes(keypoints[..., :3], 1, 2).astype(np.float64)
+    by_point = points.reshape(-1, len(rig), 3)
     weights = np.where(by_point[..., 2] >= min_confidence, by_point[..., 2], 0)
     return triangulate(by_point[..., :2], weights, rig, max_error_px=max_error_px)

@@ -10,6 +10,7 @@ from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
 from intercap_core.config import PersonSettings
+from intercap_core.detection.exposure import at_set_times
 from intercap_core.detection.person_masks import choose_mask
 from intercap_core.detection.read import Detections
 from intercap_core.detection.sides import BODY_POINTS
@@ -31,6 +32,7 @@ def run(*, detections: Path, scene: Path, output: Path, settings: PersonSettings
     with artefacts.read(scene, SCENE) as source:
         rig = Rig.from_artefact(source)
         times, image_of = source["times"], source["image_of"]
+        time_offset = source["time_offset"]
     if rig.names != found.camera_names or len(times) != found.num_sets:
         raise UserError(
             f"{detections} and {scene}: cameras or frame sets differ ({len(found.camera_names)} "
@@ -40,12 +42,15 @@ def run(*, detections: Path, scene: Path, output: Path, settings: PersonSettings
     found = found.showing(image_of)
     person = find_subject(found, rig, times, min_confidence=settings.min_confidence)
     keypoints = subject_keypoints(found, person)
-    keypoints, points = triangulate_people(
-        keypoints,
+    # rays of one moment meet; what is written down is where each camera saw the points
+    moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=settings.min_confidence)
+    moved, points = triangulate_people(
+        np.concatenate([moved, keypoints[..., :2]], -1),
         rig,
         min_confidence=settings.min_confidence,
         max_error_px=settings.max_reprojection_px,
     )
+    keypoints = moved[..., [3, 4, 2]]
     missing = (person != NOBODY).sum(1) < 2
     if missing.all():
         raise UserError(
