@@ -57,6 +57,7 @@ class Schema:
     stage: str
     fields: Mapping[str, Field]
     attributes: Mapping[str, str] = field(default_factory=dict)  # name -> what it says
+    optional_attributes: Mapping[str, str] = field(default_factory=dict)  # files may lack them
     frame: str = "master colour camera: x right, y down, z forward"
     units: str = "metres, seconds, radians unless a dataset says otherwise"
 
@@ -221,7 +222,8 @@ def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: st
         for key, declared in schema.fields.items()
         if not declared.optional and "{camera}" not in key and key not in file
     ]
-    unset = sorted(set(schema.attributes) ^ set(writer.attributes))
+    set_here = set(writer.attributes) - set(schema.optional_attributes)
+    unset = sorted(set(schema.attributes) ^ set_here)
     if missing or unset:
         raise ValueError(f"artefact {schema.name!r}: missing {missing}, attributes off: {unset}")
     file.attrs["schema"] = schema.name

@@ -166,6 +166,11 @@ class ExportSettings(Model):
     The intercap and bop layouts are in camera frames by definition."""
 
 
+StudioFault = Literal[
+    "dead_half", "no_depth", "zero_depth", "same_serial", "backwards_clock", "no_overlap"
+]
+
+
 class StudioCapture(Model):
     """One virtual recording."""
 
@@ -179,6 +184,10 @@ class StudioCapture(Model):
     """Number of frame sets."""
     annotate: bool = False
     """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
+    room: Literal["random", "furnished", "bare"] = "random"
+    """With walls and furniture, or only a floor; by chance one capture in five is bare."""
+    faults: tuple[StudioFault, ...] = ()
+    """What is broken in this recording on top of the usual errors; see docs/studio.md."""
 
 
 class StudioSettings(Model):
@@ -192,12 +201,16 @@ class StudioSettings(Model):
     """Scale of every error; 1 is the headline."""
     noise_family: Literal["a", "b"] = "a"
     """Shapes of the error distributions."""
-    colour_mode: Literal["720P", "1080P"] = "1080P"
+    colour_mode: Literal["720P", "1080P", "1440P", "1536P", "2160P", "3072P"] = "1080P"
     """Resolution of the colour cameras."""
+    depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
+        "NFOV_UNBINNED"
+    )
+    """Field of view and resolution of the depth cameras."""
     cameras: Annotated[int, Field(ge=1, le=16)] = 6
     """Kinects in the ring."""
     slips: Literal["missing", "silent"] = "missing"
-    """Up to two cameras lose frames, or deliver old frames whose device times do not tell."""
+    """Two cameras lose frames, or deliver old frames whose device times do not tell."""
 
 
 class BodyModels(Model):

@@ -208,6 +208,10 @@ def _artefact(schema: Schema) -> list[str]:
     ]
     lines += [f"- attribute `{name}`: {meaning}" for name, meaning in schema.attributes.items()]
     lines += [
+        f"- attribute `{name}` (optional): {meaning}"
+        for name, meaning in schema.optional_attributes.items()
+    ]
+    lines += [
         "",
         "| dataset | shape | type | units | frame | meaning |",
         "|---|---|---|---|---|---|",

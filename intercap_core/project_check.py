@@ -37,7 +37,8 @@ def check_device(project: Project) -> None:
 def faults_of_sequences(project: Project) -> list[Fault]:
     """Check what every sequence needs: annotation, files, mesh, poses, the heads of recordings.
 
-    Recordings that the studio is to make are not missed; images are not read.
+    Recordings that the studio is to make are not missed, but it must be able to make them; images
+    are not read.
     """
     meshes = {
         name: _fault_of_mesh(project, name)
@@ -53,6 +54,7 @@ def faults_of_sequences(project: Project) -> list[Fault]:
         if mesh is not None:
             faults.append(Fault(name, mesh))
         if project.recordings_made(name) is not None:
+            faults += [Fault(name, message) for message in _faults_of_capture(project, name)]
             continue
         faults += [Fault(name, message) for message in _faults_of_files(row)]
     return faults
@@ -76,6 +78,18 @@ def _fault_of_mesh(project: Project, name: str) -> str | None:
     except UserError as error:
         return str(error)
     return None
+
+
+def _faults_of_capture(project: Project, name: str) -> list[str]:
+    from intercap_core.studio.stage import check_capture
+
+    settings = project.config.studio
+    assert settings is not None
+    try:
+        check_capture(settings.captures[name], settings, project.sequences[name].object)
+    except UserError as error:
+        return [f"{project.path}: {error}"]
+    return []
 
 
 def _faults_of_files(row: SequenceEntry) -> list[str]:

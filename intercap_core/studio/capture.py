@@ -7,7 +7,6 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
@@ -65,8 +64,7 @@ def make_capture(
         moment,
         sequence,
         capture,
-        np.stack([r.object_pixels for r in recorded], 1),
-        np.stack([r.object_whole for r in recorded], 1),
+        recorded,
     )
     if capture.annotate:
         text = yaml.safe_dump(erring_annotation(stage, moment, contact), sort_keys=True)

@@ -145,6 +145,10 @@ class MkvWriter:
         stamp = struct.pack("<Q", time_ns)
         self._write("IMU", stamp + acc + stamp + gyro, device_time_us)
 
+    def turn_back(self) -> None:
+        """Let the next image be older than the last: a device's clock jumped back."""
+        self._flush_cluster()
+
     def close(self) -> None:
         """Write the index, fill in sizes and positions, and close the file; safe to call twice."""
         if self._file.closed:

@@ -12,12 +12,13 @@ import open3d as o3d
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import invert
 from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH, write_calibration
+from intercap_core.studio.failures import CLOCK_FALLS_BACK_SETS
 from intercap_core.studio.keypoints import Detector, to_json
 from intercap_core.studio.looks import body_colours
 from intercap_core.studio.masks import Labels, Segmenter
 from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View, scene_of
-from intercap_core.studio.rig import DEPTH_MODE, STAGGER_S
+from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.sensor import DepthSensor
 from intercap_core.studio.stage import Moment, Stage
 
@@ -31,11 +32,14 @@ COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 
 @dataclass(frozen=True)
 class Recorded:
-    """Pixels of the object in this view: ``object_pixels`` (T,) seen, ``object_whole`` (T,) that it
-    would cover if nothing hid it."""
+    """What one camera has of every set: ``object_pixels`` (T,) of the object that are seen,
+    ``object_whole`` (T,) that it would cover if nothing hid it; ``colour`` and ``depth`` (T,) bool:
+    there is an image whose device time is the set's, and depth that is not empty."""
 
     object_pixels: np.ndarray
     object_whole: np.ndarray
+    colour: np.ndarray
+    depth: np.ndarray
 
 
 class Kinect:
@@ -45,8 +49,12 @@ class Kinect:
         self.stage, self.index, self.colour_mode = stage, index, colour_mode
         self.true: Camera = stage.rig.true[index]
         self.claimed: Camera = stage.rig.claimed[index]
-        self.serial = f"{100_000 + stage.noise.seed % 100_000:06d}{index + 1:06d}"
-        self.sets = [t for t in range(stage.frames) if t not in stage.rig.missing[index]]
+        self.broken = {kind for kind, at in stage.failures.broken.items() if at == index}
+        number = 1 if "same_serial" in self.broken else index + 1
+        self.serial = f"{100_000 + stage.noise.seed % 100_000:06d}{number:06d}"
+        end = stage.frames // 2 if "dead_half" in self.broken else stage.frames
+        self.sets = [t for t in range(end) if t not in stage.rig.missing[index]]
+        self.depth_mode = None if "no_depth" in self.broken else stage.depth_mode
 
     @property
     def exposures(self) -> np.ndarray:
@@ -55,10 +63,17 @@ class Kinect:
         offset = self.stage.rig.offset_s[self.index] + STAGGER_S * self.index
         return self.stage.set_times + offset - late
 
+    def fallen_back(self, t: int) -> bool:
+        """Whether the device's clock has jumped back before set ``t``."""
+        return "backwards_clock" in self.broken and t >= self.stage.frames // 2
+
     def device_time_us(self, t: int) -> int:
         """What the device says about the image of set ``t``."""
         stagger = round(STAGGER_S * 1e6) * self.index
-        return START_US + round(t * 1e6 / self.stage.fps) + stagger
+        jitter = round(self.stage.failures.jitter_s[t, self.index] * 1e6)
+        if self.fallen_back(t):
+            t -= min(CLOCK_FALLS_BACK_SETS, self.stage.frames // 2)
+        return START_US + round(t * 1e6 / self.stage.fps) + stagger + jitter
 
     def record(self, folder: Path, detector: Detector, segmenter: Segmenter) -> Recorded:
         """Write <camera>.mkv, keypoints/<camera>/ and candidates/<camera>.json."""
@@ -70,7 +85,7 @@ class Kinect:
         assert self.true.depth is not None
         colour_view = View(self.true.colour, colour_pose, stage.room, coloured=True)
         depth_view = View(self.true.depth, depth_pose, stage.room, coloured=False)
-        sensor = DepthSensor(depth_view, stage.noise, name)
+        sensor = DepthSensor(depth_view, stage.noise, name, stage.depth_mode)
         rng = stage.noise.rng("photo", name)
         gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
         photographer = Photographer(colour_view, gain, rng)
@@ -84,17 +99,27 @@ class Kinect:
         points = stage.keypoints(moment)
         hidden = np.zeros(points.shape[:2], bool)
         seen, whole = np.zeros(stage.frames, int), np.zeros(stage.frames, int)
+        empty = stage.failures.depth_empty[:, self.index]
+        has_depth = ~stage.failures.depth_away[:, self.index]
         candidates = []
+        last_us = 0
         with self._writer(folder / f"{name}.mkv") as writer:
             for number, t in enumerate(self.sets):
                 surfaces, normals = surfaces_at(stage, moment, t, colours)
                 scene = scene_of(*((s.vertices, s.faces) for s in surfaces))
                 cast = colour_view.cast(scene, surfaces, normals)
-                self._inertial(writer, t, rng, depth_pose)
+                inertial = self._inertial(t, rng, depth_pose)
                 jpeg = photographer.jpeg(photographer.photograph(cast))
-                writer.write_colour(jpeg, self.device_time_us(t))
                 depth = sensor.image(depth_view.cast(scene, surfaces, normals))
-                writer.write_depth(depth, self.device_time_us(t))
+                time_us = self.device_time_us(t)
+                if time_us < last_us:
+                    writer.turn_back()
+                writer.write_colour(jpeg, time_us)
+                if has_depth[t]:
+                    writer.write_depth(depth if not empty[t] else 0 * depth, time_us)
+                for sample in inertial:
+                    writer.write_imu(*sample)
+                last_us = time_us
                 hidden[t] = _hidden(scene, colour_view, points[t])
                 seen[t], whole[t] = self._object_pixels(cast, colour_view, surfaces[1])
                 truth = Labels(cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1))
@@ -102,35 +127,45 @@ class Kinect:
                     candidates.append({"image_id": number, **result})
         self._write_candidates(folder, candidates)
         self._write_keypoints(folder, detector, moment, points, hidden)
-        return Recorded(seen, whole)
+        colour = np.zeros(stage.frames, bool)
+        colour[[t for t in self.sets if not self.fallen_back(t)]] = True
+        return Recorded(seen, whole, colour, colour & has_depth & ~empty)
 
     def _writer(self, path: Path) -> MkvWriter:
         calibration = write_calibration(
-            self.claimed, colour_mode=self.colour_mode, depth_mode=DEPTH_MODE, serial=self.serial
+            self.claimed,
+            colour_mode=self.colour_mode,
+            depth_mode=self.stage.depth_mode,
+            serial=self.serial,
         )
         return MkvWriter(
             path,
             calibration_json=calibration,
             colour_mode=self.colour_mode,
-            depth_mode=DEPTH_MODE,
+            depth_mode=self.depth_mode,
             fps=self.stage.fps,
             serial=self.serial,
-            start_offset_ns=self.device_time_us(self.sets[0]) * 1000,
+            start_offset_ns=min(self.device_time_us(t) for t in self.sets) * 1000,
             wired_sync_mode="SUBORDINATE" if self.index else "MASTER",
             subordinate_delay_ns=round(STAGGER_S * 1e9) * self.index,
             with_imu=True,
         )
 
-    def _inertial(self, writer: MkvWriter, t: int, rng: np.random.Generator,
-                  stage_from_depth: np.ndarray) -> None:  # fmt: skip
-        """The device stands still: its accelerometer feels the ground push up."""
+    def _inertial(
+        self, t: int, rng: np.random.Generator, stage_from_depth: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray, int]]:
+        """Acceleration, turning rate and device time over one period of a device that stands
+        still: its accelerometer feels the ground push up."""
         up = ACCELEROMETER_FROM_DEPTH @ stage_from_depth[:3, :3].T @ (0, 0, GRAVITY)
-        period = 1_000_000 // self.stage.fps
-        for k in range(IMU_PER_FRAME):
-            time = self.device_time_us(t) + (k * period // IMU_PER_FRAME) // 3
-            writer.write_imu(
-                up + rng.normal(0, ACCELEROMETER_NOISE, 3), rng.normal(0, GYROSCOPE_NOISE, 3), time
+        first, period = self.device_time_us(t), 1_000_000 // self.stage.fps
+        return [
+            (
+                up + rng.normal(0, ACCELEROMETER_NOISE, 3),
+                rng.normal(0, GYROSCOPE_NOISE, 3),
+                first + k * period // IMU_PER_FRAME,
             )
+            for k in range(IMU_PER_FRAME)
+        ]
 
     def _object_pixels(self, cast: Cast, view: View, thing: Surface) -> tuple[int, int]:
         seen = int((cast.identity == OBJECT).sum())

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
+from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES, Mode
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import invert, rigid
 from intercap_core.studio.skeleton import turn, unit
@@ -19,11 +19,13 @@ RADIUS_M, RADIUS_SPREAD_M = 2.55, 0.2
 HEIGHTS_M, HEIGHT_SPREAD_M = (1.05, 2.05), 0.08
 AIM_HEIGHT_M = 0.85
 STAGGER_S = 160e-6  # the designed delay of each subordinate
-DEPTH_MODE = "NFOV_UNBINNED"
 EXTRINSIC_ERROR_M, EXTRINSIC_ERROR_DEG = 0.010, 0.5  # of the rig file, at noise 1
 FOCAL_ERROR, CENTRE_ERROR_PX = 3e-4, 0.25  # of the devices' own calibration
 MAX_OFFSET_S = 0.008
-MISSING_FRAMES = (1, 4)
+SLIPPING_CAMERAS = 2
+SLIPPED_FRAMES = (1, 4)
+SLIP_LASTS = (5, 20)  # sets until a silent slip is over
+SLIP_STAYS = 0.3  # share of the silent slips that last to the end
 COLOUR_FROM_DEPTH_M = (-0.0320, -0.0021, 0.0039)
 DEPTH_TILT_DEG = 5.6  # the depth camera looks down against the colour camera
 
@@ -53,22 +55,28 @@ def build_rig(
     cameras: int,
     frames: int,
     colour_mode: str,
+    depth_mode: str = "NFOV_UNBINNED",
     noise: float,
     slips: str = "missing",
+    overlap: bool = True,
 ) -> StudioRig:
     """Make a rig around the stage's origin; ``noise`` scales every error.
 
-    ``slips``: "missing" frames in up to two cameras, or "silent": their images are one to four
-    frames late for a while and the device times do not tell.
+    ``slips``: "missing" frames in two cameras, or "silent": their images are one to four frames
+    late for a while or from then on, and the device times do not tell. Without ``overlap`` all
+    cameras but the master look away.
     """
     stage_from_camera = _ring(rng, cameras)
+    if not overlap:
+        for pose in stage_from_camera[1:]:
+            pose[:3, :3] = turn(np.array([0, 0, np.pi])) @ pose[:3, :3]
     true, claimed = [], []
     master_from_stage = invert(stage_from_camera[0])
     for index in range(cameras):
         camera = Camera(
             f"k{index + 1}",
             _colour_lens(rng, colour_mode),
-            _depth_lens(rng),
+            _depth_lens(rng, depth_mode),
             _colour_from_depth(rng),
             master_from_stage @ stage_from_camera[index],
         )
@@ -140,19 +148,31 @@ def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
     )  # fmt: skip
 
 
-def _depth_lens(rng: np.random.Generator) -> Intrinsics:
-    width, height = DEPTH_MODES[DEPTH_MODE].size
+def _depth_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
+    narrow = DEPTH_MODES["NFOV_UNBINNED"]
+    width, height = narrow.size
     focal = 504.5 + rng.normal(0, 1.0)
     distortion = np.array([0.55, -0.02, -7e-5, 2e-5, -0.0027, 0.89, 0.086, -0.0139])
     shift = rng.normal(0, 0.05)
     distortion[0] += shift
     distortion[5] += shift + rng.normal(0, 0.002)
     distortion[2:4] += rng.normal(0, 5e-5, 2)
-    return Intrinsics(
+    lens = Intrinsics(
         width, height, focal, focal * (1 + rng.normal(0, 2e-4)),
         (width - 1) / 2 + rng.normal(8, 3), (height - 1) / 2 + rng.normal(14, 3),
         distortion, 1.74,
     )  # fmt: skip
+    return lens if mode == "NFOV_UNBINNED" else _in_mode(lens, narrow, DEPTH_MODES[mode])
+
+
+def _in_mode(lens: Intrinsics, mode: Mode, other: Mode) -> Intrinsics:
+    """The same glass and sensor read out in another mode."""
+    scale = other.binned[0] / mode.binned[0]
+    cx, cy = (np.array([lens.cx, lens.cy]) + mode.crop + 0.5) * scale - other.crop - 0.5
+    width, height = other.size
+    return replace(
+        lens, width=width, height=height, fx=lens.fx * scale, fy=lens.fy * scale, cx=cx, cy=cy
+    )
 
 
 def _colour_from_depth(rng: np.random.Generator) -> np.ndarray:
@@ -172,19 +192,20 @@ def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> I
 def _slips(
     rng: np.random.Generator, cameras: int, frames: int, kind: str, noise: float
 ) -> tuple[tuple[frozenset[int], ...], np.ndarray]:
-    """Frames that are missing, and silent slips (T, C), in up to two subordinate cameras; one
-    more camera starts late and one ends early."""
+    """Frames that are missing, or silent slips (T, C), in two subordinate cameras where there are
+    two; a camera starts late and one ends early."""
     missing: list[set[int]] = [set() for _ in range(cameras)]
     slip = np.zeros((frames, cameras), np.int32)
     others = np.arange(1, cameras)
     if len(others) == 0 or frames < 8 or noise == 0:
         return tuple(frozenset(m) for m in missing), slip
-    for camera in rng.permutation(others)[: rng.integers(1, 3)]:
-        length = int(rng.integers(MISSING_FRAMES[0], MISSING_FRAMES[1] + 1))
-        start = int(rng.integers(2, max(3, frames - length - 2)))
+    for camera in rng.permutation(others)[:SLIPPING_CAMERAS]:
+        length = int(rng.integers(SLIPPED_FRAMES[0], SLIPPED_FRAMES[1] + 1))
+        first = max(2, length)  # nothing is shown that was before the recording
+        start = int(rng.integers(first, max(first + 1, frames - length - 2)))
         if kind == "silent":
-            end = min(frames, start + int(rng.integers(5, 20)))
-            slip[start:end, camera] = min(length, start)
+            end = start + int(rng.integers(*SLIP_LASTS))
+            slip[start : frames if rng.random() < SLIP_STAYS else end, camera] = length
         else:
             missing[camera].update(range(start, min(frames, start + length)))
     late, early = rng.permutation(others)[[0, -1]]

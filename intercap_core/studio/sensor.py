@@ -6,13 +6,15 @@ Azure Kinect and its comparison to Kinect V1 and V2"): about 1 mm at 1 m, 10 mm 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
+from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.render import Cast, View
 
-NEAR_M, FAR_M = 0.45, 4.3
 NOISE_M, NOISE_PER_M2 = 0.0006, 0.00058  # standard deviation = a + b z^2
 SMOOTH_SHARE = 0.45  # of the noise's variance that neighbours share
 BIAS_M = 0.003  # of a camera
@@ -23,11 +25,31 @@ GRAZING_COSINE = 0.16
 DARK = 0.10  # albedo below which the light does not always come back
 
 
+@dataclass(frozen=True)
+class ModeLimits:
+    """Of one depth mode: nearest and farthest distance that is measured, somewhat beyond what the
+    data sheet warrants, and its noise against the narrow unbinned mode's."""
+
+    near_m: float
+    far_m: float
+    noise: float
+
+
+LIMITS = {
+    "NFOV_UNBINNED": ModeLimits(0.45, 4.3, 1.0),
+    "NFOV_2X2BINNED": ModeLimits(0.45, 6.0, 0.7),
+    "WFOV_2X2BINNED": ModeLimits(0.23, 3.2, 1.2),
+    "WFOV_UNBINNED": ModeLimits(0.23, 2.5, 2.0),
+}
+
+
 class DepthSensor:
     """One depth camera looking at the room through ``view``; errors from ``noise``."""
 
-    def __init__(self, view: View, noise: NoiseSource, name: str) -> None:
-        self.view, self._noise = view, noise
+    def __init__(
+        self, view: View, noise: NoiseSource, name: str, mode: str = "NFOV_UNBINNED"
+    ) -> None:
+        self.view, self._noise, self._limits = view, noise, LIMITS[mode]
         rng = noise.rng("depth", name)
         self._rng = rng
         self.bias = float(noise.tails(rng.normal(size=1))[0]) * BIAS_M * noise.scale
@@ -35,10 +57,7 @@ class DepthSensor:
         rays = view.lens.rays
         direction = np.dstack([rays, np.ones(rays.shape[:2], np.float32)]) @ view.rotation.T
         self._direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-        v, u = np.mgrid[: view.lens.height, : view.lens.width]
-        # the narrow field of view is a hexagon in the image
-        x, y = abs(u / (view.lens.width - 1) * 2 - 1), abs(v / (view.lens.height - 1) * 2 - 1)
-        self._in_field = (x + 0.55 * y < 1.42) & np.isfinite(rays[..., 0])
+        self._in_field = _field(view.lens, mode)
         self._static_holes = self._holes(
             view.depth, view.normal, self._direction, np.ones_like(view.depth), rng,
             persistent=True,
@@ -80,6 +99,7 @@ class DepthSensor:
         depth[~finite] = 0
         depth, lost = self._edges(depth, scale)
         sigma = np.float32(NOISE_M) + np.float32(NOISE_PER_M2) * depth * depth
+        sigma *= np.float32(self._limits.noise)
         white = rng.standard_normal(depth.shape, np.float32)
         soft = cv2.GaussianBlur(white, (3, 3), 0.9)
         own = rng.standard_normal(depth.shape, np.float32)
@@ -90,7 +110,7 @@ class DepthSensor:
         ripple = RIPPLE_M * np.sin(2 * np.pi * depth / RIPPLE_PERIOD_M + self._ripple)
         measured = depth + scale * (sigma * mixed + ripple.astype(np.float32)) + self.bias
         valid = finite & ~holes & ~lost & self._in_field
-        valid &= (measured > NEAR_M) & (measured < FAR_M)
+        valid &= (measured > self._limits.near_m) & (measured < self._limits.far_m)
         return np.where(valid, np.round(measured * 1000), 0).astype(np.uint16)
 
     def _edges(self, depth: np.ndarray, scale: np.float32) -> tuple[np.ndarray, np.ndarray]:
@@ -112,3 +132,12 @@ class DepthSensor:
             * np.where(depth[r, c] - near[r, c] < far[r, c] - depth[r, c], 1, -1)
         )
         return depth, lost
+
+
+def _field(lens: Intrinsics, mode: str) -> np.ndarray:
+    """Pixels (H, W) that the infrared light reaches: a hexagon in the narrow modes, a disc in the
+    wide ones."""
+    v, u = np.mgrid[: lens.height, : lens.width]
+    x, y = u / (lens.width - 1) * 2 - 1, v / (lens.height - 1) * 2 - 1
+    lit = abs(x) + 0.55 * abs(y) < 1.42 if mode.startswith("NFOV") else np.hypot(x, y) < 1
+    return lit & np.isfinite(lens.rays[..., 0])

@@ -14,6 +14,7 @@ from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.render import vertex_normals
+from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.interactions.base import TrueObject
 from intercap_core.studio.motion import Puppet
@@ -51,17 +52,8 @@ class Stage:
     def __init__(
         self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry
     ) -> None:
-        kind = interaction_named(capture.interaction)
-        if entry.name != kind.object_class:
-            raise UserError(
-                f"studio: interaction {capture.interaction!r} needs object {kind.object_class!r}, "
-                f"the sequence has {entry.name!r}; correct the sequence's object"
-            )
-        if capture.subject not in subject_names():
-            raise UserError(
-                f"studio: no subject {capture.subject!r}, there are {', '.join(subject_names())}; "
-                "correct 'subject' of the capture"
-            )
+        check_capture(capture, settings, entry.name)
+        self.depth_mode = settings.depth_mode
         self.frames, self.fps = capture.frames, settings.fps
         self.duration = capture.frames / settings.fps
         self.noise = NoiseSource(capture.seed, settings.noise, settings.noise_family, settings.fps)
@@ -72,6 +64,7 @@ class Stage:
             entry.name, vertices, faces, colours / 255.0, DistanceField(vertices, faces, threads=1)
         )
         self.bounds = np.stack([vertices.min(0), vertices.max(0)])
+        kind = interaction_named(capture.interaction)
         self.interaction = kind(self.puppet, self.thing, self.noise.rng("script"))
         rng = self.noise.rng("room")
         self.stage_from_script = _placed(rng, self.interaction.centre)
@@ -80,13 +73,20 @@ class Stage:
             cameras=settings.cameras,
             frames=capture.frames,
             colour_mode=settings.colour_mode,
+            depth_mode=settings.depth_mode,
             noise=settings.noise,
             slips=settings.slips,
+            overlap="no_overlap" not in capture.faults,
+        )
+        self.failures = Failures.draw(
+            self.noise, frames=capture.frames, cameras=settings.cameras, faults=capture.faults
         )
         furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
-        bare = bool(rng.random() < BARE_ROOM_SHARE)
+        by_chance = bool(rng.random() < BARE_ROOM_SHARE)
+        bare = by_chance if capture.room == "random" else capture.room == "bare"
         eyes = invert(self.rig.master_from_stage) @ self.rig.true.master_from_colour
         self.room = build_room(rng, furniture, eyes[:, :2, 3], bare=bare)
+        self.bare = bare
 
     @cached_property
     def set_times(self) -> np.ndarray:
@@ -141,6 +141,22 @@ class Stage:
         """Points (..., 3) of the stage in the master's colour frame."""
         pose = self.rig.master_from_stage
         return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def check_capture(capture: StudioCapture, settings: StudioSettings, object_name: str) -> None:
+    """Raise UserError for a subject, interaction, object or fault that the studio cannot play."""
+    kind = interaction_named(capture.interaction)
+    if object_name != kind.object_class:
+        raise UserError(
+            f"studio: interaction {capture.interaction!r} needs object {kind.object_class!r}, "
+            f"the sequence has {object_name!r}; correct the sequence's object"
+        )
+    if capture.subject not in subject_names():
+        raise UserError(
+            f"studio: no subject {capture.subject!r}, there are {', '.join(subject_names())}; "
+            "correct 'subject' of the capture"
+        )
+    check_faults(capture.faults, cameras=settings.cameras, frames=capture.frames)
 
 
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.config import StudioCapture
 from intercap_core.schemas import CONTACT_REGIONS, TRUTH
+from intercap_core.studio.recording import Recorded
 from intercap_core.studio.render import scene_of
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.skeleton import turn, unit
@@ -24,17 +26,18 @@ ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 
 
 
 def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture: StudioCapture,
-                seen: np.ndarray, whole: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Write the truth artefact of the set times' ``moment``.
+                recorded: Sequence[Recorded]) -> np.ndarray:  # fmt: skip
+    """Write the truth artefact of the set times' ``moment``; ``recorded`` by each camera.
 
-    ``seen`` and ``whole`` (T, C): pixels of the object, hidden and not. Returns the true region
-    contact (T, R).
+    Returns the true region contact (T, R).
     """
     rig = stage.rig
     master = rig.master_from_stage
     pose = master @ moment.stage_from_object
     contact = region_contact(stage, moment)
     body_visible, object_visible = visible(stage, moment)
+    seen = np.stack([camera.object_pixels for camera in recorded], 1)
+    whole = np.stack([camera.object_whole for camera in recorded], 1)
     views = (seen >= SEEN_PIXELS) & (seen >= SEEN_SHARE * np.maximum(whole, 1))
     normal = master[:3, 2]
     with artefacts.write(
@@ -46,6 +49,8 @@ def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture
         object=stage.thing.name,
         ground_offset=float(-normal @ master[:3, 3]),
         fps=float(stage.fps),
+        room="bare" if stage.bare else "furnished",
+        faults=", ".join(_faults(stage, capture)),
     ) as file:
         file.put("times", stage.set_times)
         file.put("body_vertices", stage.to_master(moment.body))
@@ -65,10 +70,18 @@ def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture
         file.put("master_from_colour", rig.true.master_from_colour)
         file.put("time_offset", rig.offset_s + STAGGER_S * np.arange(len(rig.offset_s)))
         file.put("slip", rig.slip)
+        file.put("recorded", np.stack([camera.colour for camera in recorded], 1))
+        file.put("depth_recorded", np.stack([camera.depth for camera in recorded], 1))
         file.put("ground_normal", normal)
         file.put("body_visible", body_visible)
         file.put("object_visible", object_visible)
     return contact
+
+
+def _faults(stage: Stage, capture: StudioCapture) -> list[str]:
+    """The faults that were asked for, those of one camera with its name."""
+    names, broken = stage.rig.true.names, stage.failures.broken
+    return [f"{kind} {names[broken[kind]]}" if kind in broken else kind for kind in capture.faults]
 
 
 def region_contact(stage: Stage, moment: Moment) -> np.ndarray:

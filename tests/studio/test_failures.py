@@ -1,0 +1,148 @@
+"""Slips, clocks, faults and depth modes: what a capture has on purpose, its truth says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.camera.k4a_calibration import DEPTH_MODES
+from intercap_core.capture.k4a import Recording
+from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.errors import UserError
+from intercap_core.schemas import TRUTH
+from intercap_core.studio.capture import make_capture
+from intercap_core.studio.failures import Failures, check_faults
+from intercap_core.studio.noise import NoiseSource
+from intercap_core.studio.recording import START_US
+from intercap_core.studio.rig import StudioRig, build_rig
+from intercap_core.studio.stage import check_capture
+
+FRAMES, FPS = 8, 5
+
+
+def rig_of(seed: int, **options: object) -> StudioRig:
+    settings = dict(cameras=6, frames=45, colour_mode="720P", noise=1.0) | options
+    return build_rig(np.random.default_rng(seed), **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_two_cameras_slip_by_one_to_four_frames(seed: int) -> None:
+    silent = rig_of(seed, slips="silent").slip
+    slipping = np.flatnonzero(silent.any(0))
+    assert len(slipping) == 2 and 0 not in slipping
+    for camera in slipping:
+        slipped = np.flatnonzero(silent[:, camera])
+        assert 1 <= silent[slipped[0], camera] <= 4
+        assert len(set(silent[slipped, camera])) == 1
+        assert slipped[0] >= silent[slipped[0], camera]
+        assert len(slipped) >= 3 and (np.diff(slipped) == 1).all()
+    lost = rig_of(seed).missing
+    inside = [sorted(m - set(range(3)) - set(range(42, 45))) for m in lost]
+    assert sum(len(sets) > 0 for sets in inside) <= 2
+    assert sum(len(m) >= 1 for m in lost) >= 2 and lost[0] == frozenset()
+
+
+def test_some_slips_last_to_the_end_and_some_do_not() -> None:
+    lasting = [rig_of(seed, slips="silent").slip[-1].any() for seed in range(30)]
+    assert 5 < sum(lasting) < 28
+
+
+@pytest.mark.parametrize("mode", DEPTH_MODES)
+def test_a_depth_mode_reads_out_the_same_glass(mode: str) -> None:
+    """A ray falls on the same place of the sensor in every mode."""
+    rays = np.array([[0.0, 0, 1], [0.2, -0.1, 1], [-0.3, 0.25, 1]])
+    places = []
+    for name in ("NFOV_UNBINNED", mode):
+        lens, read = rig_of(3, depth_mode=name).true[1].depth, DEPTH_MODES[name]
+        assert lens is not None and (lens.width, lens.height) == read.size
+        places.append((lens.project(rays) + read.crop + 0.5) / read.binned)
+    np.testing.assert_allclose(places[1], places[0], atol=1e-12)
+
+
+def test_clocks_are_unsteady_but_the_masters() -> None:
+    noise = NoiseSource(5, 1.0, "a", 30.0)
+    failures = Failures.draw(noise, frames=400, cameras=4, faults=())
+    assert not failures.jitter_s[:, 0].any()
+    assert 80e-6 < failures.jitter_s[:, 1:].std() < 120e-6
+    assert np.abs(failures.jitter_s).max() < 301e-6
+    lost = failures.depth_away | failures.depth_empty
+    assert lost.any(0).sum() == 1 and 1 <= lost.sum() <= 9 and not lost[:, 0].any()
+    still = Failures.draw(NoiseSource(5, 0.0, "a", 30.0), frames=400, cameras=4, faults=())
+    assert not still.jitter_s.any() and not still.depth_away.any()
+
+
+def test_no_overlap_leaves_the_middle_to_the_master() -> None:
+    rig = rig_of(2, overlap=False)
+    middle = rig.master_from_stage[:3, 3] + rig.master_from_stage[:3, 2] * 0.85
+    for index, camera in enumerate(rig.true):
+        at = camera.colour_from_master[:3, :3] @ middle + camera.colour_from_master[:3, 3]
+        assert bool(camera.colour.sees(at)) == (index == 0)
+
+
+@pytest.fixture(scope="module")
+def broken_capture(
+    tmp_path_factory: pytest.TempPathFactory, object_entry: Callable[[str], ObjectEntry]
+) -> Path:
+    """Five frames a second, three cameras: one dies, one's clock jumps back."""
+    folder = tmp_path_factory.mktemp("studio") / "broken"
+    make_capture(
+        StudioCapture(
+            interaction="stool_sit", subject="s02", seed=78, frames=FRAMES, room="bare",
+            faults=("backwards_clock", "dead_half"),
+        ),
+        StudioSettings(
+            captures={}, cameras=3, colour_mode="720P", depth_mode="WFOV_2X2BINNED", fps=FPS
+        ),
+        sequence="broken", objects=object_entry("stool"), output=folder,
+    )  # fmt: skip
+    return folder
+
+
+def test_faults_are_in_the_recordings_and_in_the_truth(broken_capture: Path) -> None:
+    with artefacts.read(broken_capture / "truth.h5", TRUTH) as truth:
+        faults = dict(entry.split() for entry in truth.attributes["faults"].split(", "))
+        assert truth.attributes["room"] == "bare"
+        recorded, names = truth["recorded"], list(truth["camera_names"])
+    for index, name in enumerate(names):
+        with Recording(broken_capture / f"{name}.mkv") as recording:
+            assert recording.info.depth_mode == "WFOV_2X2BINNED"
+            assert recording.info.fps == FPS
+            packets = list(recording.packets())
+        colour = [p.device_time_us for p in packets if p.kind == "colour"]
+        depth = [recording.depth_image(p.content) for p in packets if p.kind == "depth"]
+        assert depth[0].shape == (512, 512)
+        assert not depth[0][:20, :20].any() and depth[0][200:300, 200:300].any()
+        gravity = [p for p in packets if p.kind == "imu"]
+        assert len(gravity) >= len(colour)
+        sets = np.rint((np.array(colour) - START_US) * FPS / 1e6).astype(int)
+        if faults["dead_half"] == name:
+            assert sets.max() < FRAMES // 2 and not recorded[FRAMES // 2 :, index].any()
+        elif faults["backwards_clock"] == name:
+            assert (np.diff(colour) < 0).sum() == 1 and sets.max() < FRAMES // 2
+            assert not recorded[FRAMES // 2 :, index].any()
+        else:
+            assert set(sets) == set(np.flatnonzero(recorded[:, index]))
+
+
+@pytest.mark.parametrize(
+    ("capture", "says"),
+    [
+        ({"subject": "nobody"}, "no subject 'nobody'"),
+        ({"interaction": "dance"}, "no interaction 'dance'"),
+        ({"interaction": "cup_drink"}, "needs object 'cup'"),
+        ({"faults": ("dead_half",), "frames": 2}, "need 4 frames"),
+    ],
+)
+def test_a_capture_that_cannot_be_made_is_told(capture: dict[str, object], says: str) -> None:
+    values = {"interaction": "stool_sit", "subject": "s02", "seed": 1} | capture
+    with pytest.raises(UserError, match=says):
+        check_capture(StudioCapture(**values), StudioSettings(captures={}), "stool")  # type: ignore[arg-type]
+
+
+def test_a_single_camera_has_no_faults() -> None:
+    with pytest.raises(UserError, match="need a second camera"):
+        check_faults(("dead_half",), cameras=1, frames=9)
