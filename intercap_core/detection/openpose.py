@@ -29,6 +29,13 @@ _LISTS = {
     "hand_right_keypoints_2d": 21,
     "face_keypoints_2d": 70,
 }
+# BEHAVE keeps the lists of one person at the top, under names of its own.
+_BEHAVE_LISTS = {
+    "pose_keypoints_2d": "body_joints",
+    "hand_left_keypoints_2d": "left_hand_joints",
+    "hand_right_keypoints_2d": "right_hand_joints",
+    "face_keypoints_2d": "face_joints",
+}
 _JAW_LINE, _INNER_FACE = slice(0, 17), slice(17, 68)
 _FILE_NAME = re.compile(r"(?:.*?_)?(\d+)_keypoints\.json")
 
@@ -61,14 +68,17 @@ def read_people(path: Path) -> np.ndarray:
     """Read one file: (P, 135, 3) float32 of x, y (px) and confidence; P may be 0.
 
     A point that is not finite, or has no confidence, becomes zeros. A hand or face that the
-    detector did not look for (an empty list) has confidence 0. Raises :class:`UnreadableJson` for
-    a file that is not JSON, and UserError where it is JSON of another layout.
+    detector did not look for (an empty list) has confidence 0. BEHAVE's files hold one person.
+    Raises :class:`UnreadableJson` for a file that is not JSON, and UserError where it is JSON of
+    another layout.
     """
     try:
         content = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         raise UnreadableJson(f"{path}: not valid JSON ({error})") from None
     people = content.get("people") if isinstance(content, dict) else None
+    if isinstance(content, dict) and "people" not in content and "body_joints" in content:
+        people = [{name: content.get(theirs, []) for name, theirs in _BEHAVE_LISTS.items()}]
     if not isinstance(people, list):
         raise UserError(f"{path}: has no list 'people'; expected a file as OpenPose writes it")
     result = np.zeros((len(people), NUM_KEYPOINTS, 3), np.float32)

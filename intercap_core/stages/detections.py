@@ -9,15 +9,42 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.config import DetectionsSettings, SequenceEntry
+from intercap_core.capture.intercap import numbers_of
+from intercap_core.config import DetectionsSettings, LayoutName, SequenceEntry
 from intercap_core.detection import openpose
-from intercap_core.detection.coco import CandidateFile, Instance, boxes_of, read_candidates
+from intercap_core.detection.coco import Instance, boxes_of, read_candidates
+from intercap_core.detection.mask_files import (
+    BehaveFiles,
+    MaskFile,
+    UnreadableMask,
+    read_mask,
+    release_masks,
+)
 from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.schemas import DETECTIONS, FRAMES
 
 NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
 FILES_NAMED = 3  # broken files that a note names; more are counted
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """The colour images that the T frame sets hold of one camera.
+
+    ``number`` (T,) is what files of keypoints and candidates call the image, -1 = no image;
+    ``time_us`` (T,) its device time.
+    """
+
+    name: str
+    size: tuple[int, int]
+    number: np.ndarray
+    time_us: np.ndarray
+
+    @property
+    def sets(self) -> list[int]:
+        """Frame sets with an image."""
+        return np.flatnonzero(self.number >= 0).tolist()
 
 
 @dataclass
@@ -36,18 +63,19 @@ def run(
 ) -> None:
     """Read the sequence's OpenPose and COCO files and write the detections artefact.
 
-    A file belongs to the colour image of its number in the camera's own recording. Missing or cut
-    keypoint files and missing cameras are noted, not fatal. Raises UserError where neither
-    keypoints nor candidates are found for any image, or a file has another layout than it must.
+    A file belongs to the colour image of its number: in the camera's own recording, or in the
+    image file's name where the layout is the InterCap release's. BEHAVE's keypoints and masks lie
+    beside its images and are read from there unless the row names others. Missing or cut files and
+    missing cameras are noted, not fatal. Raises UserError where neither keypoints nor candidates
+    are found for any image, or a file has another layout than it must.
     """
     with artefacts.read(frames, FRAMES) as source:
-        cameras = source.text("camera_names")
-        sizes = source["colour_size"]
-        images = np.where(source["dropped"][:, None], -1, source["colour_index"])
-    found = [
-        _read_camera(sequence, name, images[:, c], tuple(int(n) for n in sizes[c]), settings)
-        for c, name in enumerate(cameras)
-    ]
+        images = _images(source, sequence.layout)
+    cameras = [camera.name for camera in images]
+    beside = None
+    if sequence.layout == "behave":
+        beside = BehaveFiles(sequence.recordings, sequence.object)
+    found = [_read_camera(sequence, camera, beside, settings) for camera in images]
     if not any(d.keypoints_found.any() or d.candidates_found.any() for d in found):
         raise UserError(
             f"sequence {sequence.sequence}: no detections for any of its images (keypoints "
@@ -59,7 +87,7 @@ def run(
         output, DETECTIONS, settings_digest=digest(settings), sequence=sequence.sequence
     ) as writer:
         writer.put("camera_names", cameras)
-        writer.put("colour_size", sizes)
+        writer.put("colour_size", [camera.size for camera in images])
         writer.put("note", ["; ".join(d.notes) for d in found])
         writer.put("keypoints_found", np.stack([d.keypoints_found for d in found], 1))
         writer.put("candidates_found", np.stack([d.candidates_found for d in found], 1))
@@ -85,69 +113,123 @@ def _offsets(per_set: list[np.ndarray] | list[list[Instance]]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([len(entries) for entries in per_set])]).astype(np.int64)
 
 
+def _images(source: artefacts.Artefact, layout: LayoutName) -> list[CameraImages]:
+    indices = np.where(source["dropped"][:, None], -1, source["colour_index"])
+    images = []
+    for c, name in enumerate(source.text("camera_names")):
+        width, height = (int(n) for n in source["colour_size"][c])
+        index = number = indices[:, c]
+        times = np.full(len(index), -1, np.int64)
+        if layout in ("intercap", "behave") and (index >= 0).any():
+            times = np.where(index >= 0, source[f"cameras/{name}/colour_time"][index], -1)
+        if layout == "intercap":
+            number = np.where(index >= 0, numbers_of(times), -1)
+        images.append(CameraImages(name, (width, height), number, times))
+    return images
+
+
 def _read_camera(
     sequence: SequenceEntry,
-    name: str,
-    images: np.ndarray,
-    size: tuple[int, ...],
+    images: CameraImages,
+    beside: BehaveFiles | None,
     settings: DetectionsSettings,
 ) -> CameraDetections:
+    count, name = len(images.number), images.name
     result = CameraDetections(
-        people=[NOBODY] * len(images),
-        instances=[[] for _ in images],
-        keypoints_found=np.zeros(len(images), bool),
-        candidates_found=np.zeros(len(images), bool),
+        people=[NOBODY] * count,
+        instances=[[] for _ in range(count)],
+        keypoints_found=np.zeros(count, bool),
+        candidates_found=np.zeros(count, bool),
     )
-    if not (images >= 0).any():
+    if not images.sets:
         return result
     if sequence.keypoints is not None:
-        _add_people(result, sequence.keypoints / name, images)
+        folder = sequence.keypoints / name
+        if folder.is_dir():
+            files = openpose.keypoint_files(folder)
+            _add_people(result, {t: files.get(int(images.number[t])) for t in images.sets})
+        else:
+            result.notes.append(f"no folder of keypoints {folder.parent.name}/{folder.name}")
+    elif beside is not None:
+        times = {t: int(images.time_us[t]) for t in images.sets}
+        _add_people(result, {t: beside.keypoints(time, name) for t, time in times.items()})
     if sequence.candidates is not None:
-        _add_candidates(result, sequence.candidates / f"{name}.json", images, size, settings)
+        _add_candidates(result, sequence.candidates, images, settings)
+    elif beside is not None:
+        times = {t: int(images.time_us[t]) for t in images.sets}
+        _add_masks(result, {t: beside.masks(time, name) for t, time in times.items()}, images.size)
     return result
 
 
-def _add_people(result: CameraDetections, folder: Path, images: np.ndarray) -> None:
-    if not folder.is_dir():
-        result.notes.append(f"no folder of keypoints {folder.parent.name}/{folder.name}")
-        return
-    files = openpose.keypoint_files(folder)
+def _add_people(result: CameraDetections, files: dict[int, Path | None]) -> None:
+    """Read the keypoint file of each frame set, None = there is none."""
     missing, broken = 0, []
-    for t, image in enumerate(images):
-        if image < 0:
-            continue
-        path = files.get(int(image))
+    for t, path in files.items():
         if path is None:
             missing += 1
             continue
         try:
-            result.people[t] = openpose.read_people(path)
-            result.keypoints_found[t] = True
+            people = openpose.read_people(path)
         except openpose.UnreadableJson:
-            broken.append(path.name)
+            broken.append(_short(path))
+            continue
+        # BEHAVE states "nobody" as a person without any confidence.
+        result.people[t] = people[(people[..., 2] > 0).any(1)]
+        result.keypoints_found[t] = True
     if missing:
         result.notes.append(f"no keypoint file for {missing} images")
-    if broken:
-        more = f" and {len(broken) - FILES_NAMED} more" if len(broken) > FILES_NAMED else ""
-        result.notes.append(f"keypoint files not readable: {', '.join(broken[:FILES_NAMED])}{more}")
+    _note_broken(result, "keypoint files", broken)
 
 
 def _add_candidates(
-    result: CameraDetections,
-    path: Path,
-    images: np.ndarray,
-    size: tuple[int, ...],
-    settings: DetectionsSettings,
+    result: CameraDetections, folder: Path, images: CameraImages, settings: DetectionsSettings
 ) -> None:
-    if not path.is_file():
+    """Read a camera's COCO results, and masks that the folder keeps as images."""
+    path = folder / f"{images.name}.json"
+    mask_files = release_masks(folder, images.name)
+    if not path.is_file() and mask_files is None:
         result.notes.append(f"no candidates {path.parent.name}/{path.name}")
         return
-    width, height = size
-    results: CandidateFile = read_candidates(
-        path, width=width, height=height, min_score=settings.min_score
-    )
-    for t, image in enumerate(images):
-        if image < 0 or (results.images is not None and int(image) not in results.images):
-            continue
-        result.instances[t] = results.instances.get(int(image), [])
-        result.candidates_found[t] = True
+    numbers = {t: int(images.number[t]) for t in images.sets}
+    if path.is_file():
+        width, height = images.size
+        results = read_candidates(path, width=width, height=height, min_score=settings.min_score)
+        for t, number in numbers.items():
+            if results.images is None or number in results.images:
+                result.instances[t] = list(results.instances.get(number, []))
+                result.candidates_found[t] = True
+    if mask_files is not None:
+        files = {t: [mask_files[n]] if n in mask_files else [] for t, n in numbers.items()}
+        _add_masks(result, files, images.size)
+
+
+def _add_masks(
+    result: CameraDetections, files: dict[int, list[MaskFile]], size: tuple[int, int]
+) -> None:
+    """Read the mask images of each frame set; an empty mask is no candidate."""
+    missing, broken = 0, []
+    for t, mask_files in files.items():
+        missing += not mask_files
+        for file in mask_files:
+            try:
+                instance = read_mask(file, size)
+            except UnreadableMask as error:
+                broken.append(f"{_short(file.path)} {error}")
+                continue
+            result.candidates_found[t] = True
+            if instance is not None:
+                result.instances[t].append(instance)
+    if missing:
+        result.notes.append(f"no mask for {missing} images")
+    _note_broken(result, "masks", broken)
+
+
+def _short(path: Path) -> str:
+    """The file's name with its folder's, which is a camera or a moment."""
+    return f"{path.parent.name}/{path.name}"
+
+
+def _note_broken(result: CameraDetections, what: str, broken: list[str]) -> None:
+    if broken:
+        more = f" and {len(broken) - FILES_NAMED} more" if len(broken) > FILES_NAMED else ""
+        result.notes.append(f"{what} not readable: {', '.join(broken[:FILES_NAMED])}{more}")
