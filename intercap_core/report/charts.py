@@ -17,7 +17,10 @@ _LABEL = 150
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A line through (x, y), drawn in the page's ``colour`` (a CSS class)."""
+    """A line through (x, y), drawn in the page's ``colour`` (a CSS class) or in one as "#rrggbb".
+
+    A line without a name is not in the legend.
+    """
 
     name: str
     colour: str
@@ -61,10 +64,10 @@ def line_chart(
             f"{at_x(float(x)):.1f},{at_y(float(y)):.1f}"
             for x, y in zip(line.x, line.y, strict=True)
         )
-        parts.append(f'<polyline class="line {line.colour}" points="{points}"/>')
-    for index, line in enumerate(series):
+        parts.append(f'<polyline {_stroke(line.colour)} points="{points}"/>')
+    for index, line in enumerate(line for line in series if line.name):
         x = _LEFT + 100 * index
-        parts.append(f'<line class="line {line.colour}" x1="{x}" x2="{x + 20}" {_same("y", 14)}/>')
+        parts.append(f'<line {_stroke(line.colour)} x1="{x}" x2="{x + 20}" {_same("y", 14)}/>')
         parts.append(_text(x + 26, 18, line.name, "legend", "start"))
     parts.append(_text(_LEFT + inner_width / 2, _HEIGHT - 8, x_label, "label", "middle"))
     parts.append(
@@ -109,6 +112,93 @@ def timeline(bands: Sequence[Band], total: int) -> str:
     return "".join([*parts, "</svg>"])
 
 
+@dataclass(frozen=True)
+class StateRow:
+    """A row that is always in some state: ``runs`` (first, last, state, what it says), a text."""
+
+    name: str
+    runs: Sequence[tuple[int, int, str, str]]
+    beside: str
+
+
+def state_timeline(
+    rows: Sequence[StateRow], total: int, marks: Sequence[tuple[int, str]] = ()
+) -> str:
+    """Rows of ``total`` frames in the page's colours of states (CSS classes).
+
+    ``marks``: vertical lines after a frame, with what they say on hovering.
+    """
+    width, inner = 980, 560
+    left, bottom = 90, _ROW * len(rows)
+    height = bottom + 24
+    parts = [_open(width, height, "timeline of every camera's frames")]
+
+    def at_x(frame: float) -> float:
+        return left + inner * frame / max(total, 1)
+
+    for index, row in enumerate(rows):
+        y = _ROW * index + 4
+        parts.append(_text(left - 8, y + 12, row.name, "tick", "end"))
+        for first, last, state, says in row.runs:
+            x = at_x(first)
+            long = max(1.5, at_x(last + 1) - x)
+            parts.append(
+                f'<rect class="state {state}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
+                f'height="{_ROW - 7}"><title>{escape(says)}</title></rect>'
+            )
+        parts.append(_text(left + inner + 10, y + 12, row.beside, "tick", "start"))
+    for frame, says in marks:
+        x = at_x(frame + 1)
+        parts.append(
+            f'<line class="gap" {_same("x", x)} y1="0" y2="{bottom}">'
+            f"<title>{escape(says)}</title></line>"
+        )
+    for tick in ticks(0, total, 8):
+        if tick < total and tick == int(tick):
+            parts.append(_text(at_x(tick + 0.5), height - 6, _number(tick), "tick", "middle"))
+    return "".join([*parts, "</svg>"])
+
+
+@dataclass(frozen=True)
+class BarPair:
+    """A number before and after; ``weak`` ones rest on little."""
+
+    name: str
+    before: float
+    after: float
+    beside: str
+    weak: bool
+
+
+def bar_pairs(rows: Sequence[BarPair], unit: str) -> str:
+    """Two bars a row, before over after, with their values."""
+    top = max([*(v for r in rows for v in (r.before, r.after) if math.isfinite(v)), 1e-9])
+    width, left, inner, tall = 640, 90, 360, 24
+    height = tall * len(rows) + 40
+    parts = [_open(width, height, f"before and after, {unit}")]
+    for tick in ticks(0, top):
+        x = left + inner * tick / top
+        parts.append(f'<line class="grid" {_same("x", x)} y1="2" y2="{height - 36}"/>')
+        parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
+    for index, row in enumerate(rows):
+        y = tall * index + 4
+        parts.append(_text(left - 8, y + 12, row.name, "tick", "end"))
+        for value, css, down in ((row.before, "faint", 0), (row.after, "c1", 8)):
+            if math.isfinite(value):
+                kind = f"bar {css} weak" if row.weak else f"bar {css}"
+                parts.append(
+                    f'<rect class="{kind}" x="{left}" y="{y + down}" '
+                    f'width="{max(1.0, inner * value / top):.1f}" height="7"/>'
+                )
+        values = " → ".join(
+            f"{v:.1f}" if math.isfinite(v) else "–" for v in (row.before, row.after)
+        )
+        text = f"{values}  ·  {row.beside}{', weak' if row.weak else ''}"
+        parts.append(_text(left + inner + 10, y + 12, text, "tick", "start"))
+    parts.append(_text(left + inner / 2, height - 6, unit, "label", "middle"))
+    return "".join([*parts, "</svg>"])
+
+
 def dumbbells(rows: Sequence[tuple[str, float, float]], unit: str) -> str:
     """One row a pair of numbers, before and after."""
     finite = [v for _, *pair in rows for v in pair if math.isfinite(v)]
@@ -147,6 +237,12 @@ def _open(width: int, height: int, name: str) -> str:
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}" '
         f'style="max-width:{width}px">'
     )
+
+
+def _stroke(colour: str) -> str:
+    if colour.startswith("#"):
+        return f'class="line" stroke="{escape(colour)}"'
+    return f'class="line {colour}"'
 
 
 def _same(axis: str, value: float) -> str:

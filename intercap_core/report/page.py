@@ -17,7 +17,9 @@ from markupsafe import Markup
 
 from intercap_core.metrics import figures, flags
 from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.report import charts, measures
+from intercap_core.report import capture, charts, measures
+from intercap_core.report.capture import CaptureFacts
+from intercap_core.report.capture_pictures import CapturePicture
 from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
 from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
 from intercap_core.schemas import METRIC_REGIONS
@@ -51,14 +53,15 @@ class ObjectHeat:
 class Content:
     """All that the page is made from.
 
-    ``residuals`` by sequence: name, before and after of each camera pair, metres. ``trace`` by
-    sequence: what to print of each stage. ``failed``: sequences without a result and why.
+    ``captures`` of the sequences that are shown. ``residuals`` by sequence: name, before and after
+    of each camera pair, metres. ``trace`` by sequence: what to print of each stage. ``failed``: sequences without a result and why.
     """
 
     dataset: str
     sequences: Sequence[SequenceMetrics]
     table: pd.DataFrame
     details: Sequence[Detail]
+    captures: Sequence[CaptureFacts]
     body_heat: Sequence[HeatPicture]
     body_top: float
     body_frames: int
@@ -101,6 +104,7 @@ def _context(content: Content) -> dict[str, Any]:
         "clouds": measures.clouds(content.dataset, content.sequences),
         "heat": _heat(content),
         "cameras": measures.cameras(content.sequences, content.residuals),
+        "captures": [_capture(facts) for facts in content.captures],
         "worst": sorted(rows, key=lambda row: row["rank"])[:_WORST],
         "flagged_runs": runs[:_MAX_RUNS],
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
@@ -209,6 +213,12 @@ def _heat(content: Content) -> dict[str, Any]:
     }
 
 
+def _capture(facts: CaptureFacts) -> dict[str, Any]:
+    found = capture.context(facts)
+    found["pictures"] = [[_embedded(p, p.caption) for p in row] for row in found["pictures"]]
+    return found
+
+
 def _detail(content: Content, detail: Detail) -> dict[str, Any]:
     s = next(s for s in content.sequences if s.name == detail.name)
     cameras: dict[str, list[dict[str, Any]]] = {}
@@ -279,8 +289,13 @@ def _counted(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
-def _embedded(picture: HeatPicture | Overlay, caption: str) -> dict[str, Any]:
-    kind, data = ("jpeg", picture.jpeg) if isinstance(picture, Overlay) else ("png", picture.png)
+def _embedded(picture: HeatPicture | Overlay | CapturePicture, caption: str) -> dict[str, Any]:
+    if isinstance(picture, CapturePicture):
+        kind, data = picture.kind, picture.data
+    elif isinstance(picture, Overlay):
+        kind, data = "jpeg", picture.jpeg
+    else:
+        kind, data = "png", picture.png
     return {
         "data": f"image/{kind};base64,{base64.b64encode(data).decode()}",
         "width": picture.width,

@@ -23,6 +23,7 @@ from intercap_core.metrics.contact import CONTACT_M
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.heatmaps import Heatmaps, collect
 from intercap_core.report import tables
+from intercap_core.report.capture import read_capture
 from intercap_core.report.heat_pictures import body_pictures, object_pictures
 from intercap_core.report.overlays import Fit, choose_cameras, choose_frames, overlays
 from intercap_core.report.page import Content, Detail, ObjectHeat, render
@@ -85,6 +86,7 @@ def run(
         for name, s in zip(sequences, measured, strict=True)
         if name in shown
     ]
+    captures = [read_capture(s.frames, s.scene) for name, s in sequences.items() if name in shown]
     first = next(iter(sequences.values()))
     with artefacts.read(first.joint, JOINT) as artefact:
         model = load_model(
@@ -97,6 +99,7 @@ def run(
         sequences=measured,
         table=by_sequence,
         details=details,
+        captures=captures,
         body_heat=body_pictures(model, heat.body, body_top),
         body_top=body_top,
         body_frames=heat.body_frames,
