@@ -70,10 +70,18 @@ def extract(name: str, layout: Layout, writer: artefacts.Writer) -> View:
             view.depth_delay_us = recording.depth_delay_us
             _Copy(recording, view, writer).run()
     except UserError as error:
-        # An artefact holds no path of a machine.
-        view.notes.append(str(error).replace(f"{layout.sequence.recordings}/", ""))
+        view.notes.append(str(error))
         view.camera = None
+    view.notes = [_without_folders(note, layout) for note in view.notes]
     return view
+
+
+def _without_folders(text: str, layout: Layout) -> str:
+    """An artefact holds no path of a machine: files by what is below the sequence's folders."""
+    recordings, calibration = layout.sequence.recordings, layout.sequence.calibration
+    for folder in (recordings, calibration.parent):
+        text = text.replace(f"{folder}/", "")
+    return text.replace(str(recordings), recordings.name)
 
 
 class _Copy:

@@ -51,4 +51,7 @@ def open_layout(sequence: SequenceEntry) -> Layout:
             from intercap_core.capture.behave import BehaveLayout
 
             return BehaveLayout(sequence)
-    raise UserError(f"sequence {sequence.sequence!r}: layout {sequence.layout!r} has no reader")
+        case "plain":
+            from intercap_core.capture.plain import PlainLayout
+
+            return PlainLayout(sequence)

@@ -1,0 +1,154 @@
+"""Layout ``plain``: a folder of images or a video for each camera, and a calibration file.
+
+``recordings`` holds ``<camera>/`` with JPEG or PNG files (or ``<camera>/colour/``), or
+``<camera>.mp4`` and its like; ``<camera>/depth/`` holds 16-bit PNG files, millimetres, where the
+camera has depth. ``calibration`` is as :mod:`intercap_core.camera.opencv_calibration` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.camera.extrinsics_files import CAMERA_NAME
+from intercap_core.camera.opencv_calibration import read_opencv_calibration
+from intercap_core.camera.rig import Camera
+from intercap_core.capture.image_files import DamagedImage, Shot, read_depth
+from intercap_core.capture.source import CameraRecording, Image, Layout
+from intercap_core.capture.timestamps import find_timestamps, rate_of, read_timestamps, shots_of
+from intercap_core.config import SequenceEntry
+from intercap_core.errors import UserError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts")
+COLOUR_FOLDERS = ("colour", "color", "rgb")
+
+
+class PlainLayout(Layout):
+    """Folders and videos named after the cameras."""
+
+    def __init__(self, sequence: SequenceEntry) -> None:
+        super().__init__(sequence)
+        calibration = read_opencv_calibration(sequence.calibration)
+        self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
+        below = sorted(sequence.recordings.iterdir())
+        self._folders = {p.name: p for p in below if p.is_dir() and (_colour(p) or _depth(p))}
+        self._videos = [p for p in below if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()]
+        found = sorted({*self._folders, *(path.stem for path in self._videos)})
+        self.names = [name for name in found if CAMERA_NAME.fullmatch(name)]
+
+    def open(self, name: str) -> CameraRecording:
+        """Open the camera's video or folder.
+
+        Raises UserError where it has neither or several, or where nothing says the times.
+        """
+        known, folder = self._known[name], self._folders.get(name)
+        colour, depth = (_colour(folder), _depth(folder)) if folder else ([], [])
+        videos = [path for path in self._videos if path.stem == name]
+        recorded = [path.name for path in videos] + [f"{name}/"] * bool(colour)
+        if len(recorded) != 1:
+            found = f"as {' and '.join(recorded)}" if recorded else "depth alone"
+            raise UserError(
+                f"{self.sequence.recordings}: camera {name} is recorded {found}, expected one "
+                "video or one folder of .jpg or .png; keep or add one"
+            )
+        with_depth = bool(depth) and known.depth is not None
+        camera = Camera(
+            name,
+            known.colour,
+            known.depth if with_depth else None,
+            known.colour_from_depth if with_depth else None,
+            self.extrinsics.master_from_colour[name],
+        )
+        source = videos[0] if videos else folder
+        assert source is not None
+        stem = source.with_name(f"{name}_timestamps") if videos else source / "timestamps"
+        file = find_timestamps(stem)
+        times = read_timestamps(file) if file else None
+        recording: CameraRecording
+        if videos:
+            from intercap_core.capture.video import VideoRecording
+
+            recording = VideoRecording(
+                source,
+                camera,
+                depth if with_depth else [],
+                fps=known.fps,
+                offset_s=known.time_offset,
+                times=times,
+            )
+        else:
+            shots = shots_of(
+                colour,
+                depth if with_depth else [],
+                fps=known.fps,
+                offset_s=known.time_offset,
+                times=times,
+                source=source,
+            )
+            stated = np.array([shot.time_us for shot in shots if shot.colour])
+            recording = FolderRecording(source, camera, shots, known.fps or rate_of(stated) or 1.0)
+        if depth and not with_depth:
+            recording.notes.append(
+                "its depth images are not read: the calibration says nothing of depth (aligned, or "
+                "a lens)"
+            )
+        return recording
+
+
+class FolderRecording(CameraRecording):
+    """A folder of colour files, copied, and of depth files."""
+
+    def __init__(self, folder: Path, camera: Camera, shots: list[Shot], fps: float) -> None:
+        super().__init__(folder, camera, fps=fps)
+        self._shots = shots
+
+    def images(self) -> Iterator[Image]:
+        """All colour files as they are, then depth, in the order of the files' numbers."""
+        unreadable = []
+        for time_us, colour, _ in self._shots:
+            if colour is None:
+                continue
+            try:
+                content = colour.read_bytes()
+            except OSError:
+                unreadable.append(colour.name)
+                continue
+            yield Image("colour", time_us, content)
+        if unreadable:
+            self.notes.append(f"{len(unreadable)} unreadable files (first: {unreadable[0]})")
+        yield from depth_images(self, self._shots)
+
+
+def depth_images(recording: CameraRecording, shots: list[Shot]) -> Iterator[Image]:
+    """Decode the depth files among ``shots`` one at a time; what is damaged is noted."""
+    lens, damaged = recording.camera.depth, []
+    for time_us, _, path in shots:
+        if path is None or lens is None:
+            continue
+        try:
+            image = read_depth(path, (lens.width, lens.height))
+        except DamagedImage as error:
+            damaged.append(f"{path.name} {error}")
+            continue
+        yield Image("depth", time_us, image)
+    if damaged:
+        recording.notes.append(f"{len(damaged)} depth images left out (first: {damaged[0]})")
+
+
+def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+
+
+def _colour(folder: Path) -> list[Path]:
+    """The camera's colour files, below its folder or in a folder of their own."""
+    own = [found for name in COLOUR_FOLDERS if (found := _images(folder / name, IMAGE_SUFFIXES))]
+    return own[0] if own else _images(folder, IMAGE_SUFFIXES)
+
+
+def _depth(folder: Path) -> list[Path]:
+    return _images(folder / "depth", (".png",))

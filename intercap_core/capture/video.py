@@ -1,0 +1,122 @@
+"""Video files: packets are copied where each is a JPEG, else images are decoded and stored as such.
+
+The packets of other codecs are no images by themselves: most hold only what changed, so that one
+image cannot be read without those before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+from intercap_core.camera.rig import Camera
+from intercap_core.capture.encoded import JPEG_QUALITY, jpeg_of
+from intercap_core.capture.plain import depth_images
+from intercap_core.capture.source import CameraRecording, Image
+from intercap_core.capture.timestamps import Timestamps, shots_of
+from intercap_core.errors import UserError
+
+
+class VideoRecording(CameraRecording):
+    """One video file, and perhaps a folder of depth files.
+
+    The file's own clock, from its first image on, gives the times; ``times`` as
+    :func:`.timestamps.read_timestamps` reads them override it, one for each image in order.
+    ``offset_s`` is added. Raises UserError, naming the file, where it is no video.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        depth: list[Path],
+        *,
+        fps: float | None,
+        offset_s: float,
+        times: Timestamps | None,
+    ) -> None:
+        try:
+            self._container = av.open(str(path))
+        except (av.error.FFmpegError, OSError) as error:
+            raise UserError(
+                f"{path}: cannot be opened as a video ({error.strerror}); copy the file again, or "
+                "convert it"
+            ) from error
+        if not self._container.streams.video:
+            self._container.close()
+            raise UserError(f"{path}: holds no video; give the camera's video")
+        self._stream: Any = self._container.streams.video[0]
+        self._stream.thread_type = "AUTO"
+        rate = fps or float(self._stream.average_rate or self._stream.guessed_rate or 30)
+        super().__init__(path, camera, fps=rate)
+        self._offset_s = offset_s
+        self._times = None if times is None else list(times.values())
+        self._shots = shots_of(
+            [], depth, fps=rate, offset_s=offset_s, times=times, source=path.with_suffix("")
+        )
+        self._damaged = 0
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def images(self) -> Iterator[Image]:
+        """Images in the order in which they are shown, then depth."""
+        copied = self._stream.codec_context.name == "mjpeg"
+        count = 0
+        first: float | None = None
+        for stamp, content in self._copied() if copied else self._decoded():
+            seconds = count / self.fps if stamp is None else stamp
+            first = seconds if first is None else first
+            if self._times is not None:
+                if count >= len(self._times):
+                    self.notes.append(f"only {count} timestamps: the images after them left out")
+                    break
+                seconds, first = self._times[count], 0.0
+            count += 1
+            yield Image("colour", round((seconds - first + self._offset_s) * 1e6), content)
+        if self._times is not None and count < len(self._times):
+            self.notes.append(f"{len(self._times)} timestamps, but {count} images")
+        if not copied:
+            codec = self._stream.codec_context.name
+            self.notes.append(f"colour was recorded as {codec}, stored as JPEG of quality "
+                              f"{JPEG_QUALITY}")  # fmt: skip
+        if self._damaged:
+            self.notes.append(f"{self._damaged} damaged packets left out")
+        if self.truncated:
+            self.notes.append(f"the file is cut off: {count} images could be read")
+        yield from depth_images(self, self._shots)
+
+    def _packets(self) -> Iterator[Any]:
+        demuxed = self._container.demux(self._stream)
+        while True:
+            try:
+                yield next(demuxed)
+            except (StopIteration, av.error.EOFError):
+                return
+            except (av.error.FFmpegError, OSError):
+                self.truncated = True
+                return
+
+    def _copied(self) -> Iterator[tuple[float | None, bytes]]:
+        for packet in self._packets():
+            if packet.size:
+                stamp = None if packet.pts is None else float(packet.pts * packet.time_base)
+                yield stamp, bytes(packet)
+
+    def _decoded(self) -> Iterator[tuple[float | None, bytes]]:
+        for packet in self._packets():
+            try:
+                frames = packet.decode()
+            except (av.error.FFmpegError, OSError):
+                self._damaged += 1
+                continue
+            for frame in frames:
+                image = frame.to_ndarray(format="bgr24")
+                # A phone held upright records lying images and says so; viewers turn them.
+                image = np.rot90(image, round((getattr(frame, "rotation", 0) or 0) / 90))
+                yield frame.time, jpeg_of(np.ascontiguousarray(image))
