@@ -16,6 +16,7 @@ from intercap_core.energy.body_cloud import COVERINGS, CloudRows
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import BodyProblem, Views
+from intercap_core.solve.velocity import limited_velocity
 
 # What is left of a keypoint's error in metres once its fixed part is taken out: the start, refined
 # from the residuals themselves.
@@ -34,6 +35,8 @@ _SAMPLE_SHARE = 0.25
 _FULL_SAMPLE = 2.0  # points with which a sample counts half
 _HUBER_M = 0.012
 _VERTEX_CHUNK = 16
+# Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
+_MAX_SPEED = 6.0
 
 
 class Evidence:
@@ -138,11 +141,17 @@ class Evidence:
 
     def _shift(self, points: Tensor) -> Tensor | None:
         """How far points (N,...,3) move until each camera exposes: (N,C,...,3), or None."""
-        delay = self.seen.time_offset
-        if not np.any(delay) or len(self.frames) < 2:
+        offset = self.seen.time_offset
+        if not np.any(offset):
             return None
-        velocity = np.gradient(points.double().cpu().numpy(), self.seen.times[self.frames], axis=0)
-        return self._tensor(delay)[:, None, None] * self._tensor(velocity)[:, None]
+        return self._tensor(offset)[:, None, None] * self.velocity(points)[:, None]
+
+    def velocity(self, points: Tensor) -> Tensor:
+        """(N,...,3) m/s of the usable frames' points (N,...,3)."""
+        found = limited_velocity(
+            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=_MAX_SPEED
+        )
+        return self._tensor(found)
 
     def refine_sigma(self, problem: BodyProblem) -> None:
         """Noise of each group of keypoints from its residuals: 1.48 median absolute deviation."""

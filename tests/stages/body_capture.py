@@ -74,24 +74,29 @@ def write_capture(
     seen_by: tuple[int, ...] | None = None,
     pixel_noise: np.ndarray | float = 0.0,
     depth_noise_mm: float = 0.0,
+    time_offset: np.ndarray | None = None,
     seed: int = 0,
 ) -> Inputs:
     """Write what the cameras see of a surface (T,V,3) and of keypoints (T,135,3), master frame.
 
-    In ``missing`` frames nobody is there; cameras not in ``seen_by`` detect nobody.
-    ``pixel_noise``: standard deviation or (T,C,135,2) shifts.
+    Both may be (T,C,...): what each camera sees when it exposes, ``time_offset`` (C,) s late. In
+    ``missing`` frames nobody is there; cameras not in ``seen_by`` detect nobody. ``pixel_noise``:
+    standard deviation or (T,C,135,2) shifts.
     """
     random = np.random.default_rng(seed)
     count, cameras = len(surface), len(rig)
     paths = Inputs(*(folder / f"{name}.h5" for name in ("frames", "scene", "person")))
     present = ~np.isin(np.arange(count), missing)
     times = np.arange(count) / FPS
+    if surface.ndim == 3:
+        surface, keypoints = (np.repeat(x[:, None], cameras, 1) for x in (surface, keypoints))
     _write_frames(paths.frames, rig, surface, faces, times, present, depth, depth_noise_mm, random)
-    _write_scene(paths.scene, rig, times)
+    _write_scene(paths.scene, rig, times, np.zeros(cameras) if time_offset is None else time_offset)
 
     observed = np.zeros((count, cameras, 135, 3))
     for c, camera in enumerate(rig):
-        observed[:, c, :, :2] = camera.colour.project(apply(camera.colour_from_master, keypoints))
+        seen = apply(camera.colour_from_master, keypoints[:, c])
+        observed[:, c, :, :2] = camera.colour.project(seen)
     noise = pixel_noise
     if not isinstance(noise, np.ndarray):
         noise = noise * random.standard_normal((count, cameras, 135, 2))
@@ -104,9 +109,9 @@ def write_capture(
     joints[~present] = np.nan
     views = np.where(np.isfinite(joints[..., 0]), cameras, 0)
     masks = [
-        _mask(camera, surface[t], faces) if present[t] else b""
+        _mask(camera, surface[t, c], faces) if present[t] else b""
         for t in range(count)
-        for camera in rig
+        for c, camera in enumerate(rig)
     ]
     offsets, runs = pack_ragged(masks)
     with artefacts.write(paths.person, PERSON, sequence="test") as writer:
@@ -158,7 +163,7 @@ def _write_frames(path, rig, surface, faces, times, present, depth, noise, rando
         writer.put("colour_index", np.full_like(index, -1))
         writer.put("depth_index", index if depth else np.full_like(index, -1))
         writer.put("skew", np.zeros((count, cameras)))
-        for camera in rig:
+        for c, camera in enumerate(rig):
             group = f"cameras/{camera.name}"
             writer.put(f"{group}/colour", np.zeros(0, np.uint8))
             writer.put(f"{group}/colour_offsets", np.zeros(1, np.int64))
@@ -167,14 +172,14 @@ def _write_frames(path, rig, surface, faces, times, present, depth, noise, rando
             for t in range(count if depth else 0):
                 image = np.full((DEPTH.height, DEPTH.width), BACKGROUND_MM, np.uint16)
                 if present[t]:
-                    drawn = render(surface[t], faces, DEPTH, camera.depth_from_master)
+                    drawn = render(surface[t, c], faces, DEPTH, camera.depth_from_master)
                     z = 1000 * drawn.depth + noise * random.standard_normal(drawn.depth.shape)
                     image[drawn.window][drawn.mask] = np.rint(z[drawn.mask]).astype(np.uint16)
                 rows.append(image[None])
             writer.put(f"{group}/depth_time", np.zeros(count if depth else 0, np.int64))
 
 
-def _write_scene(path: Path, rig: Rig, times: np.ndarray) -> None:
+def _write_scene(path: Path, rig: Rig, times: np.ndarray, time_offset: np.ndarray) -> None:
     cameras = len(rig)
     with artefacts.write(
         path, SCENE, sequence="test", master="k1", fps=FPS, extrinsics_refined=False,
@@ -191,7 +196,7 @@ def _write_scene(path: Path, rig: Rig, times: np.ndarray) -> None:
         writer.put("pair_points", np.zeros(0, np.int64))
         writer.put("pair_residual_before", np.zeros(0))
         writer.put("pair_residual_after", np.zeros(0))
-        writer.put("time_offset", np.zeros(cameras))
+        writer.put("time_offset", time_offset)
         writer.put("time_offset_sigma", np.full(cameras, np.nan))
         writer.put("slip", np.zeros((len(times), cameras), np.int32))
         writer.put("image_of", np.arange(len(times))[:, None].repeat(cameras, 1))
