@@ -42,7 +42,8 @@ SequenceName = Annotated[Name, AfterValidator(_not_reserved)]
 Metres = Annotated[float, AfterValidator(_metres)]
 Position = tuple[Metres, Metres, Metres]
 FrameNumber = Annotated[int, Field(ge=0, strict=True)]
-RegionName = Literal[CONTACT_REGIONS]  # type: ignore[valid-type]
+ANY_REGION = "any"
+ContactPart = Literal[(*CONTACT_REGIONS, ANY_REGION)]  # type: ignore[valid-type]
 LayoutName = Literal["k4a", "intercap", "behave", "plain"]
 
 
@@ -294,6 +295,9 @@ class SequenceEntry(Model):
     """Folder of <camera>.json files: instance segmentation in COCO's result format."""
     truth: Path | None = None
     """Truth of a virtual recording; read by the metrics alone."""
+    annotation: Path | None = None
+    """This sequence's annotation file; without one, <sequence>.yaml in the folder of annotations,
+    where it is there."""
 
 
 class SubjectEntry(Model):
@@ -353,8 +357,9 @@ class ObjectEntry(Model):
 class ContactInterval(Model):
     """One body part touching the object for a while."""
 
-    part: RegionName
-    """Contact region of the body."""
+    part: ContactPart
+    """Contact region of the body; any = it is not known which, only that none touches outside of
+    these intervals."""
     start: FrameNumber
     """First frame set in contact, from 0."""
     end: Annotated[int, Field(gt=0, strict=True)]

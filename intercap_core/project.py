@@ -47,6 +47,9 @@ class Project:
         """Where this sequence's annotation file is, or would be."""
         if self.annotation_made(sequence):
             return self.results / "recordings" / sequence / "annotation.yaml"
+        named = self.sequences[sequence].annotation if sequence in self.sequences else None
+        if named is not None:
+            return named
         return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
     def artefact(self, sequence: str, stage: str) -> Path:
@@ -56,11 +59,17 @@ class Project:
     def annotation(self, sequence: str) -> Annotation:
         """Load this sequence's annotation; empty where there is no file.
 
-        Raises UserError naming file and field where the file is broken, or where an entry lies
-        past the end of the recording (as soon as its frames have been read).
+        Raises UserError naming file and field where the file is broken or the sequence's row names
+        one that is not there, or where an entry lies past the end of the recording (as soon as its
+        frames have been read).
         """
         path = self.annotation_path(sequence)
         if not path.exists():
+            if path == self.sequences[sequence].annotation:
+                raise UserError(
+                    f"{path}: sequence {sequence!r} names this annotation, and there is no such "
+                    "file; correct the column or clear it"
+                )
             return Annotation()
         annotation = _parse(Annotation, _or_empty(read_yaml(path)), str(path), "annotation")
         with contextlib.suppress(artefacts.Unreadable):

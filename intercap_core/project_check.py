@@ -62,11 +62,12 @@ def faults_of_sequences(project: Project) -> list[Fault]:
 
 def _annotations_of_nobody(project: Project) -> list[Fault]:
     folder = tidy(project.path.parent / project.config.annotations)
-    named = {f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
+    known = {folder / f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
+    known |= {project.annotation_path(name) for name in project.sequences}
     return [
         Fault("", f"{path}: no sequence has this annotation's name; rename it to <sequence>.yaml")
         for path in sorted(folder.glob("*.y*ml"))
-        if path.name not in named
+        if path not in known
     ]
 
 

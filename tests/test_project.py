@@ -255,6 +255,21 @@ def test_tables_may_start_with_a_byte_order_mark(folder: Path) -> None:
     assert set(load_project(Path("config.yaml")).subjects) == {"s01", "s02"}
 
 
+def test_a_row_can_name_its_annotation(folder: Path) -> None:
+    table = folder / "sequences.tsv"
+    lines = table.read_text().splitlines()
+    header, first, *others = [line for line in lines if line and not line.startswith("#")]
+    rows = [f"{header}\tannotation", f"{first}\tannotations/other.yaml"]
+    table.write_text("\n".join([*rows, *(f"{line}\t" for line in others)]) + "\n")
+    (folder / "annotations" / "one.yaml").write_text("drop_frames: [1]\n")
+    with pytest.raises(UserError, match=r"other.yaml: sequence 'one' names this annotation"):
+        load_project(Path("config.yaml")).annotation("one")
+    (folder / "annotations" / "other.yaml").write_text("drop_frames: [2]\n")
+    project = load_project(Path("config.yaml"))
+    assert project.annotation("one").drop_frames == (2,)
+    assert project.annotation("two") == Annotation()
+
+
 def test_annotation_past_the_end(folder: Path) -> None:
     annotation = Annotation.model_validate(
         {

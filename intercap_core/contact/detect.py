@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.config import ContactInterval
+from intercap_core.config import ANY_REGION, ContactInterval
 
 # Chance for a region to begin or end touching, per second: an interaction of a few seconds has a
 # handful of changes.
@@ -120,12 +120,17 @@ def annotation_evidence(
     """Log odds (T, R) that annotated intervals add, and the labels (T, R) int8 they state.
 
     Regions named by no interval are annotated as free throughout: who annotates a sequence's
-    contact annotates all of it. Towards an interval's ends the evidence fades to nothing over
-    the frames by which people err.
+    contact annotates all of it. While some part touches that is not named, regions have no label
+    (-1) and no evidence unless they are named as well. Towards an interval's ends the evidence
+    fades to nothing over the frames by which people err.
     """
     labels = np.zeros((frames, len(regions)), np.int8)
-    for interval in intervals:
-        labels[interval.start : interval.end, regions.index(interval.part)] = 1
+    for interval in sorted(intervals, key=lambda interval: interval.part != ANY_REGION):
+        during = slice(interval.start, interval.end)
+        if interval.part == ANY_REGION:
+            labels[during] = -1
+        else:
+            labels[during, regions.index(interval.part)] = 1
     position = np.arange(frames)
     evidence = np.empty(labels.shape)
     for r in range(len(regions)):
@@ -136,5 +141,6 @@ def annotation_evidence(
             else np.full(frames, np.inf)
         )
         certainty = np.clip(nearest / _ANNOTATION_SLACK, 0.0, 1.0)
-        evidence[:, r] = np.where(labels[:, r] == 1, 1.0, -1.0) * certainty * _ANNOTATED_LOGIT
+        sign = np.choose(labels[:, r] + 1, (0.0, -1.0, 1.0))
+        evidence[:, r] = sign * certainty * _ANNOTATED_LOGIT
     return evidence, labels

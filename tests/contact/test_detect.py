@@ -74,6 +74,18 @@ def test_annotation_is_certain_inside_and_undecided_at_its_ends():
     assert (evidence[:, 1] < -5).all()
 
 
+def test_contact_of_an_unnamed_part_rules_out_what_lies_outside_it_alone():
+    intervals = [
+        ContactInterval(part="left_hand", start=20, end=30),
+        ContactInterval(part="any", start=10, end=40),
+    ]
+    evidence, labels = annotation_evidence(intervals, ["left_hand", "seat"], 60)
+    assert (labels[:10] == 0).all() and (labels[40:] == 0).all()
+    assert (labels[10:40, 1] == -1).all() and (evidence[10:40, 1] == 0).all()
+    assert (labels[20:30, 0] == 1).all() and (labels[10:20, 0] == -1).all()
+    assert evidence[0, 1] < -5 and evidence[55, 0] < -5 and evidence[25, 0] > 0
+
+
 def test_not_knowing_where_the_object_is_does_not_refute_a_grasp():
     sigma = np.full((60, 1), 0.012)
     sigma[20:50] = 0.5
