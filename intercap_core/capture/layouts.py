@@ -8,12 +8,13 @@ from intercap_core.capture.source import Layout
 from intercap_core.config import LayoutName, SequenceEntry
 from intercap_core.errors import UserError
 
-# What the workflow watches, below the folder of recordings. Folders stand for the images in them:
-# their times change when an image comes or goes, and a sequence has thousands of images.
+# What the workflow watches, below the folder of recordings ("" = the folder itself). Folders stand
+# for what is in them: their times change when an image comes or goes, and watching each of a
+# sequence's thousands of images would keep a run that has nothing to do busy for minutes.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
     "k4a": ("*.mkv",),
     "intercap": ("Frames_Cam*/*",),
-    "behave": (".", "t*"),
+    "behave": ("",),
     "plain": ("*", "*/colour", "*/depth"),
 }
 
@@ -23,8 +24,13 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
     folder = sequence.recordings
     if not folder.is_dir():
         return []
-    found = {p for glob in INPUTS[sequence.layout] if glob != "." for p in folder.glob(glob)}
-    return sorted(found | ({folder} if "." in INPUTS[sequence.layout] else set()))
+    return sorted(
+        {
+            path
+            for pattern in INPUTS[sequence.layout]
+            for path in (folder.glob(pattern) if pattern else [folder])
+        }
+    )
 
 
 def open_layout(sequence: SequenceEntry) -> Layout:

@@ -38,6 +38,7 @@ rule frames:
         runtime=60,
     params:
         settings=settings_of("frames"),
+        layout=layout_of,
         annotation=annotation_of("drop_frames"),
         code=code_of("frames"),
     message:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 
+from intercap_core.capture.layouts import input_files
 from intercap_core.code_digest import code_digest
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
@@ -62,10 +63,10 @@ def recorded(column):
         made = made_by_studio(wildcards, column)
         if made is not None:
             return made
-        value = getattr(PROJECT.sequences[wildcards.sequence], column)
-        if column == "recordings" and value.is_dir():
-            return sorted(value.glob("*.mkv"))
-        return existing(value)
+        row = PROJECT.sequences[wildcards.sequence]
+        if column == "recordings":
+            return input_files(row)
+        return existing(getattr(row, column))
 
     return files
 
@@ -165,6 +166,11 @@ def all_entries():
 def tracked_subject(wildcards):
     """Param: digest of the subject's row; its body file is an input."""
     return digest(of_sequence(wildcards)[2])
+
+
+def layout_of(wildcards):
+    """Param: how the sequence's recordings are laid out; the files themselves are inputs."""
+    return PROJECT.sequences[wildcards.sequence].layout
 
 
 def capture_of(wildcards):
