@@ -30,7 +30,7 @@ READS: dict[str, tuple[str, ...]] = {
     "frames": (),
     "detections": ("frames",),
     "scene": ("frames", "detections"),
-    "person": ("detections", "scene"),
+    "person": ("frames", "detections", "scene"),
     "object_track": ("frames", "scene", "detections", "person"),
     "body_fit": ("frames", "scene", "person"),
     "joint": ("frames", "scene", "person", "object_track", "body_fit"),

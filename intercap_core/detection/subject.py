@@ -2,11 +2,13 @@
 
 The order of people in a detector's file says nothing: each frame set's detections are grouped by
 whether their rays meet, groups are linked over time in space, and the subject is the track that
-most views and sets support, near the middle of the ring.
+most views and sets support, near the middle of the ring. In a set where no rays meet, depth tells
+where the people of each single view are.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -27,6 +29,11 @@ MAX_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
 LINK_SLACK_M = 0.25  # scatter of a group's centre
 CENTRE_RANGE_M = 1.5  # support counts half as much this far from the ring's middle
 MAX_GAP_S = 2.0  # tracks are joined over at most this long
+LIFTED_SUPPORT = 0.5  # of a point that one view sees, with depth; two views give about two
+
+Lift = Callable[[int, int, np.ndarray], np.ndarray]
+"""Points (P, 25, 3), master frame, NaN = not known, of the people (P, 25, 3) that view c sees in
+set t, by its depth alone: called with t, c and the people."""
 
 
 @dataclass(frozen=True)
@@ -51,18 +58,25 @@ class _Track:
 
 
 def find_subject(
-    detections: Detections, rig: Rig, times: np.ndarray, *, min_confidence: float
+    detections: Detections,
+    rig: Rig,
+    times: np.ndarray,
+    *,
+    min_confidence: float,
+    lift: Lift | None = None,
 ) -> np.ndarray:
     """Find the subject: the index of its detection in every image (T, C) int32, -1 = not seen.
 
-    ``times`` (T,) seconds. All -1 where no two views agree on anybody in any set.
+    ``times`` (T,) seconds. ``lift`` places the people of single views in sets where no two views
+    agree on anybody. All -1 where nobody can be placed in any set.
     """
-    groups = [
-        _groups_of_set(
-            [detections.people(t, c)[:, BODY_POINTS] for c in range(len(rig))], rig, min_confidence
-        )
-        for t in range(detections.num_sets)
-    ]
+    groups = []
+    for t in range(detections.num_sets):
+        seen = [detections.people(t, c)[:, BODY_POINTS] for c in range(len(rig))]
+        found = _groups_of_set(seen, rig, min_confidence)
+        if not found and lift is not None:
+            found = _lifted_groups(t, seen, lift)
+        groups.append(found)
     chosen = _subject_track(groups, times, ring_centre(rig))
     people = np.full((detections.num_sets, len(rig)), NOBODY, np.int32)
     for t, group in chosen.items():
@@ -107,6 +121,19 @@ def _groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) ->
             taken |= members
             result.append(group)
     return result
+
+
+def _lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[Group]:
+    """Every person (P, 25, 3) of each view as a group of its own; best supported first."""
+    result = []
+    for c, found in enumerate(people):
+        for i, points in enumerate(lift(t, c, found) if len(found) else ()):
+            count = int(np.isfinite(points[:, 0]).sum())
+            if count >= MIN_COMMON_POINTS:
+                members = np.full(len(people), NOBODY, np.int32)
+                members[c] = i
+                result.append(Group(members, points, LIFTED_SUPPORT * count))
+    return sorted(result, key=lambda group: -group.support)
 
 
 def _pair_proposals(

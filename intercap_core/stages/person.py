@@ -9,8 +9,10 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
+from intercap_core.capture.frames import Frames
 from intercap_core.config import PersonSettings
 from intercap_core.detection.exposure import at_set_times
+from intercap_core.detection.lifting import Lifter
 from intercap_core.detection.person_masks import choose_mask
 from intercap_core.detection.read import Detections
 from intercap_core.detection.sides import BODY_POINTS
@@ -22,43 +24,68 @@ from intercap_core.project import digest
 from intercap_core.schemas import PERSON, SCENE
 
 
-def run(*, detections: Path, scene: Path, output: Path, settings: PersonSettings) -> None:
+def run(
+    *, frames: Path, detections: Path, scene: Path, output: Path, settings: PersonSettings
+) -> None:
     """Find the subject by geometry and write the person artefact.
 
-    Sets in which fewer than two views agree on the subject are flagged ``missing``. Raises
-    UserError where no set has the subject in two views, or the inputs are of different captures.
+    A set in which one view alone sees the subject takes its points from that view's depth; sets in
+    which neither two views nor depth place it are flagged ``missing``. Raises UserError where that
+    is so in every set, or the inputs are of different captures.
     """
     found = Detections.load(detections)
-    with artefacts.read(scene, SCENE) as source:
+    with artefacts.read(scene, SCENE) as source, Frames.open(frames) as images:
         rig = Rig.from_artefact(source)
         times, image_of = source["times"], source["image_of"]
         time_offset = source["time_offset"]
-    if rig.names != found.camera_names or len(times) != found.num_sets:
-        raise UserError(
-            f"{detections} and {scene}: cameras or frame sets differ ({len(found.camera_names)} "
-            f"cameras, {found.num_sets} sets against {len(rig)} and {len(times)}); re-run stages "
-            "'detections' and 'scene' for this sequence"
+        if rig.names != found.camera_names or len(times) != found.num_sets:
+            raise UserError(
+                f"{detections} and {scene}: cameras or frame sets differ "
+                f"({len(found.camera_names)} cameras, {found.num_sets} sets against {len(rig)} and "
+                f"{len(times)}); re-run stages 'detections' and 'scene' for this sequence"
+            )
+        found = found.showing(image_of)
+        confident = settings.min_confidence
+        lifter = Lifter(images.showing(image_of), source, min_confidence=confident)
+        person = find_subject(found, rig, times, min_confidence=confident, lift=lifter.people)
+        keypoints = subject_keypoints(found, person)
+        # rays of one moment meet; what is written down is where each camera saw the points
+        moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
+        moved, points = triangulate_people(
+            np.concatenate([moved, keypoints[..., :2]], -1),
+            rig,
+            min_confidence=confident,
+            max_error_px=settings.max_reprojection_px,
         )
-    found = found.showing(image_of)
-    person = find_subject(found, rig, times, min_confidence=settings.min_confidence)
-    keypoints = subject_keypoints(found, person)
-    # rays of one moment meet; what is written down is where each camera saw the points
-    moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=settings.min_confidence)
-    moved, points = triangulate_people(
-        np.concatenate([moved, keypoints[..., :2]], -1),
-        rig,
-        min_confidence=settings.min_confidence,
-        max_error_px=settings.max_reprojection_px,
-    )
-    keypoints = moved[..., [3, 4, 2]]
-    missing = (person != NOBODY).sum(1) < 2
+        keypoints = moved[..., [3, 4, 2]]
+        lifted = lifter.fill(person, keypoints, points)
+    missing = ((person != NOBODY).sum(1) < 2) & ~lifted
     if missing.all():
         raise UserError(
-            f"sequence {found.sequence}: no frame set has one person in two views that agree "
-            f"({detections}); check the keypoint files and the calibration"
+            f"sequence {found.sequence}: the subject can be placed in no frame set: {_why(found)}"
         )
     masks = _masks(found, keypoints, points, rig, settings.min_confidence)
     _write(output, found, person, keypoints, points, missing, masks, settings)
+
+
+def _why(found: Detections) -> str:
+    """Why nobody can be placed, and what to do."""
+    seeing = [
+        name
+        for c, name in enumerate(found.camera_names)
+        if any(len(found.people(t, c)) for t in range(found.num_sets))
+    ]
+    if not seeing:
+        return f"no image has keypoints of anybody ({found.path}); check the keypoint files"
+    if len(seeing) == 1:
+        return (
+            f"camera {seeing[0]} alone sees anybody, without depth beside its keypoints, so that "
+            "the distance is not known; add a second camera or depth"
+        )
+    return (
+        f"no two views agree on one person ({found.path}); check the keypoint files and the "
+        "calibration"
+    )
 
 
 def subject_keypoints(detections: Detections, person: np.ndarray) -> np.ndarray:

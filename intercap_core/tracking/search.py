@@ -30,6 +30,7 @@ MAX_GROUPS = 3
 GOOD_ENOUGH = 0.55  # confidence above which less likely groups are not searched
 NEAR_TURNS = 12  # turns about each axis of the best pose that are compared with it
 TURNS_FITTED = 4
+SAME_AXIS_COSINE = float(np.cos(np.radians(10)))
 STANDING_BONUS = 0.03  # of confidence
 STANDING_COSINE = float(np.cos(np.radians(12)))
 MIN_POINTS = 15  # of a candidate's cloud
@@ -134,12 +135,15 @@ def _turned(
 
 
 def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
-    """Turns (N, 4, 4) of the object about its principal axes, in its own frame.
+    """Turns (N, 4, 4) of the object about the axes of its frame and its principal axes.
 
-    ``steps`` angles a full turn; those that the symmetry group holds anyway are left out.
+    ``steps`` angles a full turn; those that the symmetry group holds anyway are left out. They
+    turn about the middle of its box, where a turned silhouette covers the old one best.
     """
-    _, axes = np.linalg.eigh(np.cov(mesh.vertices.T))
-    centre = mesh.centre_of_mass
+    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
+    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a mug's handle tilts them
+    axes = np.concatenate([np.eye(3), principal[:, new]], 1)
+    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     found = []
     for axis in axes.T:
         for angle in 2 * np.pi * np.arange(1, steps) / steps:

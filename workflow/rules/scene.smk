@@ -29,6 +29,7 @@ rule scene:
 rule person:
     """The subject over views, and the triangulated keypoints."""
     input:
+        frames=rules.frames.output.frames,
         detections=rules.detections.output.detections,
         scene=rules.scene.output.scene,
     output:

@@ -1,0 +1,165 @@
+"""Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
+
+Depth measures the skin, a keypoint is a joint: the point lies deeper on the pixel's ray by how
+thick the body is there. A joint that something covers is put behind what covers it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
+from intercap_core.camera.clouds import depth_points
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply
+from intercap_core.capture.frames import Frames
+from intercap_core.detection.sides import BODY_POINTS
+from intercap_core.detection.subject import NOBODY
+from intercap_core.detection.triangulation import Triangulation
+
+# How deep a keypoint lies under the skin, metres: the open body's, standing, its median over all
+# horizontal directions. What is not named lies on the skin.
+_INSET_M = {
+    "neck": 0.065, "shoulder": 0.060, "elbow": 0.046, "wrist": 0.026, "mid_hip": 0.13,
+    "hip": 0.106, "knee": 0.059, "ankle": 0.040,
+}  # fmt: skip
+_HAND_INSET_M = 0.008  # half a finger
+_BEFORE_BACKGROUND_MM = 40  # nearer than the background by less is background
+_REACH_M = 0.03  # around a keypoint, across: where its depth is read
+_MIN_SAMPLES = 4
+_NEAREST_SHARE = 0.2  # of the samples: nearer ones may float
+_SURFACE_M = 0.05  # samples this far behind the nearest are another surface
+_ENOUGH_POINTS = 8  # of the body: a set with so many triangulated needs no lifting
+
+
+def _insets() -> np.ndarray:
+    """(135,) metres."""
+    parts = [name.removeprefix("left_").removeprefix("right_") for name in KEYPOINT_NAMES]
+    inset = np.array([_INSET_M.get(part, 0.0) for part in parts])
+    inset[LEFT_HAND] = inset[RIGHT_HAND] = _HAND_INSET_M
+    return inset
+
+
+INSETS_M = _insets()
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """What a depth image shows in front of the background, as the colour camera sees it.
+
+    ``pixels`` (N, 2) of the colour image and ``distance`` (N,) along the ray, metres.
+    """
+
+    camera: Camera
+    pixels: np.ndarray
+    distance: np.ndarray
+
+    @classmethod
+    def of(
+        cls, depth: np.ndarray, camera: Camera, background: np.ndarray | None, bias_m: float
+    ) -> Relief:
+        """Every second pixel of every second row of ``depth`` (H, W) uint16 mm.
+
+        ``background`` (H, W) uint16 mm, 0 = unknown; ``bias_m`` is subtracted from the depth.
+        """
+        near = np.zeros_like(depth)
+        near[::2, ::2] = depth[::2, ::2]
+        if background is not None:
+            behind = background.astype(np.int32)
+            near[(behind > 0) & (near.astype(np.int32) > behind - _BEFORE_BACKGROUND_MM)] = 0
+        points = depth_points(near, camera).points
+        if bias_m:
+            points = points * (1 - np.float32(bias_m) / points[:, 2:])
+        assert camera.colour_from_depth is not None
+        points = apply(camera.colour_from_depth, points)
+        points = points[camera.colour.inside_model(points)]
+        return cls(camera, camera.colour.project(points), np.linalg.norm(points, axis=1))
+
+    def lift(self, pixels: np.ndarray, seen: np.ndarray, inset_m: np.ndarray) -> np.ndarray:
+        """Points (K, 3), master frame, of keypoints at ``pixels`` (K, 2) where ``seen`` (K,).
+
+        ``inset_m`` (K,): how deep each lies. NaN where nothing is measured.
+        """
+        result = np.full((len(pixels), 3), np.nan)
+        if not len(self.distance):
+            return result
+        rays = self.camera.colour.unproject(pixels)
+        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        reach = self.camera.colour.fx * _REACH_M / self.distance
+        for k in np.flatnonzero(seen & np.isfinite(rays).all(1)):
+            away = np.abs(self.pixels - pixels[k]).max(1)
+            found = self.distance[away < reach]
+            if len(found) < _MIN_SAMPLES:
+                continue
+            nearest = np.quantile(found, _NEAREST_SHARE)
+            surface = np.median(found[found < nearest + _SURFACE_M])
+            result[k] = rays[k] * (surface + inset_m[k])
+        return apply(self.camera.master_from_colour, result)
+
+
+class Lifter:
+    """Lifts keypoints of a recording's single views.
+
+    ``frames`` read by the moment that their images show, ``scene`` the scene artefact.
+    """
+
+    def __init__(self, frames: Frames, scene: Artefact, *, min_confidence: float) -> None:
+        self._frames, self._min_confidence = frames, min_confidence
+        self._rig = Rig.from_artefact(scene)
+        self._bias = np.nan_to_num(scene["depth_bias"])
+        known = set(scene.keys("cameras/"))
+        self._background = [
+            scene[f"cameras/{name}/background"] if f"cameras/{name}/background" in known else None
+            for name in self._rig.names
+        ]
+        self._relief = lru_cache(maxsize=len(self._rig))(self._load)
+
+    def _load(self, t: int, c: int) -> Relief | None:
+        camera = self._rig[c]
+        depth = self._frames.depth(t, c) if camera.depth is not None else None
+        if depth is None:
+            return None
+        return Relief.of(depth, camera, self._background[c], float(self._bias[c]))
+
+    def people(self, t: int, c: int, people: np.ndarray) -> np.ndarray:
+        """Points (P, 25, 3) of body keypoints (P, 25, 3) in view ``c`` of set ``t``; see
+        :data:`intercap_core.detection.subject.Lift`."""
+        relief = self._relief(t, c)
+        if relief is None:
+            return np.full(people.shape, np.nan)
+        seen = people[..., 2] >= self._min_confidence
+        inset = INSETS_M[BODY_POINTS]
+        return np.stack(
+            [relief.lift(body[:, :2], s, inset) for body, s in zip(people, seen, strict=True)]
+        )
+
+    def fill(self, person: np.ndarray, keypoints: np.ndarray, found: Triangulation) -> np.ndarray:
+        """Lift, in place, what ``found`` (T * 135 points) lacks where few points are triangulated.
+
+        ``person`` (T, C) and ``keypoints`` (T, C, 135, 3) are the subject's. A set takes its points
+        from the view that gives most of them; that view counts as the one that agrees. Returns the
+        sets (T,) bool that were lifted.
+        """
+        sets, views = person.shape
+        points = found.points.reshape(sets, -1, 3)
+        inlier = found.inlier.reshape(sets, -1, views)
+        triangulated = np.isfinite(points[:, BODY_POINTS, 0]).sum(1)
+        lifted = np.zeros(sets, bool)
+        for t in np.flatnonzero(triangulated < _ENOUGH_POINTS):
+            best, best_view = np.full(points.shape[1:], np.nan), -1
+            for c in np.flatnonzero(person[t] != NOBODY):
+                relief = self._relief(int(t), int(c))
+                if relief is None:
+                    continue
+                seen = keypoints[t, c, :, 2] >= self._min_confidence
+                option = relief.lift(keypoints[t, c, :, :2], seen, INSETS_M)
+                if np.isfinite(option[:, 0]).sum() > np.isfinite(best[:, 0]).sum():
+                    best, best_view = option, int(c)
+            new = np.isnan(points[t, :, 0]) & np.isfinite(best[:, 0])
+            points[t, new], inlier[t, new, best_view] = best[new], True
+            lifted[t] = new.any()
+        return lifted
