@@ -95,41 +95,35 @@ def _faults_of_capture(project: Project, name: str) -> list[str]:
 
 def _faults_of_files(row: SequenceEntry) -> list[str]:
     faults = []
-    recordings = sorted(row.recordings.glob("*.mkv")) if row.recordings.is_dir() else []
-    if not row.recordings.is_dir():
-        faults.append(f"there is no folder {row.recordings} of recordings")
-    elif not recordings:
-        faults.append(f"{row.recordings} holds no <camera>.mkv")
     for column in ("calibration", "keypoints", "candidates", "truth"):
         path = getattr(row, column)
         if path is not None and not path.exists():
             faults.append(f"column {column} says {path}, which is not there")
-    faults += [message for path in recordings for message in _faults_of_recording(path)]
-    if row.calibration.exists():
-        faults += _faults_of_poses(row.calibration, recordings)
+    if not row.recordings.is_dir():
+        return [f"there is no folder {row.recordings} of recordings", *faults]
+    return faults + (_faults_of_recordings(row) if row.calibration.exists() else [])
+
+
+def _faults_of_recordings(row: SequenceEntry) -> list[str]:
+    from intercap_core.capture.layouts import open_layout
+
+    try:
+        layout = open_layout(row)
+    except UserError as error:
+        return [str(error)]
+    if not layout.names:
+        return [f"{row.recordings} holds no camera's recording in the layout {row.layout}"]
+    faults = []
+    for name in layout.names:
+        if name not in layout.extrinsics.master_from_colour:
+            faults.append(
+                f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add "
+                "the camera"
+            )
+            continue
+        try:
+            with layout.open(name):
+                pass
+        except UserError as error:
+            faults.append(str(error))
     return faults
-
-
-def _faults_of_recording(path: Path) -> list[str]:
-    from intercap_core.capture.k4a import Recording
-
-    try:
-        with Recording(path) as recording:
-            recording.camera(path.stem)
-    except UserError as error:
-        return [str(error)]
-    return []
-
-
-def _faults_of_poses(calibration: Path, recordings: list[Path]) -> list[str]:
-    from intercap_core.camera.extrinsics_files import read_extrinsics
-
-    try:
-        known = read_extrinsics(calibration).master_from_colour
-    except UserError as error:
-        return [str(error)]
-    return [
-        f"{calibration}: has no pose of {path.stem}, which {path} records; add the camera"
-        for path in recordings
-        if path.stem not in known
-    ]
