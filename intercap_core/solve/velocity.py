@@ -23,12 +23,20 @@ def limited_velocity(
     have velocity 0 and are nobody's neighbour; with one neighbour the one-sided difference counts.
     """
     known = np.isfinite(positions).all(-1) if known is None else known
+    change = np.diff(np.where(known[..., None], positions, 0), axis=0)
+    return limited_rate(change, times, max_speed=max_speed, known=known)
+
+
+def limited_rate(
+    change: np.ndarray, times: np.ndarray, *, max_speed: float, known: np.ndarray
+) -> np.ndarray:
+    """:func:`limited_velocity` (T, ..., D) from the ``change`` (T-1, ..., D) from each position to
+    the next: of what is no vector itself, as rotations."""
     if len(times) < 2:
-        return np.zeros(positions.shape)
-    step = np.diff(times).reshape(-1, *[1] * (positions.ndim - 1))
+        return np.zeros((len(times), *change.shape[1:]))
+    step = np.diff(times).reshape(-1, *[1] * (change.ndim - 1))
     both = known[1:] & known[:-1] & (step[..., 0] < MAX_GAP_S)
-    slope = np.where(both[..., None], np.diff(np.where(known[..., None], positions, 0), axis=0), 0)
-    slope = slope / step
+    slope = np.where(both[..., None], change, 0) / step
     none, still = np.zeros((1, *both.shape[1:]), bool), np.zeros((1, *slope.shape[1:]))
     ahead, behind = np.concatenate([slope, still]), np.concatenate([still, slope])
     has_ahead, has_behind = np.concatenate([both, none]), np.concatenate([none, both])

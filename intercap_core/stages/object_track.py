@@ -40,7 +40,7 @@ class _Recording:
         rig = Rig.from_scene(scene)
         with artefacts.read(scene, SCENE) as artefact:
             present = artefact["present"]
-            bias = artefact["depth_bias"]
+            bias, late = artefact["depth_bias"], artefact["time_offset"]
             self._frames = frames.showing(artefact["image_of"])
             self._detections = detections.showing(artefact["image_of"])
             self.up = artefact["zup_from_master"][2, :3].copy()
@@ -50,7 +50,9 @@ class _Recording:
         usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
         self.cameras = [int(c) for c in np.flatnonzero(usable)]
         self._geometry = [
-            ViewGeometry.for_object(rig[c], diameter_m, float(np.nan_to_num(bias[c])))
+            ViewGeometry.for_object(
+                rig[c], diameter_m, float(np.nan_to_num(bias[c])), float(late[c])
+            )
             for c in self.cameras
         ]
 
@@ -108,6 +110,7 @@ def run(
             source.views,
             source.labels(),
             settings,
+            times=recording.time_s,
             labels=object_.labels,
             up=source.up if np.isfinite(source.up).all() else None,
         )

@@ -21,7 +21,10 @@ MAX_STEP = 4
 
 @dataclass(frozen=True, eq=False)
 class ViewGeometry:
-    """A camera with its reduced lenses; pixel (i, j) of a reduced image is (i, j) * step."""
+    """A camera with its reduced lenses; pixel (i, j) of a reduced image is (i, j) * step.
+
+    It exposes ``time_offset_s`` later than the frame set's time.
+    """
 
     camera: Camera
     lens: Intrinsics
@@ -29,10 +32,15 @@ class ViewGeometry:
     depth_lens: Intrinsics | None
     depth_step: int
     depth_bias_m: float = 0.0
+    time_offset_s: float = 0.0
 
     @classmethod
     def for_object(
-        cls, camera: Camera, diameter_m: float, depth_bias_m: float = 0.0
+        cls,
+        camera: Camera,
+        diameter_m: float,
+        depth_bias_m: float = 0.0,
+        time_offset_s: float = 0.0,
     ) -> ViewGeometry:
         """Choose the reduction by how large the object appears at a typical distance."""
         step = _step(camera.colour.fx, diameter_m, SILHOUETTE_PX)
@@ -44,6 +52,7 @@ class ViewGeometry:
             reduced_lens(camera.depth, depth_step) if camera.depth else None,
             depth_step,
             depth_bias_m,
+            time_offset_s,
         )
 
 

@@ -91,36 +91,45 @@ def fit_pose(
     labels: tuple[str, ...] = (),
     rounds: tuple[int, ...] = (4, 5),
     start_scale: float = 1.0,
+    twist: np.ndarray | None = None,
 ) -> Fit:
     """Fit the pose (4, 4) to all views, starting from ``pose``.
 
     Before each of the ``rounds`` (Gauss-Newton steps at most), every view keeps the candidate
     that overlaps the render most, if by ``min_overlap``. ``background_term`` also penalises
     render over known background. ``start_scale`` shrinks the first robust scale where the start is
-    known better than from a search. The pivot of the rotation is the mesh's origin.
+    known better than from a search. The pivot of the rotation is the mesh's origin. ``twist`` (6,)
+    is the object's turn and shift in a second (rad, m), by which each view sees it when it exposes;
+    None = at rest. To first order in what it moves meanwhile, a step of the pose is the same step
+    of what every view sees.
     """
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
     depth_scale = max(depth_scale * start_scale, DEPTH_SCALES_M[1])
     contour_scale = max(contour_scale * start_scale, CONTOUR_SCALES_PX[1])
     information = np.eye(6)
     done = False
-    fits = [ViewFit(mesh, view, pose, min_overlap, labels) for view in views]
+    seen = _seen(pose, views, twist)
+    fits = [
+        ViewFit(mesh, view, there, min_overlap, labels)
+        for view, there in zip(views, seen, strict=True)
+    ]
     for number, steps in enumerate(rounds):
         if number:
-            changed = [view_fit.choose_again(pose) for view_fit in fits]
+            changed = [fit.choose_again(there) for fit, there in zip(fits, seen, strict=True)]
             if done and not any(changed):
                 break
         done = False
         for _ in range(steps):
             hessian, gradient = _prior_terms(prior, pose)
-            for view_fit in fits:
-                h, g = view_fit.normal_equations(pose, depth_scale, contour_scale, background_term)
+            for fit, there in zip(fits, seen, strict=True):
+                h, g = fit.normal_equations(there, depth_scale, contour_scale, background_term)
                 hessian += h
                 gradient += g
             information = hessian
             damped = hessian + np.diag(DAMPING * np.diag(hessian) + 1e-9)
             step = _limited(-np.linalg.solve(damped, gradient))
-            pose = _moved(pose, step)
+            pose = moved(pose, step)
+            seen = _seen(pose, views, twist)
             settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
             depth_scale = max(depth_scale * SHRINK, DEPTH_SCALES_M[1])
             contour_scale = max(contour_scale * SHRINK, CONTOUR_SCALES_PX[1])
@@ -128,7 +137,10 @@ def fit_pose(
             if settled and small:
                 done = True
                 break
-    reports = tuple(view_fit.report(pose, REPORT_SCALE * CONTOUR_SCALES_PX[1]) for view_fit in fits)
+    reports = tuple(
+        fit.report(there, REPORT_SCALE * CONTOUR_SCALES_PX[1])
+        for fit, there in zip(fits, seen, strict=True)
+    )
     return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), reports)
 
 
@@ -160,8 +172,15 @@ def _limited(step: np.ndarray) -> np.ndarray:
     return step / max(1.0, turn / MAX_STEP_RAD, shift / MAX_STEP_M)
 
 
-def _moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    moved = pose.copy()
-    moved[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
-    moved[:3, 3] += step[3:]
-    return moved
+def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
+    """The pose that each view shows: the same array where it exposes at the frame set's time."""
+    late = [0.0 if twist is None else view.geometry.time_offset_s for view in views]
+    return [pose if not t or twist is None else moved(pose, t * twist) for t in late]
+
+
+def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) after ``step`` (6,): a turn about the origin, from the left, and a shift."""
+    result = pose.copy()
+    result[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
+    result[:3, 3] += step[3:]
+    return result

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit, MotionPrior, assess, fit_pose
+from intercap_core.tracking.motion import expected, extrapolated, loose, twists
 from intercap_core.tracking.search import own_turns, plausibility, rank_frames, same_pose, search
 
 log = logging.getLogger(__name__)
@@ -36,13 +36,14 @@ DOUBT = 0.55  # of the usual score: below, a search may find better
 RECOVERY_CONFIDENCE = 0.40
 RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
 SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
-STILL_M, STILL_RAD = 0.004, np.radians(1.5)  # slower than this: no motion is predicted
-ONSET_M, ONSET_RAD = 0.02, np.radians(5)  # in one frame, from rest
 AGREE_M, AGREE_DEG = 0.02, 10.0
-GROWTH_LOST_M, GROWTH_LOST_RAD = 0.04, np.radians(8)  # standard deviation added a lost frame
 CACHED_FRAMES = 12
 PASS_ROUNDS = (3, 3)
 PASS_SCALE = 0.5
+# What a view sees has moved by less until it exposes: not worth another fit.
+MOVED_M, MOVED_RAD = 0.001, np.radians(0.2)
+TIMED_ROUNDS, TIMED_SCALE = (4,), 0.25
+WORSE_SCORE = 0.98  # of a fit that allows for the motion, for which the motion is not believed
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ class Tracker:
     """Tracks one object through one recording.
 
     ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
-    labels alone; ``labels`` the classes the object may be given; ``up`` (3,) the vertical.
+    labels alone; ``times`` (T,) of the frames, seconds; ``labels`` the classes the object may be
+    given; ``up`` (3,) the vertical.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class Tracker:
         labels_by_view: list[list[list[str]]],
         settings: ObjectTrackSettings,
         *,
+        times: np.ndarray,
         labels: tuple[str, ...],
         up: np.ndarray | None,
     ) -> None:
@@ -90,6 +93,7 @@ class Tracker:
         self._labels_by_view = labels_by_view
         self._count = len(labels_by_view)
         self._settings = settings
+        self._times = times
         self._labels = labels
         self._up = up
         self._searches = 0
@@ -118,7 +122,8 @@ class Tracker:
             for t, result in self._pass(frames, one[start_at], known=one, may_search=False):
                 two[t] = result
         merged = [self._merge(a, b) for a, b in zip(one, two, strict=True)]
-        return Track(self._unwrapped(merged), seed_frame, initial is not None)
+        timed = self._timed(self._unwrapped(merged))
+        return Track(self._unwrapped(timed), seed_frame, initial is not None)
 
     def _both_ways(self, seed_frame: int, seed: Fit) -> list[FrameResult]:
         """Every frame (T), tracked from the seed to both ends."""
@@ -236,8 +241,8 @@ class Tracker:
         lost_for = 1 if start.lost else 0
         self._searches = 0
         for t in frames:
-            predicted = now if lost_for else _extrapolated(before, now)
-            prior = _expected(before, now, predicted, lost_for)
+            predicted = now if lost_for else extrapolated(before, now)
+            prior = expected(before, now, predicted, lost_for)
             start_pose = self._better_start(t, predicted, now)
             if known is not None and same_pose(self._mesh, start_pose, known[t].fit.pose):
                 result = known[t]
@@ -252,7 +257,7 @@ class Tracker:
                 result = again or result
             if result.lost:
                 lost_for += 1
-                frozen = replace(result.fit, pose=predicted, covariance=_loose(prior))
+                frozen = replace(result.fit, pose=predicted, covariance=loose(prior))
                 result = replace(result, fit=frozen)
                 before = now = predicted
             else:
@@ -272,6 +277,7 @@ class Tracker:
         prior: MotionPrior,
         rounds: tuple[int, ...] = PASS_ROUNDS,
         scale: float = PASS_SCALE,
+        twist: np.ndarray | None = None,
     ) -> Fit:
         return fit_pose(
             self._mesh,
@@ -283,6 +289,7 @@ class Tracker:
             labels=self._labels,
             rounds=rounds,
             start_scale=scale,
+            twist=twist,
         )
 
     def _better_start(self, t: int, predicted: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -331,6 +338,29 @@ class Tracker:
             better = one if not one.lost else better
         return replace(better, disagree=disagree and not better.lost)
 
+    def _timed(self, frames: list[FrameResult]) -> list[FrameResult]:
+        """The frames in which the object moves, fitted again to what each view sees of it when it
+        exposes: the passes take all views to show one moment."""
+        poses = np.array([frame.fit.pose for frame in frames])
+        known = np.array([not frame.lost for frame in frames])
+        found = twists(poses, known, self._times)
+        late = max(abs(view.geometry.time_offset_s) for view in self._views(0))
+        turn, shift = (late * np.linalg.norm(part, axis=1) for part in (found[:, :3], found[:, 3:]))
+        result = list(frames)
+        for t in map(int, np.flatnonzero(known & ((turn > MOVED_RAD) | (shift > MOVED_M)))):
+            before = poses[max(t - 1, 0)]
+            fit = self._fit(
+                t,
+                poses[t],
+                expected(before, poses[t], poses[t], 0),
+                rounds=TIMED_ROUNDS,
+                scale=TIMED_SCALE,
+                twist=found[t],
+            )
+            if fit.score >= WORSE_SCORE * frames[t].fit.score and not self._result(fit).lost:
+                result[t] = replace(frames[t], fit=fit)
+        return result
+
     def _unwrapped(self, frames: list[FrameResult]) -> list[FrameResult]:
         """Equivalent poses that follow each other as closely as the symmetry allows."""
         if self._mesh.symmetry.trivial:
@@ -342,41 +372,8 @@ class Tracker:
         return result
 
 
-def _extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """The next pose at constant velocity; the last one where the object is at rest."""
-    shift = now[:3, 3] - before[:3, 3]
-    turn = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T)
-    predicted = now.copy()
-    if np.linalg.norm(shift) > STILL_M:
-        predicted[:3, 3] += shift
-    if turn.magnitude() > STILL_RAD:
-        predicted[:3, :3] = turn.as_matrix() @ now[:3, :3]
-    return predicted
-
-
-def _expected(
-    before: np.ndarray, now: np.ndarray, predicted: np.ndarray, lost_for: int
-) -> MotionPrior:
-    """How far the object may be from the prediction: it may start to move, turn or stop.
-
-    From rest one frame of a hand's acceleration, in motion half of the last step beside that, and
-    more for every frame since it was last seen.
-    """
-    shift = float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
-    turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())
-    return MotionPrior(
-        predicted,
-        ONSET_M + 0.5 * shift + lost_for * GROWTH_LOST_M,
-        ONSET_RAD + 0.5 * turn + lost_for * GROWTH_LOST_RAD,
-    )
-
-
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:
     """How implausible a jump is, in units of confidence: a tie goes to the nearer pose."""
     distance = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
     angle = float(mesh.symmetry.rotation_error_deg(pose[:3, :3], last[:3, :3]))
     return min(0.1 * distance, 0.1) + min(0.05 * angle / 180, 0.05)
-
-
-def _loose(prior: MotionPrior) -> np.ndarray:
-    return np.diag(np.repeat([prior.sigma_rad**2, prior.sigma_m**2], 3))

@@ -56,6 +56,9 @@ class ObjectCapture:
     depth_noise_m: float = 0.002
     missed: set[tuple[int, int]] = field(default_factory=set)  # (t, c) without the object
     hidden: set[int] = field(default_factory=set)  # frames in which the object is not there at all
+    speed: float = 0.03  # metres a frame
+    turn_deg: float = 3.0  # a frame
+    time_offset: np.ndarray = field(default_factory=lambda: np.zeros(16))  # of each camera, seconds
 
     @classmethod
     def make(
@@ -70,12 +73,22 @@ class ObjectCapture:
     ) -> ObjectCapture:
         """The object glides and turns in front of the post, ``speed`` metres a frame."""
         rig, master_from_room = ring(cameras)
-        poses = []
-        for t in range(frames):
-            turn = Rotation.from_euler("zx", [40 + turn_deg * t, 8], degrees=True).as_matrix()
-            place = np.array([0.25, -0.2 + speed * t, 0.5])
-            poses.append(master_from_room @ rigid(turn, place))
-        return cls(mesh, rig, master_from_room, np.array(poses), label)
+        capture = cls(
+            mesh, rig, master_from_room, np.zeros((frames, 4, 4)), label,
+            speed=speed, turn_deg=turn_deg,
+        )  # fmt: skip
+        capture.poses[:] = [capture.pose_at(t) for t in range(frames)]
+        return capture
+
+    @property
+    def times(self) -> np.ndarray:
+        return np.arange(len(self.poses)) / FPS
+
+    def pose_at(self, t: float) -> np.ndarray:
+        """master_from_object (4, 4), ``t`` in frames."""
+        turn = Rotation.from_euler("zx", [40 + self.turn_deg * t, 8], degrees=True).as_matrix()
+        place = np.array([0.25, -0.2 + self.speed * t, 0.5])
+        return self.master_from_room @ rigid(turn, place)
 
     def image(self, t: int, c: int) -> tuple[np.ndarray, bytes, Detected]:
         """Depth (H, W) uint16 mm, the person's RLE and candidates of one image."""
@@ -106,7 +119,8 @@ class ObjectCapture:
         in_room = camera_from_master @ self.master_from_room
         at_post = in_room @ rigid(np.eye(3), np.array([-0.12, 0.0, 0.85]))
         at_floor = in_room @ rigid(np.eye(3), np.array([0, 0, -0.02]))
-        object_pose = camera_from_master @ self.poses[t]
+        exposed = self.pose_at(t + FPS * self.time_offset[c])
+        object_pose = camera_from_master @ exposed
         if t in self.hidden:
             object_pose = camera_from_master @ rigid(np.eye(3), np.array([0, 0, 50.0]))
         image = render_scene(
@@ -129,7 +143,7 @@ class ObjectCapture:
         names = list(self.rig.names)
         models = self.rig.datasets()
         extrinsics = self.rig.master_from_colour
-        times = np.arange(count) / FPS
+        times = self.times
         paths = {
             stage: folder / f"{stage}.h5" for stage in ("frames", "scene", "detections", "person")
         }
@@ -177,7 +191,7 @@ class ObjectCapture:
             w.put("pair_points", np.zeros(0, np.int64))
             w.put("pair_residual_before", np.zeros(0))
             w.put("pair_residual_after", np.zeros(0))
-            w.put("time_offset", np.zeros(cameras))
+            w.put("time_offset", self.time_offset[:cameras])
             w.put("time_offset_sigma", np.full(cameras, np.nan))
             w.put("slip", np.zeros((count, cameras), np.int32))
             w.put("image_of", index)

@@ -32,12 +32,13 @@ def capture(mesh) -> ObjectCapture:
     return ObjectCapture.make(mesh, 6)
 
 
-def _views(capture: ObjectCapture, t: int) -> list[View]:
+def _views(capture: ObjectCapture, t: int, timed: bool = True) -> list[View]:
     diameter = 2 * capture.mesh.radius
     views = []
     for c, camera in enumerate(capture.rig):
         depth, person, candidates = capture.image(t, c)
-        geometry = ViewGeometry.for_object(camera, diameter)
+        late = capture.time_offset[c] if timed else 0.0
+        geometry = ViewGeometry.for_object(camera, diameter, time_offset_s=late)
         views.append(View.build(geometry, depth, person, candidates))
     return views
 
@@ -159,12 +160,12 @@ def test_frames_with_more_likely_views_are_searched_first():
     assert order[0] == 2 and sorted(order) == [0, 1, 2, 3]
 
 
-def _track(capture, mesh, initial=None):
+def _track(capture, mesh, initial=None, timed=True):
     count = len(capture.poses)
-    images = [_views(capture, t) for t in range(count)]
+    images = [_views(capture, t, timed) for t in range(count)]
     labels = [[[c.label for c in view.candidates] for view in views] for views in images]
     tracker = Tracker(
-        mesh, images.__getitem__, labels, SETTINGS, labels=LABELS,
+        mesh, images.__getitem__, labels, SETTINGS, times=capture.times, labels=LABELS,
         up=capture.master_from_room[:3, 2],
     )  # fmt: skip
     return tracker.run(initial)
@@ -190,6 +191,20 @@ def test_track_from_an_annotation_that_is_a_little_wrong(mesh):
     assert track.annotated and track.seed_frame == 2
     for t, frame in enumerate(track.frames):
         assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 3
+
+
+def test_known_offsets_of_the_exposures_make_a_moving_object_better(mesh):
+    """At 1.5 m/s and 3 rad/s, eight milliseconds are 12 mm and 1.4 degrees."""
+    capture = ObjectCapture.make(mesh, 5, speed=0.1, turn_deg=11.5)
+    capture.time_offset = np.array([0.0, 0.008, 0.008, -0.003])
+    errors = {}
+    for timed in (True, False):
+        track = _track(capture, mesh, (2, capture.poses[2]), timed)
+        found = zip(track.frames, capture.poses, strict=True)
+        errors[timed] = np.array([_error(mesh, frame.fit.pose, true) for frame, true in found])
+    # the median: ten centimetres and eleven degrees from frame to frame may lose the track's end
+    assert (np.median(errors[True], 0) < 0.4 * np.median(errors[False], 0)).all()
+    assert (np.median(errors[True], 0) < (1.5, 0.3)).all()
 
 
 def test_symmetric_poses_do_not_jump(objects_skateboard):
