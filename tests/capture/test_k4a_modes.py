@@ -152,9 +152,7 @@ def test_an_unknown_codec_is_named(tmp_path):
     ) as writer:
         writer.write_colour(bytes(100), 0)
     path.write_bytes(path.read_bytes().replace(b"MJPG\0", b"Y800\0"))
-    with pytest.raises(
-        UserError, match=r"k1\.mkv: colour is recorded as Y800, expected MJPG, NV12"
-    ):
+    with pytest.raises(UserError, match="recorded as Y800, expected MJPG, NV12"):
         read(tmp_path)
 
 

@@ -3,73 +3,31 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from kinect_files import (
+    PERIOD_US,
+    depth_at,
+    entry_of,
+    jpeg_at,
+    make_camera,
+    notes_of,
+    pose_of,
+    record,
+    run,
+)
 
 from intercap_core import artefacts
 from intercap_core.camera.extrinsics_files import Extrinsics, read_extrinsics, write_rig_file
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
-from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
 from intercap_core.config import FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
-from intercap_core.studio.calibration import write_calibration
-from intercap_core.studio.mkv import MkvWriter
-
-PERIOD_US = 66_666
-MODES = dict(colour_mode="720P", depth_mode="NFOV_2X2BINNED")
-DEPTH_DELAY_US = 500
-
-
-def pose_of(index: int) -> np.ndarray:
-    turn = cv2.Rodrigues(np.array([0.0, 1.0 * index, 0.0]))[0]
-    return rigid(turn, np.array([0.5 * index, 0.0, 0.1 * index]))
-
-
-def make_camera(index: int) -> Camera:
-    colour = Intrinsics(*COLOUR_MODES["720P"].size, 610.0 + index, 611.0, 640.0, 360.0)
-    depth = Intrinsics(*DEPTH_MODES["NFOV_2X2BINNED"].size, 252.0, 252.0, 160.0 + index, 150.0)
-    between = rigid(cv2.Rodrigues(np.array([0.1, 0, 0]))[0], np.array([-0.032, 0, 0]))
-    return Camera(f"k{index + 1}", colour, depth, between, pose_of(index))
-
-
-def depth_at(camera: int, tick: int) -> np.ndarray:
-    return np.full((288, 320), 1000 + 100 * camera + tick, np.uint16)
-
-
-def jpeg_at(camera: int, tick: int) -> bytes:
-    image = np.full((720, 1280, 3), (10 * camera, tick, 128), np.uint8)
-    return cv2.imencode(".jpg", image)[1].tobytes()
-
-
-def record(folder: Path, camera: int, ticks, *, clock_us: int = 3_000_000, depth: bool = True):
-    device = make_camera(camera)
-    with MkvWriter(
-        folder / f"{device.name}.mkv",
-        calibration_json=write_calibration(device, serial=str(camera), **MODES),
-        colour_mode=MODES["colour_mode"],
-        depth_mode=MODES["depth_mode"] if depth else None,
-        fps=15,
-        serial=str(camera),
-        start_offset_ns=clock_us * 1000,
-        depth_delay_ns=DEPTH_DELAY_US * 1000,
-        wired_sync_mode="SUBORDINATE" if camera else "MASTER",
-        subordinate_delay_ns=160_000 * camera,
-        with_imu=True,
-    ) as writer:
-        for tick in ticks:
-            time_us = clock_us + tick * PERIOD_US + 160 * camera
-            writer.write_imu([0, 0, -9.8], [0, 0, 0], time_us)
-            writer.write_colour(jpeg_at(camera, tick), time_us)
-            if depth:
-                writer.write_depth(depth_at(camera, tick), time_us + DEPTH_DELAY_US)
 
 
 @pytest.fixture
@@ -80,22 +38,7 @@ def capture(tmp_path) -> SequenceEntry:
     record(folder, 0, range(6))
     record(folder, 1, [0, 1, 2, 4, 5])
     record(folder, 2, range(5))
-    poses = {f"k{i + 1}": pose_of(i) for i in range(3)}
-    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", poses))
-    return SequenceEntry(
-        sequence="s1", subject="a", object="b", recordings=folder, calibration=tmp_path / "rig.json"
-    )
-
-
-def run(capture: SequenceEntry, drop=()) -> Path:
-    output = capture.calibration.parent / "out" / "frames.h5"
-    stage.run(sequence=capture, output=output, settings=FramesSettings(), frames_to_drop=drop)
-    return output
-
-
-def notes_of(path: Path) -> dict[str, str]:
-    with artefacts.read(path, FRAMES) as frames:
-        return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
+    return entry_of(folder, cameras=3)
 
 
 def test_every_image_is_in_its_set_unchanged(capture):
