@@ -41,6 +41,8 @@ app = typer.Typer(
         "config/subjects.tsv (config/README.md explains every entry), then\n\n"
         "[cyan]intercap check[/cyan] says what is wrong with them, and\n\n"
         "[cyan]intercap run[/cyan] computes what is missing or out of date.\n\n"
+        "[bold]A released data set:[/bold] [cyan]intercap tables intercap ~/InterCap --output "
+        "config/intercap[/cyan] writes these tables for it.\n\n"
         "[bold]One step:[/bold] [cyan]intercap joint config/demo/config.yaml cup_drink_s02[/cyan] "
         "runs one stage on artefacts that are there; "
         "[cyan]intercap inspect results/demo/cup_drink_s02/joint.h5[/cyan] says what a file holds."
@@ -71,6 +73,60 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
     if faults:
         raise typer.Exit(1)
+
+
+@app.command(rich_help_panel=WHOLE)
+def tables(
+    layout: Annotated[
+        str, typer.Argument(metavar="LAYOUT", help="Whose release it is: intercap or behave.")
+    ],
+    root: Annotated[Path, typer.Argument(help="The folder that it was unpacked to.")],
+    output: Annotated[
+        Path, typer.Option(help="Folder for config.yaml and its tables, such as config/intercap.")
+    ],
+    dataset: Annotated[
+        str | None, typer.Option(help="Name of the dataset; else that of the layout.")
+    ] = None,
+    calibrations: Annotated[
+        Path | None, typer.Option(help="intercap: folder of calibration_first, _second, _third.")
+    ] = None,
+    annotations: Annotated[
+        Path | None, typer.Option(help="intercap: folder of subject01_motion01_seg0, ...")
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="intercap: folder of the release's 01.ply, 02.ply, ...")
+    ] = None,
+    objects: Annotated[
+        Path, typer.Option(help="intercap without meshes: the objects.yaml to use.")
+    ] = Path("config/objects.yaml"),
+    keypoints: Annotated[
+        Path | None, typer.Option(help="intercap: OpenPose files, a folder for each sequence.")
+    ] = None,
+    candidates: Annotated[
+        Path | None, typer.Option(help="intercap: segmentations, a folder for each sequence.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Write over files there.")] = False,
+) -> None:
+    """Write a project's settings, tables and annotations for a released data set.
+
+    The release stays where it is and as it is. What it does not say, or says twice, is told and
+    stands as a remark in the tables: look through them before you run.
+
+    Examples: intercap tables intercap ~/InterCap --output config/intercap;
+    intercap tables behave ~/BEHAVE --output config/behave
+    """
+    from intercap_core.tables.command import write_tables
+    from intercap_core.tables.intercap import Sources
+
+    sources = Sources(calibrations, annotations, meshes, keypoints, candidates)
+    done = write_tables(
+        layout, root, output, dataset=dataset, sources=sources, objects=objects, replace=replace
+    )
+    for remark in done.remarks:
+        typer.echo(f"note: {remark}", err=True)
+    for path in done.written:
+        typer.echo(path)
+    typer.echo(f"{done.sequences} sequences; now: intercap check {output / 'config.yaml'}")
 
 
 @app.command(

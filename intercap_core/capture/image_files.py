@@ -155,3 +155,18 @@ class AlignedRecording(CameraRecording):
             self.notes.append(f"no depth image beside {without_depth} of its colour images")
         if damaged:
             self.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
+
+    def sample_depth(self, count: int) -> list[np.ndarray]:
+        """Up to ``count`` depth images (H, W) uint16 mm, spread over the recording.
+
+        Raises UserError where none can be read.
+        """
+        paths = [shot.depth for shot in self._shots if shot.depth is not None]
+        chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int))
+        images = []
+        for index in chosen.tolist():
+            with contextlib.suppress(DamagedImage):
+                images.append(read_depth(paths[index], self._size))
+        if not images:
+            raise UserError(f"{self.source}: none of its depth images can be read")
+        return images

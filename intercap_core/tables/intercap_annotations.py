@@ -1,0 +1,133 @@
+"""The InterCap release's annotations: when body and object touch, where the object starts.
+
+Each sequence has a folder ``subject<s>_motion<o>_seg<k>`` with ``contact.txt`` and ``config.ini``;
+the number after "motion" is the object's. There are more folders than sequences.
+"""
+
+from __future__ import annotations
+
+import configparser
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import ValidationError
+
+from intercap_core.config import ANY_REGION, Annotation
+
+FOLDER = re.compile(
+    r"subject(\d{1,2})_(?:motion|object)(\d{1,2})_seg_?(\d{1,2})([A-Za-z0-9_-]*)", re.IGNORECASE
+)
+FARTHEST_START = (
+    2  # frames: where an image is missing, the release's tools take one of the next two
+)
+
+Key = tuple[int, int, int]  # subject, object, segment
+
+
+@dataclass
+class Converted:
+    """An annotation as the project's YAML, empty = nothing usable, and what was wrong with it."""
+
+    text: str
+    faults: list[str] = field(default_factory=list)
+
+
+def annotation_folders(root: Path) -> dict[Key, list[Path]]:
+    """Folders by sequence; those whose name ends with the segment come first, then by name."""
+    found: dict[Key, list[tuple[str, Path]]] = {}
+    for path in sorted(root.iterdir()):
+        match = FOLDER.fullmatch(path.name)
+        if match and path.is_dir():
+            subject, thing, segment = (int(number) for number in match.groups()[:3])
+            found.setdefault((subject, thing, segment), []).append((match.group(4), path))
+    return {key: [path for _, path in sorted(paths)] for key, paths in found.items()}
+
+
+def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
+    """Turn a folder's files into an annotation of the frame sets of one recording.
+
+    ``numbers`` (T,) are the numbers of the frames that any camera has, increasing: frame set t is
+    frame ``numbers[t]``. ``with_pose``: the object's mesh is the release's, so its first pose
+    holds. What cannot be read is left out and said.
+    """
+    faults: list[str] = []
+    sections: dict[str, Any] = {}
+    contact = _contact(folder / "contact.txt", numbers, faults)
+    if contact is not None:
+        sections["contact"] = contact
+    pose = _object_pose(folder / "config.ini", numbers, faults) if with_pose else None
+    if pose is not None:
+        sections["object_pose"] = pose
+    try:
+        Annotation.model_validate(sections)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        section = str(first["loc"][0])
+        faults.append(f"{section}: {first['msg']}")
+        sections.pop(section, None)
+    if not sections:
+        return Converted("", faults)
+    head = f"# From {folder.name} of the release. Frames are frame sets, from 0.\n"
+    return Converted(head + yaml.safe_dump(sections, sort_keys=False), faults)
+
+
+def _contact(
+    path: Path, numbers: np.ndarray, faults: list[str]
+) -> list[dict[str, str | int]] | None:
+    """Intervals of contact: lines alternate between first frame, from 1, and last frame.
+
+    None where there are none: an empty file does not say that nothing touches.
+    """
+    if not path.is_file():
+        return None
+    try:
+        values = [int(word) for word in path.read_text(encoding="utf-8").split()]
+    except (OSError, ValueError):
+        faults.append("contact.txt is not a list of frame numbers")
+        return None
+    if len(values) % 2:
+        faults.append(f"contact.txt has {len(values)} numbers, the last start has no end")
+        values.pop()
+    intervals: list[dict[str, str | int]] = []
+    for first, end in zip(values[::2], values[1::2], strict=True):
+        start = first - 1  # counted from 1; the end is exclusive once that is so
+        if start < 0 or end <= start:
+            faults.append(f"contact.txt: {first} to {end} is no interval")
+            continue
+        sets = [int(t) for t in np.searchsorted(numbers, (start, end))]
+        if sets[0] == sets[1]:
+            faults.append(f"contact.txt: no image from {first} to {end}")
+            continue
+        intervals.append({"part": ANY_REGION, "start": sets[0], "end": sets[1]})
+    return intervals or None
+
+
+def _object_pose(path: Path, numbers: np.ndarray, faults: list[str]) -> dict[str, Any] | None:
+    """The object's pose in the frame that the release's tracker starts from."""
+    if not path.is_file():
+        return None
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string(path.read_text(encoding="utf-8"))
+        translation, rotation = (
+            [float(word) for word in parser[section][key].split()]
+            for section, key in (("init_trans", "trans"), ("init_rot", "rot"))
+        )
+        frame = int(parser["init_frame_id"]["id"])
+        if len(translation) != 3 or len(rotation) != 3:
+            raise ValueError
+    except (OSError, ValueError, KeyError, configparser.Error):
+        faults.append(
+            "config.ini has no [init_trans] trans, [init_rot] rot (three numbers each) and "
+            "[init_frame_id] id"
+        )
+        return None
+    at = int(np.searchsorted(numbers, frame))
+    if frame < 0 or at == len(numbers) or numbers[at] > frame + FARTHEST_START:
+        faults.append(f"config.ini gives the object's pose in frame {frame}, which has no image")
+        return None
+    return {"frame": at, "rotation_vector": rotation, "translation": translation}

@@ -1,0 +1,126 @@
+"""A project's settings, tables and annotations, written for recordings that are there."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from intercap_core.config import SequenceEntry
+from intercap_core.errors import UserError
+
+COLUMNS = (
+    "sequence", "subject", "object", "layout", "recordings", "calibration", "keypoints",
+    "candidates", "annotation",
+)  # fmt: skip
+REQUIRED = [name for name, info in SequenceEntry.model_fields.items() if info.is_required()]
+
+
+@dataclass
+class Row:
+    """One sequence: its columns, and remarks that stand above it in the table."""
+
+    columns: dict[str, str | Path]
+    remarks: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Draft:
+    """What is to be written.
+
+    ``subjects``: gender by name; ``objects``: an objects.yaml that is there, or entries whose
+    ``mesh`` and ``contact_vertices`` are paths; ``annotations``: text by path below the folder
+    of annotations; ``remarks``: what the user must know, also written into config.yaml.
+    """
+
+    dataset: str
+    rows: list[Row] = field(default_factory=list)
+    subjects: dict[str, str] = field(default_factory=dict)
+    objects: Path | dict[str, dict[str, Any]] = field(default_factory=dict)
+    annotations: dict[str, str] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:
+    """Write config.yaml and what it names into ``folder``; returns the files written.
+
+    Paths are written relative to the file that holds them. Raises UserError, before anything is
+    written, where a file is there and ``replace`` is False, or a path holds a tab or a line break.
+    """
+    files = {
+        "config.yaml": _config(draft, folder),
+        "sequences.tsv": _sequences(draft.rows, folder),
+        "subjects.tsv": _table(("subject", "gender"), sorted(draft.subjects.items())),
+    }
+    if not isinstance(draft.objects, Path):
+        files["objects.yaml"] = _objects(draft.objects, folder)
+    files |= {f"annotations/{path}": text for path, text in draft.annotations.items()}
+    there = [folder / name for name in files if os.path.lexists(folder / name)]
+    if there and not replace:
+        more = f" (and {len(there) - 1} more)" if len(there) > 1 else ""
+        raise UserError(
+            f"{there[0]}: is there already{more}, so nothing was written; name another output "
+            "folder, or add --replace to write these files anew"
+        )
+    written = []
+    try:
+        for name, text in files.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+            written.append(path)
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}); name another output folder"
+        ) from None
+    return written
+
+
+def _config(draft: Draft, folder: Path) -> str:
+    lines = [f"# {remark}" for remark in draft.remarks]
+    objects = draft.objects if isinstance(draft.objects, Path) else folder / "objects.yaml"
+    settings = {"dataset": draft.dataset, "objects": _relative(objects, folder)}
+    return "\n".join([*lines, yaml.safe_dump(settings, sort_keys=False)])
+
+
+def _sequences(rows: list[Row], folder: Path) -> str:
+    used = [
+        name for name in COLUMNS if name in REQUIRED or any(row.columns.get(name) for row in rows)
+    ]
+    lines = []
+    for row in rows:
+        lines += [f"# {remark}" for remark in row.remarks]
+        lines.append("\t".join(_cell(row.columns.get(name, ""), folder) for name in used))
+    return "\n".join(["\t".join(used), *lines, ""])
+
+
+def _cell(value: str | Path, folder: Path) -> str:
+    text = _relative(value, folder) if isinstance(value, Path) else value
+    if any(character in text for character in "\t\r\n"):
+        raise UserError(
+            f"{text!r}: a path with a tab or a line break cannot stand in a table; rename it"
+        )
+    return text
+
+
+def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    return "\n".join(["\t".join(cells) for cells in [header, *rows]] + [""])
+
+
+def _objects(entries: dict[str, dict[str, Any]], folder: Path) -> str:
+    written = {
+        name: {
+            key: _relative(value, folder) if isinstance(value, Path) else value
+            for key, value in entry.items()
+        }
+        for name, entry in entries.items()
+    }
+    return yaml.safe_dump(written, sort_keys=False)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    # As the loader joins them: by text, so that links stay links.
+    return os.path.relpath(os.path.abspath(path), os.path.abspath(folder))
