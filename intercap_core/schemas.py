@@ -311,6 +311,8 @@ _PER_STAGE_TRUTH = {
         ("object_rotation", ("T",), "float32", "angle, the smallest over the symmetry group", "deg"),
         ("object_normalised", ("T",), "float32", "translation error over stated deviation, median 1 if honest", "1"),
         ("object_centre", ("T", "3"), "float64", "centre of mass of the fitted object", "m"),
+        ("object_turn", ("T",), "float32", "turn since the frame before, beyond the true one, the smallest over the symmetry group; NaN in the first", "deg"),
+        ("object_flagged", ("T",), "bool", "the stage itself does not trust the object's pose", "1"),
         ("acceleration_body", ("T",), "float32", "error of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
         ("acceleration_hands", ("T",), "float32", "the same over 30 finger joints", "m/frame^2"),
         ("acceleration_object", ("T",), "float32", "the same at the object's centre", "m/frame^2"),
@@ -322,7 +324,7 @@ _PER_STAGE_TRUTH = {
 
 METRICS = Schema(
     name="metrics",
-    version=1,
+    version=2,
     stage="metrics",
     attributes={
         "sequence": "sequence name",
@@ -365,7 +367,7 @@ METRICS = Schema(
         "truth/object_views": Field(("T",), "int8", "views that truly see the object", optional=True),
         "truth/object_moving": Field(("T",), "bool", "the true object moves", optional=True),
         "truth/object_centre": Field(("T", "3"), "float64", "true centre of mass", "m", "master", optional=True),
-        "truth/extrinsics_before": Field(("C",), "float32", "RMS displacement over a 2 m cube by each camera's error as given", "m", optional=True),
+        "truth/extrinsics_before": Field(("C",), "float32", "RMS displacement over a 2 m cube by each camera's error as given; NaN = the master, or no images", "m", optional=True),
         "truth/extrinsics_after": Field(("C",), "float32", "the same after refinement", "m", optional=True),
     },
 )  # fmt: skip

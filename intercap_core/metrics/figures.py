@@ -148,7 +148,10 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """True displacement of the cameras but the master, mean and worst, before and after."""
+    """True displacement of the cameras that have images, mean and worst, before and after.
+
+    The master is left out: poses are relative to it.
+    """
     figures: Figures = {}
     for when in ("before", "after"):
         found = [
@@ -157,7 +160,7 @@ def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
             if f"truth/extrinsics_{when}" in s.values
         ]
         if found:
-            moved = 1e3 * np.concatenate([np.sort(v)[1:] for v in found])  # the master stays
+            moved = 1e3 * np.concatenate([v[np.isfinite(v)] for v in found]).astype(np.float64)
             if len(moved) == 0:
                 continue
             figures[f"{when}_mean_mm"] = float(moved.mean())
@@ -208,7 +211,7 @@ def _object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures
         return {}
     seen = np.concatenate([s.values["truth/object_views"] >= 2 for s in have])
     lost = np.concatenate([_lost(s, stage) for s in have])
-    flagged = np.concatenate([s.values["flagged"] for s in have])
+    flagged = np.concatenate([s.values[f"{key}flagged"] for s in have])
     figures: Figures = {"lost_share": float(lost.mean())}
     figures["lost_unnoticed_share"] = float((lost & ~flagged).mean())
     for name, scale in (("translation", 1e3), ("rotation", 1.0)):
@@ -227,16 +230,27 @@ def _object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures
     counted = [f for f in first if f is not None]
     if counted:
         figures["first_frame_success"] = float(np.mean(counted))
-    jitter, lags = [], []
-    for s in have:
+    return figures | _promptness_figures(have, key)
+
+
+def _promptness_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
+    """Jitter over all frames of rest, and by how much the track errs at the start of motion."""
+    figures: Figures = {}
+    steps, turns, lags = [np.zeros(0)], [np.zeros(0)], []
+    for s in sequences:
         centre, true = s.values[key + "centre"], s.values["truth/object_centre"]
         moves = s.values["truth/object_moving"]
-        jitter.append(motion.rest_jitter(centre, true, moves))
+        resting = motion.resting_steps(moves)
+        steps.append(motion.steps(centre, true)[resting])
+        turns.append(s.values[key + "turn"][1:][resting])
         lags += motion.motion_onset_lags(centre, true, moves, s.fps)
-    if np.isfinite(jitter).any():
-        figures["rest_jitter_mm"] = 1e3 * float(np.sqrt(np.nanmean(np.square(jitter))))
+    for name, values, scale in (("mm", steps, 1e3), ("deg", turns, 1.0)):
+        pooled_steps = np.concatenate(values).astype(np.float64)
+        if len(pooled_steps):
+            figures[f"rest_jitter_{name}"] = scale * float(np.sqrt((pooled_steps**2).mean()))
     if lags:
-        figures["motion_onset_frames"] = float(np.mean(lags))
+        figures["motion_onset_frames"] = float(np.abs(lags).mean())
+        figures["motion_onset_late_frames"] = float(np.mean(lags))
     return figures
 
 

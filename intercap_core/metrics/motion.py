@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.rigid.symmetry import SymmetryGroup
+
 REFERENCE_FPS = 30.0
 REST_SPEED = 0.02  # m/s: the true object rests below this ...
 REST_TURN = np.radians(5.0)  # ... and below this, rad/s
@@ -49,14 +51,25 @@ def moving(rotation: np.ndarray, centre: np.ndarray, fps: float) -> np.ndarray:
     return result
 
 
-def rest_jitter(centre: np.ndarray, true_centre: np.ndarray, is_moving: np.ndarray) -> float:
-    """RMS frame-to-frame motion of the track beyond the true one while the object rests, metres.
+def resting_steps(is_moving: np.ndarray) -> np.ndarray:
+    """Steps (T-1,) between frames (T,) over which the true object rests."""
+    return ~is_moving[1:] & ~is_moving[:-1]
 
-    ``centre`` and ``true_centre`` (T, 3), ``is_moving`` (T,); NaN where it never rests.
+
+def steps(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
+    """Length (T-1,) of the track's steps beyond the true ones, metres; both (T, 3)."""
+    return np.linalg.norm(np.diff(centre - true_centre, axis=0), axis=-1)
+
+
+def turns(rotation: np.ndarray, true_rotation: np.ndarray, symmetry: SymmetryGroup) -> np.ndarray:
+    """Angle (T-1,) of the track's turns beyond the true ones, degrees; both (T, 3, 3).
+
+    Each rotation is taken as the equivalent one that is nearest to the rotation before it.
     """
-    resting = ~is_moving[1:] & ~is_moving[:-1]
-    steps = np.diff(centre - true_centre, axis=0)[resting]
-    return float(np.sqrt((steps**2).sum(-1).mean())) if len(steps) else float("nan")
+    nearest = symmetry.nearest_equivalent(rotation[1:], rotation[:-1])
+    turned = nearest @ np.swapaxes(rotation[:-1], -1, -2)
+    truly = true_rotation[1:] @ np.swapaxes(true_rotation[:-1], -1, -2)
+    return SymmetryGroup.none().rotation_error_deg(turned, truly)
 
 
 def motion_onset_lags(

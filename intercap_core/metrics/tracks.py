@@ -45,10 +45,12 @@ class BodyTrack:
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """T poses master_from_object; ``covariance`` (T, 6, 6) or None."""
+    """T poses master_from_object; ``flagged`` (T,): the stage itself does not trust the frame;
+    ``covariance`` (T, 6, 6) or None."""
 
     rotation: np.ndarray
     translation: np.ndarray
+    flagged: np.ndarray
     covariance: np.ndarray | None = None
 
 
@@ -68,5 +70,10 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
 def read_object(path: Path, stage: str) -> ObjectTrack:
     """Poses of the ``"object_track"`` or ``"joint"`` artefact; raises UserError as reading does."""
     with artefacts.read(path, OBJECT_TRACK if stage == "object_track" else JOINT) as artefact:
-        covariance = artefact["covariance"] if stage == "object_track" else None
-        return ObjectTrack(artefact["rotation"], artefact["translation"], covariance)
+        first = stage == "object_track"
+        return ObjectTrack(
+            artefact["rotation"],
+            artefact["translation"],
+            artefact["lost" if first else "flagged"],
+            artefact["covariance"] if first else None,
+        )

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
-from intercap_core.errors import UserError
 from intercap_core.metrics import body, contact, motion, object_pose
 from intercap_core.metrics.clouds import SurfaceSamples
+from intercap_core.metrics.times import match_times
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import METRIC_REGIONS, TRUTH
@@ -50,7 +50,7 @@ class Truth:
         Raises UserError where the file is broken or does not cover those moments.
         """
         with artefacts.read(path, TRUTH) as file:
-            at = _match(path, file["times"], times, fps)
+            at = match_times(path, file["times"], times, fps)
             vertices = visible = None
             face, weights = file["correspondence_face"], file["correspondence_weights"]
             if len(face) == num_vertices:
@@ -90,21 +90,6 @@ class Truth:
         return self.object_vertices[nearest], self.object_visible[:, nearest]
 
 
-def _match(path: Path, true_times: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
-    """The truth's set (T,) nearest to each recorded set."""
-    if len(true_times) == len(times):
-        return np.arange(len(times))
-    after = np.clip(np.searchsorted(true_times, times), 1, len(true_times) - 1)
-    nearest = after - (times - true_times[after - 1] < true_times[after] - times)
-    worst = float(np.abs(true_times[nearest] - times).max())
-    if worst > 0.5 / fps:
-        raise UserError(
-            f"{path}: holds {len(true_times)} frames and the recording {len(times)}, the nearest "
-            f"up to {worst:.3f} s apart; make the truth of this recording again or leave it out"
-        )
-    return nearest
-
-
 def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
     """Errors of T fitted bodies' joints by key of the metrics artefact."""
     joints, tips = track.joints, track.tips
@@ -137,6 +122,10 @@ def object_errors(
             track.rotation, truth.rotation, mesh.symmetry
         ),
         "object_centre": fitted,
+        "object_turn": np.append(
+            np.nan, motion.turns(track.rotation, truth.rotation, mesh.symmetry)
+        ),
+        "object_flagged": track.flagged,
         "acceleration_object": motion.acceleration_error(fitted[:, None], true[:, None], fps),
     }
     if track.covariance is not None:

@@ -37,7 +37,9 @@ _TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
     ("acceleration_hands_mm", "acceleration error, hands, mm/frame²", 2, False),
     ("acceleration_object_mm", "acceleration error, object, mm/frame²", 2, False),
     ("rest_jitter_mm", "jitter while the object rests, mm", 2, False),
-    ("motion_onset_frames", "late at the start of motion, frames", 1, None),
+    ("rest_jitter_deg", "… its rotation, degrees", 2, False),
+    ("motion_onset_frames", "start of motion late or early by, frames", 1, False),
+    ("motion_onset_late_frames", "… signed, late is positive", 1, None),
     ("joint_normalised_median", "error over stated deviation, joints (honest: 0.7-1.4)", 2, None),
     ("object_normalised_median", "error over stated deviation, object (honest: 0.7-1.4)", 2, None),
 )

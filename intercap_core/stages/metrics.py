@@ -170,9 +170,12 @@ def _extrinsics_errors(scene: artefacts.Artefact, truth: truths.Truth) -> Values
     order = [truth.camera_names.index(name) for name in names]
     true = truth.master_from_colour[order]
     master = names.index(str(scene.attributes["master"]))
+    counted = scene["present"] & (np.arange(len(names)) != master)
     return {
-        "truth/extrinsics_before": displacement(scene["master_from_colour_start"], true, master),
-        "truth/extrinsics_after": displacement(scene["master_from_colour"], true, master),
+        f"truth/extrinsics_{when}": np.where(
+            counted, displacement(scene[key], true, master), np.nan
+        )
+        for when, key in (("before", "master_from_colour_start"), ("after", "master_from_colour"))
     }
 
 

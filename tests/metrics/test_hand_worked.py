@@ -185,9 +185,21 @@ def test_moving_jitter_and_onset() -> None:
 
     shaking = centre.copy()
     shaking[:, 1] += 0.001 * (-1.0) ** np.arange(30)
-    assert motion.rest_jitter(shaking, centre, moves) == pytest.approx(0.002)
-    assert motion.rest_jitter(centre, centre, moves) == 0
-    assert np.isnan(motion.rest_jitter(centre, centre, np.ones(30, bool)))
+    assert motion.steps(shaking, centre) == pytest.approx(0.002)
+    assert motion.steps(centre, centre) == pytest.approx(0)
+    assert motion.resting_steps(moves).tolist() == [True] * 13 + [False] * 16
+
+
+def test_turns_are_beyond_the_true_ones_and_over_the_symmetry_group() -> None:
+    none = SymmetryGroup.none()
+    round_ = SymmetryGroup.from_settings(
+        Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
+    )
+    found = np.stack([_turn_z(angle) for angle in (0, 2, 2)])
+    true = np.stack([_turn_z(angle) for angle in (40, 40, 43)])
+    assert motion.turns(found, true, none) == pytest.approx([2, 3], abs=1e-5)
+    still = np.repeat(np.eye(3)[None], 3, 0)
+    assert motion.turns(found, still, round_) == pytest.approx([0, 0], abs=1e-5)
 
 
 def test_cloud_distances_count_all_or_only_visible_points() -> None:

@@ -61,6 +61,8 @@ def _tracked(**values: object) -> SequenceMetrics:
         "truth/joint/object_translation": [0.001, 0.003, 0.900, 0.100],
         "truth/joint/object_rotation": [1.0, 2.0, 99.0, 3.0],
         "truth/joint/object_centre": np.zeros((total, 3)),
+        "truth/joint/object_turn": [np.nan, 0.0, 0.0, 0.0],
+        "truth/joint/object_flagged": [False, False, True, False],
         "truth/object_centre": np.zeros((total, 3)),
         "truth/object_moving": np.zeros(total, bool),
         "truth/object_views": [6, 2, 1, 6],
@@ -117,8 +119,64 @@ def test_flags_are_judged_on_truly_bad_frames() -> None:
     assert figures.flag_figures([sequence()]) == {}
 
 
-def test_extrinsics_leave_the_master_out() -> None:
-    moved = {"before": [0, 0.01, 0.03], "after": [0, 0, 0.002]}
+def test_a_lost_object_is_noticed_by_its_own_stage_alone() -> None:
+    s = _tracked(flagged=[True] * 4, **{"truth/joint/object_flagged": np.zeros(4, bool)})
+    assert figures.truth_figures([s], "joint")["lost_unnoticed_share"] == 0.5
+
+
+def test_jitter_is_pooled_over_the_frames_of_rest() -> None:
+    def shaking(step_m: float, turn_deg: float, moving: list[bool]) -> SequenceMetrics:
+        centre = np.zeros((4, 3))
+        centre[1::2, 0] = step_m
+        return _tracked(
+            **{
+                "truth/joint/object_centre": centre,
+                "truth/joint/object_turn": np.array([np.nan, *[turn_deg] * 3]),
+                "truth/object_moving": np.array(moving),
+            }
+        )
+
+    # three steps of 1 mm and 1 degree, and one of 7 mm and 5 degrees
+    both = [shaking(0.001, 1, [False] * 4), shaking(0.007, 5, [False, False, True, True])]
+    found = figures.truth_figures(both, "joint")
+    assert found["rest_jitter_mm"] == pytest.approx(np.sqrt(52 / 4))
+    assert found["rest_jitter_deg"] == pytest.approx(np.sqrt(28 / 4))
+    never = figures.truth_figures([shaking(0.001, 1, [True] * 4)], "joint")
+    assert "rest_jitter_mm" not in never and "rest_jitter_deg" not in never
+
+
+def test_late_and_early_starts_of_motion_do_not_cancel() -> None:
+    total, fps = 40, 30.0
+
+    def started(at: int) -> np.ndarray:
+        centre = np.zeros((total, 3))
+        centre[at:, 0] = 0.02 * np.arange(1, total - at + 1)
+        return centre
+
+    def late_by(frames: int) -> SequenceMetrics:
+        moving = np.arange(total) >= 19
+        values = {
+            "truth/joint/object_translation": np.zeros(total),
+            "truth/joint/object_rotation": np.zeros(total),
+            "truth/joint/object_centre": started(20 + frames),
+            "truth/joint/object_turn": np.zeros(total),
+            "truth/joint/object_flagged": np.zeros(total, bool),
+            "truth/joint/acceleration_object": np.zeros(total),
+            "truth/object_centre": started(20),
+            "truth/object_moving": moving,
+            "truth/object_views": np.full(total, 6),
+            "flagged": np.zeros(total, bool),
+        }
+        return SequenceMetrics("s", "p", "cup", fps, True, values)
+
+    found = figures.truth_figures([late_by(4), late_by(-2)], "joint")
+    assert found["motion_onset_frames"] == pytest.approx(3)
+    assert found["motion_onset_late_frames"] == pytest.approx(1)
+
+
+def test_extrinsics_leave_the_master_and_absent_cameras_out() -> None:
+    none = np.nan
+    moved = {"before": [0.01, none, none, 0.03], "after": [0, none, none, 0.002]}
     s = sequence(**{f"truth/extrinsics_{when}": values for when, values in moved.items()})
     assert figures.extrinsics_figures([s]) == pytest.approx(
         {"before_mean_mm": 20, "before_worst_mm": 30, "after_mean_mm": 1, "after_worst_mm": 2}
