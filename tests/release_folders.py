@@ -12,9 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from intercap_core.camera.aligned_depth import depth_on_colour
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert
+from intercap_core.capture.frames import Frames
 
 Colour = Callable[[int, int], bytes | None]  # of set t and camera c
 Depth = Callable[[int, int], np.ndarray | None]
@@ -107,6 +109,33 @@ def behave_lens(lens: Intrinsics) -> dict[str, object]:
     pinhole = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy}
     opencv = [*pinhole.values(), *lens.distortion.tolist()]
     return {"width": lens.width, "height": lens.height, **pinhole, "opencv": opencv}
+
+
+def convert_frames(
+    frames: Frames, root: Path, layout: str, sets: Iterable[int]
+) -> tuple[Path, Path]:
+    """Write frame sets of any capture as ``layout`` has them, depth on the colour grid.
+
+    Frame set t becomes InterCap's frame t, and BEHAVE's moment of t seconds; BEHAVE's Kinect 1 is
+    the second camera. Returns the folders of recordings and of calibration.
+    """
+    chosen = list(sets)
+
+    def depth(t: int, c: int) -> np.ndarray | None:
+        image = frames.depth(t, c)
+        return None if image is None else depth_on_colour(image, frames.rig[c])
+
+    if layout == "intercap":
+        return write_intercap(
+            root, frames.rig, numbers=chosen, colour=frames.colour_jpeg, depth=depth
+        )
+    return write_behave(
+        root,
+        frames.rig,
+        times=[f"{t:04d}.000" for t in chosen],
+        colour=lambda index, c: frames.colour_jpeg(chosen[index], c),
+        depth=lambda index, c: depth(chosen[index], c),
+    )
 
 
 def _png(depth: np.ndarray | None) -> bytes | None:
