@@ -54,7 +54,8 @@ class Content:
     """All that the page is made from.
 
     ``captures`` of the sequences that are shown. ``residuals`` by sequence: name, before and after
-    of each camera pair, metres. ``trace`` by sequence: what to print of each stage. ``failed``: sequences without a result and why.
+    of each camera pair, metres. ``trace`` by sequence: what to print of each stage. ``failed``:
+    sequences without a result and why.
     """
 
     dataset: str
