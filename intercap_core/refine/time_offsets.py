@@ -1,0 +1,190 @@
+"""Each camera's time offset from what a fit of the moving body leaves over.
+
+Where camera c exposes tau_c later than the fit believes, it sees every point farther along its way.
+With r = prediction minus observation of a point that a view sees, u the prediction's velocity in
+that view and J its derivative by the point's position,
+
+    r_c = - u_c tau_c + J_c e + b_c + noise,
+
+e is the fit's own error at that point and moment, which all views share, and b_c what a camera
+always sees off about the point (the detector's idea of a joint, calibration, clothing). e is
+eliminated for each point and moment, b by taking everything relative to its mean over time. Both
+errors and noise last over many frames: r and u are taken as innovations of a first-order
+autoregression whose coefficient is that of the residuals themselves. What is left is weighted by
+its own scale and robustly (Geman-McClure), and solved for all cameras at once with a prior on
+their offsets; the master's is zero, since the sets' times are the master's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+LOOSE_SIGMA_S = 0.010  # of an offset that nothing is known of: beyond it sets would be mismatched
+# A fitted point's error; loose, so that it is the views' disagreement that tells.
+POINT_SIGMA_M = 0.03
+MAX_CORRELATION = 0.98
+ROBUST_SCALE = 3.0  # standard deviations at which an innovation starts to count as an outlier
+ROUNDS = 4
+_GAP = 1.5  # of the usual time step: rows farther apart are no neighbours
+_LEAST_ROWS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """What C cameras see of K points in T frames, D numbers each (pixels, or one distance).
+
+    residual (T,C,K,D) prediction minus observation; velocity (T,C,K,D) of the prediction, a second;
+    by_point (T,C,K,D,P) derivative of the prediction by P coordinates of the point's position,
+    metres; weight (T,C,K) relative trust, 0 = not seen; part (K,): points of one part err together.
+    """
+
+    residual: np.ndarray
+    velocity: np.ndarray
+    by_point: np.ndarray
+    weight: np.ndarray
+    part: np.ndarray
+
+
+@dataclass(frozen=True)
+class TimeOffsets:
+    """``offset`` (C,) seconds later than the sets' times and ``sigma`` (C,) its stated standard
+    deviation, both 0 for the master."""
+
+    offset: np.ndarray
+    sigma: np.ndarray
+
+
+def estimate_offsets(
+    sightings: Sequence[Sightings],
+    times: np.ndarray,
+    current: np.ndarray,
+    *,
+    prior: np.ndarray,
+    prior_sigma: np.ndarray,
+    master: int,
+) -> TimeOffsets:
+    """Estimate all offsets (C,), seconds.
+
+    ``current`` (C,) are the offsets that the predictions allow for; ``times`` (T,) of the frames.
+    ``prior`` and ``prior_sigma`` (C,) are what is known beside the sightings, sigma NaN where
+    nothing is: :data:`LOOSE_SIGMA_S` about zero.
+    """
+    count = len(current)
+    known = np.isfinite(prior_sigma)
+    expected = np.where(known, prior, 0.0) - current
+    precision = np.diag(np.where(known, prior_sigma, LOOSE_SIGMA_S) ** -2.0)
+    free = np.arange(count) != master
+    all_innovations = [found for s in sightings if (found := _Innovations.of(s, times)) is not None]
+    change = np.zeros(count)
+    for _ in range(ROUNDS):
+        hessian, gradient = precision.copy(), precision @ (expected - change)
+        for found in all_innovations:
+            h, g = found.normal_equations(change)
+            hessian, gradient = hessian + h, gradient + g
+        change[free] += np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
+    spread = precision + sum(found.spread(change) for found in all_innovations)
+    inverse = np.linalg.inv(hessian[np.ix_(free, free)])
+    sigma = np.zeros(count)
+    sigma[free] = np.sqrt(np.diag(inverse @ spread[np.ix_(free, free)] @ inverse))
+    return TimeOffsets(np.where(free, current + change, 0.0), sigma)
+
+
+@dataclass(eq=False)
+class _Innovations:
+    """Sightings as innovations over time, without their means: rows of T - 1 frames, in units of
+    their own standard deviation."""
+
+    residual: np.ndarray
+    velocity: np.ndarray
+    by_point: np.ndarray
+    weight: np.ndarray
+    part: np.ndarray
+
+    @classmethod
+    def of(cls, seen: Sightings, times: np.ndarray) -> _Innovations | None:
+        """None where too few rows follow each other."""
+        step = np.diff(times)
+        if not len(step):
+            return None
+        following = (step < _GAP * np.median(step))[:, None, None]
+        weight = np.minimum(seen.weight[1:], seen.weight[:-1]) * following
+        if np.count_nonzero(weight) < _LEAST_ROWS:
+            return None
+        correlation = _correlation(_centred(seen.residual, seen.weight), weight > 0)
+        residual, velocity = (
+            _centred(x[1:] - correlation * x[:-1], weight) for x in (seen.residual, seen.velocity)
+        )
+        scale = np.ones(residual.shape[2])
+        for part in np.unique(seen.part):
+            here = seen.part == part
+            size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
+            scale[here] = 1.4826 * np.median(size) if len(size) else 1.0
+        scale = np.maximum(scale, 1e-9)[:, None]
+        return cls(
+            residual / scale,
+            velocity / scale,
+            seen.by_point[1:] / scale[..., None],
+            weight,
+            seen.part,
+        )
+
+    def _left(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What offsets ``change`` (C,) and the best point errors leave (T-1,C,K,D), robust weights
+        (T-1,C,K), and the points' inverse matrices (T-1,K,P,P)."""
+        residual = self.residual + self.velocity * change[:, None, None]
+        weight = self._robust(residual)
+        left, inverse = self._without_point_errors(residual, weight)
+        for _ in range(2):
+            weight = self._robust(left)
+            left, inverse = self._without_point_errors(residual, weight)
+        return left, weight, inverse
+
+    def _robust(self, residual: np.ndarray) -> np.ndarray:
+        square = (residual**2).sum(-1) / residual.shape[-1]
+        return self.weight * (ROBUST_SCALE**2 / (ROBUST_SCALE**2 + square)) ** 2
+
+    def _without_point_errors(
+        self, residual: np.ndarray, weight: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        pulled = self.by_point * weight[..., None, None]
+        matrix = np.einsum("tckdp,tckdq->tkpq", pulled, self.by_point)
+        inverse = np.linalg.inv(matrix + np.eye(matrix.shape[-1]) * POINT_SIGMA_M**-2)
+        pull = np.einsum("tckdp,tckd->tkp", pulled, residual)
+        error = np.einsum("tkpq,tkq->tkp", inverse, pull)
+        return residual - np.einsum("tckdp,tkp->tckd", self.by_point, error), inverse
+
+    def normal_equations(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """H (C,C) and g (C,) of the offsets' next correction H^-1 g, point errors eliminated."""
+        left, weight, inverse = self._left(change)
+        along = self.velocity * weight[..., None]
+        own = (along * self.velocity).sum((0, 2, 3))
+        cross = np.einsum("tckd,tckdp->tckp", along, self.by_point)
+        shared = np.einsum("tckp,tkpq,tjkq->cj", cross, inverse, cross, optimize=True)
+        return np.diag(own) - shared, -(along * left).sum((0, 2, 3))
+
+    def spread(self, change: np.ndarray) -> np.ndarray:
+        """Covariance (C,C) of g, taken from how far the parts of the body differ in theirs."""
+        left, weight, _ = self._left(change)
+        pull = (self.velocity * weight[..., None] * left).sum((0, 3))
+        parts = [pull[:, self.part == part].sum(1) for part in np.unique(self.part)]
+        return np.asarray(sum(np.outer(p, p) for p in parts))
+
+
+def _centred(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """``values`` (T,C,K,D) less their mean over time of each camera and point; 0 where unseen."""
+    total = np.maximum(weight.sum(0), 1e-12)[..., None]
+    mean = (values * weight[..., None]).sum(0) / total
+    return np.where(weight[..., None] > 0, values - mean, 0.0)
+
+
+def _correlation(residual: np.ndarray, both: np.ndarray) -> float:
+    """Correlation of successive residuals (T,C,K,D) where ``both`` (T-1,C,K) are seen, outliers
+    clipped."""
+    now, before = residual[1:][both], residual[:-1][both]
+    limit = ROBUST_SCALE * 1.4826 * np.median(np.abs(now))
+    now, before = (np.clip(x, -limit, limit) for x in (now, before))
+    power = np.sqrt((now**2).sum() * (before**2).sum())
+    return float(np.clip((now * before).sum() / max(power, 1e-30), 0.0, MAX_CORRELATION))
