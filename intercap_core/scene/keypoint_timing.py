@@ -1,0 +1,149 @@
+"""Each camera's constant time offset from the motion of the subject's keypoints.
+
+An image that is late shows every keypoint further along its path: a residual along the pixel
+velocity, which no wrong place of the joint, no constant error of the detector and, over time, no
+wrong pose of the camera explains. All offsets are found together by generalised least squares;
+where the joints are and how the cameras' poses err are unknowns of the same problem.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.camera.rig import Rig
+from intercap_core.capture.synchronise import images_of_moments
+from intercap_core.scene.keypoint_motion import Motion, build_motion
+from intercap_core.scene.keypoint_noise import MISSING, TimeNoise, fit_noise
+
+WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
+POSE_SIGMA = np.r_[np.full(3, np.radians(1.0)), np.full(3, 0.02)]  # of the poses as they are given
+OFFSET_SIGMA_S = 0.05
+KNOWN_SIGMA_S = 0.02  # an offset less certain than this is not known
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """``offset`` (C,) s and ``sigma`` (C,) s, NaN = too little evidence; ``information`` (C, C)
+    1/s^2 and ``vector`` (C,) 1/s: the normal equations ``information @ offset = vector`` of all
+    cameras' offsets without the master's being 0 and without any prior on them."""
+
+    offset: np.ndarray
+    sigma: np.ndarray
+    information: np.ndarray
+    vector: np.ndarray
+
+
+def keypoint_offsets(
+    keypoints: np.ndarray, slip: np.ndarray, rig: Rig, times: np.ndarray, *, master: int = 0
+) -> Offsets:
+    """Estimate when each camera exposes, seconds after the master.
+
+    ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``slip``
+    (T, C) whole sets by which an image is older than its set; ``times`` (T,) s.
+    """
+    shown = by_moment(keypoints, slip)
+    views = len(rig)
+    empty = Offsets(np.zeros(views), np.full(views, np.nan), np.zeros((views, views)),
+                    np.zeros(views))  # fmt: skip
+    if len(times) < 3 or views < 2:
+        return empty
+    motion = build_motion(shown, rig, times)
+    if not motion.valid.any():
+        return empty
+    information, vector = _normal_equations(motion)
+    return _solved(information, vector, master)
+
+
+def by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
+    """Keypoints (T, C, 135, 3) of the images that show each set's moment; 0 where none does."""
+    image_of = images_of_moments(slip, keypoints[..., 2].any(-1))
+    shown = keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
+    shown[image_of < 0] = 0
+    return shown
+
+
+def windows(sets: int) -> list[slice]:
+    """Slices of about equal length, at most :data:`WINDOW_SETS` long."""
+    edges = np.linspace(0, sets, -(-sets // WINDOW_SETS) + 1).round().astype(int)
+    return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+
+
+def series_of(values: np.ndarray) -> np.ndarray:
+    """(T, K, 2C) to (K, 2C, T)."""
+    return np.moveaxis(values, 0, 2)
+
+
+def noise_of(motion: Motion) -> TimeNoise:
+    """The detector's noise over time, from the first window."""
+    part = windows(len(motion.times))[0]
+    series = series_of(motion.projected(motion.residual))[..., part]
+    valid = np.repeat(np.moveaxis(motion.valid, (0, 1, 2), (2, 1, 0)), 2, axis=1)[..., part]
+    size = series.shape[2]
+    return fit_noise(motion.times[part], series.reshape(-1, size), valid.reshape(-1, size))
+
+
+def precisions(motion: Motion, noise: TimeNoise, part: slice) -> np.ndarray:
+    """Inverse covariances (K, C, W, W) over time of one window, the same for x and y."""
+    valid = np.moveaxis(motion.valid[part], 0, 2)  # (C, K, W)
+    variance = np.where(valid, 0.0, MISSING)
+    views, count, size = variance.shape
+    found = noise.precision(motion.times[part], variance.reshape(-1, size))
+    return np.swapaxes(found.reshape(views, count, size, size), 0, 1)
+
+
+def _normal_equations(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Information (C, C) and vector (C,) of the offsets; the poses' errors are eliminated."""
+    views = len(motion.rig)
+    noise = noise_of(motion)
+    columns = _columns(motion)  # (n, T, K, 2C)
+    residual = series_of(motion.projected(motion.residual))
+    size = len(columns)
+    matrix, right = np.zeros((size, size)), np.zeros(size)
+    for part in windows(len(motion.times)):
+        precision = precisions(motion, noise, part)
+        for k in range(precision.shape[0]):
+            for c in range(views):
+                if not motion.valid[part, c, k].any():
+                    continue
+                both = slice(2 * c, 2 * c + 2)
+                rows = columns[:, part, k, both].transpose(2, 1, 0)  # (2, W, n)
+                weighted = precision[k, c] @ rows
+                matrix += np.einsum("xtm,xtn->mn", rows, weighted, optimize=True)
+                right += np.einsum("xtn,xt->n", weighted, residual[k, both, part])
+    prior = np.diag(np.tile(POSE_SIGMA**-2.0, views))
+    poses = matrix[views:, views:] + prior
+    solved = np.linalg.solve(poses, matrix[views:, :views])
+    information = matrix[:views, :views] - matrix[:views, views:] @ solved
+    return (information + information.T) / 2, right[:views] - solved.T @ right[views:]
+
+
+def _columns(motion: Motion) -> np.ndarray:
+    """How the projected residuals (T, K, 2C) change with each camera's offset, then with each
+    camera's six pose errors: (7C, T, K, 2C)."""
+    views = len(motion.rig)
+    offsets = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
+    poses = []
+    for c, camera in enumerate(motion.rig):
+        arm = np.nan_to_num(motion.paths.points - camera.master_from_colour[:3, 3])
+        by_point = motion.by_point[:, c]
+        # Turning the camera by w about its centre moves the point in it by w x arm, reversed.
+        turned = -np.cross(np.eye(3)[:, None, None], arm)
+        moved = np.concatenate([turned, np.broadcast_to(-np.eye(3)[:, None, None], turned.shape)])
+        pixels = np.einsum("tkij,ptkj->ptki", by_point, moved)
+        poses += [motion.projected_of(c, pixels[p]) for p in range(6)]
+    return np.stack(offsets + poses)
+
+
+def _solved(information: np.ndarray, vector: np.ndarray, master: int) -> Offsets:
+    views = len(vector)
+    free = np.flatnonzero(np.arange(views) != master)
+    reduced = information[np.ix_(free, free)] + OFFSET_SIGMA_S**-2.0 * np.eye(len(free))
+    covariance = np.linalg.inv(reduced)
+    offset, sigma = np.zeros(views), np.zeros(views)
+    offset[free] = covariance @ vector[free]
+    sigma[free] = np.sqrt(np.diag(covariance))
+    unknown = sigma > KNOWN_SIGMA_S
+    offset[unknown], sigma[unknown] = 0.0, np.nan
+    return Offsets(offset, sigma, information, vector)
