@@ -226,9 +226,10 @@ class _Loader(yaml.SafeLoader):
 
 
 def _matrix(entry: dict[Any, Any]) -> Any:
-    """Rows of a matrix as ``cv2.FileStorage`` writes it."""
+    """Nested lists of an array as ``cv2.FileStorage`` writes it."""
     try:
-        return np.array(entry["data"], np.float64).reshape(entry["rows"], entry["cols"]).tolist()
+        shape = entry["sizes"] if "sizes" in entry else (entry["rows"], entry["cols"])
+        return np.array(entry["data"], np.float64).reshape(shape).tolist()
     except (KeyError, TypeError, ValueError):
         return None
 
@@ -237,11 +238,13 @@ def _yaml_matrix(loader: yaml.SafeLoader, node: Any) -> Any:
     return _matrix(loader.construct_mapping(node, deep=True))
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _yaml_matrix)
+_MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
+for _name in _MATRIX_TYPES:
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _yaml_matrix)
 
 
 def _json_object(entry: dict[str, Any]) -> Any:
-    return _matrix(entry) if entry.get("type_id") == "opencv-matrix" else entry
+    return _matrix(entry) if entry.get("type_id") in _MATRIX_TYPES else entry
 
 
 def _load(path: Path) -> dict[str, Any]:
