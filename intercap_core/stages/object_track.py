@@ -119,9 +119,9 @@ def run(
         except NotFound:
             raise UserError(
                 f"sequence {sequence}: object {object_.name!r} was found in no frame (no "
-                f"segmentation candidate with measured depth fits its size; labels expected: "
-                f"{', '.join(object_.labels) or 'any'}); check the candidates, or annotate "
-                "'object_pose'"
+                "segmentation candidate, with depth or in two views, fits its size; labels "
+                f"expected: {', '.join(object_.labels) or 'any'}); check the candidates, or "
+                "annotate 'object_pose'"
             ) from None
         names = list(recording.rig.names)
     with artefacts.write(

@@ -1,52 +1,34 @@
 """Find the object's pose in a frame set with nothing to start from.
 
-Candidates of different views are joined where their measured points lie together; rotations from a
-grid over SO(3) modulo the symmetry group are aligned to the joined cloud by batched point-to-plane
-ICP; the best are rendered and compared with every view, and the best of those are fitted.
+Candidates of different views are joined where they lie together; rotations from a grid over SO(3)
+modulo the symmetry group are aligned to what they show, points or silhouettes; the best are
+rendered and compared with every view, and the best of those are fitted.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import apply
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.symmetry import SymmetryGroup
-from intercap_core.tracking.evidence import Candidate, View
+from intercap_core.tracking.alignment import align
+from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit, assess, fit_pose
+from intercap_core.tracking.groups import PERSON_LABELS, find_groups
 
 GRID = 240  # rotations of a trivial group: about 40 degrees apart, inside the fit's basin
 UPRIGHT = 24  # turns about the vertical of the standing pose, 15 degrees apart
-CLOUD_POINTS = 150
-ICP_STEPS = 6
-ICP_SCALES_M = (0.08, 0.015)
 COMPARED = 16  # poses rendered after ICP
 FITTED = 6  # poses fitted after rendering
-MAX_GROUPS = 3
 GOOD_ENOUGH = 0.55  # confidence above which less likely groups are not searched
 NEAR_TURNS = 12  # turns about each axis of the best pose that are compared with it
 TURNS_FITTED = 4
 SAME_AXIS_COSINE = float(np.cos(np.radians(10)))
 STANDING_BONUS = 0.03  # of confidence
 STANDING_COSINE = float(np.cos(np.radians(12)))
-MIN_POINTS = 15  # of a candidate's cloud
 SAME_POSE_M, SAME_POSE_DEG = 0.02, 12.0
-PERSON_LABELS = frozenset({"person"})
-
-
-@dataclass(frozen=True)
-class _Cluster:
-    """One candidate's measured points (N, 3), master frame, and its image's index."""
-
-    view: int
-    candidate: Candidate
-    points: np.ndarray
-    centre: np.ndarray
-    likely: bool
 
 
 def search(
@@ -65,16 +47,14 @@ def search(
     ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
     ``near`` (3,) prefers candidates near a place where the object was seen.
     """
-    groups = _join(mesh, _clusters(views, mesh.diameter, labels), near)
+    groups = find_groups(mesh, views, labels, near)
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
     rotations = rotation_grid(mesh.symmetry, up)
     found: list[Fit] = []
     for group in groups:
         if found and max(fit.confidence for fit in found) > GOOD_ENOUGH:
             break
-        cloud = _thinned(group)
-        eyes = _eyes(group, views, cloud)
-        poses, residual = _align(mesh, field, cloud, eyes, rotations)
+        poses, residual = align(mesh, field, group, views, rotations)
         compared = []
         for index in _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED):
             start = assess(mesh, views, poses[index], min_overlap=0.1, labels=labels)
@@ -245,138 +225,6 @@ def _standing(up: np.ndarray) -> np.ndarray:
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], 1)
-
-
-def _clusters(views: list[View], diameter: float, labels: tuple[str, ...]) -> list[_Cluster]:
-    """The measured points of every candidate that could be the object."""
-    found = []
-    for number, view in enumerate(views):
-        geometry = view.geometry
-        if view.depth is None or geometry.depth_lens is None:
-            continue
-        candidates = [c for c in view.candidates if c.label not in PERSON_LABELS and c.mask.area]
-        if not candidates:
-            continue
-        stride = max(1, 2 // geometry.depth_step)
-        depth = view.depth[::stride, ::stride]
-        rays = geometry.depth_lens.rays[::stride, ::stride]
-        valid = (depth > 0) & np.isfinite(rays[..., 0])
-        depth, rays = depth[valid], rays[valid]
-        local = np.column_stack([rays * depth[:, None], depth])
-        camera = geometry.camera
-        assert camera.colour_from_depth is not None
-        pixel = np.rint(geometry.lens.project(apply(camera.colour_from_depth, local))).astype(int)
-        for candidate in candidates:
-            inside = np.flatnonzero(candidate.mask.sample(pixel[:, 0], pixel[:, 1]))
-            if len(inside) < MIN_POINTS:
-                continue
-            z = depth[inside]
-            inside = inside[np.abs(z - np.median(z)) < 0.75 * diameter]
-            points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
-            centre = np.median(points, axis=0)
-            spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
-            if len(points) < MIN_POINTS or spread > 0.75 * diameter:
-                continue
-            likely = not labels or candidate.label in labels
-            found.append(_Cluster(number, candidate, points, centre, likely))
-    return found
-
-
-def _join(
-    mesh: ObjectMesh, clusters: list[_Cluster], near: np.ndarray | None
-) -> list[list[_Cluster]]:
-    """Groups of clusters, at most one a view, that may be one object: the most likely first."""
-    groups: list[tuple[float, list[_Cluster]]] = []
-    for anchor in clusters:
-        group = [anchor]
-        for view in sorted({c.view for c in clusters} - {anchor.view}):
-            others = [c for c in clusters if c.view == view]
-            distances = [float(np.linalg.norm(c.centre - anchor.centre)) for c in others]
-            nearest = int(np.argmin(distances))
-            if distances[nearest] < 0.6 * mesh.diameter + 0.03:
-                group.append(others[nearest])
-        value = sum(1.0 if c.likely else 0.5 for c in group)
-        if near is not None:
-            value -= 2.0 * float(np.linalg.norm(anchor.centre - near))
-        groups.append((value, group))
-    groups.sort(key=lambda item: -item[0])
-    kept: list[list[_Cluster]] = []
-    for _, group in groups:
-        if len(kept) == MAX_GROUPS:
-            break
-        members = {(c.view, c.candidate.index) for c in group}
-        known = [{(c.view, c.candidate.index) for c in other} for other in kept]
-        if all(len(members & other) <= 0.5 * len(members) for other in known):
-            kept.append(group)
-    return kept
-
-
-def _thinned(group: list[_Cluster]) -> list[np.ndarray]:
-    """The same number of points, at most, of each view's cluster."""
-    share = CLOUD_POINTS // len(group)
-    return [
-        c.points[np.linspace(0, len(c.points) - 1, min(share, len(c.points))).astype(int)]
-        for c in group
-    ]
-
-
-def _eyes(group: list[_Cluster], views: list[View], cloud: list[np.ndarray]) -> np.ndarray:
-    """The camera centre (N, 3) that measured each point of the joined cloud."""
-    centres = [views[c.view].geometry.camera.master_from_depth[:3, 3] for c in group]
-    return np.concatenate(
-        [np.broadcast_to(eye, part.shape) for eye, part in zip(centres, cloud, strict=True)]
-    )
-
-
-def _align(
-    mesh: ObjectMesh,
-    field: DistanceField,
-    parts: list[np.ndarray],
-    eyes: np.ndarray,
-    rotations: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """ICP of all rotations at once: poses (N, 4, 4) and robust mean residual (N,) in metres."""
-    cloud = np.concatenate(parts)
-    count = len(rotations)
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    middle = (area[:, None] * (a + b + c) / 3).sum(0) / area.sum()
-    # the mean of the views' means: a near view holds more points but not more of the object
-    centre = np.mean([part.mean(0) for part in parts], axis=0)
-    rotation = rotations.copy()
-    translation = centre - rotation @ middle
-    scales = np.geomspace(*ICP_SCALES_M, ICP_STEPS)
-    residual = np.zeros(count)
-    for scale in [*scales, scales[-1]]:
-        local = np.einsum("nji,npj->npi", rotation, cloud[None] - translation[:, None])
-        closest = field.closest(local.reshape(-1, 3))
-        points = closest.points.reshape(count, -1, 3)
-        normals = closest.normals.reshape(count, -1, 3)
-        gap = local - points
-        along = (gap * normals).sum(-1)
-        distance = np.linalg.norm(gap, axis=-1)
-        # a measured point cannot lie on a face that looks away from the camera
-        to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
-        facing = (to_eye * normals).sum(-1) > 0
-        weight = (scale**2 / (scale**2 + distance**2)) ** 2 * np.where(facing, 1.0, 0.1)
-        cost = np.where(facing, distance, np.maximum(distance, 0.01))
-        residual = np.minimum(cost, 0.05).mean(1)
-        jacobian = np.concatenate([np.cross(local, normals), normals], -1)
-        weighted = jacobian * weight[..., None]
-        hessian = np.einsum("npi,npj->nij", weighted, jacobian)
-        gradient = np.einsum("npi,np->ni", weighted, along)
-        hessian += 1e-3 * np.einsum("nii,ij->nij", hessian, np.eye(6)) + 1e-6 * np.eye(6)
-        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        limit = np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1) / np.radians(15))
-        limit = np.maximum(limit, np.linalg.norm(step[:, 3:], axis=1) / 0.05)
-        step /= limit[:, None]
-        # the step moves the object in its own frame: pose <- pose * exp(step)
-        translation = translation + np.einsum("nij,nj->ni", rotation, step[:, 3:])
-        rotation = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotation
-    poses[:, :3, 3] = translation
-    return poses, residual
 
 
 def _distinct(mesh: ObjectMesh, poses: np.ndarray, order: np.ndarray, count: int) -> list[int]:
