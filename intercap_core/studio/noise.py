@@ -10,10 +10,17 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 FAMILY_B_SLOWER = 1.7  # correlation times of family "b" against those of family "a"
 OVERSAMPLING = 4
+_QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
+
+
+def gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard normal values in float32 for whole images: one of 65536 quantiles each, a quarter
+    of the time of the generator's own."""
+    return _QUANTILES[rng.integers(0, 1 << 16, shape, np.uint16)]
 
 
 @dataclass(frozen=True)

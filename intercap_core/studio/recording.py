@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import invert
@@ -17,7 +16,7 @@ from intercap_core.studio.keypoints import Detector, to_json
 from intercap_core.studio.looks import body_colours
 from intercap_core.studio.masks import Labels, Segmenter
 from intercap_core.studio.mkv import MkvWriter
-from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View, scene_of
+from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.sensor import DepthSensor
 from intercap_core.studio.stage import Moment, Stage
@@ -105,12 +104,11 @@ class Kinect:
         last_us = 0
         with self._writer(folder / f"{name}.mkv") as writer:
             for number, t in enumerate(self.sets):
-                surfaces, normals = surfaces_at(stage, moment, t, colours)
-                scene = scene_of(*((s.vertices, s.faces) for s in surfaces))
-                cast = colour_view.cast(scene, surfaces, normals)
+                surfaces = surfaces_at(stage, moment, t, colours)
+                cast = colour_view.cast(surfaces)
                 inertial = self._inertial(t, rng, depth_pose)
                 jpeg = photographer.jpeg(photographer.photograph(cast))
-                depth = sensor.image(depth_view.cast(scene, surfaces, normals))
+                depth = sensor.image(depth_view.cast(surfaces))
                 time_us = self.device_time_us(t)
                 if time_us < last_us:
                     writer.turn_back()
@@ -120,8 +118,9 @@ class Kinect:
                 for sample in inertial:
                     writer.write_imu(*sample)
                 last_us = time_us
-                hidden[t] = _hidden(scene, colour_view, points[t])
-                seen[t], whole[t] = self._object_pixels(cast, colour_view, surfaces[1])
+                hidden[t] = _hidden(cast, colour_view, points[t])
+                seen[t] = int((cast.identity == OBJECT).sum())
+                whole[t] = colour_view.count(surfaces[1])
                 truth = Labels(cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1))
                 for result in masks.candidates(t, truth):
                     candidates.append({"image_id": number, **result})
@@ -167,10 +166,6 @@ class Kinect:
             for k in range(IMU_PER_FRAME)
         ]
 
-    def _object_pixels(self, cast: Cast, view: View, thing: Surface) -> tuple[int, int]:
-        seen = int((cast.identity == OBJECT).sum())
-        return seen, view.count(scene_of((thing.vertices, thing.faces)), thing.vertices)
-
     def _write_candidates(self, folder: Path, candidates: list[dict[str, object]]) -> None:
         path = folder / "candidates" / f"{self.true.name}.json"
         path.parent.mkdir(exist_ok=True)
@@ -189,32 +184,37 @@ class Kinect:
             (target / f"{number:012d}_keypoints.json").write_text(to_json(people[t]))
 
 
-def surfaces_at(stage: Stage, moment: Moment, t: int, colours: np.ndarray
-              ) -> tuple[tuple[Surface, Surface], tuple[np.ndarray, np.ndarray]]:  # fmt: skip
-    """The clothed body and the object at one moment, and their smooth normals."""
-    pose, thing = moment.stage_from_object[t], stage.thing
-    body = Surface(moment.clothed[t], stage.subject.faces, colours)
-    moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
-    body_normals = stage.subject.normals(moment.clothed[t][None])[0]
+def surfaces_at(
+    stage: Stage, moment: Moment, t: int, colours: np.ndarray
+) -> tuple[Surface, Surface]:
+    """The clothed body and the object at one moment."""
+    clothed, thing, subject = moment.clothed[t], stage.thing, stage.subject
+    normals = subject.normals(clothed[None])[0]
     return (
-        (body, Surface(moved, thing.faces, thing.colours)),
-        (body_normals, stage.thing_normals @ pose[:3, :3].T),
-    )
+        Surface(clothed, subject.faces.astype(np.int32), normals, colours, np.eye(4)),
+        Surface(
+            thing.vertices, thing.faces, stage.thing_normals, thing.colours,
+            moment.stage_from_object[t],
+        ),
+    )  # fmt: skip
 
 
-def _hidden(scene: o3d.t.geometry.RaycastingScene, view: View, points: np.ndarray) -> np.ndarray:
-    """Which keypoints (135,) something stands before."""
+def _hidden(cast: Cast, view: View, points: np.ndarray) -> np.ndarray:
+    """Which keypoints (135,) of those in the image something stands before."""
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]
     cover[[0, 15, 16, 17, 18]] = COVER_M["face"] * 2
-    way = points - view.eye
-    rays = np.concatenate([np.broadcast_to(view.eye, way.shape), way], 1).astype(np.float32)
-    hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
-    distance = np.linalg.norm(way, axis=1)
-    hidden = hit * distance < distance - cover
     at = points @ view.camera_from_stage[:3, :3].T + view.camera_from_stage[:3, 3]
     u, v = np.round(view.lens.project(at)).astype(int).T
     inside = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height) & (at[:, 2] > 0)
-    room = np.full(135, np.inf)
+    room, moving = np.full((2, 135), np.inf)
     room[inside] = view.depth[v[inside], u[inside]]
-    return hidden | (room < at[:, 2] - 0.03)
+    height, width = cast.identity.shape
+    u, v = u - cast.x0, v - cast.y0
+    inside &= (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    depth = np.full(cast.identity.size, np.inf, np.float32)
+    depth[cast.pixels] = cast.depth
+    moving[inside] = depth[v[inside] * width + u[inside]]
+    distance = np.linalg.norm(points - view.eye, axis=1)
+    nearness = moving / np.maximum(at[:, 2], 1e-6)
+    return (nearness * distance < distance - cover) | (room < at[:, 2] - 0.03)

@@ -1,22 +1,29 @@
-"""Images of the stage by ray casting: the static room once a camera, moving things every frame.
+"""Images of the stage: the static room by ray casting, once a camera; moving things every frame.
 
-Rays are not normalised (z = 1 in the camera's frame), so a hit's parameter is its depth z.
+Rays are not normalised (z = 1 in the camera's frame), so a hit's parameter is its depth z. Moving
+things are drawn by a z-buffer over the same rays: half the cost of building a tree for a body that
+is another one in every image.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 import open3d as o3d
 
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.rigid.render import Drawable, render_scene
+from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 
 BODY, OBJECT = 1, 2  # what an identity image holds; 0 is the room
-BOX_MARGIN_PX = 3
+BOX_MARGIN_PX = 1
 AMBIENT = 0.42
+VOID = 0.04  # grey of what lies beyond the room
 # Directions to the lamps and their strength: two ceiling lamps
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
 SENSOR_NOISE = 2.0  # grey levels
@@ -26,24 +33,29 @@ JPEG_QUALITY = 85
 
 @dataclass(frozen=True)
 class Surface:
-    """A moving mesh in the stage: vertices (V, 3), faces (F, 3), colours (V, 3) RGB in [0, 1]."""
+    """A closed moving mesh in its own frame: vertices (V, 3), faces (F, 3), unit normals (V, 3),
+    colours (V, 3) RGB in [0, 1], and where it is, stage_from_mesh (4, 4)."""
 
     vertices: np.ndarray
     faces: np.ndarray
+    normals: np.ndarray
     colours: np.ndarray
+    stage_from_mesh: np.ndarray
 
 
 @dataclass(frozen=True)
 class Cast:
     """What moving things look like in a window whose first pixel is (x0, y0).
 
-    ``identity`` (h, w) uint8 BODY, OBJECT or 0 where the room is nearer; ``depth`` (h, w) float32
-    z in metres, inf where 0; ``normal`` (h, w, 3) stage frame and ``colour`` (h, w, 3) float32.
+    ``identity`` (h, w) uint8 BODY, OBJECT or 0 where the room is nearer. Of the n pixels that are
+    not 0: ``pixels`` (n,) flat index in the window, ``depth`` (n,) z in metres, ``normal`` (n, 3)
+    stage frame and ``colour`` (n, 3), float32.
     """
 
     x0: int
     y0: int
     identity: np.ndarray
+    pixels: np.ndarray
     depth: np.ndarray
     normal: np.ndarray
     colour: np.ndarray
@@ -53,6 +65,12 @@ class Cast:
         """Rows and columns of the image."""
         height, width = self.identity.shape
         return slice(self.y0, self.y0 + height), slice(self.x0, self.x0 + width)
+
+    @property
+    def image_pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns (n,) in the image of the pixels that are not 0."""
+        rows, columns = np.divmod(self.pixels, max(self.identity.shape[1], 1))
+        return rows + self.y0, columns + self.x0
 
 
 def scene_of(*meshes: tuple[np.ndarray, np.ndarray]) -> o3d.t.geometry.RaycastingScene:
@@ -85,100 +103,136 @@ class View:
         self.rotation = stage_from_camera[:3, :3].astype(np.float32)
         self.eye = stage_from_camera[:3, 3].astype(np.float32)
         shape = (lens.height, lens.width)
-        xy = lens.rays  # no ray beyond the lens's radius: directions of zero hit nothing
-        ahead = np.ones((*shape, 1), np.float32)
-        self._directions = np.nan_to_num(np.concatenate([xy, ahead], -1) @ self.rotation.T)
         self.depth = np.full(shape, np.inf, np.float32)
         self.normal = np.zeros((*shape, 3), np.float32)
-        room_scene = scene_of((room.vertices, room.faces))
-        self.colour = np.zeros((*shape, 3), np.float32)
+        self.colour = np.full((*shape, 3) if coloured else (0, 0, 3), VOID, np.float32)
         self.material = np.full(shape, -1, np.int16)
+        room_scene = scene_of((room.vertices, room.faces))
+        facing = _facing(room, self.eye)
+        brightness = shade(facing)
         for top in range(0, lens.height, 120):
             rows = slice(top, top + 120)
-            rays = self._rays(rows, slice(0, lens.width))
+            rays = self._rays(rows)
             hit = room_scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
             depth, face = hit["t_hit"].numpy(), hit["primitive_ids"].numpy()
-            seen = np.isfinite(depth)
-            normal = hit["primitive_normals"].numpy()
-            normal *= -np.sign((normal * rays[..., 3:]).sum(-1, keepdims=True))
-            normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-            self.depth[rows], self.normal[rows] = depth, np.where(seen[..., None], normal, 0)
-            self.material[rows][seen] = room.material[face[seen]]
+            seen = np.flatnonzero(np.isfinite(depth))
+            face = face.ravel()[seen]
+            self.depth[rows] = depth
+            self.normal[rows].reshape(-1, 3)[seen] = facing[face]
+            self.material[rows].ravel()[seen] = room.material[face]
             if coloured:
-                self.colour[rows] = _room_colours(room, rays, depth, face, normal, seen)
+                points = rays.reshape(-1, 6)[seen]
+                points = points[:, :3] + depth.ravel()[seen, None] * points[:, 3:]
+                colours = _room_colours(room, points, face, facing) * brightness[face, None]
+                self.colour[rows].reshape(-1, 3)[seen] = colours
 
-    def _rays(self, rows: slice, columns: slice) -> np.ndarray:
-        """(h, w, 6) float32: origin and direction in the stage."""
-        directions = self._directions[rows, columns]
+    def directions(self, rows: slice = slice(None)) -> np.ndarray:
+        """Rays (h, W, 3) float32 of image rows in the stage, z = 1 in the camera; zero beyond the
+        lens's radius, so that they hit nothing."""
+        xy = self.lens.rays[rows]
+        directions = xy @ self.rotation[:, :2].T + self.rotation[:, 2]
+        directions[np.isnan(xy[..., 0])] = 0
+        return directions
+
+    def _rays(self, rows: slice) -> np.ndarray:
+        """(h, W, 6) float32: origin and direction in the stage."""
+        directions = self.directions(rows)
         rays = np.empty((*directions.shape[:2], 6), np.float32)
         rays[..., :3], rays[..., 3:] = self.eye, directions
         return rays
 
-    def box(self, points: np.ndarray) -> tuple[int, int, int, int]:
-        """x0, y0, x1, y1 around points (N, 3) of the stage, clipped to the image; maybe empty."""
-        at = points @ self.camera_from_stage[:3, :3].T + self.camera_from_stage[:3, 3]
-        at = at[at[:, 2] > 0.1]
-        if len(at) == 0:
-            return 0, 0, 0, 0
-        pixels = self.lens.project(at)
-        low = np.floor(pixels.min(0)).astype(int) - BOX_MARGIN_PX
-        high = np.ceil(pixels.max(0)).astype(int) + BOX_MARGIN_PX + 1
-        size = (self.lens.width, self.lens.height)
-        x0, y0 = np.clip(low, 0, size)
-        x1, y1 = np.clip(high, 0, size)
-        return int(x0), int(y0), int(x1), int(y1)
+    def _drawable(self, surface: Surface) -> Drawable:
+        pose = self.camera_from_stage @ surface.stage_from_mesh
+        return Drawable(surface.vertices, surface.faces, pose)
 
-    def cast(self, scene: o3d.t.geometry.RaycastingScene, surfaces: tuple[Surface, ...],
-             normals: tuple[np.ndarray, ...]) -> Cast:  # fmt: skip
-        """Cast ``surfaces`` (in the scene's order: body, object) over the room."""
-        x0, y0, x1, y1 = self.box(np.concatenate([s.vertices for s in surfaces]))
-        window = slice(y0, y1), slice(x0, x1)
-        height, width = max(y1 - y0, 0), max(x1 - x0, 0)
-        identity = np.zeros((height, width), np.uint8)
-        depth = np.full((height, width), np.inf, np.float32)
-        normal = np.zeros((height, width, 3), np.float32)
-        colour = np.zeros((height, width, 3), np.float32)
-        if height and width:
-            hit = scene.cast_rays(o3d.core.Tensor.from_numpy(self._rays(*window)))
-            distance = hit["t_hit"].numpy()
-            nearer = distance < self.depth[window]
-            geometry, face = hit["geometry_ids"].numpy(), hit["primitive_ids"].numpy()
-            uv = hit["primitive_uvs"].numpy()
-            for number, (surface, smooth) in enumerate(zip(surfaces, normals, strict=True)):
-                here = nearer & (geometry == number)
-                corner = surface.faces[face[here]]
-                u, v = uv[here][:, :1], uv[here][:, 1:]
-                weight = (1 - u - v, u, v)
-                identity[here] = number + 1
-                normal[here] = sum(w * smooth[corner[:, k]] for k, w in enumerate(weight))
-                colour[here] = sum(w * surface.colours[corner[:, k]] for k, w in enumerate(weight))
-            depth[nearer] = distance[nearer]
-            normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        return Cast(x0, y0, identity, depth, normal, colour)
+    def cast(self, surfaces: Sequence[Surface]) -> Cast:
+        """Draw ``surfaces`` (body, object) over the room."""
+        drawn = render_scene(
+            [self._drawable(s) for s in surfaces], self.lens, margin_px=BOX_MARGIN_PX
+        )
+        nearer = drawn.mask & (drawn.depth < self.depth[drawn.window])
+        identity = np.where(nearer, drawn.body + 1, 0).astype(np.uint8)
+        pixels = np.flatnonzero(nearer)
+        depth = drawn.depth.ravel()[pixels]
+        normal, colour = np.empty((2, len(pixels), 3), np.float32)
+        rays = self.lens.rays[drawn.window].reshape(-1, 2)
+        for number, surface in enumerate(surfaces):
+            here = np.flatnonzero(identity.ravel()[pixels] == number + 1)
+            _interpolate(
+                here, pixels, drawn.face.ravel(), rays, self._drawable(surface).camera_from_mesh,
+                surface.vertices, surface.faces, surface.normals, surface.colours,
+                surface.stage_from_mesh, normal, colour,
+            )  # fmt: skip
+        return Cast(drawn.x0, drawn.y0, identity, pixels, depth, normal, colour)
 
-    def count(self, scene: o3d.t.geometry.RaycastingScene, points: np.ndarray) -> int:
-        """Pixels that a scene's only mesh, around points (N, 3), would cover if nothing hid it."""
-        x0, y0, x1, y1 = self.box(points)
-        if x1 <= x0 or y1 <= y0:
-            return 0
-        rays = self._rays(slice(y0, y1), slice(x0, x1))
-        hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
-        return int(np.isfinite(hit).sum())
+    def count(self, surface: Surface) -> int:
+        """Pixels that a surface would cover if nothing hid it."""
+        return int(render_scene([self._drawable(surface)], self.lens).mask.sum())
 
 
-def _room_colours(room: Room, rays: np.ndarray, depth: np.ndarray, face: np.ndarray,
-                  normal: np.ndarray, seen: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Shaded colours (h, w, 3) of the empty room."""
-    colours = np.full((*depth.shape, 3), 0.04, np.float32)
-    material = np.full(depth.shape, -1)
-    material[seen] = room.material[face[seen]]
+@numba.njit(cache=True)
+def _interpolate(here, pixels, face, rays, camera_from_mesh, vertices, faces, normals, colours,
+                 stage_from_mesh, normal, colour):  # fmt: skip
+    """Fill rows ``here`` of ``normal`` and ``colour`` (n, 3) from the corners of the triangles hit.
+
+    A corner's weight is the volume that the ray spans with the two other corners.
+    """
+    corner = np.empty((3, 3))
+    weight = np.empty(3)
+    mixed = np.empty(3)
+    for i in here:
+        triangle = faces[face[pixels[i]]]
+        x, y = rays[pixels[i], 0], rays[pixels[i], 1]
+        for k in range(3):
+            for axis in range(3):
+                value = camera_from_mesh[axis, 3]
+                for other in range(3):
+                    value += camera_from_mesh[axis, other] * vertices[triangle[k], other]
+                corner[k, axis] = value
+        total = 0.0
+        for k in range(3):
+            a, b = corner[(k + 1) % 3], corner[(k + 2) % 3]
+            weight[k] = (
+                (a[1] * b[2] - a[2] * b[1]) * x
+                + (a[2] * b[0] - a[0] * b[2]) * y
+                + (a[0] * b[1] - a[1] * b[0])
+            )
+            total += weight[k]
+        length = 0.0
+        for axis in range(3):
+            mixed[axis] = 0.0
+            shade = 0.0
+            for k in range(3):
+                mixed[axis] += weight[k] / total * normals[triangle[k], axis]
+                shade += weight[k] / total * colours[triangle[k], axis]
+            colour[i, axis] = shade
+            length += mixed[axis] * mixed[axis]
+        length = max(np.sqrt(length), 1e-6)
+        for axis in range(3):
+            value = 0.0
+            for other in range(3):
+                value += stage_from_mesh[axis, other] * mixed[other]
+            normal[i, axis] = value / length
+
+
+def _facing(room: Room, eye: np.ndarray) -> np.ndarray:
+    """Unit normals (F, 3) float32 of the room's faces on the side of the eye."""
+    first, second, third = (room.vertices[room.faces[:, k]] for k in range(3))
+    normal = np.cross(second - first, third - first)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return (normal * np.sign(((eye - first) * normal).sum(1))[:, None]).astype(np.float32)
+
+
+def _room_colours(
+    room: Room, points: np.ndarray, face: np.ndarray, facing: np.ndarray
+) -> np.ndarray:
+    """Colours (N, 3) of points of the empty room on faces (N,), not yet shaded."""
+    colours = np.empty((len(points), 3), np.float32)
+    material = room.material[face]
     for index, look in enumerate(room.materials):
-        here = material == index
-        if not here.any():
-            continue
-        points = rays[here][:, :3] + depth[here][:, None] * rays[here][:, 3:]
-        colours[here] = look(points.astype(np.float64), normal[here])
-        colours[here] *= shade(normal[here])[:, None]
+        here = np.flatnonzero(material == index)
+        if len(here):
+            colours[here] = look(points[here].astype(np.float64), facing[face[here]])
     return colours
 
 
@@ -192,24 +246,24 @@ class Photographer:
         self._room = np.ascontiguousarray(room[..., ::-1].astype(np.uint8))
         # sensor noise: one tile, taken at another place in each image
         size = (view.lens.height + 64, view.lens.width + 64, 3)
-        tile = rng.normal(0, SENSOR_NOISE, size).astype(np.float32)
-        self._noise = cv2.GaussianBlur(tile, (0, 0), 0.6) * np.float32(1.6)
+        tile = gaussian(rng, size) * np.float32(SENSOR_NOISE)
+        tile = np.rint(cv2.GaussianBlur(tile, (0, 0), 0.6) * np.float32(1.6))
+        self._brighter = np.maximum(tile, 0).astype(np.uint8)
+        self._darker = np.maximum(-tile, 0).astype(np.uint8)
         self._rng = rng
 
     def photograph(self, cast: Cast) -> np.ndarray:
         """The image (H, W, 3) uint8 BGR."""
         image = self._room.copy()
-        if cast.identity.size:
-            lit = cast.colour * shade(cast.normal)[..., None] * self.gain * np.float32(255)
-            lit = np.clip(lit, 0, 255)[..., ::-1]
+        if len(cast.pixels):
+            lit = cast.colour * shade(cast.normal)[:, None] * self.gain * np.float32(255)
+            image[cast.image_pixels] = np.clip(lit, 0, 255)[:, ::-1].astype(np.uint8)
             window = image[cast.window]
-            moving = cast.identity > 0
-            window[moving] = lit[moving].astype(np.uint8)
             window[...] = cv2.GaussianBlur(window, (3, 3), EDGE_BLUR_PX)
         y, x = self._rng.integers(0, 64, 2)
-        height, width = image.shape[:2]
-        noisy = cv2.add(image, self._noise[y : y + height, x : x + width], dtype=cv2.CV_8U)
-        return noisy
+        part = slice(y, y + image.shape[0]), slice(x, x + image.shape[1])
+        cv2.add(image, self._brighter[part], image)
+        return cv2.subtract(image, self._darker[part], image)
 
     def jpeg(self, image: np.ndarray) -> bytes:
         """Compress as the device does."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.studio.noise import NoiseSource
+from intercap_core.studio.noise import NoiseSource, gaussian
 from intercap_core.studio.render import Cast, View
 
 NOISE_M, NOISE_PER_M2 = 0.0006, 0.00058  # standard deviation = a + b z^2
@@ -54,84 +54,79 @@ class DepthSensor:
         self._rng = rng
         self.bias = float(noise.tails(rng.normal(size=1))[0]) * BIAS_M * noise.scale
         self._ripple = rng.uniform(0, 2 * np.pi)
-        rays = view.lens.rays
-        direction = np.dstack([rays, np.ones(rays.shape[:2], np.float32)]) @ view.rotation.T
-        self._direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-        self._in_field = _field(view.lens, mode)
-        self._static_holes = self._holes(
-            view.depth, view.normal, self._direction, np.ones_like(view.depth), rng,
-            persistent=True,
-        )  # fmt: skip
-
-    def _holes(
-        self,
-        depth: np.ndarray,
-        normal: np.ndarray,
-        direction: np.ndarray,
-        albedo: np.ndarray,
-        rng: np.random.Generator,
-        *,
-        persistent: bool,
-    ) -> np.ndarray:
-        cosine = np.abs(np.einsum("hwc,hwc->hw", normal, direction))
-        risk = 0.9 * np.clip(1 - cosine / (GRAZING_COSINE * (0.5 + 0.5 * self._noise.scale)), 0, 1)
-        risk += np.clip(1 - albedo / DARK, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
-        risk = np.where(np.isfinite(risk), risk, 1) * min(self._noise.scale, 1.5)
-        blotches = cv2.GaussianBlur(
-            rng.standard_normal(depth.shape, np.float32), (0, 0), 2.0 if persistent else 1.2
+        direction = view.directions()
+        self._direction = direction / np.maximum(
+            np.linalg.norm(direction, axis=-1, keepdims=True), 1e-9
         )
-        blotches = 0.5 + 0.5 * np.tanh(blotches / (0.28 if persistent else 0.45) / 1.2)
-        return blotches < risk
+        self._in_field = _field(view.lens, mode)
+        self._finite = np.isfinite(view.depth)
+        self._room = np.where(self._finite, view.depth, 0)
+        cosine = np.einsum("hwc,hwc->hw", view.normal, self._direction)
+        risk = self._risk(view.depth, cosine, np.ones_like(view.depth))
+        blotches = _blotches(rng, view.depth.shape, 2.0, 0.28)
+        self._static_holes = blotches < np.where(np.isfinite(risk), risk, 1)
+
+    def _risk(self, depth: np.ndarray, cosine: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+        """Share (...) of holes on surfaces at grazing angles and on dark ones."""
+        scale = self._noise.scale
+        risk = 0.9 * np.clip(1 - np.abs(cosine) / (GRAZING_COSINE * (0.5 + 0.5 * scale)), 0, 1)
+        risk += np.clip(1 - albedo / DARK, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
+        return risk * min(scale, 1.5)
 
     def image(self, cast: Cast) -> np.ndarray:
         """Depth (H, W) uint16 in millimetres, 0 = invalid, of the room with moving things."""
         rng, scale = self._rng, np.float32(self._noise.scale)
-        depth = self.view.depth.copy()
-        holes = self._static_holes.copy()
-        if cast.identity.size:
-            window = cast.window
-            moving = cast.identity > 0
-            depth[window][moving] = cast.depth[moving]
-            direction, albedo = self._direction[window], cast.colour.mean(-1)
-            fresh = self._holes(cast.depth, cast.normal, direction, albedo, rng, persistent=False)
-            holes[window] = np.where(moving, fresh, holes[window])
-        finite = np.isfinite(depth)
-        depth[~finite] = 0
-        depth, lost = self._edges(depth, scale)
-        sigma = np.float32(NOISE_M) + np.float32(NOISE_PER_M2) * depth * depth
-        sigma *= np.float32(self._limits.noise)
-        white = rng.standard_normal(depth.shape, np.float32)
-        soft = cv2.GaussianBlur(white, (3, 3), 0.9)
-        own = rng.standard_normal(depth.shape, np.float32)
-        mixed = np.float32(np.sqrt(1 - SMOOTH_SHARE)) * own
-        mixed += np.float32(np.sqrt(SMOOTH_SHARE) / max(soft.std(), 1e-6)) * soft
+        depth, invalid = self._room.copy(), ~self._finite | ~self._in_field | self._static_holes
+        if len(cast.pixels):
+            at = cast.image_pixels
+            depth[at] = cast.depth
+            cosine = np.einsum("nc,nc->n", cast.normal, self._direction[at])
+            risk = self._risk(cast.depth, cosine, cast.colour.mean(-1))
+            blotches = _blotches(rng, cast.identity.shape, 1.2, 0.45).ravel()[cast.pixels]
+            invalid[at] = ~self._in_field[at] | (blotches < risk)
+        self._edges(depth, invalid, scale)
+        white, error = gaussian(rng, depth.shape), gaussian(rng, depth.shape)
+        error *= np.float32(np.sqrt(1 - SMOOTH_SHARE))
+        kernel = cv2.getGaussianKernel(3, 0.9)
+        unit = np.sqrt(SMOOTH_SHARE) / np.linalg.norm(kernel @ kernel.T)
+        error += cv2.GaussianBlur(white, (3, 3), 0.9) * np.float32(unit)
         if self._noise.family == "b":  # now and then a pixel is far off
-            mixed *= np.where(np.abs(white) > 2.2, np.float32(3.0), np.float32(0.85))
-        ripple = RIPPLE_M * np.sin(2 * np.pi * depth / RIPPLE_PERIOD_M + self._ripple)
-        measured = depth + scale * (sigma * mixed + ripple.astype(np.float32)) + self.bias
-        valid = finite & ~holes & ~lost & self._in_field
-        valid &= (measured > self._limits.near_m) & (measured < self._limits.far_m)
-        return np.where(valid, np.round(measured * 1000), 0).astype(np.uint16)
+            error *= np.where(np.abs(white) > 2.2, np.float32(3.0), np.float32(0.85))
+        sigma = depth * depth
+        sigma *= np.float32(NOISE_PER_M2)
+        sigma += np.float32(NOISE_M)
+        error *= sigma
+        error *= np.float32(self._limits.noise)
+        phase = depth * np.float32(2 * np.pi / RIPPLE_PERIOD_M) + np.float32(self._ripple)
+        error += np.float32(RIPPLE_M) * np.sin(phase)
+        error *= scale
+        error += depth
+        error += np.float32(self.bias)
+        invalid |= (error <= self._limits.near_m) | (error >= self._limits.far_m)
+        error[invalid] = 0
+        return np.rint(error * 1000).astype(np.uint16)
 
-    def _edges(self, depth: np.ndarray, scale: np.float32) -> tuple[np.ndarray, np.ndarray]:
-        """Mix depths across steps, or lose them; returns depth and which pixels are lost."""
+    def _edges(self, depth: np.ndarray, invalid: np.ndarray, scale: np.float32) -> None:
+        """Mix depths across steps, or lose them, in place."""
         kernel = np.ones((3, 3), np.uint8)
-        near, far = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
-        rows, columns = np.nonzero((far - near > EDGE_M) & (near > 0))
-        chance = self._rng.random((2, len(rows)), np.float32)
-        share = chance[1]
-        flying = chance[0] < FLYING * min(float(scale), 1.5)
-        gone = ~flying & (chance[0] < (FLYING + LOST_AT_EDGE) * min(float(scale), 1.5))
-        lost = np.zeros(depth.shape, bool)
-        lost[rows[gone], columns[gone]] = True
-        r, c = rows[flying], columns[flying]
-        depth = depth.copy()
-        depth[r, c] += (
-            share[flying]
-            * (far[r, c] - near[r, c])
-            * np.where(depth[r, c] - near[r, c] < far[r, c] - depth[r, c], 1, -1)
-        )
-        return depth, lost
+        near, far = cv2.erode(depth, kernel).ravel(), cv2.dilate(depth, kernel).ravel()
+        at = np.flatnonzero((far - near > EDGE_M) & (near > 0))
+        chance, share = self._rng.random((2, len(at)), np.float32)
+        strength = min(float(scale), 1.5)
+        flying = chance < FLYING * strength
+        gone = ~flying & (chance < (FLYING + LOST_AT_EDGE) * strength)
+        invalid.ravel()[at[gone]] = True
+        at, share = at[flying], share[flying]
+        here = depth.ravel()[at]
+        towards = np.where(here - near[at] < far[at] - here, 1, -1)
+        depth.ravel()[at] = here + share * (far[at] - near[at]) * towards
+
+
+def _blotches(rng: np.random.Generator, shape: tuple[int, ...], size: float,
+              contrast: float) -> np.ndarray:  # fmt: skip
+    """Values in [0, 1] (H, W) that change over ``size`` pixels."""
+    smooth = cv2.GaussianBlur(gaussian(rng, shape), (0, 0), size)
+    return 0.5 + 0.5 * np.tanh(smooth / contrast / 1.2)
 
 
 def _field(lens: Intrinsics, mode: str) -> np.ndarray:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import numba
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
@@ -113,11 +114,7 @@ class Subject:
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
         """(B,V,3) -> unit normals (B,V,3), each face counted by its area."""
-        a, b, c = (vertices[:, self.faces[:, k]] for k in range(3))
-        cross = np.cross(b - a, c - a)
-        spread = _corner_matrix(self.faces.tobytes(), len(self.faces), vertices.shape[1])
-        summed = np.stack([spread @ x for x in cross])
-        return summed / np.maximum(np.linalg.norm(summed, axis=-1, keepdims=True), 1e-12)
+        return _normals(np.asarray(vertices, np.float64), self.faces)
 
     def _chain(self, local: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         world = np.empty_like(local)
@@ -147,16 +144,7 @@ class Subject:
         out = np.empty_like(rest)
         for b in range(batch):
             rows = np.concatenate([world[b].reshape(-1, 9), offsets[b], real[b], dual[b]], 1)
-            mixed = self.weights @ rows
-            linear = np.einsum("vij,vj->vi", mixed[:, :9].reshape(-1, 3, 3), rest[b])
-            linear += mixed[:, 9:12]
-            length = np.linalg.norm(mixed[:, 12:16], axis=1, keepdims=True)
-            q, e = mixed[:, 12:16] / length, mixed[:, 16:20] / length
-            xyz, w = q[:, :3], q[:, 3:]
-            turned = rest[b] + 2 * np.cross(xyz, np.cross(xyz, rest[b]) + w * rest[b])
-            shift = 2 * (w * e[:, :3] - e[:, 3:] * xyz + np.cross(xyz, e[:, :3]))
-            share = _DUAL_QUATERNION_SHARE
-            out[b] = (1 - share) * linear + share * (turned + shift)
+            _blend_one(self.weights @ rows, rest[b], out[b])
         return out
 
 
@@ -171,12 +159,48 @@ def _file() -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files}
 
 
-@cache
-def _corner_matrix(faces: bytes, count: int, num_vertices: int) -> csr_matrix:
-    """(V,F) matrix that adds each face's vector to its three vertices."""
-    corners = np.frombuffer(faces, np.int64).reshape(count, 3)
-    columns = np.repeat(np.arange(count), 3)
-    return csr_matrix((np.ones(3 * count), (corners.ravel(), columns)), shape=(num_vertices, count))
+@numba.njit(cache=True)
+def _normals(vertices, faces):
+    """(B,V,3) and faces (F,3) -> unit normals (B,V,3), weighted by area."""
+    normals = np.zeros_like(vertices)
+    for b in range(len(vertices)):
+        for f in range(len(faces)):
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            p, q, r = vertices[b, i], vertices[b, j], vertices[b, k]
+            ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+            vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+            x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            for corner in (i, j, k):
+                normals[b, corner, 0] += x
+                normals[b, corner, 1] += y
+                normals[b, corner, 2] += z
+        for v in range(vertices.shape[1]):
+            x, y, z = normals[b, v]
+            length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+            for axis in range(3):
+                normals[b, v, axis] /= length
+    return normals
+
+
+@numba.njit(cache=True)
+def _blend_one(mixed, rest, out):
+    """Fill ``out`` (V,3) from rest (V,3) and each vertex's blend ``mixed`` (V,20): a matrix, a
+    translation, and the real and dual part of a quaternion (x y z w)."""
+    for v in range(len(rest)):
+        x, y, z = rest[v]
+        length = np.sqrt((mixed[v, 12:16] ** 2).sum())
+        a, b, c, w = mixed[v, 12:16] / length
+        ea, eb, ec, ew = mixed[v, 16:20] / length
+        # turned = p + 2 q x (q x p + w p), shifted by 2 (w e - e_w q + q x e)
+        tx, ty, tz = b * z - c * y + w * x, c * x - a * z + w * y, a * y - b * x + w * z
+        dx = 2 * (b * tz - c * ty + w * ea - ew * a + b * ec - c * eb)
+        dy = 2 * (c * tx - a * tz + w * eb - ew * b + c * ea - a * ec)
+        dz = 2 * (a * ty - b * tx + w * ec - ew * c + a * eb - b * ea)
+        moved = (x + dx, y + dy, z + dz)
+        for axis in range(3):
+            m = mixed[v, 3 * axis : 3 * axis + 3]
+            linear = m[0] * x + m[1] * y + m[2] * z + mixed[v, 9 + axis]
+            out[v, axis] = linear + _DUAL_QUATERNION_SHARE * (moved[axis] - linear)
 
 
 def _normalised(barycentric: np.ndarray) -> np.ndarray:
