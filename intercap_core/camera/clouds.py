@@ -82,10 +82,14 @@ def colour_lookup(
     A point counts as hidden when the depth image holds a surface more than ``HIDDEN_BEHIND_M``
     nearer in the same or a neighbouring cell of the colour image (a z-buffer of all depth pixels
     that could cover it, coarse enough to have no holes). The neighbours make it err to the safe
-    side: at a nearer surface's edge a seam of about two depth pixels is called hidden too. Raises
-    ValueError as :func:`depth_points` does.
+    side: at a nearer surface's edge a seam of about two depth pixels is called hidden too. Depth on
+    the colour grid hides nothing: its pixels are the colour image's. Raises ValueError as
+    :func:`depth_points` does.
     """
     cloud = depth_points(depth, camera, index)
+    if camera.aligned:
+        hidden = np.zeros(len(cloud.depth_index), bool)
+        return ColourLookup(cloud.depth_index, cloud.depth_index.astype(np.int64), hidden)
     colour = camera.colour
     wanted = _to_colour(cloud, camera)
     pixels, z = wanted

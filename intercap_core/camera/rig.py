@@ -45,6 +45,18 @@ class Camera:
         """(4, 4). Raises ValueError for a camera without depth."""
         return invert(self.master_from_depth)
 
+    @cached_property
+    def aligned(self) -> bool:
+        """Whether depth lies on the colour image's pixel grid: one lens, one place."""
+        if self.depth is None or self.colour_from_depth is None:
+            return False
+        same_size = (self.depth.width, self.depth.height) == (self.colour.width, self.colour.height)
+        return (
+            same_size
+            and np.array_equal(self.depth.parameters, self.colour.parameters)
+            and np.array_equal(self.colour_from_depth, np.eye(4))
+        )
+
     def moved(self, master_from_colour: np.ndarray) -> Camera:
         """Return the same camera at another pose (4, 4)."""
         return replace(self, master_from_colour=np.asarray(master_from_colour, np.float64))
