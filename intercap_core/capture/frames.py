@@ -128,7 +128,7 @@ class Frames:
         return self._artefact.rows(f"cameras/{self.rig.names[c]}/depth", index)
 
     def colour_jpeg(self, t: int, c: int) -> bytes | None:
-        """Return the JPEG as recorded; None if there is none."""
+        """Return the JPEG (or PNG) file as recorded; None if there is none."""
         index = int(self._colour_index[t, c])
         if index < 0:
             return None
@@ -141,7 +141,7 @@ class Frames:
     def colour(self, t: int, c: int) -> np.ndarray | None:
         """Return the colour image (H, W, 3) uint8, BGR; None if there is none.
 
-        Raises UserError where the recorded JPEG cannot be decoded.
+        Raises UserError where the recorded image cannot be decoded.
         """
         jpeg = self.colour_jpeg(t, c)
         if jpeg is None:
@@ -151,7 +151,7 @@ class Frames:
         if image is None or image.shape != (lens.height, lens.width, 3):
             raise UserError(
                 f"{self._artefact.path}: sequence {self.sequence}, camera {self.rig.names[c]}, "
-                f"frame {t}: the recorded JPEG does not decode to {lens.width}x{lens.height}; add "
+                f"frame {t}: the recorded image does not decode to {lens.width}x{lens.height}; add "
                 f"{t} to drop_frames in the sequence's annotation"
             )
         return image

@@ -85,22 +85,24 @@ def run(
 def _note_same_devices(views: list[View]) -> None:
     """Say where two recordings are of one device; set the second aside where they are one."""
     for first, second in combinations([view for view in views if view.present], 2):
-        if first.source is None or second.source is None or not second.present:
+        if first.source is None or second.source is None or first.serial != second.serial:
+            continue
+        if not (first.present and second.present):
             continue
         files = f"{first.source.name} and {second.source.name}"
-        copied = first.fingerprint == second.fingerprint and np.array_equal(
+        note = ""
+        if first.fingerprint == second.fingerprint and np.array_equal(
             first.colour_times, second.colour_times
-        )
-        if copied:
-            for view in (first, second):
-                view.notes.append(f"{files} hold the same images: {second.name} is set aside")
+        ):
+            note = f"{files} hold the same images: {second.source.name} is set aside"
             second.camera = None
-        elif first.serial and first.serial == second.serial:
-            for view in (first, second):
-                view.notes.append(
-                    f"{files} have the same serial number {first.serial}: check which camera each "
-                    "was recorded with"
-                )
+        elif first.serial:
+            note = (
+                f"{files} have the same serial number {first.serial}: check which camera each was "
+                "recorded with"
+            )
+        for view in (first, second):
+            view.notes += [note] * bool(note)
 
 
 def _require_usable(views: list[View], sequence: SequenceEntry) -> None:
