@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -49,7 +50,18 @@ app = typer.Typer(
     ),
 )
 
+
+class Part(StrEnum):
+    """What `intercap evaluate` can be held to."""
+
+    sequences = "sequences"
+    captures = "captures"
+
+
 DEFAULT_SETTINGS = Path("config/config.yaml")
+CAPTURE_SETTINGS = [
+    Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
+]
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
 SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
 Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all.")]
@@ -163,6 +175,13 @@ def report(settings: Settings = DEFAULT_SETTINGS) -> None:
 @app.command(rich_help_panel=WHOLE)
 def evaluate(
     settings: Settings = Path("config/evaluation/config.yaml"),
+    captures: Annotated[
+        list[Path],
+        typer.Option(metavar="SETTINGS", help="Recordings taken to the scene alone; may repeat."),
+    ] = CAPTURE_SETTINGS,
+    only: Annotated[
+        Part | None, typer.Option(help="One part: what is taken to the end, or to the scene.")
+    ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
         "results/evaluation.json"
     ),
@@ -170,12 +189,14 @@ def evaluate(
 ) -> None:
     """Run the evaluation captures and print the tables against truth.
 
-    Example: intercap evaluate
+    Examples: intercap evaluate; intercap evaluate --only captures --output capture.json
     """
     from intercap_core.evaluation import evaluate as run_evaluation
 
     _check_output(output, replace_any=True)
-    raise typer.Exit(run_evaluation(settings, output, cores=cores))
+    whole = None if only is Part.captures else settings
+    parts = [] if only is Part.sequences else captures
+    raise typer.Exit(run_evaluation(whole, parts, output, cores=cores))
 
 
 @app.command(rich_help_panel=WHOLE)

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from intercap_core.capture_evaluation import evaluate_captures, print_captures
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
 from intercap_core.metrics.figures import SequenceMetrics
@@ -19,31 +20,54 @@ from intercap_core.run import run_workflow
 PLAIN, ANNOTATED = "no annotations", "annotated"
 
 
-def evaluate(settings: Path, output: Path, *, cores: int = 0) -> int:
+def evaluate(
+    settings: Path | None, captures: Sequence[Path], output: Path, *, cores: int = 0
+) -> int:
     """Bring the evaluation captures up to date, print the tables and write ``output``.
 
-    ``output`` is flat JSON with keys ``area.measure``; areas of the annotated captures end in
-    ``_annotated``. Returns the workflow's exit status; sequences that failed are left out of the
-    figures and named. Raises UserError where none has a result.
+    ``settings`` are of recordings that are taken to the end, ``captures`` of those that are taken
+    to the scene alone. ``output`` is flat JSON with keys ``area.measure``: areas of annotated
+    recordings end in ``_annotated``, those of ``captures`` have their dataset's name. Returns the
+    workflow's exit status; sequences that failed are left out of the figures and named. Raises
+    UserError where a project's settings are wrong, or none of its sequences has a result.
     """
+    projects = [load_project(path) for path in captures]  # faults are told before any work
+    status, flat = 0, dict[str, float]()
+    if settings is not None:
+        status, flat = _evaluate_sequences(settings, cores)
+    found = [evaluate_captures(project, cores=cores) for project in projects]
+    for captured in found:
+        status = status or captured.status
+        flat |= _flattened(captured.area, captured.figures)
+    if found:
+        print_captures(found)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    print(output)
+    return status
+
+
+def _evaluate_sequences(settings: Path, cores: int) -> tuple[int, dict[str, float]]:
     project = load_project(settings)
     status = run_workflow(settings, cores=cores)
     groups = measured_groups(project)
     tables = {name: areas(sequences) for name, sequences in groups.items() if sequences}
     if not tables:
         raise UserError(f"{settings}: no sequence has metrics; look into {project.logs}")
-    flat = {
-        f"{area}{'' if group == PLAIN else '_annotated'}.{measure}": float(f"{value:.6g}")
-        for group, found in tables.items()
-        for area, measures in found.items()
+    flat: dict[str, float] = {}
+    for group, found in tables.items():
+        for area, measures in found.items():
+            flat |= _flattened(f"{area}{'' if group == PLAIN else '_annotated'}", measures)
+    print_tables(tables, {name: len(sequences) for name, sequences in groups.items()})
+    return status, flat
+
+
+def _flattened(area: str, measures: dict[str, float]) -> dict[str, float]:
+    return {
+        f"{area}.{measure}": float(f"{value:.6g}")
         for measure, value in measures.items()
         if math.isfinite(value)
     }
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    print_tables(tables, {name: len(sequences) for name, sequences in groups.items()})
-    print(output)
-    return status
 
 
 def measured_groups(project: Project) -> dict[str, list[SequenceMetrics]]:

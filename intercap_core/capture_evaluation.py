@@ -1,0 +1,97 @@
+"""The capture's part of `intercap evaluate`: recordings taken to the scene and held to truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core.errors import UserError
+from intercap_core.metrics import capture
+from intercap_core.metrics.capture import CaptureErrors
+from intercap_core.project import Project
+from intercap_core.run import run_workflow
+
+_WIDTH = 112
+
+
+@dataclass(frozen=True)
+class CaptureEvaluation:
+    """Errors of every capture of one project, their figures, and the workflow's exit status."""
+
+    area: str
+    errors: Sequence[CaptureErrors]
+    figures: dict[str, float]
+    missing: Sequence[str]
+    status: int
+
+
+def evaluate_captures(project: Project, *, cores: int = 0) -> CaptureEvaluation:
+    """Bring the scenes of all sequences up to date and measure them; no later stage is run.
+
+    Raises UserError where a sequence has no truth to hold it to, or none has a scene.
+    """
+    without = [name for name, row in project.sequences.items() if row.truth is None]
+    if without:
+        raise UserError(
+            f"{project.path}: sequence {without[0]!r} has no truth to be evaluated against; leave "
+            "it out, or name its truth in the table"
+        )
+    scenes = {name: project.artefact(name, "scene") for name in project.sequences}
+    targets = [str(path) for path in scenes.values()]
+    status = run_workflow(project.path, cores=cores, arguments=targets)
+    errors = [
+        capture.measure(project.artefact(name, "frames"), scene, row.truth)
+        for (name, scene), row in zip(scenes.items(), project.sequences.values(), strict=True)
+        if scene.is_file() and row.truth is not None
+    ]
+    if not errors:
+        raise UserError(f"{project.path}: no sequence has a scene; look into {project.logs}")
+    missing = [name for name, scene in scenes.items() if not scene.is_file()]
+    area = project.config.dataset
+    return CaptureEvaluation(area, errors, capture.figures(errors), missing, status)
+
+
+def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:
+    """One table with a row for each capture, one of the figures with a column for each project."""
+    console = Console()
+    console.width = max(console.width, _WIDTH)  # a table that is cut when piped is of no use
+    heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
+             "deg")  # fmt: skip
+    table = Table("capture", *heads, box=None, title="captures against truth, after scene")
+    for found in evaluations:
+        for e in found.errors:
+            table.add_row(
+                e.sequence,
+                e.room,
+                _mean_mm(e.before),
+                _mean_mm(e.after),
+                f"{1e3 * e.after.max():.1f}" if len(e.after) else "",
+                _mean_mm(np.abs(e.offset), 2),
+                f"{e.slips.found} of {e.slips.found + e.slips.missed}",
+                str(e.slips.false),
+                _number(1e3 * e.ground_m, 2),
+                _number(e.ground_deg, 3),
+            )
+        for name in found.missing:
+            table.add_row(name, "no scene")
+    console.print(table)
+    names = list(dict.fromkeys(name for found in evaluations for name in found.figures))
+    table = Table("measure", *(found.area for found in evaluations), box=None)
+    table.title = "all captures, after scene"
+    for name in names:
+        values = (found.figures.get(name, math.nan) for found in evaluations)
+        table.add_row(name, *(_number(value, 3) for value in values))
+    console.print(table)
+
+
+def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
+    return _number(1e3 * float(values.mean()), digits) if len(values) else ""
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
