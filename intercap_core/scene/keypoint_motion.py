@@ -39,9 +39,9 @@ OUTLIER_SIGMA = 4.0
 class Motion:
     """K keypoints in T sets of C views.
 
-    ``paths`` in the master frame; ``residual`` (T, C, K, 2) px, found less expected, 0 where not ``seen``;
-    ``seen`` and ``valid`` (T, C, K) bool: has a residual, and one that is no outlier; ``sigma``
-    (C, K) px, what the residuals scatter by; ``bias`` (C, K, 2) px was taken off.
+    ``paths`` in the master frame; ``residual`` (T, C, K, 2) px, found less expected, 0 where not
+    ``seen``; ``seen`` and ``valid`` (T, C, K) bool: has a residual, and one that is no outlier;
+    ``sigma`` (C, K) px, what the residuals scatter by; ``bias`` (C, K, 2) px was taken off.
     """
 
     rig: Rig
@@ -102,22 +102,22 @@ class Motion:
         return np.einsum("tkef,tkf->tke", columns, np.nan_to_num(values))
 
 
-def build_motion(keypoints: np.ndarray, rig: Rig, times: np.ndarray) -> Motion:
-    """Fit moving points to ``keypoints`` (T, C, 135, 3) x, y, confidence, 0 = not seen."""
-    chosen = keypoints[:, :, POINTS]
-    pixels, seen = chosen[..., :2], chosen[..., 2] >= MIN_CONFIDENCE
+def build_motion(
+    keypoints: np.ndarray, rig: Rig, times: np.ndarray, start: np.ndarray | None = None
+) -> Motion:
+    """Fit moving points to ``keypoints`` (T, C, 135, 3) x, y, confidence, 0 = not seen.
+
+    ``start`` (T, K, 3): points of nearly the same keypoints, NaN = not known.
+    """
+    pixels, seen = _chosen(keypoints)
     scale = pixel_scale(rig)[:, None]
-    found = triangulate(
-        np.swapaxes(pixels, 1, 2).reshape(-1, len(rig), 2),
-        np.swapaxes(seen, 1, 2).reshape(-1, len(rig)).astype(float),
-        rig,
-        max_error_px=LOOSE_PX_AT_1080P,
-    )
-    points = found.points.reshape(len(times), len(POINTS), 3)
-    valid = seen & np.swapaxes(found.inlier.reshape(len(times), len(POINTS), -1), 1, 2)
-    bias = np.zeros((*seen.shape[1:], 2))
-    sigma = np.broadcast_to(4.0 * scale, seen.shape[1:])
-    for _ in range(ROUNDS):
+    if start is None:
+        points, valid = _triangulated(pixels, seen, rig)
+        sigma = np.broadcast_to(4.0 * scale, seen.shape[1:])
+        rounds = ROUNDS
+    else:
+        points, valid, rounds = start, seen, ROUNDS - 1
+    for _ in range(rounds):
         smooth = smooth_paths(times, points).points
         expected, by_point = _project(smooth, rig)
         known = seen & np.isfinite(expected[..., 0])
@@ -129,10 +129,47 @@ def build_motion(keypoints: np.ndarray, rig: Rig, times: np.ndarray) -> Motion:
         valid = known & (np.nan_to_num(size, nan=np.inf) < OUTLIER_SIGMA * sigma)
         points = _refitted(smooth, residual, by_point, valid, sigma)
     paths = smooth_paths(times, points)
+    return _seeing(pixels, seen, rig, paths, sigma, bias)
+
+
+def seeing(motion: Motion, keypoints: np.ndarray) -> Motion:
+    """Other ``keypoints`` (T, C, 135, 3) of the same motion."""
+    pixels, seen = _chosen(keypoints)
+    return _seeing(pixels, seen, motion.rig, motion.paths, motion.sigma, motion.bias)
+
+
+def _seeing(
+    pixels: np.ndarray,
+    seen: np.ndarray,
+    rig: Rig,
+    paths: Paths,
+    sigma: np.ndarray,
+    bias: np.ndarray,
+) -> Motion:
     expected, _ = _project(paths.points, rig)
-    known = seen & np.isfinite(expected[..., 0])
-    residual = np.where(known[..., None], pixels - expected - bias, 0.0)
-    return Motion(rig, times, paths, residual, known, valid & known, sigma, bias)
+    seen = seen & np.isfinite(expected[..., 0])
+    residual = np.where(seen[..., None], pixels - expected - bias, 0.0)
+    valid = seen & (np.linalg.norm(residual, axis=-1) < OUTLIER_SIGMA * sigma)
+    return Motion(rig, paths.times, paths, residual, seen, valid, sigma, bias)
+
+
+def _chosen(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (T, C, K, 2) and whether they are seen (T, C, K), of :data:`POINTS`."""
+    chosen = keypoints[:, :, POINTS]
+    return chosen[..., :2], chosen[..., 2] >= MIN_CONFIDENCE
+
+
+def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Points (T, K, 3) of each set on its own, and who agrees with them (T, C, K)."""
+    sets, views, count = seen.shape
+    found = triangulate(
+        np.swapaxes(pixels, 1, 2).reshape(-1, views, 2),
+        np.swapaxes(seen, 1, 2).reshape(-1, views).astype(float),
+        rig,
+        max_error_px=LOOSE_PX_AT_1080P,
+    )
+    inlier = np.swapaxes(found.inlier.reshape(sets, count, views), 1, 2)
+    return found.points.reshape(sets, count, 3), inlier
 
 
 def _project(points: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:

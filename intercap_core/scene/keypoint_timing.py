@@ -9,6 +9,7 @@ where the joints are and how the cameras' poses err are unknowns of the same pro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
 def windows(sets: int) -> list[slice]:
     """Slices of about equal length, at most :data:`WINDOW_SETS` long."""
     edges = np.linspace(0, sets, -(-sets // WINDOW_SETS) + 1).round().astype(int)
-    return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def series_of(values: np.ndarray) -> np.ndarray:

@@ -9,13 +9,13 @@ doubt. While nobody moves a slip cannot be seen, and none is reported.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA, Motion, build_motion
+from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA, Motion, build_motion, seeing
 from intercap_core.scene.keypoint_timing import by_moment, noise_of, precisions, windows
 
 # In log likelihood, without the keypoints that gain most: limbs that a detector confuses, or
@@ -23,6 +23,8 @@ from intercap_core.scene.keypoint_timing import by_moment, noise_of, precisions,
 MIN_GAIN = 60.0
 LEFT_OUT = 4
 CLEAR_GAIN = 10.0  # an interval must gain this much over the whole recording's being late
+WORTH = 0.2  # of the best interval's gain makes another worth taking at once
+APART_S = 1.0
 MAX_ROUNDS = 12
 MIN_SETS = 8
 
@@ -64,61 +66,73 @@ def find_slips(
     (T,) s. What all images of a camera are late by is counted from the ``master``'s.
     """
     slip = np.zeros(keypoints.shape[:2], np.int32)
-    intervals: list[Interval] = []
     if len(times) < MIN_SETS or len(rig) < 2:
         return Slips(slip, ())
+    steps = [s for s in range(-max_slip, max_slip + 1) if s]
+    motion = build_motion(keypoints, rig, times)
     for _ in range(MAX_ROUNDS):
-        found = _round(by_moment(keypoints, slip), rig, times, fps, max_slip)
-        if not found:
+        evidence = _Evidence(motion, steps, fps)
+        best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
+        if not best:
             break
-        for interval in found:
-            moment = np.arange(len(times)) - slip[:, interval.camera]
-            late = (moment >= interval.first) & (moment <= interval.last)
-            slip[late | _whole(interval, len(times)), interval.camera] += interval.slip
-        intervals += found
+        for interval in _apart(best, times):
+            _apply(slip, interval)
+        motion = build_motion(by_moment(keypoints, slip), rig, times, motion.paths.points)
+    slip, intervals = _polished(slip, keypoints, motion, steps, fps)
     always = [i.slip for i in intervals if i.camera == master and _whole(i, len(times))]
-    return Slips(slip - np.int32(sum(always)), tuple(intervals))
+    return Slips(slip - np.int32(sum(always)), tuple(sorted(intervals, key=lambda i: -i.gain)))
 
 
 def _whole(interval: Interval, sets: int) -> bool:
     return interval.last - interval.first + 1 == sets
 
 
-def _round(
-    keypoints: np.ndarray, rig: Rig, times: np.ndarray, fps: float, max_slip: int
-) -> list[Interval]:
-    """The best interval of each camera that is beyond doubt, of those that overlap the best."""
-    motion = build_motion(keypoints, rig, times)
-    if not motion.valid.any():
-        return []
-    shifts = [s for s in range(-max_slip, max_slip + 1) if s]
-    moved = np.stack([np.nan_to_num(motion.shifted(s / fps)) for s in shifts])
-    evidence = _Evidence(_tolerant(motion, moved))
-    best: list[Interval] = []
-    for c in range(len(rig)):
-        always, at_times = {}, []
-        for window in evidence.windows(c):
-            for shift, late in zip(shifts, moved, strict=True):
-                slipped = window.slipped(late[window.part, c])
-                if not window.between:
-                    always[shift] = always.get(shift, 0.0) + slipped.whole()
-                if shift > 0:
-                    at_times.append(slipped.best(c, window.part.start, shift))
-        candidates = [i for i in at_times if i.sure >= MIN_GAIN]
-        top = max(candidates, key=lambda i: i.gain, default=None)
-        shift = max(shifts, key=lambda s: _sure(always[s]))
-        whole = always[shift]
-        if _sure(whole) >= MIN_GAIN and (top is None or whole.sum() > top.gain - CLEAR_GAIN):
-            top = Interval(c, 0, len(times) - 1, shift, float(whole.sum()), _sure(whole))
-        if top is not None:
-            best.append(top)
-    best.sort(key=lambda i: -i.gain)
+def _apply(slip: np.ndarray, interval: Interval) -> None:
+    """Add to ``slip`` (T, C), in place, for the images that so far show the interval's moments."""
+    moment = np.arange(len(slip)) - slip[:, interval.camera]
+    late = (moment >= interval.first) & (moment <= interval.last)
+    slip[late | _whole(interval, len(slip)), interval.camera] += interval.slip
+
+
+def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
+    """The best interval and those that it cannot have brought about.
+
+    A camera that is out of step makes others look so: weaker ones and those near it in time wait.
+    """
+    ordered = sorted(intervals, key=lambda i: -i.gain)
     taken: list[Interval] = []
-    for interval in best:
-        # A camera out of step makes the others look so while it lasts: one at a time.
-        if all(interval.first > o.last or interval.last < o.first for o in taken):
+    for interval in ordered:
+        early, late = times[interval.first] - APART_S, times[interval.last] + APART_S
+        if interval.gain >= WORTH * ordered[0].gain and all(
+            times[other.last] < early or times[other.first] > late for other in taken
+        ):
             taken.append(interval)
     return taken
+
+
+def _polished(
+    slip: np.ndarray, keypoints: np.ndarray, motion: Motion, steps: list[int], fps: float
+) -> tuple[np.ndarray, list[Interval]]:
+    """Find each interval once more, against the motion that no slip disturbs any longer."""
+    result, intervals = slip.copy(), []
+    for c in range(slip.shape[1]):
+        constant = np.int32(np.median(slip[:, c])) if (slip[:, c] != 0).all() else np.int32(0)
+        if constant:
+            whole = Interval(c, 0, len(slip) - 1, int(constant), np.inf, np.inf)
+            intervals.append(whole)
+        differs = np.flatnonzero(slip[:, c] != constant)
+        for run in (
+            np.split(differs, np.flatnonzero(np.diff(differs) > 1) + 1) if len(differs) else ()
+        ):
+            before = slip.copy()
+            before[run, c] = constant
+            shown = seeing(motion, by_moment(keypoints, before))
+            found = _Evidence(shown, steps, fps).best(c)
+            result[run, c] = constant
+            if found is not None and not _whole(found, len(slip)):
+                _apply(result, found)
+                intervals.append(found)
+    return result, intervals
 
 
 def _tolerant(motion: Motion, moved: np.ndarray) -> Motion:
@@ -135,24 +149,46 @@ def _sure(gains: np.ndarray) -> float:
 
 
 class _Evidence:
-    """What the residuals of each camera say, whitened over views."""
+    """What the residuals say for slips of ``steps`` frames."""
 
-    def __init__(self, motion: Motion) -> None:
-        self._motion = motion
-        self._noise = noise_of(motion)
+    def __init__(self, motion: Motion, steps: list[int], fps: float) -> None:
+        self._steps = steps
+        self._late = np.stack([np.nan_to_num(motion.shifted(s / fps)) for s in steps])
+        self._motion = _tolerant(motion, self._late)
+        noise = noise_of(self._motion)
         whole = windows(len(motion.times))
         between = [
-            slice((a.start + a.stop) // 2, (b.start + b.stop) // 2)
-            for a, b in zip(whole, whole[1:], strict=False)
+            slice((a.start + a.stop) // 2, (b.start + b.stop) // 2) for a, b in pairwise(whole)
         ]
         self._parts = [(part, False) for part in whole] + [(part, True) for part in between]
-        self._precisions = [precisions(motion, self._noise, part) for part, _ in self._parts]
+        self._precisions = [precisions(self._motion, noise, part) for part, _ in self._parts]
 
-    def windows(self, camera: int) -> Iterator[_Window]:
-        """The windows over the recording, first those that cover it, then those between them."""
+    def best(self, camera: int) -> Interval | None:
+        """The interval of one camera that gains most, if it is beyond doubt."""
+        sets = len(self._motion.times)
         root, series = _own_series(self._motion, camera)
+        always = dict.fromkeys(self._steps, 0.0)
+        candidates = []
         for (part, between), precision in zip(self._parts, self._precisions, strict=True):
-            yield _Window(part, between, root[part], series[part], precision[:, camera])
+            window = _Window(root[part], series[part], precision[:, camera])
+            for step, late in zip(self._steps, self._late, strict=True):
+                slipped = window.slipped(late[part, camera])
+                if not between:
+                    always[step] = always[step] + slipped.gains(0, part.stop - part.start)
+                if step > 0:
+                    first, last, gains = slipped.best()
+                    candidates.append(
+                        Interval(camera, part.start + first, part.start + last, step,
+                                 float(gains.sum()), _sure(gains))
+                    )  # fmt: skip
+        candidates = [i for i in candidates if i.sure >= MIN_GAIN]
+        step = max(self._steps, key=lambda s: _sure(always[s]))
+        total = float(always[step].sum())
+        whole = Interval(camera, 0, sets - 1, step, total, _sure(always[step]))
+        top = max(candidates, key=lambda i: i.gain, default=None)
+        if whole.sure >= MIN_GAIN and (top is None or whole.gain > top.gain - CLEAR_GAIN):
+            return whole
+        return top
 
 
 def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
@@ -176,11 +212,9 @@ def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """``part`` of the sets, W of them; ``root`` (W, K, 2, 2) and ``series`` (W, K, 2) as
-    :func:`_own_series` gives; ``precision`` (K, W, W) over time."""
+    """W sets: ``root`` (W, K, 2, 2) and ``series`` (W, K, 2) as :func:`_own_series` gives;
+    ``precision`` (K, W, W) over time."""
 
-    part: slice
-    between: bool
     root: np.ndarray
     series: np.ndarray
     precision: np.ndarray
@@ -200,25 +234,19 @@ class _Slipped:
     linear: np.ndarray
     precision: np.ndarray
 
-    def whole(self) -> np.ndarray:
-        """The keypoints' gains (K,) if the whole window is late."""
-        return self._gains(0, self.linear.shape[1])
-
-    def _gains(self, first: int, end: int) -> np.ndarray:
+    def gains(self, first: int, end: int) -> np.ndarray:
+        """The keypoints' gains (K,) if the sets from ``first`` to before ``end`` are late."""
         part = slice(first, end)
         change, precision = self.change[:, part], self.precision[:, part, part]
         energy = (change * (precision @ change)).sum((1, 2))
         return self.linear[:, part].sum(1) - energy / 2
 
-    def best(self, camera: int, start: int, shift: int) -> Interval:
-        """The interval of greatest gain; sets counted from the window's ``start``."""
+    def best(self) -> tuple[int, int, np.ndarray]:
+        """First and last set of the interval of greatest gain, and the keypoints' gains (K,)."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
         gain = interval_gains(self.linear.sum(0), energy)
-        first, end = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        sure = _sure(self._gains(int(first), int(end)))
-        return Interval(
-            camera, start + int(first), start + int(end) - 1, shift, float(gain[first, end]), sure
-        )
+        first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
+        return first, end - 1, self.gains(first, end)
 
 
 def interval_gains(linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ class Paths:
 
 def smooth_paths(times: np.ndarray, points: np.ndarray) -> Paths:
     """Smooth ``points`` (T, K, 3), NaN = not known, at increasing ``times`` (T,) s."""
-    sets, count = points.shape[:2]
+    sets = len(points)
     known = np.isfinite(points[..., 0])
     smooth = np.full(points.shape, np.nan)
     velocity = np.full(points.shape, np.nan)
@@ -61,7 +61,7 @@ def smooth_paths(times: np.ndarray, points: np.ndarray) -> Paths:
 
 
 def _penalty(times: np.ndarray) -> np.ndarray:
-    """D'D in upper banded form (4, T), D the third divided differences in units of the usual gap."""
+    """D'D in upper banded form (4, T), D third divided differences in units of the usual gap."""
     gap = float(np.median(np.diff(times)))
     scaled = (times - times[0]) / gap
     rows = len(times) - ORDER
