@@ -54,7 +54,7 @@ def test_depth_on_the_colour_grid_is_looked_up_at_its_own_pixel():
     camera = replace(rig[0], colour=lens, depth=lens, colour_from_depth=np.eye(4))
     assert camera.aligned and not rig[0].aligned
     depth = np.rint(room_depth(camera, zup_from_master, FURNITURE) * 1000).astype(np.uint16)
-    # A hair's breadth of offset takes the long way: projection and the test of what is hidden.
+    # A hair's breadth of offset takes the long way, by projection.
     nudged = np.eye(4)
     nudged[0, 3] = 1e-9
     index = np.arange(500, 15000, 7)
@@ -63,4 +63,4 @@ def test_depth_on_the_colour_grid_is_looked_up_at_its_own_pixel():
         projected = colour_lookup(depth, replace(camera, colour_from_depth=nudged), pixels)
         assert np.array_equal(found.depth_index, projected.depth_index)
         assert np.array_equal(found.colour_index, projected.colour_index)
-        assert not found.hidden.any() and projected.hidden.mean() < 0.1
+        assert not found.hidden.any()
