@@ -3,7 +3,7 @@
 # make lint      ruff, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone),
 #                tables and results/evaluation.json
-# make bench     seconds a frame and peak memory, results/bench.json
+# make bench     seconds a frame and peak memory, extraction alone and its bytes, results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -18,9 +20,10 @@ from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
 from intercap_core.run import snakemake_command
 from intercap_core.schemas import FRAMES
-from intercap_core.step import SEQUENCE_STAGES
+from intercap_core.step import SEQUENCE_STAGES, run_step
 
 SAMPLE_SECONDS = 0.1
+EXTRACTIONS = 3
 MEGABYTE = 1 << 20
 
 
@@ -30,7 +33,8 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     The recording is made before, if it is a virtual one. Then every stage from the recordings to
     the metrics is computed anew through the workflow: process starts count, the studio does not.
     ``end_to_end.peak_memory_mb`` is the largest sum of resident memory over all processes of the
-    run; a stage's is its own process's. Raises UserError where a stage fails.
+    run; a stage's is its own process's. ``frames.fps`` is :func:`extraction`'s. Raises UserError
+    where a stage fails.
     """
     project = load_project(settings)
     sequence = next(iter(project.sequences))
@@ -45,6 +49,7 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
         "end_to_end.seconds_per_frame": round(seconds / frames, 4),
         "end_to_end.peak_memory_mb": round(peak / MEGABYTE, 1),
         **_stages(project, sequence, frames),
+        **extraction(project, sequence, frames),
     }
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
@@ -90,6 +95,34 @@ def _stages(project: Project, sequence: str, frames: int) -> dict[str, float]:
     return figures
 
 
+def extraction(project: Project, sequence: str, frames: int) -> dict[str, float]:
+    """Speed of the frames stage alone, and its artefact's size beside the recordings' own.
+
+    ``frames.fps``: frame sets of all cameras a second, the median of ``EXTRACTIONS`` runs within
+    one process whose imports are done and whose input the system has read before.
+    ``frames.bytes_ratio``: bytes of frames.h5 over bytes of the recording files, whole: colour and
+    depth packets, and whatever else was recorded (infrared, inertial samples, attachments).
+    """
+    seconds = []
+    with tempfile.TemporaryDirectory(dir=project.results) as folder:
+        output = Path(folder) / "frames.h5"
+        for _ in range(1 + EXTRACTIONS):  # the first one imports and warms up
+            output.unlink(missing_ok=True)
+            start = time.perf_counter()
+            run_step("frames", project, sequence, inputs={}, output=output)
+            seconds.append(time.perf_counter() - start)
+        written = output.stat().st_size
+    row = project.sequences[sequence]
+    files = row.recordings.rglob("*.mkv" if row.layout == "k4a" else "*")
+    recorded = sum(path.stat().st_size for path in files if path.is_file())
+    return {
+        "frames.fps": round(frames / statistics.median(seconds[1:]), 2),
+        "frames.bytes_ratio": round(written / recorded, 4),
+        "frames.bytes_per_set": round(written / frames),
+        "frames.recorded_bytes_per_set": round(recorded / frames),
+    }
+
+
 def _print(figures: dict[str, float], title: str) -> None:
     table = Table("stage", "seconds a frame", "peak memory, MB", title=title, box=None)
     for area in ("end_to_end", *SEQUENCE_STAGES):
@@ -99,4 +132,12 @@ def _print(figures: dict[str, float], title: str) -> None:
             f"{figures[f'{area}.seconds_per_frame']:.3f}",
             "" if memory is None else f"{memory:.0f}",
         )
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    console.print(
+        f"extraction alone: {figures['frames.fps']:.1f} frame sets a second; "
+        f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "
+        f"{figures['frames.recorded_bytes_per_set'] / 1e6:.2f} MB "
+        f"(ratio {figures['frames.bytes_ratio']:.3f})",
+        highlight=False,
+    )
