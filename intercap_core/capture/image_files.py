@@ -35,13 +35,11 @@ class Shot(NamedTuple):
     depth: Path | None
 
 
-def read_colour(path: Path, size: tuple[int, int]) -> bytes:
-    """Return a whole JPEG or PNG file of ``size`` as it is; raises :class:`DamagedImage`."""
+def read_colour(path: Path) -> bytes:
+    """Return a whole JPEG or PNG file as it is; raises :class:`DamagedImage` for anything else."""
     content = _read(path)
-    found = encoded_size(content)
-    if found is None:
-        raise DamagedImage("is no whole JPEG")
-    _check_size(found, size)
+    if encoded_size(content) is None:
+        raise DamagedImage("is no whole JPEG or PNG")
     return content
 
 
@@ -94,7 +92,44 @@ def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     return None
 
 
-class AlignedRecording(CameraRecording):
+class FilesRecording(CameraRecording):
+    """One camera's image files: colour files as they are, depth decoded.
+
+    Depth images have the size of the camera's depth lens; without one they are not read.
+    """
+
+    def __init__(self, source: Path, camera: Camera, shots: list[Shot], fps: float) -> None:
+        super().__init__(source, camera, fps=fps)
+        self._shots = shots
+
+    def images(self) -> Iterator[Image]:
+        """Images in the order of the shots; damaged ones are left out and counted."""
+        return read_shots(self, self._shots)
+
+
+def read_shots(recording: CameraRecording, shots: list[Shot]) -> Iterator[Image]:
+    """Yield the images of ``shots``; what is damaged is noted at the recording, by first name."""
+    lens = recording.camera.depth
+    damaged: list[str] = []
+    for time_us, colour, depth in shots:
+        if colour is not None:
+            try:
+                yield Image("colour", time_us, read_colour(colour))
+            except DamagedImage as error:
+                damaged.append(f"{colour.name} {error}")
+        if depth is not None and lens is not None:
+            try:
+                yield Image("depth", time_us, read_depth(depth, (lens.width, lens.height)))
+            except DamagedImage as error:
+                damaged.append(f"{depth.name} {error}")
+    without = sum(shot.colour is not None and shot.depth is None for shot in shots)
+    if lens is not None and without:
+        recording.notes.append(f"no depth image beside {without} of its colour images")
+    if damaged:
+        recording.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
+
+
+class AlignedRecording(FilesRecording):
     """One camera's image files, with depth on the colour image's grid.
 
     ``shots`` are in order of time. A camera none of whose depth files is a 16-bit PNG of the
@@ -116,7 +151,7 @@ class AlignedRecording(CameraRecording):
         fault = self._fault_of_depth()
         aligned = not fault and any(shot.depth for shot in shots)
         camera = Camera(name, lens, lens if aligned else None, np.eye(4) if aligned else None, pose)
-        super().__init__(source, camera, fps=fps)
+        super().__init__(source, camera, shots, fps)
         if fault:
             self.notes.append(fault)
         if not any(shot.colour for shot in shots):
@@ -132,29 +167,6 @@ class AlignedRecording(CameraRecording):
             except DamagedImage as error:
                 fault = fault or f"no depth used: {path.name} {error}"
         return fault
-
-    def images(self) -> Iterator[Image]:
-        """Colour files as they are, depth decoded; damaged ones are left out and counted."""
-        damaged: list[str] = []
-        without_depth = 0
-        for time_us, colour, depth in self._shots:
-            if colour is not None:
-                try:
-                    yield Image("colour", time_us, read_colour(colour, self._size))
-                except DamagedImage as error:
-                    damaged.append(f"{colour.name} {error}")
-            if self.camera.depth is None:
-                continue
-            without_depth += depth is None
-            if depth is not None:
-                try:
-                    yield Image("depth", time_us, read_depth(depth, self._size))
-                except DamagedImage as error:
-                    damaged.append(f"{depth.name} {error}")
-        if without_depth:
-            self.notes.append(f"no depth image beside {without_depth} of its colour images")
-        if damaged:
-            self.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
 
     def sample_depth(self, count: int) -> list[np.ndarray]:
         """Up to ``count`` depth images (H, W) uint16 mm, spread over the recording.

@@ -7,7 +7,6 @@ camera has depth. ``calibration`` is as :mod:`intercap_core.camera.opencv_calibr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,8 @@ import numpy as np
 from intercap_core.camera.extrinsics_files import CAMERA_NAME
 from intercap_core.camera.opencv_calibration import read_opencv_calibration
 from intercap_core.camera.rig import Camera
-from intercap_core.capture.image_files import DamagedImage, Shot, read_depth
-from intercap_core.capture.source import CameraRecording, Image, Layout
+from intercap_core.capture.image_files import FilesRecording
+from intercap_core.capture.source import CameraRecording, Layout
 from intercap_core.capture.timestamps import find_timestamps, rate_of, read_timestamps, shots_of
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
@@ -89,53 +88,13 @@ class PlainLayout(Layout):
                 source=source,
             )
             stated = np.array([shot.time_us for shot in shots if shot.colour])
-            recording = FolderRecording(source, camera, shots, known.fps or rate_of(stated) or 1.0)
+            recording = FilesRecording(source, camera, shots, known.fps or rate_of(stated) or 1.0)
         if depth and not with_depth:
             recording.notes.append(
                 "its depth images are not read: the calibration says nothing of depth (aligned, or "
                 "a lens)"
             )
         return recording
-
-
-class FolderRecording(CameraRecording):
-    """A folder of colour files, copied, and of depth files."""
-
-    def __init__(self, folder: Path, camera: Camera, shots: list[Shot], fps: float) -> None:
-        super().__init__(folder, camera, fps=fps)
-        self._shots = shots
-
-    def images(self) -> Iterator[Image]:
-        """All colour files as they are, then depth, in the order of the files' numbers."""
-        unreadable = []
-        for time_us, colour, _ in self._shots:
-            if colour is None:
-                continue
-            try:
-                content = colour.read_bytes()
-            except OSError:
-                unreadable.append(colour.name)
-                continue
-            yield Image("colour", time_us, content)
-        if unreadable:
-            self.notes.append(f"{len(unreadable)} unreadable files (first: {unreadable[0]})")
-        yield from depth_images(self, self._shots)
-
-
-def depth_images(recording: CameraRecording, shots: list[Shot]) -> Iterator[Image]:
-    """Decode the depth files among ``shots`` one at a time; what is damaged is noted."""
-    lens, damaged = recording.camera.depth, []
-    for time_us, _, path in shots:
-        if path is None or lens is None:
-            continue
-        try:
-            image = read_depth(path, (lens.width, lens.height))
-        except DamagedImage as error:
-            damaged.append(f"{path.name} {error}")
-            continue
-        yield Image("depth", time_us, image)
-    if damaged:
-        recording.notes.append(f"{len(damaged)} depth images left out (first: {damaged[0]})")
 
 
 def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import JPEG_QUALITY, jpeg_of
-from intercap_core.capture.plain import depth_images
+from intercap_core.capture.image_files import read_shots
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.capture.timestamps import Timestamps, shots_of
 from intercap_core.errors import UserError
@@ -89,7 +89,7 @@ class VideoRecording(CameraRecording):
             self.notes.append(f"{self._damaged} damaged packets left out")
         if self.truncated:
             self.notes.append(f"the file is cut off: {count} images could be read")
-        yield from depth_images(self, self._shots)
+        yield from read_shots(self, self._shots)
 
     def _packets(self) -> Iterator[Any]:
         demuxed = self._container.demux(self._stream)
