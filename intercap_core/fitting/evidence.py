@@ -5,6 +5,8 @@ Set up anew between rounds of the solver, together with how far each kind of obs
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -39,12 +41,21 @@ _VERTEX_CHUNK = 16
 _MAX_SPEED = 6.0
 
 
+class ViewDistances(NamedTuple):
+    """What the points of each camera say of the samples: their mean distance (N,C,S), metres, and
+    effective number (N,C,S), 0 = none; the samples' normals (N,S,3)."""
+
+    distance: Tensor
+    points: Tensor
+    normal: Tensor
+
+
 class Evidence:
     """Observations of the N usable frames.
 
     frames (N,) their ids. keypoint_sigma (135,) m and cloud_noise (G,) m start from what is usual
     and are refined from residuals. cloud_residual (N,): median distance of points at the last
-    matching, metres, NaN = none.
+    matching, metres, NaN = none. by_view: what each camera's points said then, or None.
     """
 
     def __init__(
@@ -64,6 +75,7 @@ class Evidence:
         self.group = torch.as_tensor(self.samples.group, device=model.device)
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
+        self.by_view: ViewDistances | None = None
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         for part, value in _KEYPOINT_SIGMA:
             self.keypoint_sigma[part] = value
@@ -186,14 +198,15 @@ class Evidence:
 
     def match(self, problem: BodyProblem, reach: float) -> CloudRows:
         """Correspondences of all frames at the problem's bodies, within ``reach`` metres."""
-        count, size = len(self.frames), len(self.samples.vertex)
+        count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
         expected = problem.thickness()
         params = self.model.parameters(problem.base)
         faces = self.model.faces
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
         shift = self._shift(where)
-        mean = where.new_zeros(count, size)
-        total = where.new_zeros(count, size)
+        of_views = where.new_zeros(count, views, size)
+        points = where.new_zeros(count, views, size)
+        expected = expected.repeat(views)
         normal = where.new_zeros(count, size, 3)
         for start in range(0, count, _VERTEX_CHUNK):
             at = slice(start, start + _VERTEX_CHUNK)
@@ -214,9 +227,15 @@ class Evidence:
                     moved = (late * normal[t, found.sample]).sum(1)
                     found = found._replace(distance=found.distance - moved)
                 self.cloud_residual[t] = found.distance[found.valid].abs().nanmedian()
-                mean[t], total[t] = body_cloud.gather(
-                    found, cloud.trust, expected, size, huber=_HUBER_M
+                # gathered by camera and sample: those that several cameras see tell their offsets
+                found = found._replace(sample=cloud.view * size + found.sample)
+                apart, number = body_cloud.gather(
+                    found, cloud.trust, expected, views * size, huber=_HUBER_M
                 )
+                of_views[t], points[t] = apart.reshape(views, -1), number.reshape(views, -1)
+        self.by_view = ViewDistances(of_views, points, normal)
+        total = points.sum(1)
+        mean = (of_views * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
         share = self.cloud_weight * _SAMPLE_SHARE
         weight = share * total / (total + _FULL_SAMPLE) / noise**2

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,15 @@ from intercap_core.fitting.observations import person_clouds, read_observations
 from intercap_core.fitting.problem import BodyProblem
 from intercap_core.fitting.schedule import Fitter, Settled
 from intercap_core.refine.equations import NormalEquations
+from intercap_core.refine.sightings import cloud_sightings, keypoint_sightings
 from intercap_core.refine.state import BODY, State
+from intercap_core.refine.time_offsets import OffsetPrior, TimeOffsets, estimate_offsets
 
 # Frames without a believable fit stay near where they were bridged unless their neighbours pull.
 _BRIDGED_TURN, _BRIDGED_SHIFT = 0.3, 0.1  # rad, metres
+_OFFSET_MOVED_S = 0.001  # at the speed of a fast hand, some millimetres
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,27 @@ class BodyData:
         keypoint[self._fitter.frames] = pixels.cpu().numpy()
         cloud[self._fitter.frames] = metres.cpu().numpy()
         return Residuals(keypoint, cloud)
+
+    def refine_offsets(self, prior: OffsetPrior) -> TimeOffsets:
+        """Estimate the cameras' time offsets at the state of the last :meth:`refresh`.
+
+        Where they differ from those that the predictions allow for by more than a millisecond,
+        the predictions allow for these from now on.
+        """
+        evidence, problem = self._fitter.evidence, self._problem
+        seen = evidence.seen
+        sightings = [
+            replace(found, weight=found.weight * self._trusted[:, None, None])
+            for found in (keypoint_sightings(evidence, problem), cloud_sightings(evidence, problem))
+            if found is not None
+        ]
+        times = seen.times[evidence.frames]
+        offsets = estimate_offsets(sightings, times, seen.time_offset, prior)
+        log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
+        if np.abs(offsets.offset - seen.time_offset).max() > _OFFSET_MOVED_S:
+            evidence.seen = replace(seen, time_offset=offsets.offset)
+            self._fitter.observe(problem)
+        return offsets
 
     def _place(self, state: State) -> None:
         vector = state.parameters(self._fitter.model).vector()

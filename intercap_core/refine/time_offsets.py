@@ -28,8 +28,10 @@ POINT_SIGMA_M = 0.03
 MAX_CORRELATION = 0.98
 ROBUST_SCALE = 3.0  # standard deviations at which an innovation starts to count as an outlier
 ROUNDS = 4
+PART_POINTS = 4.0  # points of one part count as at most so many: they err together
 _GAP = 1.5  # of the usual time step: rows farther apart are no neighbours
 _LEAST_ROWS = 50
+_SMALLEST_SIGMA_S = 1e-5  # the master's is zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,16 @@ class Sightings:
 
 
 @dataclass(frozen=True)
+class OffsetPrior:
+    """What is known beside the sightings: ``offset`` (C,) and ``sigma`` (C,), seconds, sigma NaN
+    where nothing is (:data:`LOOSE_SIGMA_S` about zero); ``master`` has none."""
+
+    offset: np.ndarray
+    sigma: np.ndarray
+    master: int
+
+
+@dataclass(frozen=True)
 class TimeOffsets:
     """``offset`` (C,) seconds later than the sets' times and ``sigma`` (C,) its stated standard
     deviation, both 0 for the master."""
@@ -61,22 +73,18 @@ def estimate_offsets(
     sightings: Sequence[Sightings],
     times: np.ndarray,
     current: np.ndarray,
-    *,
-    prior: np.ndarray,
-    prior_sigma: np.ndarray,
-    master: int,
+    prior: OffsetPrior,
 ) -> TimeOffsets:
     """Estimate all offsets (C,), seconds.
 
     ``current`` (C,) are the offsets that the predictions allow for; ``times`` (T,) of the frames.
-    ``prior`` and ``prior_sigma`` (C,) are what is known beside the sightings, sigma NaN where
-    nothing is: :data:`LOOSE_SIGMA_S` about zero.
     """
     count = len(current)
-    known = np.isfinite(prior_sigma)
-    expected = np.where(known, prior, 0.0) - current
-    precision = np.diag(np.where(known, prior_sigma, LOOSE_SIGMA_S) ** -2.0)
-    free = np.arange(count) != master
+    known = np.isfinite(prior.sigma)
+    expected = np.where(known, prior.offset, 0.0) - current
+    sigma = np.maximum(np.where(known, prior.sigma, LOOSE_SIGMA_S), _SMALLEST_SIGMA_S)
+    precision = np.diag(sigma**-2.0)
+    free = np.arange(count) != prior.master
     all_innovations = [found for s in sightings if (found := _Innovations.of(s, times)) is not None]
     change = np.zeros(count)
     for _ in range(ROUNDS):
@@ -120,6 +128,7 @@ class _Innovations:
         scale = np.ones(residual.shape[2])
         for part in np.unique(seen.part):
             here = seen.part == part
+            weight[:, :, here] *= min(1.0, PART_POINTS / np.count_nonzero(here))
             size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
             scale[here] = 1.4826 * np.median(size) if len(size) else 1.0
         scale = np.maximum(scale, 1e-9)[:, None]
@@ -166,11 +175,13 @@ class _Innovations:
         return np.diag(own) - shared, -(along * left).sum((0, 2, 3))
 
     def spread(self, change: np.ndarray) -> np.ndarray:
-        """Covariance (C,C) of g, taken from how far the parts of the body differ in theirs."""
+        """Covariance (C,C) of g, taken from how far frames and parts of the body differ in theirs:
+        errors that last count in the one, errors of a moment in the other."""
         left, weight, _ = self._left(change)
-        pull = (self.velocity * weight[..., None] * left).sum((0, 3))
-        parts = [pull[:, self.part == part].sum(1) for part in np.unique(self.part)]
-        return np.asarray(sum(np.outer(p, p) for p in parts))
+        pull = (self.velocity * weight[..., None] * left).sum(3)  # (T-1, C, K)
+        parts = [pull[:, :, self.part == part].sum((0, 2)) for part in np.unique(self.part)]
+        groups = np.concatenate([np.array(parts), pull.sum(2)])
+        return groups.T @ groups
 
 
 def _centred(values: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -37,6 +37,7 @@ from intercap_core.refine.minimise import minimise
 from intercap_core.refine.object_data import TrackedPoses
 from intercap_core.refine.problem import Ground, Problem
 from intercap_core.refine.state import State
+from intercap_core.refine.time_offsets import OffsetPrior
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, SCENE
@@ -110,7 +111,8 @@ def run(
             else None
         )
         fps = float(source.attributes["fps"])
-        time_offset = source["time_offset"]
+        master = source.text("camera_names").index(str(source.attributes["master"]))
+        known_offsets = OffsetPrior(source["time_offset"], source["time_offset_sigma"], master)
     patches = contact_patches(model)
     problem = Problem(
         model=model,
@@ -133,6 +135,7 @@ def run(
     for rounds in _ROUNDS:
         problem.probability = found.probability
         data.refresh(state)
+        data.refine_offsets(known_offsets)
         problem.refresh(state)
         if not before:
             before = problem.equations(state).energy
@@ -146,6 +149,7 @@ def run(
     after = minimum.equations.energy
     flagged, reasons = _flags(failed, bridged, lost, disagree, problem, state)
     report = data.residuals(state)
+    offsets = data.refine_offsets(known_offsets)
 
     with artefacts.write(
         output,
@@ -164,7 +168,8 @@ def run(
         writer.put("region_names", CONTACT_REGIONS)
         writer.put("contact_probability", found.probability)
         writer.put("contact_annotated", found.labels)
-        writer.put("time_offset", time_offset)
+        writer.put("time_offset", offsets.offset)
+        writer.put("time_offset_sigma", offsets.sigma)
         names = sorted(before.keys() | after.keys())
         writer.put("energy_names", names)
         writer.put("energy_before", [before.get(name, 0.0) for name in names])

@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.refine.time_offsets import LOOSE_SIGMA_S, Sightings, estimate_offsets
+from intercap_core.refine.time_offsets import (
+    LOOSE_SIGMA_S,
+    OffsetPrior,
+    Sightings,
+    estimate_offsets,
+)
 
 FPS = 15.0
 T, C, K = 60, 5, 30
 TRUE = np.array([0.0, 6.0, -7.0, 2.5, -4.0]) * 1e-3
-NOTHING = {"prior": np.zeros(C), "prior_sigma": np.full(C, np.nan), "master": 0}
+NOTHING = OffsetPrior(np.zeros(C), np.full(C, np.nan), 0)
 TIMES = np.arange(T) / FPS
 PX_PER_M = 350.0
 
@@ -52,7 +57,7 @@ def _within(found, most: float) -> bool:
 def test_offsets_are_found_under_lasting_errors_and_the_sigma_is_honest():
     errors, stated = [], []
     for seed in range(6):
-        found = estimate_offsets([_sightings(seed)], TIMES, np.zeros(C), **NOTHING)
+        found = estimate_offsets([_sightings(seed)], TIMES, np.zeros(C), NOTHING)
         assert found.offset[0] == 0 and found.sigma[0] == 0
         errors.append((found.offset - TRUE)[1:])
         stated.append(found.sigma[1:])
@@ -63,14 +68,14 @@ def test_offsets_are_found_under_lasting_errors_and_the_sigma_is_honest():
 
 def test_what_the_fit_allows_for_already_is_added():
     current = 0.7 * TRUE
-    found = estimate_offsets([_sightings(late=TRUE - current)], TIMES, current, **NOTHING)
+    found = estimate_offsets([_sightings(late=TRUE - current)], TIMES, current, NOTHING)
     assert _within(found, 1.5e-3)
 
 
 def test_a_shared_shift_of_the_fit_along_the_motion_is_no_offset():
     """A fit that follows the mean of all cameras is itself late; only the views' difference to the
     master counts."""
-    found = estimate_offsets([_sightings(late=TRUE - 0.003)], TIMES, np.zeros(C), **NOTHING)
+    found = estimate_offsets([_sightings(late=TRUE - 0.003)], TIMES, np.zeros(C), NOTHING)
     assert _within(found, 1.5e-3)
 
 
@@ -79,26 +84,24 @@ def test_outliers_and_swaps_are_left_out():
     rng = np.random.default_rng(1)
     wrong = rng.uniform(size=seen.weight.shape) < 0.05
     seen.residual[wrong] += 80 * rng.normal(size=(wrong.sum(), 2))
-    found = estimate_offsets([seen], TIMES, np.zeros(C), **NOTHING)
+    found = estimate_offsets([seen], TIMES, np.zeros(C), NOTHING)
     assert _within(found, 2e-3)
 
 
 def test_without_motion_the_prior_stays():
     seen = _sightings(late=np.zeros(C))
     still = Sightings(seen.residual, 0 * seen.velocity, seen.by_point, seen.weight, seen.part)
-    given = {"prior": TRUE, "prior_sigma": np.array([0, 1, 1, np.nan, 2]) * 1e-3 + 1e-9}
-    found = estimate_offsets([still], TIMES, np.zeros(C), **given, master=0)
+    given = OffsetPrior(TRUE, np.array([0, 1, 1, np.nan, 2]) * 1e-3, 0)
+    found = estimate_offsets([still], TIMES, np.zeros(C), given)
     assert found.offset == pytest.approx([0, TRUE[1], TRUE[2], 0, TRUE[4]])
     assert found.sigma == pytest.approx([0, 1e-3, 1e-3, LOOSE_SIGMA_S, 2e-3], rel=1e-3)
-    assert estimate_offsets([], TIMES, np.zeros(C), **given, master=0).offset == pytest.approx(
-        found.offset
-    )
+    assert estimate_offsets([], TIMES, np.zeros(C), given).offset == pytest.approx(found.offset)
 
 
 def test_a_camera_that_sees_nothing_keeps_its_prior():
     seen = _sightings()
     seen.weight[:, 3] = 0
-    found = estimate_offsets([seen], TIMES, np.zeros(C), **NOTHING)
+    found = estimate_offsets([seen], TIMES, np.zeros(C), NOTHING)
     assert found.offset[3] == pytest.approx(0) and found.sigma[3] == pytest.approx(LOOSE_SIGMA_S)
     assert np.abs(found.offset - TRUE)[[1, 2, 4]].max() < 1.5e-3
 
@@ -113,5 +116,5 @@ def test_distances_along_a_normal_tell_too():
     residual += 0.005 * rng.normal(size=(1, C, 200, 1)) + 0.004 * rng.normal(size=residual.shape)
     weight = (rng.uniform(size=(T, C, 200)) < 0.4).astype(float)
     seen = Sightings(residual, velocity, np.ones((*residual.shape, 1)), weight, np.arange(200) // 8)
-    found = estimate_offsets([seen], TIMES, np.zeros(C), **NOTHING)
+    found = estimate_offsets([seen], TIMES, np.zeros(C), NOTHING)
     assert _within(found, 1.5e-3)
