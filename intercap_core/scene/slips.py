@@ -167,28 +167,48 @@ class _Evidence:
         """The interval of one camera that gains most, if it is beyond doubt."""
         sets = len(self._motion.times)
         root, series = _own_series(self._motion, camera)
-        always = dict.fromkeys(self._steps, 0.0)
-        candidates = []
+        always = {step: np.zeros(series.shape[1]) for step in self._steps}
+        top = None
         for (part, between), precision in zip(self._parts, self._precisions, strict=True):
             window = _Window(root[part], series[part], precision[:, camera])
-            for step, late in zip(self._steps, self._late, strict=True):
-                slipped = window.slipped(late[part, camera])
-                if not between:
-                    always[step] = always[step] + slipped.gains(0, part.stop - part.start)
-                if step > 0:
-                    first, last, gains = slipped.best()
-                    candidates.append(
-                        Interval(camera, part.start + first, part.start + last, step,
-                                 float(gains.sum()), _sure(gains))
-                    )  # fmt: skip
-        candidates = [i for i in candidates if i.sure >= MIN_GAIN]
+            cases = {
+                step: window.slipped(late[part, camera])
+                for step, late in zip(self._steps, self._late, strict=True)
+            }
+            if not between:
+                for step, case in cases.items():
+                    always[step] += case.gains(0, part.stop - part.start)
+            found = _best_of_window({s: case for s, case in cases.items() if s > 0})
+            if found is not None and (top is None or found.gain > top.gain):
+                top = replace(
+                    found,
+                    camera=camera,
+                    first=part.start + found.first,
+                    last=part.start + found.last,
+                )
         step = max(self._steps, key=lambda s: _sure(always[s]))
-        total = float(always[step].sum())
-        whole = Interval(camera, 0, sets - 1, step, total, _sure(always[step]))
-        top = max(candidates, key=lambda i: i.gain, default=None)
+        whole = Interval(camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step]))
         if whole.sure >= MIN_GAIN and (top is None or whole.gain > top.gain - CLEAR_GAIN):
             return whole
         return top
+
+
+def _best_of_window(cases: dict[int, _Slipped]) -> Interval | None:
+    """The interval, by place in the window, that gains most, if it is beyond doubt."""
+    best: tuple[float, int, int] | None = None
+    for case in cases.values():
+        first, last, gains = case.best()
+        if _sure(gains) >= MIN_GAIN and (best is None or gains.sum() > best[0]):
+            best = float(gains.sum()), first, last
+    if best is None:
+        return None
+    _, first, last = best
+    # The gain tells best that and when images are late, the misfit by how much.
+    step = min(cases, key=lambda s: cases[s].misfit(first, last + 1))
+    first, last, gains = cases[step].best()
+    if _sure(gains) < MIN_GAIN:
+        return None
+    return Interval(0, first, last, step, float(gains.sum()), _sure(gains))
 
 
 def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
@@ -223,13 +243,16 @@ class _Window:
         """The case that keypoints are displaced by ``late`` (W, K, 2) px."""
         change = np.einsum("tkij,tkj->ktj", self.root, late)
         weighted = self.precision @ np.swapaxes(self.series, 0, 1)
-        return _Slipped(change, (change * weighted).sum(-1), self.precision)
+        series = np.swapaxes(self.series, 0, 1)
+        return _Slipped(series, change, (change * weighted).sum(-1), self.precision)
 
 
 @dataclass(frozen=True, eq=False)
 class _Slipped:
-    """``change`` (K, W, 2) of the whitened residuals, ``linear`` (K, W) its product with them."""
+    """Residuals ``series`` (K, W, 2), their ``change`` (K, W, 2) by the slip, and ``linear`` (K, W)
+    the product of the two, whitened over time by ``precision`` (K, W, W)."""
 
+    series: np.ndarray
     change: np.ndarray
     linear: np.ndarray
     precision: np.ndarray
@@ -240,6 +263,12 @@ class _Slipped:
         change, precision = self.change[:, part], self.precision[:, part, part]
         energy = (change * (precision @ change)).sum((1, 2))
         return self.linear[:, part].sum(1) - energy / 2
+
+    def misfit(self, first: int, end: int) -> float:
+        """Truncated squares of what the slip leaves. Not whitened over time: that would count the
+        errors of the paths themselves, which change fast, as much as the motion."""
+        left = self.series[:, first:end] - self.change[:, first:end]
+        return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMA**2).sum())
 
     def best(self) -> tuple[int, int, np.ndarray]:
         """First and last set of the interval of greatest gain, and the keypoints' gains (K,)."""
