@@ -128,6 +128,17 @@ def test_ray_table_holds_every_pixels_ray_and_nan_outside_the_radius():
     assert outside[0, 0] and not outside[512, 512]
 
 
+@pytest.mark.parametrize("lens", [*LENSES, COLOUR.scaled(2.0), COLOUR.cropped(300, 7, 1001, 902)])
+def test_interpolated_rays_of_a_large_image_project_to_their_pixels(lens):
+    v, u = np.mgrid[0 : lens.height : 7, 0 : lens.width : 11]
+    xy = lens.rays[v, u].astype(np.float64)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], -1)
+    assert np.abs(lens.project(rays) - np.stack([u, v], -1)).max() < 5e-4  # float32's own share
+    corners = np.array([[0, 0], [lens.width - 1, lens.height - 1]])
+    exact = lens.unproject(corners)[:, :2]
+    assert np.allclose(lens.rays[corners[:, 1], corners[:, 0]], exact, atol=1e-6)
+
+
 def test_parameters_round_trip():
     again = Intrinsics.from_parameters((COLOUR.width, COLOUR.height), COLOUR.parameters)
     assert np.array_equal(again.parameters, COLOUR.parameters)
