@@ -12,6 +12,7 @@ from synthetic_people import seen_by, walking, write_detections
 from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
+from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import PersonSettings
 from intercap_core.detection import masks
 from intercap_core.errors import UserError
@@ -23,7 +24,7 @@ T = 8
 BODY = walking(T, np.array([-0.2, 0.1]), np.array([0.01, 0]))
 
 
-def write_scene(path: Path, rig: Rig, sets: int) -> Path:
+def write_scene(path: Path, rig: Rig, sets: int, slip: np.ndarray | None = None) -> Path:
     attributes = {
         "sequence": "test", "master": "k1", "fps": 15.0, "extrinsics_refined": False,
         "ground_found": False, "ground_source": "none", "ground_rms": 0.0, "ground_inliers": 0,
@@ -39,8 +40,9 @@ def write_scene(path: Path, rig: Rig, sets: int) -> Path:
         for key in ("depth_bias", "time_offset"):
             writer.put(key, np.zeros(count))
         writer.put("time_offset_sigma", np.full(count, np.nan))
-        writer.put("slip", np.zeros((sets, count), int))
-        writer.put("image_of", np.arange(sets)[:, None].repeat(count, 1))
+        slip = np.zeros((sets, count), int) if slip is None else slip
+        writer.put("slip", slip)
+        writer.put("image_of", images_of_moments(slip, np.ones(slip.shape, bool)))
         writer.put("pairs", np.zeros((0, 2), int))
         for key in ("pair_points", "pair_residual_before", "pair_residual_after"):
             writer.put(key, np.zeros(0, int))
@@ -66,11 +68,11 @@ def detected() -> np.ndarray:
     return keypoints
 
 
-def run(tmp_path, people, candidates=None) -> Path:
+def run(tmp_path, people, candidates=None, slip=None) -> Path:
     person.run(
         frames=write_frames(tmp_path / "frames.h5", RIG, num_sets=T),
         detections=write_detections(tmp_path / "detections.h5", RIG, people, candidates),
-        scene=write_scene(tmp_path / "scene.h5", RIG, T),
+        scene=write_scene(tmp_path / "scene.h5", RIG, T, slip),
         output=tmp_path / "person.h5",
         settings=PersonSettings(),
     )
@@ -122,6 +124,22 @@ def test_masks_follow_the_points_not_the_label_or_the_order(tmp_path, detected):
     assert chosen[1] == candidates[0, 1][0][1]
     assert chosen[2] == candidates[0, 2][1][1]
     assert chosen[3] == b"" and chosen[4] == b""
+
+
+def test_slipped_images_count_where_their_moment_is(tmp_path, detected):
+    """From set 3 on the fourth camera's images are two sets old: only moments 6 and 7 lack them."""
+    slip = np.zeros((T, 6), np.int32)
+    slip[3:, 3] = 2
+    late = [[[detected[t - slip[t, c], c]] for c in range(6)] for t in range(T)]
+    candidates = {(5, 3): [("person", masks.encode(silhouette(detected[3, 3])))]}
+    with artefacts.read(run(tmp_path, late, candidates, slip), PERSON) as found:
+        there = found["person"] >= 0
+        assert (~there).sum() == 2 and not there[6:, 3].any()
+        seen = found["keypoints"][there]
+        np.testing.assert_allclose(seen, detected[there].astype(np.float32))
+        rles = artefacts.unpack_ragged(found["mask_offsets"], found["mask_rle"])
+        assert rles[3 * 6 + 3] == candidates[5, 3][0][1]
+        assert (found["joint_views"][:6] == 6).all() and (found["joint_views"][6:] <= 5).all()
 
 
 def test_same_input_same_bytes(tmp_path, detected):
