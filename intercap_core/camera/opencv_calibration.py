@@ -69,7 +69,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
             "a camera); docs/recordings.md shows one"
         )
     master = content.get("master", next(iter(entries)))
-    if master not in entries:
+    if not isinstance(master, str) or master not in entries:
         raise UserError(
             f"{path}: master {master!r} is none of the cameras ({', '.join(map(str, entries))}); "
             "correct the name or add the camera"

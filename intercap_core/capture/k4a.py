@@ -83,7 +83,9 @@ class Recording:
         truncated = _is_truncated(self.path)
         try:
             # The tracks' heads say all there is to know; probing would buffer packets instead.
-            self._container = av.open(str(self.path), options={"probesize": "32768"})
+            self._container = av.open(
+                str(self.path), options={"probesize": "32768"}, metadata_errors="replace"
+            )
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{self.path}: cannot be opened as a recording ({error.strerror}); record again, "
@@ -196,7 +198,7 @@ class Recording:
 
     def _read_info(self, truncated: bool) -> RecordingInfo:
         colour, depth = self._stream("colour"), self._stream("depth")
-        if colour is None or colour.type != "video":
+        if colour is None or colour.type != "video" or colour.codec_context is None:
             raise UserError(
                 f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
                 "colour; record with k4arecorder and the colour camera on"
@@ -227,7 +229,11 @@ class Recording:
         )
 
     def _depth_mode(self, depth: Any) -> str | None:
-        if depth is None or depth.metadata.get("K4A_DEPTH_MODE") == PASSIVE_INFRARED:
+        if (
+            depth is None
+            or depth.codec_context is None
+            or depth.metadata.get("K4A_DEPTH_MODE") == PASSIVE_INFRARED
+        ):
             return None
         return self._mode("depth", depth, "K4A_DEPTH_MODE", DEPTH_MODES)
 

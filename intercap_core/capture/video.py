@@ -40,16 +40,19 @@ class VideoRecording(CameraRecording):
         times: Timestamps | None,
     ) -> None:
         try:
-            self._container = av.open(str(path))
+            self._container = av.open(str(path), metadata_errors="replace")
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{path}: cannot be opened as a video ({error.strerror}); copy the file again, or "
                 "convert it"
             ) from error
-        if not self._container.streams.video:
+        streams = self._container.streams.video
+        if not streams or streams[0].codec_context is None:
             self._container.close()
-            raise UserError(f"{path}: holds no video; give the camera's video")
-        self._stream: Any = self._container.streams.video[0]
+            raise UserError(
+                f"{path}: holds no video that can be decoded; convert it to a common codec"
+            )
+        self._stream: Any = streams[0]
         self._stream.thread_type = "AUTO"
         rate = fps or float(self._stream.average_rate or self._stream.guessed_rate or 30)
         super().__init__(path, camera, fps=rate)

@@ -250,6 +250,14 @@ def broken_video(capture):
     (capture.recordings / "top.mp4").write_bytes(b"no video")
 
 
+def unknown_codec(capture):
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    path = capture.recordings / "top.avi"
+    write_video(path, 2, 8, "mjpeg")
+    path.write_bytes(path.read_bytes().replace(b"MJPG", b"ZZZZ"))
+
+
 def too_few_timestamps(capture):
     (capture.recordings / "top" / "timestamps.txt").write_text("1.0\n2.0\n")
 
@@ -274,6 +282,7 @@ def unnamed_image(capture):
         (other_resolution, "colour images are 64x48, the calibration of camera top is for 128x96"),
         (recorded_twice, "camera top is recorded as top.mp4 and top/"),
         (broken_video, "top.mp4: cannot be opened as a video"),
+        (unknown_codec, "top.avi: holds no video that can be decoded"),
         (too_few_timestamps, "top: 2 timestamps for 8 colour images"),
         (milliseconds, "timestamps.txt: times are 40 apart, expected seconds"),
         (not_a_number, "timestamps.txt, line 2: found 'noon'"),
