@@ -247,12 +247,15 @@ def _draw_frustum(picture: np.ndarray, view: View, corners: np.ndarray, c: int, 
     """A camera's pyramid in its colour, with its name above."""
     pairs = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
     at, z = view.project(corners)
-    text = name[:_LONGEST_NAME].encode("ascii", "replace").decode()
-    place = (int(at[:, 0].mean()) - 4 * len(text), int(at[:, 1].min()) - 6)
     for shade, thick in ((_SHADOW, 3), (_rgb(c), 1)):
         _draw_lines(picture, view, corners[np.array(pairs)], shade, thick)
-        if (z > _NEAR_M).all():
-            cv2.putText(picture, text, place, _FONT, 0.5, shade, (thick + 1) // 2, cv2.LINE_AA)
+    if not (z > _NEAR_M).all():
+        return
+    text = name[:_LONGEST_NAME].encode("ascii", "replace").decode()
+    (width, height), _ = cv2.getTextSize(text, _FONT, 0.5, 1)
+    x, y = int(at[:, 0].mean()) - width // 2, int(at[:, 1].min()) - 8
+    cv2.rectangle(picture, (x - 4, y - height - 4), (x + width + 4, y + 4), _SHADOW, -1)
+    cv2.putText(picture, text, (x, y), _FONT, 0.5, _rgb(c), 1, cv2.LINE_AA)
 
 
 def _draw_lines(
