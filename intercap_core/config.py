@@ -168,7 +168,14 @@ class ExportSettings(Model):
 
 
 StudioFault = Literal[
-    "dead_half", "no_depth", "zero_depth", "same_serial", "backwards_clock", "no_overlap"
+    "dead_half",
+    "no_depth",
+    "zero_depth",
+    "same_serial",
+    "backwards_clock",
+    "no_overlap",
+    "swapped_lenses",
+    "wrong_resolution",
 ]
 
 
@@ -187,6 +194,10 @@ class StudioCapture(Model):
     """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
     room: Literal["random", "furnished", "bare"] = "random"
     """With walls and furniture, or only a floor; by chance one capture in five is bare."""
+    layout: LayoutName = "k4a"
+    """How the recordings are laid out; the same as in the table of sequences."""
+    depth: bool = True
+    """Whether the cameras record depth."""
     faults: tuple[StudioFault, ...] = ()
     """What is broken in this recording on top of the usual errors; see docs/studio.md."""
 

@@ -187,6 +187,12 @@ def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path)
             continue
         made = project.recordings_made(sequence)
         given = project.sequences[sequence].recordings
+        layouts = captures[sequence].layout, project.sequences[sequence].layout
+        if layouts[0] != layouts[1]:
+            raise UserError(
+                f"{table}: sequence {sequence!r} has layout {layouts[1]!r}, but the studio writes "
+                f"{layouts[0]!r} (studio.captures in {project.path}); make them the same"
+            )
         if made is not None and made.resolve() != given.resolve():
             raise UserError(
                 f"{table}: sequence {sequence!r} has recordings {given}, but the studio writes "

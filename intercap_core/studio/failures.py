@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from intercap_core.config import LayoutName
 from intercap_core.errors import UserError
+from intercap_core.studio.layouts import FOLDERS, SWAPPED
 from intercap_core.studio.noise import NoiseSource
 
 CLOCK_JITTER_S = 100e-6  # of a subordinate's device times, at noise 1
@@ -16,7 +18,10 @@ MAX_JITTER = 3.0  # times the above
 DEPTH_GAPS = (1, 3)  # episodes without depth in one camera
 DEPTH_GAP_FRAMES = (1, 3)
 CLOCK_FALLS_BACK_SETS = 10  # by which a clock jumps back where that is asked for
-ONE_CAMERA_EACH = ("dead_half", "no_depth", "zero_depth", "same_serial", "backwards_clock")
+ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
+ONE_CAMERA_EACH = (
+    "dead_half", "no_depth", "zero_depth", "same_serial", "backwards_clock", "wrong_resolution"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,13 @@ class Failures:
 
     @classmethod
     def draw(
-        cls, noise: NoiseSource, *, frames: int, cameras: int, faults: Sequence[str]
+        cls,
+        noise: NoiseSource,
+        *,
+        frames: int,
+        cameras: int,
+        faults: Sequence[str] = (),
+        depth: bool = True,
     ) -> Failures:
         """Decide what fails; the master's clock is the one that the sets go by."""
         jitter = np.zeros((frames, cameras))
@@ -51,13 +62,13 @@ class Failures:
                 length = int(rng.integers(DEPTH_GAP_FRAMES[0], DEPTH_GAP_FRAMES[1] + 1))
                 which = empty if rng.random() < 0.5 else away
                 which[start : start + length, camera] = True
-        failures = cls(jitter, empty, away, _assigned(noise, cameras, faults))
-        broken = failures.broken
+        away |= not depth
+        broken = _assigned(noise, cameras, faults)
         if "no_depth" in broken:
             away[:, broken["no_depth"]] = True
         if "zero_depth" in broken:
             empty[:, broken["zero_depth"]] = True
-        return failures
+        return cls(jitter, empty, away, broken)
 
 
 def _assigned(noise: NoiseSource, cameras: int, faults: Sequence[str]) -> dict[str, int]:
@@ -67,8 +78,18 @@ def _assigned(noise: NoiseSource, cameras: int, faults: Sequence[str]) -> dict[s
     return {fault: int(order[i % len(order)]) for i, fault in enumerate(named)}
 
 
-def check_faults(faults: Sequence[str], *, cameras: int, frames: int) -> None:
+def check_faults(faults: Sequence[str], *, layout: LayoutName, cameras: int, frames: int) -> None:
     """Raise UserError where a capture asks for faults that it cannot have."""
+    strange = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
+    if strange:
+        raise UserError(
+            f"studio: recordings of layout {layout!r} cannot have fault {min(strange)}; take the "
+            "fault out or choose another layout"
+        )
+    if "swapped_lenses" in faults and cameras <= max(SWAPPED):
+        raise UserError(
+            f"studio: fault swapped_lenses is of cameras 4 and 5, 'cameras' is {cameras}; use more"
+        )
     if faults and cameras < 2:
         raise UserError(
             f"studio: faults {', '.join(faults)} need a second camera, 'cameras' is {cameras}; "

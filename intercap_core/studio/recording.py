@@ -10,12 +10,12 @@ import numpy as np
 
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import invert
-from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH, write_calibration
+from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
 from intercap_core.studio.failures import CLOCK_FALLS_BACK_SETS
 from intercap_core.studio.keypoints import Detector, to_json
+from intercap_core.studio.layouts import CaptureFolder, Device, Shot
 from intercap_core.studio.looks import body_colours
 from intercap_core.studio.masks import Labels, Segmenter
-from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.sensor import DepthSensor
@@ -53,7 +53,7 @@ class Kinect:
         self.serial = f"{100_000 + stage.noise.seed % 100_000:06d}{number:06d}"
         end = stage.frames // 2 if "dead_half" in self.broken else stage.frames
         self.sets = [t for t in range(end) if t not in stage.rig.missing[index]]
-        self.depth_mode = None if "no_depth" in self.broken else stage.depth_mode
+        self.has_depth = stage.has_depth and "no_depth" not in self.broken
 
     @property
     def exposures(self) -> np.ndarray:
@@ -74,8 +74,8 @@ class Kinect:
             t -= min(CLOCK_FALLS_BACK_SETS, self.stage.frames // 2)
         return START_US + round(t * 1e6 / self.stage.fps) + stagger + jitter
 
-    def record(self, folder: Path, detector: Detector, segmenter: Segmenter) -> Recorded:
-        """Write <camera>.mkv, keypoints/<camera>/ and candidates/<camera>.json."""
+    def record(self, folder: CaptureFolder, detector: Detector, segmenter: Segmenter) -> Recorded:
+        """Write the recording, keypoints/<camera>/ and candidates/<camera>.json."""
         stage, name = self.stage, self.true.name
         moment = stage.at(self.exposures)
         stage_from_master = invert(stage.rig.master_from_stage)
@@ -101,54 +101,34 @@ class Kinect:
         empty = stage.failures.depth_empty[:, self.index]
         has_depth = ~stage.failures.depth_away[:, self.index]
         candidates = []
-        last_us = 0
-        with self._writer(folder / f"{name}.mkv") as writer:
-            for number, t in enumerate(self.sets):
+        device = Device(
+            self.index, self.claimed, self.serial, self.colour_mode, stage.depth_mode,
+            self.has_depth, stage.fps, min(self.device_time_us(t) for t in self.sets),
+        )  # fmt: skip
+        with folder.open(device) as files:
+            for order, t in enumerate(self.sets):
                 surfaces = surfaces_at(stage, moment, t, colours)
                 cast = colour_view.cast(surfaces)
                 inertial = self._inertial(t, rng, depth_pose)
                 jpeg = photographer.jpeg(photographer.photograph(cast))
                 depth = sensor.image(depth_view.cast(surfaces))
-                time_us = self.device_time_us(t)
-                if time_us < last_us:
-                    writer.turn_back()
-                writer.write_colour(jpeg, time_us)
-                if has_depth[t]:
-                    writer.write_depth(depth if not empty[t] else 0 * depth, time_us)
-                for sample in inertial:
-                    writer.write_imu(*sample)
-                last_us = time_us
+                if empty[t]:
+                    depth[:] = 0
+                recorded_depth = depth if has_depth[t] else None
+                files.write(Shot(t, self.device_time_us(t), jpeg, recorded_depth, inertial))
                 hidden[t] = _hidden(cast, colour_view, points[t])
                 seen[t] = int((cast.identity == OBJECT).sum())
                 whole[t] = colour_view.count(surfaces[1])
                 truth = Labels(cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1))
-                for result in masks.candidates(t, truth):
-                    candidates.append({"image_id": number, **result})
-        self._write_candidates(folder, candidates)
+                found = masks.candidates(t, truth)
+                folder.add_masks(name, t, stage.fps, found, segmenter.label)
+                image = folder.image_number(t, order, stage.fps)
+                candidates += [{"image_id": image, **result} for result in found]
+        self._write_candidates(folder.path, candidates)
         self._write_keypoints(folder, detector, moment, points, hidden)
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
         return Recorded(seen, whole, colour, colour & has_depth & ~empty)
-
-    def _writer(self, path: Path) -> MkvWriter:
-        calibration = write_calibration(
-            self.claimed,
-            colour_mode=self.colour_mode,
-            depth_mode=self.stage.depth_mode,
-            serial=self.serial,
-        )
-        return MkvWriter(
-            path,
-            calibration_json=calibration,
-            colour_mode=self.colour_mode,
-            depth_mode=self.depth_mode,
-            fps=self.stage.fps,
-            serial=self.serial,
-            start_offset_ns=min(self.device_time_us(t) for t in self.sets) * 1000,
-            wired_sync_mode="SUBORDINATE" if self.index else "MASTER",
-            subordinate_delay_ns=round(STAGGER_S * 1e9) * self.index,
-            with_imu=True,
-        )
 
     def _inertial(
         self, t: int, rng: np.random.Generator, stage_from_depth: np.ndarray
@@ -171,17 +151,19 @@ class Kinect:
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
 
-    def _write_keypoints(self, folder: Path, detector: Detector, moment: Moment,
+    def _write_keypoints(self, folder: CaptureFolder, detector: Detector, moment: Moment,
                          points: np.ndarray, hidden: np.ndarray) -> None:  # fmt: skip
         master = self.stage.rig.master_from_stage[:3, :3]
         subject = detector.detect(
             self.true, self.stage.to_master(points), master @ moment.pelvis, hidden
         )
         people = detector.people(self.true, subject)
-        target = folder / "keypoints" / self.true.name
+        target = folder.path / "keypoints" / self.true.name
         target.mkdir(parents=True)
-        for number, t in enumerate(self.sets):
-            (target / f"{number:012d}_keypoints.json").write_text(to_json(people[t]))
+        for order, t in enumerate(self.sets):
+            image, content = folder.image_number(t, order, self.stage.fps), to_json(people[t])
+            (target / f"{image:012d}_keypoints.json").write_text(content)
+            folder.add_keypoints(self.true.name, t, self.stage.fps, content)
 
 
 def surfaces_at(

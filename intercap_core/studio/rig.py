@@ -5,6 +5,7 @@ Lens values are typical of devices' own calibrations; no two devices are the sam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,13 +60,15 @@ def build_rig(
     noise: float,
     slips: str = "missing",
     overlap: bool = True,
+    names: Sequence[str] | None = None,
 ) -> StudioRig:
     """Make a rig around the stage's origin; ``noise`` scales every error.
 
     ``slips``: "missing" frames in two cameras, or "silent": their images are one to four frames
     late for a while or from then on, and the device times do not tell. Without ``overlap`` all
-    cameras but the master look away.
+    cameras but the master look away. ``names`` of the cameras, the master first; k1, k2, ...
     """
+    names = names or [f"k{number}" for number in range(1, cameras + 1)]
     stage_from_camera = _ring(rng, cameras)
     if not overlap:
         for pose in stage_from_camera[1:]:
@@ -74,7 +77,7 @@ def build_rig(
     master_from_stage = invert(stage_from_camera[0])
     for index in range(cameras):
         camera = Camera(
-            f"k{index + 1}",
+            names[index],
             _colour_lens(rng, colour_mode),
             _depth_lens(rng, depth_mode),
             _colour_from_depth(rng),

@@ -17,6 +17,7 @@ from intercap_core.rigid.render import vertex_normals
 from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.interactions.base import TrueObject
+from intercap_core.studio.layouts import camera_names
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
@@ -53,7 +54,7 @@ class Stage:
         self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry
     ) -> None:
         check_capture(capture, settings, entry.name)
-        self.depth_mode = settings.depth_mode
+        self.depth_mode, self.has_depth = settings.depth_mode, capture.depth
         self.frames, self.fps = capture.frames, settings.fps
         self.duration = capture.frames / settings.fps
         self.noise = NoiseSource(capture.seed, settings.noise, settings.noise_family, settings.fps)
@@ -77,9 +78,14 @@ class Stage:
             noise=settings.noise,
             slips=settings.slips,
             overlap="no_overlap" not in capture.faults,
+            names=camera_names(capture.layout, settings.cameras),
         )
         self.failures = Failures.draw(
-            self.noise, frames=capture.frames, cameras=settings.cameras, faults=capture.faults
+            self.noise,
+            frames=capture.frames,
+            cameras=settings.cameras,
+            faults=capture.faults,
+            depth=capture.depth,
         )
         furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
         by_chance = bool(rng.random() < BARE_ROOM_SHARE)
@@ -156,7 +162,9 @@ def check_capture(capture: StudioCapture, settings: StudioSettings, object_name:
             f"studio: no subject {capture.subject!r}, there are {', '.join(subject_names())}; "
             "correct 'subject' of the capture"
         )
-    check_faults(capture.faults, cameras=settings.cameras, frames=capture.frames)
+    check_faults(
+        capture.faults, layout=capture.layout, cameras=settings.cameras, frames=capture.frames
+    )
 
 
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:

@@ -50,10 +50,11 @@ def of_sequence(wildcards):
 
 
 def made_by_studio(wildcards, name):
-    """Named output of the studio for this sequence; None for a real recording."""
+    """What stands for the studio's files of this kind; None for a real recording."""
     if PROJECT.recordings_made(wildcards.sequence) is None:
         return None
-    return expand(getattr(rules.studio.output, name), sequence=wildcards.sequence)
+    output = "truth" if name == "truth" else "manifest"
+    return expand(getattr(rules.studio.output, output), sequence=wildcards.sequence)
 
 
 def recorded(column):

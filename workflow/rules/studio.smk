@@ -2,19 +2,13 @@ _recordings = f"{RESULTS}/recordings/{{sequence}}"
 
 
 rule studio:
-    """Make one virtual recording whose truth is known; never claims a real one."""
+    """Make one virtual recording whose truth is known; never claims a real one.
+
+    Its files depend on the layout: the manifest, written last, stands for all of them.
+    """
     input:
         object=object_files,
     output:
-        recordings=[
-            f"{_recordings}/k{number}.mkv"
-            for number in range(
-                1, (SETTINGS.studio.cameras if SETTINGS.studio else 1) + 1
-            )
-        ],
-        calibration=f"{_recordings}/calibration.json",
-        keypoints=directory(f"{_recordings}/keypoints"),
-        candidates=directory(f"{_recordings}/candidates"),
         truth=f"{_recordings}/truth.h5",
         manifest=f"{_recordings}/capture.json",
     log:

@@ -1,0 +1,187 @@
+"""Each layout, written by the studio and read by the program's own readers; aligned depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
+
+import cv2
+import numpy as np
+import pytest
+
+from intercap_core.camera.rig import Camera
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.capture.layouts import open_layout
+from intercap_core.capture.source import Image
+from intercap_core.config import (
+    LayoutName,
+    ObjectEntry,
+    SequenceEntry,
+    StudioCapture,
+    StudioSettings,
+)
+from intercap_core.errors import UserError
+from intercap_core.studio.alignment import Aligner
+from intercap_core.studio.capture import make_capture
+from intercap_core.studio.failures import check_faults
+from intercap_core.studio.layouts import FOLDERS, Device, Shot, camera_names
+from intercap_core.studio.rig import StudioRig, build_rig
+
+FPS, SETS = 15, (0, 1, 4)
+LAYOUTS = get_args(LayoutName)
+
+
+def rig_of(layout: LayoutName, cameras: int = 3) -> StudioRig:
+    return build_rig(
+        np.random.default_rng(4), cameras=cameras, frames=6, colour_mode="720P", noise=1.0,
+        names=camera_names(layout, cameras),
+    )  # fmt: skip
+
+
+def write(folder: Path, layout: LayoutName, faults: tuple[str, ...] = (),
+          broken: dict[str, int] | None = None, cameras: int = 3,
+          ) -> tuple[StudioRig, bytes, np.ndarray]:  # fmt: skip
+    """A recording of a grey wall, two metres before every depth camera."""
+    rig = rig_of(layout, cameras)
+    jpeg = cv2.imencode(".jpg", np.full((720, 1280, 3), 90, np.uint8))[1].tobytes()
+    depth = np.full((576, 640), 2000, np.uint16)
+    place = FOLDERS[layout](folder, faults, broken or {}, depth=True)  # type: ignore[arg-type]
+    for index, camera in enumerate(rig.claimed):
+        device = Device(index, camera, f"{index}", "720P", "NFOV_UNBINNED", True, FPS, 1_000_000)
+        with place.open(device) as files:
+            for t in SETS:
+                time_us = 1_000_000 + round(t * 1e6 / FPS) + 160 * index
+                files.write(Shot(t, time_us, jpeg, depth if t else None, []))
+    place.write_calibration(rig.claimed, FPS)
+    return rig, jpeg, depth
+
+
+def row_of(folder: Path, layout: LayoutName) -> SequenceEntry:
+    calibration = folder / FOLDERS[layout].calibration
+    return SequenceEntry(
+        sequence="one", subject="p", object="cup", recordings=folder, layout=layout,
+        calibration=calibration,
+    )  # fmt: skip
+
+
+def images_of(folder: Path, layout: LayoutName, name: str) -> tuple[Camera, list[Image]]:
+    with open_layout(row_of(folder, layout)).open(name) as recording:
+        return recording.camera, list(recording.images())
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_is_written_is_read(tmp_path: Path, layout: LayoutName) -> None:
+    rig, jpeg, depth = write(tmp_path, layout)
+    found = open_layout(row_of(tmp_path, layout))
+    assert found.extrinsics.master == rig.claimed.names[0]
+    assert sorted(found.names) == sorted(rig.claimed.names)
+    for claimed in rig.claimed:
+        camera, images = images_of(tmp_path, layout, claimed.name)
+        np.testing.assert_allclose(
+            found.extrinsics.master_from_colour[claimed.name], claimed.master_from_colour, atol=1e-9
+        )
+        points = np.array([[0.1, 0.2, 1.0], [-0.5, 0.3, 1.4], [0.8, -0.4, 1.2]])
+        np.testing.assert_allclose(
+            camera.colour.project(points), claimed.colour.project(points), atol=1e-6
+        )
+        colour = [image for image in images if image.kind == "colour"]
+        assert [image.content for image in colour] == [jpeg] * len(SETS)
+        times = np.array([image.time_us for image in colour])
+        np.testing.assert_allclose(np.diff(times) / 1e6, np.diff(SETS) / FPS, atol=1e-3)
+        depths = [image for image in images if image.kind == "depth"]
+        assert [image.time_us for image in depths] == times[1:].tolist()
+        assert camera.depth is not None and camera.colour_from_depth is not None
+        if layout in ("k4a", "plain"):
+            assert all(np.array_equal(image.content, depth) for image in depths)
+            np.testing.assert_allclose(camera.colour_from_depth, claimed.colour_from_depth)
+        else:
+            assert depths[0].content.shape == (720, 1280)  # type: ignore[union-attr]
+            assert np.array_equal(camera.colour_from_depth, np.eye(4))
+
+
+def wall_seen_in_colour(camera: Camera, distance: float) -> np.ndarray:
+    """z (Hc, Wc) in the colour camera of the plane z = ``distance`` of its depth camera."""
+    assert camera.colour_from_depth is not None
+    depth_from_colour = invert(camera.colour_from_depth)
+    rays = np.dstack([camera.colour.rays, np.ones(camera.colour.rays.shape[:2])])
+    normal, offset = depth_from_colour[2, :3], distance - depth_from_colour[2, 3]
+    return offset / (rays @ normal)
+
+
+def test_aligned_depth_of_a_wall_is_the_walls() -> None:
+    camera = rig_of("intercap").claimed[1]
+    aligned = Aligner(camera).align(np.full((576, 640), 2000, np.uint16))
+    expected = wall_seen_in_colour(camera, 2.0) * 1000
+    seen = aligned > 0
+    assert seen.mean() > 0.5
+    assert np.abs(aligned[seen] - expected[seen]).max() < 0.6
+
+
+def test_what_the_depth_camera_cannot_see_stays_empty() -> None:
+    """A card before a wall: a strip of the wall beside it has no depth, the card is whole."""
+    camera = rig_of("intercap").claimed[1]
+    assert camera.depth is not None and camera.colour_from_depth is not None
+    depth = np.full((576, 640), 2500, np.uint16)
+    depth[200:380, 250:400] = 900
+    aligned = Aligner(camera).align(depth)
+    card, wall = (wall_seen_in_colour(camera, z) * 1000 for z in (0.9, 2.5))
+    on_card = (aligned > 0) & (np.abs(aligned - card) < 1)
+    on_wall = (aligned > 0) & (np.abs(aligned - wall) < 1)
+    assert (on_card | on_wall | (aligned == 0)).all()
+    corners = np.array([[250, 200], [399, 379]])
+    at = camera.colour.project(
+        apply(camera.colour_from_depth, camera.depth.unproject(corners) * 0.9)
+    )
+    (left, top), (right, bottom) = at.round().astype(int)
+    assert on_card[top + 3 : bottom - 3, left + 3 : right - 3].all()
+    middle = (top + bottom) // 2
+    beside = aligned[middle, left - 40 : right + 40]
+    shift = 32.0 * (1 / 900 - 1 / 2500) * camera.colour.fx  # px, of the baseline's parallax
+    assert abs((beside == 0).sum() - shift) < 5
+
+
+def test_lenses_that_the_release_swapped(tmp_path: Path) -> None:
+    rig, _, _ = write(tmp_path, "intercap", ("swapped_lenses",), cameras=5)
+    for name, index in (("k4", 4), ("k5", 3), ("k3", 2)):
+        camera, _ = images_of(tmp_path, "intercap", name)
+        assert camera.colour.fx == pytest.approx(rig.claimed[index].colour.fx, abs=1e-9)
+
+
+@pytest.mark.parametrize("layout", ["intercap", "behave"])
+def test_a_calibration_of_another_resolution_is_refused(tmp_path: Path, layout: LayoutName) -> None:
+    rig, _, _ = write(tmp_path, layout, ("wrong_resolution",), {"wrong_resolution": 2})
+    images_of(tmp_path, layout, rig.claimed.names[1])
+    with pytest.raises(UserError, match="resolution"):
+        images_of(tmp_path, layout, rig.claimed.names[2])
+
+
+def test_a_plain_calibration_of_another_resolution_says_its_size(tmp_path: Path) -> None:
+    write(tmp_path, "plain", ("wrong_resolution",), {"wrong_resolution": 2})
+    widths = [images_of(tmp_path, "plain", name)[0].colour.width for name in ("k2", "k3")]
+    assert widths == [1280, 1920]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_faults_that_a_layout_cannot_have_are_told(layout: LayoutName) -> None:
+    own = {"same_serial", "backwards_clock", "swapped_lenses", "wrong_resolution"}
+    for fault in sorted(own):
+        if fault in FOLDERS[layout].own_faults:
+            check_faults((fault,), layout=layout, cameras=6, frames=9)
+        else:
+            with pytest.raises(UserError, match=f"{layout!r} cannot have fault {fault}"):
+                check_faults((fault,), layout=layout, cameras=6, frames=9)
+
+
+def test_a_capture_without_depth(
+    tmp_path: Path, object_entry: Callable[[str], ObjectEntry]
+) -> None:
+    make_capture(
+        StudioCapture(interaction="cup_drink", subject="s03", seed=5, frames=2, layout="plain",
+                      depth=False),
+        StudioSettings(captures={}, cameras=2, colour_mode="720P"),
+        sequence="flat", objects=object_entry("cup"), output=tmp_path / "flat",
+    )  # fmt: skip
+    assert not list(tmp_path.rglob("*.png"))
+    camera, images = images_of(tmp_path / "flat", "plain", "k2")
+    assert camera.depth is None and {image.kind for image in images} == {"colour"}
