@@ -18,7 +18,7 @@ from intercap_core.errors import UserError
 
 IMAGES = 7  # of each camera, spread over the recording: their median is the static background
 STEP = 4  # of the pixels that are compared, in rows and columns
-FAR_M = 0.1  # a surface this far off is another one, or the calibration is wrong
+FAR_M = 0.3  # a surface this far off is another one, which hides the point from one camera
 MIN_POINTS = 500  # that two cameras must share
 CLEARLY = 0.9  # the best residual is at most this share of the next
 SAME_POSE = 1e-3  # metres or radians: two calibrations say the same about a pair of cameras
@@ -26,7 +26,7 @@ SAME_POSE = 1e-3  # metres or radians: two calibrations say the same about a pai
 
 @dataclass(frozen=True)
 class Choice:
-    """``best`` of the calibrations, None = cannot be told; ``residual_m``: distance for each."""
+    """``best`` of the calibrations, None = cannot be told; ``residual_m``: of each."""
 
     best: str | None
     residual_m: dict[str, float]
@@ -36,9 +36,9 @@ def choose_calibration(sequence: SequenceEntry, calibrations: Mapping[str, Path]
     """Compare the calibration folders on the background depth of one recording.
 
     Only pairs of cameras are looked at to which two calibrations give different relative poses.
-    The residual is the mean distance along the ray between a camera's points and the surface that
-    the other measured, at most ``FAR_M``. Calibrations and cameras that cannot be read are left
-    out.
+    The residual is the median distance along the ray between a camera's points and the surface
+    that the other measured, averaged over the pairs. Calibrations and cameras that cannot be read
+    are left out.
     """
     rigs: dict[str, dict[str, Camera]] = {}
     depths: dict[str, np.ndarray] = {}
@@ -96,7 +96,7 @@ def _differ(rigs: Mapping[str, dict[str, Camera]], a: str, b: str) -> bool:
 
 
 def _residual(a: Camera, b: Camera, depth_a: np.ndarray, depth_b: np.ndarray) -> float:
-    """Mean distance, metres, of what a sees from the surface that b measured; NaN = no overlap."""
+    """Median distance, metres, of what a sees from the surface that b measured; NaN = no overlap."""
     lens = b.depth
     assert lens is not None
     thinned = np.zeros_like(depth_a)
@@ -106,6 +106,5 @@ def _residual(a: Camera, b: Camera, depth_a: np.ndarray, depth_b: np.ndarray) ->
     column, row = np.rint(lens.project(points)).astype(np.int64).T
     measured = depth_b[np.minimum(row, lens.height - 1), np.minimum(column, lens.width - 1)] * 1e-3
     distance = np.abs(measured - points[:, 2])[measured > 0]
-    # What lies far off is hidden from one of the two; it must not outweigh what both see.
-    near = distance[distance < 3 * FAR_M]
-    return float(np.minimum(near, FAR_M).mean()) if len(near) >= MIN_POINTS else np.nan
+    near = distance[distance < FAR_M]
+    return float(np.median(near)) if len(near) >= MIN_POINTS else np.nan
