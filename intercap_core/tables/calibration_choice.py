@@ -96,7 +96,7 @@ def _differ(rigs: Mapping[str, dict[str, Camera]], a: str, b: str) -> bool:
 
 
 def _residual(a: Camera, b: Camera, depth_a: np.ndarray, depth_b: np.ndarray) -> float:
-    """Median distance, metres, of what a sees from the surface that b measured; NaN = no overlap."""
+    """Median distance, metres, of what a sees to what b measured; NaN = no overlap."""
     lens = b.depth
     assert lens is not None
     thinned = np.zeros_like(depth_a)
