@@ -150,6 +150,7 @@ def context(facts: CaptureFacts) -> dict[str, Any]:
         "pairs_left_out": max(0, len(facts.pairs) - _MAX_PAIRS),
         "timeline": _timeline(facts),
         "states": [(state, _WORDS[state]) for state in STATES],
+        "gaps": [f"after frame {t} ({count} {_sets(count)})" for t, count in facts.gaps],
         "cameras": [_row(camera, facts.master) for camera in facts.cameras],
         "legend": [(camera.name, _colour(c)) for c, camera in enumerate(facts.cameras)],
         "sets": len(facts.times),
@@ -244,8 +245,8 @@ def _beside(camera: CameraFacts) -> str:
         return "no image"
     parts = [f"{camera.start:.2f}–{camera.end:.2f} s"]
     parts += [
-        f"{count} {state}"
-        for state in ("missing", "slipped", "part")
+        f"{count} {word}"
+        for state, word in (("missing",) * 2, ("slipped",) * 2, ("part", "incomplete"))
         if (count := list(camera.state).count(state))
     ]
     if np.isfinite(camera.offset_sigma):

@@ -128,9 +128,8 @@ def state_timeline(
 
     ``marks``: vertical lines after a frame, with what they say on hovering.
     """
-    width, inner = 980, 560
-    left, bottom = 90, _ROW * len(rows)
-    height = bottom + 24
+    left, inner, bottom = _room_for([row.name for row in rows]), 560, _ROW * len(rows)
+    width, height = left + inner + 330, bottom + 24
     parts = [_open(width, height, "timeline of every camera's frames")]
 
     def at_x(frame: float) -> float:
@@ -173,8 +172,8 @@ class BarPair:
 def bar_pairs(rows: Sequence[BarPair], unit: str) -> str:
     """Two bars a row, before over after, with their values."""
     top = max([*(v for r in rows for v in (r.before, r.after) if math.isfinite(v)), 1e-9])
-    width, left, inner, tall = 640, 90, 360, 24
-    height = tall * len(rows) + 40
+    left, inner, tall = _room_for([row.name for row in rows]), 360, 24
+    width, height = left + inner + 190, tall * len(rows) + 40
     parts = [_open(width, height, f"before and after, {unit}")]
     for tick in ticks(0, top):
         x = left + inner * tick / top
@@ -237,6 +236,11 @@ def _open(width: int, height: int, name: str) -> str:
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}" '
         f'style="max-width:{width}px">'
     )
+
+
+def _room_for(names: Sequence[str]) -> int:
+    """Width of a column of labels, pixels."""
+    return 16 + max(30, min(240, 7 * max((len(name) for name in names), default=0)))
 
 
 def _stroke(colour: str) -> str:
