@@ -11,8 +11,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from aligned_depth import depth_on_colour
 
-from intercap_core.camera.aligned_depth import depth_on_colour
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert

@@ -74,7 +74,14 @@ class ReleaseLayout(Layout):
             Shot(time_of(at), colour.get(at), depth.get(at)) for at in sorted({*colour, *depth})
         ]
         pose = self.extrinsics.master_from_colour[name]
-        return AlignedRecording(folder, name, lens, pose, shots=shots, fps=FPS)
+        fps = frame_rate(sorted(colour))
+        return AlignedRecording(folder, name, lens, pose, shots=shots, fps=fps)
+
+
+def frame_rate(numbers: list[int]) -> float:
+    """Images a second of increasing numbers: fewer than the release's where every n-th was kept."""
+    steps = np.diff(numbers)
+    return FPS / max(1.0, float(np.median(steps))) if len(steps) else FPS
 
 
 def camera_folders(recordings: Path) -> dict[str, Path]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from synthetic_capture import FURNITURE, ring, room_depth
 
 from intercap_core.camera.clouds import (
     colour_lookup,
@@ -143,3 +146,21 @@ def test_a_colour_mask_lands_on_the_depth_pixels_of_the_panel():
 def test_an_image_of_another_size_is_refused():
     with pytest.raises(ValueError, match="does not fit camera k2"):
         depth_points(np.zeros((10, 10), np.uint16), CAMERA)
+
+
+def test_depth_on_the_colour_grid_is_looked_up_at_its_own_pixel():
+    rig, zup_from_master = ring(count=1)
+    lens = rig[0].colour.scaled(0.1)
+    camera = replace(rig[0], colour=lens, depth=lens, colour_from_depth=np.eye(4))
+    assert camera.aligned and not rig[0].aligned
+    depth = np.rint(room_depth(camera, zup_from_master, FURNITURE) * 1000).astype(np.uint16)
+    # A hair's breadth of offset takes the long way, by projection.
+    nudged = np.eye(4)
+    nudged[0, 3] = 1e-9
+    index = np.arange(500, 15000, 7)
+    for pixels in (None, index):
+        found = colour_lookup(depth, camera, pixels)
+        projected = colour_lookup(depth, replace(camera, colour_from_depth=nudged), pixels)
+        assert np.array_equal(found.depth_index, projected.depth_index)
+        assert np.array_equal(found.colour_index, projected.colour_index)
+        assert not found.hidden.any()

@@ -460,3 +460,11 @@ def test_same_folders_same_bytes(layout, request):
     sequence = request.getfixturevalue(layout)
     first = run(sequence).read_bytes()
     assert run(sequence).read_bytes() == first
+
+
+def test_release_folders_with_every_other_image_are_slower(tmp_path):
+    rig, _ = rig_of(2)
+    folders = write_intercap(tmp_path, rig, numbers=[4, 6, 8, 12], colour=jpeg_at, depth=depth_at)
+    with Frames.open(run(entry("intercap", *folders))) as frames:
+        assert frames.fps == 15 and frames.available.all()
+        assert np.allclose(frames.time_s, np.array([0, 2, 4, 8]) / 30, atol=1e-6)

@@ -1,4 +1,7 @@
-"""Depth images resampled to the colour camera's pixel grid, as released data sets have them."""
+"""Depth images resampled to the colour camera's pixel grid, as released data sets have them.
+
+Another way than the studio's, which makes recordings: so that each can be held against the other.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +22,10 @@ def depth_on_colour(depth: np.ndarray, camera: Camera) -> np.ndarray:
     The result is the z of the colour camera's frame. Four neighbouring depth pixels are one surface
     unless they differ by more than ``HIDDEN_BEHIND_M``. Over it, pixel position and 1 / z, which is
     linear over the image of a plane, are interpolated; what lies on the nearest surface of each
-    colour pixel is averaged. Raises ValueError where the image does not fit the camera or the
-    camera has no depth.
+    colour pixel is averaged.
     """
     lens, colour = camera.depth, camera.colour
-    if lens is None or camera.colour_from_depth is None or depth.shape != (lens.height, lens.width):
-        raise ValueError(f"a depth image {depth.shape} does not fit camera {camera.name}")
+    assert lens is not None and camera.colour_from_depth is not None
     z = depth.astype(np.float64) * 1e-3
     points = np.concatenate([lens.rays * z[..., None], z[..., None]], axis=-1)
     known = (depth > 0) & np.isfinite(points[..., 0])
