@@ -48,7 +48,7 @@ def synchronise(
     cameras = [np.asarray(t, np.int64) for t in times_us]
     sets = _distinct(np.sort(cameras[master]), NEW_SET_GAP * period_us)
     orphans = np.sort(np.concatenate(cameras))
-    orphans = orphans[_distance_to(orphans, sets) > NEW_SET_GAP * period_us]
+    orphans = orphans[distance_to(orphans, sets) > NEW_SET_GAP * period_us]
     extra: list[int] = []
     while len(orphans):
         group = orphans[orphans - orphans[0] <= max_skew_us]
@@ -110,7 +110,8 @@ def _nearest(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
     return np.where(nearer_right, right, left)
 
 
-def _distance_to(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
+def distance_to(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
+    """Return how far each value (N,) is from the nearest target; inf where there is none."""
     if not len(sorted_targets):
         return np.full(len(values), np.inf)
     return np.abs(values - sorted_targets[_nearest(values, sorted_targets)])

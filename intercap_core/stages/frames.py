@@ -19,7 +19,12 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.capture.clocks import WRONG, best_epoch, drift_us, epochs
 from intercap_core.capture.extract import View, extract
 from intercap_core.capture.layouts import open_layout
-from intercap_core.capture.synchronise import SetTable, nearest_images, synchronise
+from intercap_core.capture.synchronise import (
+    SetTable,
+    distance_to,
+    nearest_images,
+    synchronise,
+)
 from intercap_core.config import FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import digest
@@ -226,7 +231,14 @@ def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
             continue
         seen = np.flatnonzero(table.index[:, camera] >= 0)
         if table.unmatched[camera]:
-            view.notes.append(f"{table.unmatched[camera]} images fit no frame set")
+            used = np.zeros(len(view.colour_times), bool)
+            used[table.index[seen, camera]] = True
+            left_out = view.colour_times[view.colour_usable & ~used]
+            apart = float(np.median(distance_to(left_out, table.times_us))) / 1000
+            view.notes.append(
+                f"{table.unmatched[camera]} images fit no frame set: their device times are "
+                f"{apart:.1f} ms from the nearest one (frames.max_skew_ms)"
+            )
         if not len(seen):
             continue
         drift = drift_us(table.times_us, table.skew_us[:, camera])

@@ -178,6 +178,15 @@ def test_a_clock_that_runs_away_is_followed_and_noted(capture):
         assert frames.available.all()
 
 
+def test_a_clock_that_is_off_by_more_than_the_window_is_told(capture):
+    record(capture.recordings, 2, range(TICKS), clock_us=3_012_000)
+    output = run(capture)
+    expected = "12 images fit no frame set: their device times are 12.3 ms from the nearest one"
+    assert expected in notes_of(output)["k3"]
+    with Frames.open(output) as frames:
+        assert frames.num_sets == TICKS and not frames.available[:, 2].any()
+
+
 def test_delays_that_jitter_and_unequal_counts_are_normal(capture):
     rng = np.random.default_rng(3)
     late = {c: rng.integers(-3000, 3000, TICKS) for c in range(3)}
