@@ -292,6 +292,7 @@ TRUTH = Schema(
         "time_offset": Field(("C",), "float64", "true exposure offset", "s"),
         "slip": Field(("T", "C"), "int32", "whole frames late"),
         "recorded": Field(("T", "C"), "bool", "the camera recorded an image whose device time is this set's", optional=True),
+        "depth_bias": Field(("C",), "float64", "what each camera's depth is too far by", "m", optional=True),
         "depth_recorded": Field(("T", "C"), "bool", "and depth that is not empty", optional=True),
         "ground_normal": Field(("3",), "float64", "true floor normal, up", "1", "master"),
         "body_visible": Field(("T", "Vt"), "bool", "some camera truly sees the vertex (of the clothed body)"),

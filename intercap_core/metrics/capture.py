@@ -47,7 +47,7 @@ class CaptureErrors:
 
     ``before`` and ``after`` (C-1,) of the extrinsics, ``offset`` (C-1,), master left out;
     ``offset_normalised`` (C-1,) over the stated deviation; ``depth_bias`` (C,). Cameras without an
-    image are left out everywhere.
+    image, or without depth, are left out.
     """
 
     sequence: str
@@ -148,6 +148,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
         order = [true_names.index(name) for name in names]
         available = recorded["colour_index"] >= 0
         seen = available.any(0)
+        measured = (recorded["depth_index"] >= 0).any(0)
         master = names.index(str(found.attributes["master"]))
         others = np.delete(seen, master)
         true_poses = true["master_from_colour"][order]
@@ -175,7 +176,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
             slips=compare_slips(found["slip"], true["slip"][at][:, order], available),
             ground_m=height,
             ground_deg=angle,
-            depth_bias=(found["depth_bias"] - _true_bias(true)[order])[seen],
+            depth_bias=(found["depth_bias"] - _true_bias(true)[order])[measured],
         )
 
 
@@ -233,7 +234,7 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
 
 
 def _true_bias(truth: artefacts.Artefact) -> np.ndarray:
-    """(C,), NaN for cameras without depth, and for a truth that does not tell."""
+    """(C,), NaN for a truth that does not tell."""
     if "depth_bias" in truth:
         return truth["depth_bias"]
     return np.full(len(truth["time_offset"]), np.nan)

@@ -33,12 +33,14 @@ COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 class Recorded:
     """What one camera has of every set: ``object_pixels`` (T,) of the object that are seen,
     ``object_whole`` (T,) that it would cover if nothing hid it; ``colour`` and ``depth`` (T,) bool:
-    there is an image whose device time is the set's, and depth that is not empty."""
+    there is an image whose device time is the set's, and depth that is not empty. ``depth_bias``:
+    what its depth is too far by, metres."""
 
     object_pixels: np.ndarray
     object_whole: np.ndarray
     colour: np.ndarray
     depth: np.ndarray
+    depth_bias: float
 
 
 class Kinect:
@@ -128,7 +130,7 @@ class Kinect:
         self._write_keypoints(folder, detector, moment, points, hidden)
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
-        return Recorded(seen, whole, colour, colour & has_depth & ~empty)
+        return Recorded(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
 
     def _inertial(
         self, t: int, rng: np.random.Generator, stage_from_depth: np.ndarray

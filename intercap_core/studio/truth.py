@@ -71,6 +71,7 @@ def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture
         file.put("time_offset", rig.offset_s + STAGGER_S * np.arange(len(rig.offset_s)))
         file.put("slip", rig.slip)
         file.put("recorded", np.stack([camera.colour for camera in recorded], 1))
+        file.put("depth_bias", [camera.depth_bias for camera in recorded])
         file.put("depth_recorded", np.stack([camera.depth for camera in recorded], 1))
         file.put("ground_normal", normal)
         file.put("body_visible", body_visible)
