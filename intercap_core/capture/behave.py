@@ -25,7 +25,7 @@ from intercap_core.errors import UserError
 
 MASTER = "k1"
 FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")
-IMAGE_FILE = re.compile(r"k(\d{1,2})\.(color\.jpe?g|depth\.png)", re.IGNORECASE)
+IMAGE_FILE = re.compile(r"k(\d{1,2})\.(color\.(?:jpe?g|png)|depth\.png)", re.IGNORECASE)
 KINECT_FOLDER = re.compile(r"k?(\d{1,2})")
 NOMINAL_FPS = (30.0, 15.0, 5.0)  # of an Azure Kinect; names round the times to milliseconds
 FPS_TOLERANCE = 0.05

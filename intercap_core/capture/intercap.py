@@ -104,7 +104,9 @@ def numbered_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
     colour = next((path for path in below if COLOUR_FOLDER.fullmatch(path.name)), None)
     depths = [path for path in below if DEPTH_FOLDER.fullmatch(path.name)]
     depths.sort(key=lambda path: "align" not in path.name.lower())
-    return _numbered(colour, (".jpg", ".jpeg")), _numbered(depths[0] if depths else None, (".png",))
+    return _numbered(colour, (".jpg", ".jpeg", ".png")), _numbered(
+        depths[0] if depths else None, (".png",)
+    )
 
 
 def _numbered(folder: Path | None, suffixes: tuple[str, ...]) -> dict[int, Path]:

@@ -468,3 +468,15 @@ def test_release_folders_with_every_other_image_are_slower(tmp_path):
     with Frames.open(run(entry("intercap", *folders))) as frames:
         assert frames.fps == 15 and frames.available.all()
         assert np.allclose(frames.time_s, np.array([0, 2, 4, 8]) / 30, atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["release", "behave"])
+def test_colour_may_be_png(layout, request):
+    sequence = request.getfixturevalue(layout)
+    for path in sequence.recordings.rglob("*.jpg"):
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path.with_suffix(".png")), image)
+        path.unlink()
+    with Frames.open(run(sequence)) as frames:
+        assert frames.available.all()
+        assert frames.colour(1, 1).shape == (LENS.height, LENS.width, 3)
