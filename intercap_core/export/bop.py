@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.export.motion import Motion
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.twist import moved, twists
 
 
 def object_id(mesh_path: Path) -> int:
@@ -22,10 +25,24 @@ def object_id(mesh_path: Path) -> int:
     return max(1, int(number.group())) if number else 1
 
 
-def write(folder: Path, motion: Motion, rig: Rig, mesh: ObjectMesh, obj_id: int) -> None:
+@dataclass(frozen=True)
+class Exposures:
+    """Which images show the motion's T frames, and when: ``image_of`` (T, C) the set whose image
+    of each camera shows each frame, -1 = none; ``times`` (T,) s of the frames; ``time_offset``
+    (C,) s by which each camera exposes later."""
+
+    image_of: np.ndarray
+    times: np.ndarray
+    time_offset: np.ndarray
+
+
+def write(
+    folder: Path, motion: Motion, rig: Rig, mesh: ObjectMesh, obj_id: int, exposures: Exposures
+) -> None:
     """Write ``models/`` and one scene folder a camera, numbered in the rig's order.
 
-    ``motion`` is in the master camera's frame.
+    Images are numbered by their frame set; each has the pose at its own exposure. ``motion`` is in
+    the master camera's frame.
     """
     models = folder / "models"
     models.mkdir(parents=True)
@@ -35,11 +52,16 @@ def write(folder: Path, motion: Motion, rig: Rig, mesh: ObjectMesh, obj_id: int)
     scaled.export(models / f"obj_{obj_id:06d}.ply", vertex_normal=False)
     _dump(models / "models_info.json", {str(obj_id): model_info(mesh)})
     lenses: dict[str, Any] = {}
+    poses = rigid(motion.rotation, motion.translation)
+    twist = twists(poses, np.ones(len(motion), bool), exposures.times)
     for number, camera in enumerate(rig):
         scene = folder / "scenes" / f"{number:06d}"
         scene.mkdir(parents=True)
-        _dump(scene / "scene_camera.json", scene_camera(camera, len(motion)))
-        _dump(scene / "scene_gt.json", scene_gt(camera, motion, obj_id))
+        seen = moved(poses, exposures.time_offset[number] * twist)
+        images = {int(image): t for t, image in enumerate(exposures.image_of[:, number])}
+        shown = {image: seen[t] for image, t in sorted(images.items()) if image >= 0}
+        _dump(scene / "scene_camera.json", scene_camera(camera, list(shown)))
+        _dump(scene / "scene_gt.json", scene_gt(camera, shown, obj_id))
         lenses[f"{number:06d}"] = {
             "camera": camera.name,
             "width": camera.colour.width,
@@ -49,8 +71,9 @@ def write(folder: Path, motion: Motion, rig: Rig, mesh: ObjectMesh, obj_id: int)
     _dump(folder / "lenses.json", lenses)
 
 
-def scene_camera(camera: Camera, total: int) -> dict[str, Any]:
-    """``cam_K`` row by row, pixels; world = the master camera, translation in millimetres."""
+def scene_camera(camera: Camera, images: Sequence[int]) -> dict[str, Any]:
+    """Of each of the ``images``: ``cam_K`` row by row, pixels; world = the master camera, its
+    translation in millimetres."""
     pose = camera.colour_from_master
     entry = {
         "cam_K": camera.colour.matrix.ravel().tolist(),
@@ -58,21 +81,24 @@ def scene_camera(camera: Camera, total: int) -> dict[str, Any]:
         "cam_R_w2c": pose[:3, :3].ravel().tolist(),
         "cam_t_w2c": (1e3 * pose[:3, 3]).tolist(),
     }
-    return {str(t): entry for t in range(total)}
+    return {str(image): entry for image in images}
 
 
-def scene_gt(camera: Camera, motion: Motion, obj_id: int) -> dict[str, Any]:
-    """``cam_R_m2c`` and ``cam_t_m2c``: colour camera from model, translation in millimetres."""
-    pose = camera.colour_from_master @ rigid(motion.rotation, motion.translation)
+def scene_gt(camera: Camera, poses: Mapping[int, np.ndarray], obj_id: int) -> dict[str, Any]:
+    """``cam_R_m2c`` and ``cam_t_m2c``: colour camera from model, translation in millimetres.
+
+    ``poses``: master_from_object (4, 4) of each image by its number.
+    """
+    in_camera = {image: camera.colour_from_master @ pose for image, pose in poses.items()}
     return {
-        str(t): [
+        str(image): [
             {
-                "cam_R_m2c": pose[t, :3, :3].ravel().tolist(),
-                "cam_t_m2c": (1e3 * pose[t, :3, 3]).tolist(),
+                "cam_R_m2c": pose[:3, :3].ravel().tolist(),
+                "cam_t_m2c": (1e3 * pose[:3, 3]).tolist(),
                 "obj_id": obj_id,
             }
         ]
-        for t in range(len(motion))
+        for image, pose in in_camera.items()
     }
 
 

@@ -36,6 +36,8 @@ amass/object.npz    rotation (T,3,3), translation (T,3): frame from object, metr
 
 _BOP = """
 bop/                one scene folder a camera, in the order of lenses.json; lengths in millimetres
+  images are numbered by frame set and show the moment that they were exposed: a camera may have
+    slipped by whole sets or expose some milliseconds later; images of no frame are left out
   scene_gt.json: cam_R_m2c, cam_t_m2c = colour camera from model, row by row
   scene_camera.json: world = {master}
   cam_K is a pinhole; the images are distorted, see lenses.json (OpenCV's rational model)

@@ -19,7 +19,7 @@ from intercap_core.export import amass, bop, glb, intercap
 from intercap_core.export.motion import Motion, read_motion
 from intercap_core.export.readme import readme
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.schemas import SCENE
+from intercap_core.schemas import JOINT, SCENE
 
 MANIFEST = "export.json"
 Z_UP = "z-up: gravity-aligned, ground at z = 0, metres"
@@ -48,7 +48,10 @@ def run(
     with artefacts.read(scene, SCENE) as setting:
         rig = Rig.from_artefact(setting)
         zup_from_master = setting["zup_from_master"]
+        image_of, times = setting["image_of"], setting["times"]
         fps = float(setting.attributes["fps"])
+    with artefacts.read(joint, JOINT) as fit:
+        exposures = bop.Exposures(image_of, times, fit["time_offset"])
     motion = read_motion(joint, fps, body_models, subject.gender)
     z_up = settings.frame == "z-up"
     viewed = motion.moved(zup_from_master, Z_UP) if z_up else motion
@@ -61,7 +64,8 @@ def run(
             elif name == "amass":
                 amass.write(folder / "amass", viewed)
             elif name == "bop":
-                bop.write(folder / "bop", motion, rig, mesh, bop.object_id(object_.mesh))
+                number = bop.object_id(object_.mesh)
+                bop.write(folder / "bop", motion, rig, mesh, number, exposures)
             else:
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, z_up=z_up)

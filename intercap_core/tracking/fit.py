@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.twist import moved
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.view_fit import MIN_PIXELS, ViewFit, ViewReport, quick_report
 
@@ -176,11 +177,3 @@ def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list
     """The pose that each view shows: the same array where it exposes at the frame set's time."""
     late = [0.0 if twist is None else view.geometry.time_offset_s for view in views]
     return [pose if not t or twist is None else moved(pose, t * twist) for t in late]
-
-
-def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The pose (4, 4) after ``step`` (6,): a turn about the origin, from the left, and a shift."""
-    result = pose.copy()
-    result[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
-    result[:3, 3] += step[3:]
-    return result

@@ -1,34 +1,15 @@
-"""How the tracked object moves: where it is expected next, and what late cameras see of it."""
+"""How the tracked object moves: where it is expected next, and how surely."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.solve.velocity import limited_rate
 from intercap_core.tracking.fit import MotionPrior
 
 STILL_M, STILL_RAD = 0.004, np.radians(1.5)  # slower than this: no motion is predicted
 ONSET_M, ONSET_RAD = 0.02, np.radians(5)  # in one frame, from rest
 GROWTH_LOST_M, GROWTH_LOST_RAD = 0.04, np.radians(8)  # standard deviation added a lost frame
-
-# A thrown or kicked object; what is faster is a track that jumps.
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
-
-
-def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Turn (rad/s, from the left) and shift of the origin (m/s) in a second: (T, 6).
-
-    ``poses`` (T, 4, 4) master_from_object, believed where ``known`` (T,); ``times`` (T,) seconds.
-    Zero where nothing is known; a single jump moves no neighbour much.
-    """
-    if len(poses) < 2:
-        return np.zeros((len(poses), 6))
-    turns = Rotation.from_matrix(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1))
-    turn = limited_rate(turns.as_rotvec(), times, max_speed=MAX_TURN_RAD_S, known=known)
-    shifts = np.diff(poses[:, :3, 3], axis=0)
-    shift = limited_rate(shifts, times, max_speed=MAX_SPEED_M_S, known=known)
-    return np.concatenate([turn, shift], axis=1)
 
 
 def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:

@@ -15,9 +15,10 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.twist import twists
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit, MotionPrior, assess, fit_pose
-from intercap_core.tracking.motion import expected, extrapolated, loose, twists
+from intercap_core.tracking.motion import expected, extrapolated, loose
 from intercap_core.tracking.search import own_turns, plausibility, rank_frames, same_pose, search
 
 log = logging.getLogger(__name__)

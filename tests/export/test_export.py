@@ -8,6 +8,7 @@ import json
 import pickle
 import pickletools
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts, safe_pickle
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import ExportSettings, Symmetry
 from intercap_core.errors import UserError
 from intercap_core.export import bop
@@ -187,9 +189,32 @@ def test_bop_poses_project_the_object_onto_its_image(capture: fitted.Capture, fo
         assert lenses[f"{number:06d}"]["camera"] == camera.name
 
 
-def test_bop_states_symmetries(capture: fitted.Capture) -> None:
-    from dataclasses import replace
+def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    """The second camera is a set late from set 2 on, and exposes 8 ms after the sets' times."""
+    total, late = 5, np.array([0.0, 0.008, 0.0])
+    times = np.arange(total) / fitted.FPS
+    motion = read_motion(capture.paths["joint"], fitted.FPS, fitted.BODY_MODELS, "neutral")
+    way = np.outer(times, [1.5, 0.0, 0.0])
+    motion = replace(motion, translation=capture.translation[0] + way)
+    slip = np.zeros((total, 3), np.int32)
+    slip[2:, 1] = 1
+    image_of = images_of_moments(slip, np.ones((total, 3), bool))
+    exposures = bop.Exposures(image_of, times, late)
+    bop.write(tmp_path / "bop", motion, capture.rig, capture.mesh, 9, exposures)
+    path = tmp_path / "bop" / "scenes" / "000001"
+    entries = json.loads((path / "scene_gt.json").read_text())
+    assert sorted(entries) == sorted(json.loads((path / "scene_camera.json").read_text()))
+    assert list(entries) == ["0", "1", "3", "4"], "the image of set 2 repeats what that of set 1 is"
+    pose = capture.rig[1].colour_from_master
+    for image, moment in (("1", 1), ("3", 2), ("4", 3)):
+        there = capture.translation[0] + [1.5 * (times[moment] + 0.008), 0, 0]
+        expected = 1e3 * (pose[:3, :3] @ there + pose[:3, 3])
+        assert entries[image][0]["cam_t_m2c"] == pytest.approx(expected, abs=0.05)
 
+
+def test_bop_states_symmetries(capture: fitted.Capture) -> None:
     half = [-1, 0, 0, 0.01, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     group = SymmetryGroup.from_settings(Symmetry(discrete=(tuple(map(float, half)),)))
     info = bop.model_info(replace(capture.mesh, symmetry=group))

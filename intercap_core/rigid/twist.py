@@ -1,0 +1,36 @@
+"""Small motions of a rigid object: six numbers, a turn about its origin and a shift."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.solve.velocity import limited_rate
+
+# A thrown or kicked object; what is faster is a track that jumps.
+MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
+
+
+def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Turn (rad/s, from the left) and shift of the origin (m/s) in a second: (T, 6).
+
+    ``poses`` (T, 4, 4) master_from_object, believed where ``known`` (T,); ``times`` (T,) seconds.
+    Zero where nothing is known; a single jump moves no neighbour much.
+    """
+    if len(poses) < 2:
+        return np.zeros((len(poses), 6))
+    turns = Rotation.from_matrix(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1))
+    turn = limited_rate(turns.as_rotvec(), times, max_speed=MAX_TURN_RAD_S, known=known)
+    shifts = np.diff(poses[:, :3, 3], axis=0)
+    shift = limited_rate(shifts, times, max_speed=MAX_SPEED_M_S, known=known)
+    return np.concatenate([turn, shift], axis=1)
+
+
+def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Poses (..., 4, 4) after ``step`` (..., 6): a turn about the origin, from the left, and a
+    shift, radians and metres."""
+    result = pose.copy()
+    turn = Rotation.from_rotvec(step[..., :3]).as_matrix()
+    result[..., :3, :3] = turn @ pose[..., :3, :3]
+    result[..., :3, 3] += step[..., 3:]
+    return result
