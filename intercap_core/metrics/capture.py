@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.errors import UserError
 from intercap_core.metrics.extrinsics import displacement, rig_centre
 from intercap_core.metrics.times import match_times
 from intercap_core.schemas import FRAMES, SCENE, TRUTH
@@ -145,6 +146,12 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
     ):
         names, true_names = found.text("camera_names"), true.text("camera_names")
         at = match_times(truth, true["times"], found["times"], float(found.attributes["fps"]))
+        strangers = sorted(set(names) - set(true_names))
+        if strangers:
+            raise UserError(
+                f"{truth}: knows no camera {strangers[0]!r}, which {scene} has; it is the truth of "
+                "another recording"
+            )
         order = [true_names.index(name) for name in names]
         available = recorded["colour_index"] >= 0
         seen = available.any(0)
