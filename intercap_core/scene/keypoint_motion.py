@@ -6,7 +6,7 @@ median residual of each keypoint in each view is taken off: what is left are cha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,6 +67,11 @@ class Motion:
     def speed_px(self) -> np.ndarray:
         """Pixel velocities (T, C, K, 2), px/s, 0 where not known."""
         return np.nan_to_num(np.einsum("tckij,tkj->tcki", self.by_point, self.paths.velocity))
+
+    def at_offsets(self, offset: np.ndarray) -> Motion:
+        """The motion as seen by cameras that expose ``offset`` (C,) s late."""
+        along = np.where(self.seen[..., None], self.speed_px * offset[:, None, None], 0.0)
+        return replace(self, residual=self.residual - along)
 
     def shifted(self, seconds: float) -> np.ndarray:
         """How far (T, C, K, 2), px, the points would be seen from where they are expected by

@@ -50,16 +50,18 @@ def keypoint_offsets(
                     np.zeros(views))  # fmt: skip
     if len(times) < 3 or views < 2:
         return empty
-    motion = build_motion(shown, rig, times)
-    if not motion.valid.any():
-        return empty
+    return offsets_of(build_motion(shown, rig, times), master)
+
+
+def offsets_of(motion: Motion, master: int) -> Offsets:
+    """The offsets that a motion's residuals say."""
     information, vector = _normal_equations(motion)
     return _solved(information, vector, master)
 
 
 def by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
     """Keypoints (T, C, 135, 3) of the images that show each set's moment; 0 where none does."""
-    image_of = images_of_moments(slip, keypoints[..., 2].any(-1))
+    image_of = images_of_moments(slip, np.asarray(keypoints[..., 2].any(-1)))
     shown = keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
     shown[image_of < 0] = 0
     return shown

@@ -16,12 +16,19 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA, Motion, build_motion, seeing
-from intercap_core.scene.keypoint_timing import by_moment, noise_of, precisions, windows
+from intercap_core.scene.keypoint_timing import (
+    by_moment,
+    noise_of,
+    offsets_of,
+    precisions,
+    windows,
+)
 
 # In log likelihood, without the keypoints that gain most: limbs that a detector confuses, or
 # places, fit a slip by chance, but never all over the body.
-MIN_GAIN = 60.0
+MIN_GAIN = 45.0
 LEFT_OUT = 4
+GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
 CLEAR_GAIN = 10.0  # an interval must gain this much over the whole recording's being late
 WORTH = 0.2  # of the best interval's gain makes another worth taking at once
 APART_S = 1.0
@@ -70,15 +77,19 @@ def find_slips(
         return Slips(slip, ())
     steps = [s for s in range(-max_slip, max_slip + 1) if s]
     motion = build_motion(keypoints, rig, times)
+    offset = np.zeros(len(rig))
     for _ in range(MAX_ROUNDS):
-        evidence = _Evidence(motion, steps, fps)
+        evidence = _Evidence(motion.at_offsets(offset), steps, fps)
         best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
-        if not best:
+        if not best and offset.any():
             break
+        if not best:
+            # Slips are large against offsets, but weak ones hide behind them: look once more.
+            offset = offsets_of(motion, master).offset
         for interval in _apart(best, times):
             _apply(slip, interval)
         motion = build_motion(by_moment(keypoints, slip), rig, times, motion.paths.points)
-    slip, intervals = _polished(slip, keypoints, motion, steps, fps)
+    slip, intervals = _polished(slip, keypoints, motion, offset, steps, fps)
     always = [i.slip for i in intervals if i.camera == master and _whole(i, len(times))]
     return Slips(slip - np.int32(sum(always)), tuple(sorted(intervals, key=lambda i: -i.gain)))
 
@@ -111,7 +122,12 @@ def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
 
 
 def _polished(
-    slip: np.ndarray, keypoints: np.ndarray, motion: Motion, steps: list[int], fps: float
+    slip: np.ndarray,
+    keypoints: np.ndarray,
+    motion: Motion,
+    offset: np.ndarray,
+    steps: list[int],
+    fps: float,
 ) -> tuple[np.ndarray, list[Interval]]:
     """Find each interval once more, against the motion that no slip disturbs any longer."""
     result, intervals = slip.copy(), []
@@ -127,7 +143,7 @@ def _polished(
             before = slip.copy()
             before[run, c] = constant
             shown = seeing(motion, by_moment(keypoints, before))
-            found = _Evidence(shown, steps, fps).best(c)
+            found = _Evidence(shown.at_offsets(offset), steps, fps).best(c)
             result[run, c] = constant
             if found is not None and not _whole(found, len(slip)):
                 _apply(result, found)
@@ -273,7 +289,7 @@ class _Slipped:
     def best(self) -> tuple[int, int, np.ndarray]:
         """First and last set of the interval of greatest gain, and the keypoints' gains (K,)."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
-        gain = interval_gains(self.linear.sum(0), energy)
+        gain = interval_gains(self.linear.sum(0) - GAIN_PER_SET, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         return first, end - 1, self.gains(first, end)
 
