@@ -1,15 +1,17 @@
 """Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
 
 Depth measures the skin, a keypoint is a joint: the point lies deeper on the pixel's ray by how
-thick the body is there. A joint that something covers is put behind what covers it.
+thick the body is there. A joint that something covers is put behind what covers it, too near; where
+a view from the side shows that one shoulder or hip must be covered, it and its limb are left out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
@@ -17,7 +19,7 @@ from intercap_core.camera.clouds import depth_points
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
-from intercap_core.detection.sides import BODY_POINTS
+from intercap_core.detection.sides import ARMS, BODY_POINTS, LEGS
 from intercap_core.detection.subject import NOBODY
 from intercap_core.detection.triangulation import Triangulation
 
@@ -28,11 +30,12 @@ _INSET_M = {
     "hip": 0.106, "knee": 0.059, "ankle": 0.040,
 }  # fmt: skip
 _HAND_INSET_M = 0.008  # half a finger
-_BEFORE_BACKGROUND_MM = 40  # nearer than the background by less is background
 _REACH_M = 0.03  # around a keypoint, across: where its depth is read
 _MIN_SAMPLES = 4
 _NEAREST_SHARE = 0.2  # of the samples: nearer ones may float
 _SURFACE_M = 0.05  # samples this far behind the nearest are another surface
+# Shoulders, hips nearer to each other than this, half of an adult's breadth: one hides the other.
+_BREADTH_M = (0.18, 0.09)
 _ENOUGH_POINTS = 8  # of the body: a set with so many triangulated needs no lifting
 
 
@@ -49,7 +52,7 @@ INSETS_M = _insets()
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """What a depth image shows in front of the background, as the colour camera sees it.
+    """What a depth image shows, as the colour camera sees it.
 
     ``pixels`` (N, 2) of the colour image and ``distance`` (N,) along the ray, metres.
     """
@@ -59,19 +62,15 @@ class Relief:
     distance: np.ndarray
 
     @classmethod
-    def of(
-        cls, depth: np.ndarray, camera: Camera, background: np.ndarray | None, bias_m: float
-    ) -> Relief:
+    def of(cls, depth: np.ndarray, camera: Camera, bias_m: float) -> Relief:
         """Every second pixel of every second row of ``depth`` (H, W) uint16 mm.
 
-        ``background`` (H, W) uint16 mm, 0 = unknown; ``bias_m`` is subtracted from the depth.
+        ``bias_m`` is subtracted from the depth. The scene's background is not taken away: who
+        stands still for long is part of it.
         """
-        near = np.zeros_like(depth)
-        near[::2, ::2] = depth[::2, ::2]
-        if background is not None:
-            behind = background.astype(np.int32)
-            near[(behind > 0) & (near.astype(np.int32) > behind - _BEFORE_BACKGROUND_MM)] = 0
-        points = depth_points(near, camera).points
+        thinned = np.zeros_like(depth)
+        thinned[::2, ::2] = depth[::2, ::2]
+        points = depth_points(thinned, camera).points
         if bias_m:
             points = points * (1 - np.float32(bias_m) / points[:, 2:])
         assert camera.colour_from_depth is not None
@@ -85,20 +84,26 @@ class Relief:
         ``inset_m`` (K,): how deep each lies. NaN where nothing is measured.
         """
         result = np.full((len(pixels), 3), np.nan)
-        if not len(self.distance):
-            return result
         rays = self.camera.colour.unproject(pixels)
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        wanted = np.flatnonzero(seen & np.isfinite(rays).all(1))
+        if not len(wanted) or not len(self.distance):
+            return result
         reach = self.camera.colour.fx * _REACH_M / self.distance
-        for k in np.flatnonzero(seen & np.isfinite(rays).all(1)):
-            away = np.abs(self.pixels - pixels[k]).max(1)
-            found = self.distance[away < reach]
+        around = self._tree.query_ball_point(pixels[wanted], reach.max(), p=np.inf)
+        for k, near in zip(wanted, around, strict=True):
+            away = np.abs(self.pixels[near] - pixels[k]).max(1)
+            found = self.distance[near][away < reach[near]]
             if len(found) < _MIN_SAMPLES:
                 continue
             nearest = np.quantile(found, _NEAREST_SHARE)
             surface = np.median(found[found < nearest + _SURFACE_M])
             result[k] = rays[k] * (surface + inset_m[k])
         return apply(self.camera.master_from_colour, result)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.pixels, balanced_tree=False, compact_nodes=False)
 
 
 class Lifter:
@@ -111,11 +116,6 @@ class Lifter:
         self._frames, self._min_confidence = frames, min_confidence
         self._rig = Rig.from_artefact(scene)
         self._bias = np.nan_to_num(scene["depth_bias"])
-        known = set(scene.keys("cameras/"))
-        self._background = [
-            scene[f"cameras/{name}/background"] if f"cameras/{name}/background" in known else None
-            for name in self._rig.names
-        ]
         self._relief = lru_cache(maxsize=len(self._rig))(self._load)
 
     def _load(self, t: int, c: int) -> Relief | None:
@@ -123,7 +123,7 @@ class Lifter:
         depth = self._frames.depth(t, c) if camera.depth is not None else None
         if depth is None:
             return None
-        return Relief.of(depth, camera, self._background[c], float(self._bias[c]))
+        return Relief.of(depth, camera, float(self._bias[c]))
 
     def people(self, t: int, c: int, people: np.ndarray) -> np.ndarray:
         """Points (P, 25, 3) of body keypoints (P, 25, 3) in view ``c`` of set ``t``; see
@@ -157,9 +157,25 @@ class Lifter:
                     continue
                 seen = keypoints[t, c, :, 2] >= self._min_confidence
                 option = relief.lift(keypoints[t, c, :, :2], seen, INSETS_M)
+                option[_hidden_side(option, keypoints[t, c, :, 2])] = np.nan
                 if np.isfinite(option[:, 0]).sum() > np.isfinite(best[:, 0]).sum():
                     best, best_view = option, int(c)
             new = np.isnan(points[t, :, 0]) & np.isfinite(best[:, 0])
             points[t, new], inlier[t, new, best_view] = best[new], True
             lifted[t] = new.any()
         return lifted
+
+
+def _hidden_side(points: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """Keypoints (135,) bool that the body itself must hide, of lifted ``points`` (135, 3).
+
+    Of a shoulder or hip that coincides with the other one, the limb that the detector trusts less.
+    """
+    hidden = np.zeros(len(points), bool)
+    for limb, breadth in zip((ARMS, LEGS), _BREADTH_M, strict=True):
+        left, right = np.split(limb, 2)
+        if np.linalg.norm(points[left[0]] - points[right[0]]) < breadth:
+            sure = confidence[left] > confidence[right]
+            side = right if sure[0] else left
+            hidden[side] = sure if sure[0] else ~sure
+    return hidden

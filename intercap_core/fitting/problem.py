@@ -221,27 +221,34 @@ class BodyProblem:
         return NormalEquations(total + cost, gradient, hessian)
 
     def _points(self, keypoints: Keypoints, index: Tensor) -> PointTerm:
-        if self.views is not None:
-            views = self.views
-            return body_keypoints.reprojection(
-                keypoints.points,
-                views.observed[index],
-                views.confidence[index],
-                views.sigma[index],
-                views.lenses,
-                views.colour_from_master,
-                scale=_KEYPOINT_SCALE,
-                shift=None if views.shift is None else views.shift[index],
+        """What views and targets say about the points, together."""
+        views, targets, terms = self.views, self.targets, []
+        if views is not None:
+            terms.append(
+                body_keypoints.reprojection(
+                    keypoints.points,
+                    views.observed[index],
+                    views.confidence[index],
+                    views.sigma[index],
+                    views.lenses,
+                    views.colour_from_master,
+                    scale=_KEYPOINT_SCALE,
+                    shift=None if views.shift is None else views.shift[index],
+                )
             )
-        if self.targets is None:
+        if targets is not None:
+            terms.append(
+                body_keypoints.triangulated(
+                    keypoints.points,
+                    targets.points[index],
+                    targets.confidence[index],
+                    sigma=targets.sigma,
+                    scale=_KEYPOINT_SCALE,
+                )
+            )
+        if not terms:
             raise ValueError("the problem has neither views nor targets")
-        return body_keypoints.triangulated(
-            keypoints.points,
-            self.targets.points[index],
-            self.targets.confidence[index],
-            sigma=self.targets.sigma,
-            scale=_KEYPOINT_SCALE,
-        )
+        return PointTerm(*(sum(part[1:], start=part[0]) for part in zip(*terms, strict=True)))
 
     def _prior_cost(self, x: Tensor, shared: Tensor) -> Tensor:
         cost = body_priors.cost(self.model, x, shape=not self.one_shape)

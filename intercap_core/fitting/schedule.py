@@ -106,8 +106,9 @@ class Fitter:
             self.one_shape,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
         )  # fmt: skip
-        for _ in range(2):
-            evidence.look(problem)
+        problem.targets = self._lifted()
+        for widened in _WIDENED if problem.targets else (1.0, 1.0):
+            evidence.look(problem, widened=widened)
             self._minimise(problem, 6)
             evidence.refine_sigma(problem)
         problem.fit_shared = True
@@ -117,6 +118,7 @@ class Fitter:
             self._minimise(problem, 5)
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
+            problem.targets = None
         # Faces and hands of a shape outside the model's space would bend the whole body to fit:
         # what is shared is settled by now, and stays.
         problem.fit_shared, problem.one_shape = False, False
@@ -218,6 +220,19 @@ class Fitter:
             shape = slice(TRANSL.stop, TRANSL.stop + self.model.num_betas)
             base[:, shape] = base[:, shape].median(0).values
         return base
+
+    def _lifted(self) -> Targets | None:
+        """The body's keypoints that depth alone places, which one view's pixels cannot.
+
+        They hold the body until its cloud does. Those that something covers are far off: their
+        pixels, trusted widely at first, bring the limbs where they belong.
+        """
+        seen = self.evidence.seen
+        joints = seen.joints[self.frames][:, BODY]
+        lifted = (seen.joint_views[self.frames][:, BODY] == 1) & np.isfinite(joints).all(2)
+        if not lifted.any():
+            return None
+        return Targets(self._tensor(np.nan_to_num(joints)), self._tensor(lifted), _START_SIGMA)
 
     def _fit_triangulated(self, placed: np.ndarray, joints: np.ndarray) -> Solution:
         base = self.model.zeros(len(placed)).vector().clone()

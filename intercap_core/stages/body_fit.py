@@ -47,10 +47,10 @@ def run(
 ) -> None:
     """Fit the subject's body in all frames and write body_fit.h5.
 
-    Frames in which too little of the person is triangulated, or whose fit ends far from the
-    keypoints, are ``failed`` and ``bridged``: filled in between their neighbours. Raises UserError
-    where no frame at all can be fitted, the body file cannot be used, or the artefacts do not
-    belong together.
+    Frames in which too little of the person is placed, whose fit ends far from the keypoints, or
+    that one view sees without points of the person, are ``failed`` and ``bridged``: filled in
+    between their neighbours. Raises UserError where no frame at all can be fitted, the body file
+    cannot be used, or the artefacts do not belong together.
     """
     path = body_path(body_models, subject.gender) or OPEN_BODY
     model = BodyModel.load(path, num_betas=NUM_BETAS, num_expression=NUM_EXPRESSION, device=device)
@@ -58,19 +58,23 @@ def run(
     if not seen.usable.any():
         raise UserError(
             f"{person}: sequence {seen.sequence}: in none of its {seen.num_frames} frames do two "
-            "views agree on three keypoints of the subject's trunk; check the keypoints and the "
-            "camera poses of this sequence"
+            "views, or one and its depth, place three keypoints of the subject's trunk; check the "
+            "keypoints and the camera poses of this sequence"
         )
     clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
     fit = Fitter(model, seen, clouds, settings).run()
 
     fitted = np.zeros(seen.num_frames, bool)
-    fitted[fit.frames[(fit.keypoint_error < _BAD_RESIDUAL_M).cpu().numpy()]] = True
+    believed = fit.keypoint_error < _BAD_RESIDUAL_M
+    # one view's keypoints do not say how far away the body is, its points do
+    placed = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
+    fitted[fit.frames[(believed & placed).cpu().numpy()]] = True
     if not fitted.any():
         raise UserError(
-            f"{person}: sequence {seen.sequence}: the fitted body is more than "
-            f"{1000 * _BAD_RESIDUAL_M:.0f} mm from the keypoints in every frame; check the camera "
-            "poses and that the keypoints belong to this recording"
+            f"{person}: sequence {seen.sequence}: in every frame the fitted body is more than "
+            f"{1000 * _BAD_RESIDUAL_M:.0f} mm from the keypoints, or rests on one view without "
+            "points of the person; check the camera poses, and that keypoints and masks belong to "
+            "this recording"
         )
     vectors = np.zeros((seen.num_frames, model.num_parameters))
     vectors[fit.frames] = fit.vectors.double().cpu().numpy()
