@@ -1,6 +1,6 @@
 """Colour images as files in memory: JPEG or PNG as recorded, never decoded on the way through.
 
-JPEG: ITU-T T.81, annex B; PNG: RFC 2083.
+JPEG: ITU-T T.81, annex B; PNG: RFC 2083; Exif: CIPA DC-008, 4.6.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ _NO_FRAME_HEADERS = (0xC4, 0xC8, 0xCC)  # among C0..CF: tables, reserved, arithm
 def encoded_size(content: bytes) -> tuple[int, int] | None:
     """Return width and height of a JPEG or PNG file; None for what is no whole file of these.
 
-    The end must be there (zero bytes may follow a JPEG's); what lies between is not looked at.
+    They are those of the image as OpenCV decodes it: turned as a JPEG's Exif orientation says. The
+    end must be there (zero bytes may follow a JPEG's); what lies between is not looked at.
     """
     if content.startswith(PNG_START):
         whole = content.endswith(PNG_END) and len(content) >= 33
@@ -33,7 +34,7 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
     """Walk the segments up to the frame header, which holds the size."""
-    at = 2
+    at, lying = 2, False
     while at + 9 <= len(content) and content[at] == 0xFF:
         marker = content[at + 1]
         if marker == 0xFF:  # a fill byte
@@ -41,9 +42,26 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
             continue
         if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME_HEADERS:
             height, width = struct.unpack(">HH", content[at + 5 : at + 9])
-            return width, height
-        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+            return (height, width) if lying else (width, height)
+        end = at + 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+        if marker == 0xE1 and content[at + 4 : at + 10] == b"Exif\0\0":
+            lying = _orientation(content[at + 10 : end]) >= 5  # by a quarter turn
+        at = end
     return None
+
+
+def _orientation(tiff: bytes) -> int:
+    """The Exif orientation, 1 to 8; 1 (as stored) where there is none."""
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None or len(tiff) < 10:
+        return 1
+    (at,) = struct.unpack(f"{order}I", tiff[4:8])
+    (entries,) = struct.unpack(f"{order}H", tiff[at : at + 2].ljust(2, b"\0"))
+    for start in range(at + 2, min(at + 2 + 12 * entries, len(tiff) - 11), 12):
+        tag, _, _, value = struct.unpack(f"{order}HHIH", tiff[start : start + 10])
+        if tag == 0x0112:
+            return value if 1 <= value <= 8 else 1
+    return 1
 
 
 def jpeg_of(image: np.ndarray) -> bytes:

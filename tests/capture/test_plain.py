@@ -329,6 +329,23 @@ def test_depth_without_a_lens_is_not_read(capture):
         assert frames.rig[0].depth is None
 
 
+@pytest.mark.parametrize("count", [1, 16])
+def test_rigs_of_one_camera_and_of_sixteen(tmp_path, count):
+    names = [f"c{index:02d}" for index in range(count)]
+    for index, name in enumerate(names):
+        write_images(tmp_path / "recordings" / name, index, range(3))
+    cameras = {name: lens() | {"R": [0, 0, 0], "T": [i, 0, 0]} for i, name in enumerate(names)}
+    (tmp_path / "rig.json").write_text(json.dumps({"fps": FPS, "cameras": cameras}))
+    entry = SequenceEntry(
+        sequence="s1", subject="a", object="b", layout="plain",
+        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
+    )  # fmt: skip
+    with Frames.open(run(entry)) as frames:
+        assert frames.rig.names == tuple(names) and frames.master == "c00"
+        assert frames.colour_available.shape == (3, count) and frames.available.all()
+        assert not frames.depth_available.any()
+
+
 def test_a_rig_whose_times_nobody_says_is_refused(capture):
     content = calibrated()
     del content["fps"]
