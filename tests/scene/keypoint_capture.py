@@ -16,6 +16,8 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.detection.subject import NOBODY, find_subject
+from intercap_core.scene.late_views import with_late_views
+from intercap_core.scene.subject_views import MIN_CONFIDENCE, triangulated
 from intercap_core.studio.hands import part_of
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.keypoints import Detector
@@ -56,8 +58,15 @@ def keypoint_capture(
 ) -> KeypointCapture:
     """Make one capture; the same arguments give the same numbers."""
     capture = StudioCapture(interaction=interaction, subject=subject, seed=seed, frames=frames)
-    settings = StudioSettings(
-        captures={}, fps=fps, noise=noise, noise_family=family, cameras=cameras, slips=slips
+    settings = StudioSettings.model_validate(
+        {
+            "captures": {},
+            "fps": fps,
+            "noise": noise,
+            "noise_family": family,
+            "cameras": cameras,
+            "slips": slips,
+        }
     )
     stage = Stage(capture, settings, _object_entry(interaction_named(interaction).object_class))
     detector = Detector.build(stage.noise, stage.frames)
@@ -142,9 +151,24 @@ class _People:
 
 
 def subject_keypoints(capture: KeypointCapture) -> np.ndarray:
-    """The subject's keypoints (T, C, 135, 3) as the search finds them; zeros where not seen."""
+    """The subject's keypoints (T, C, 135, 3), sides put right, as the scene stage finds them;
+    zeros where not seen."""
     people = _People(capture)
-    index = find_subject(people, capture.rig, capture.times, min_confidence=0.3)  # type: ignore[arg-type]
+    index = find_subject(people, capture.rig, capture.times, min_confidence=MIN_CONFIDENCE)  # type: ignore[arg-type]
+    first = triangulated(_keypoints(people, index), capture.rig)
+    index = with_late_views(
+        index,
+        people,
+        first.joints,
+        capture.rig,
+        capture.times,
+        fps=capture.fps,
+        min_confidence=MIN_CONFIDENCE,
+    )
+    return triangulated(_keypoints(people, index), capture.rig).keypoints
+
+
+def _keypoints(people: _People, index: np.ndarray) -> np.ndarray:
     result = np.zeros((*index.shape, 135, 3))
     for t, c in np.argwhere(index != NOBODY):
         result[t, c] = people.people(t, c)[index[t, c]]
