@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-WRONG, NONE = -1, -2
+from intercap_core.capture.synchronise import distance_to
+
+WRONG = -1
 
 
 def epochs(times_us: np.ndarray) -> np.ndarray:
@@ -34,13 +36,16 @@ def epochs(times_us: np.ndarray) -> np.ndarray:
     return stretch
 
 
-def best_epoch(times_us: np.ndarray, stretch: np.ndarray, first_us: int, last_us: int) -> int:
-    """Return the stretch with the most images between two times; the longest where none has any.
+def best_epoch(
+    times_us: np.ndarray, stretch: np.ndarray, reference_us: np.ndarray, within_us: float
+) -> int:
+    """Return the stretch with the most images near a reference time; the longest without any.
 
-    ``stretch`` (N,) is what :func:`epochs` says of ``times_us`` (N,); of equals the first wins.
+    ``stretch`` (N,) is what :func:`epochs` says of ``times_us`` (N,); ``reference_us`` (M,) are
+    increasing. Of equals the first wins.
     """
-    inside = (times_us >= first_us) & (times_us <= last_us) & (stretch >= 0)
-    pool = stretch[inside] if inside.any() else stretch[stretch >= 0]
+    near = (distance_to(times_us, reference_us) <= within_us) & (stretch >= 0)
+    pool = stretch[near] if near.any() else stretch[stretch >= 0]
     return int(np.argmax(np.bincount(pool)))
 
 

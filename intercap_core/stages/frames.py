@@ -125,16 +125,18 @@ def _straighten_clocks(views: list[View], master: int) -> None:
     stretches = {view.name: epochs(view.colour_times) for view in present}
     straight = [view for view in present if stretches[view.name].max() == 0]
     if not straight:
-        straight = [views[master] if views[master].present else present[0]]
-        _keep_one_stretch(straight[0], stretches[straight[0].name], straight[0].colour_times)
+        first = views[master] if views[master].present else present[0]
+        _keep_one_stretch(first, stretches[first.name], first.colour_times)
+        straight = [first]
+        present.remove(first)
     reference = np.concatenate([view.usable_times for view in straight])
     for view in present:
         _keep_one_stretch(view, stretches[view.name], reference)
 
 
 def _keep_one_stretch(view: View, stretch: np.ndarray, reference_us: np.ndarray) -> None:
-    first, last = int(reference_us.min()), int(reference_us.max())
-    kept = best_epoch(view.colour_times, stretch, first, last)
+    period_us = 1e6 / view.fps
+    kept = best_epoch(view.colour_times, stretch, np.sort(reference_us), period_us)
     resets = int(stretch.max())
     wrong = int((stretch == WRONG).sum())
     if wrong:
@@ -150,7 +152,7 @@ def _keep_one_stretch(view: View, stretch: np.ndarray, reference_us: np.ndarray)
         return
     depth = epochs(view.depth_times)
     if depth.max() != resets:
-        kept = best_epoch(view.depth_times, depth, *view.usable_times[[0, -1]].tolist())
+        kept = best_epoch(view.depth_times, depth, view.usable_times, period_us)
     view.depth_usable &= depth == kept
 
 
