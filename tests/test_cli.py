@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 from rich.console import Console
+from synthetic_capture import ring, write_frames
 
 from intercap_core import artefacts
 from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
@@ -249,15 +250,15 @@ def test_inspect_finds_damage(detections: Path) -> None:
     assert "re-run stage 'detections'" in done.stderr
 
 
-def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path, detections: Path) -> None:
+def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path) -> None:
     place = small_project / "results" / "trial" / "good"
     place.mkdir(parents=True)
-    detections.rename(place / "detections.h5")
+    write_frames(place / "frames.h5", ring(1)[0], num_sets=1)
     done = intercap("person", "config.yaml", "good", folder=small_project)
     assert done.returncode == 1
     assert done.stderr == (
-        "error: results/trial/good/detections.h5: holds sequence 'one', expected 'good'; "
-        "delete it and re-run stage 'detections' for sequence 'good'\n"
+        "error: results/trial/good/frames.h5: holds sequence 'test', expected 'good'; "
+        "delete it and re-run stage 'frames' for sequence 'good'\n"
     )
 
 
