@@ -22,7 +22,7 @@ from intercap_core.refine.time_offsets import OffsetPrior, TimeOffsets, estimate
 
 # Frames without a believable fit stay near where they were bridged unless their neighbours pull.
 _BRIDGED_TURN, _BRIDGED_SHIFT = 0.3, 0.1  # rad, metres
-_OFFSET_MOVED_S = 0.001  # at the speed of a fast hand, some millimetres
+_OFFSET_SAME_S = 0.0003  # what a hand at 3 m/s moves meanwhile is a millimetre
 
 log = logging.getLogger(__name__)
 
@@ -109,26 +109,27 @@ class BodyData:
         cloud[self._fitter.frames] = metres.cpu().numpy()
         return Residuals(keypoint, cloud)
 
-    def refine_offsets(self, prior: OffsetPrior) -> TimeOffsets:
-        """Estimate the cameras' time offsets at the state of the last :meth:`refresh`.
-
-        Where they differ from those that the predictions allow for by more than a millisecond,
-        the predictions allow for these from now on.
-        """
+    def estimate_offsets(self, prior: OffsetPrior) -> TimeOffsets:
+        """Estimate the cameras' time offsets at the state of the last :meth:`refresh`."""
         evidence, problem = self._fitter.evidence, self._problem
-        seen = evidence.seen
         sightings = [
             replace(found, weight=found.weight * self._trusted[:, None, None])
             for found in (keypoint_sightings(evidence, problem), cloud_sightings(evidence, problem))
             if found is not None
         ]
-        times = seen.times[evidence.frames]
-        offsets = estimate_offsets(sightings, times, seen.time_offset, prior)
+        times = evidence.seen.times[evidence.frames]
+        offsets = estimate_offsets(sightings, times, evidence.seen.time_offset, prior)
         log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
-        if np.abs(offsets.offset - seen.time_offset).max() > _OFFSET_MOVED_S:
-            evidence.seen = replace(seen, time_offset=offsets.offset)
-            self._fitter.observe(problem)
         return offsets
+
+    def take_offsets(self, offset: np.ndarray) -> float:
+        """Predict with other offsets (C,) from now on; the largest change, seconds."""
+        evidence = self._fitter.evidence
+        change = float(np.abs(offset - evidence.seen.time_offset).max())
+        if change > _OFFSET_SAME_S:
+            evidence.seen = replace(evidence.seen, time_offset=offset)
+            self._fitter.observe(self._problem)
+        return change
 
     def _place(self, state: State) -> None:
         vector = state.parameters(self._fitter.model).vector()

@@ -31,7 +31,8 @@ ROUNDS = 4
 PART_POINTS = 4.0  # points of one part count as at most so many: they err together
 _GAP = 1.5  # of the usual time step: rows farther apart are no neighbours
 _LEAST_ROWS = 50
-_SMALLEST_SIGMA_S = 1e-5  # the master's is zero
+# What is known before comes from the same keypoints: it is not taken as surer than this.
+_PRIOR_SIGMA_S = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ def estimate_offsets(
     count = len(current)
     known = np.isfinite(prior.sigma)
     expected = np.where(known, prior.offset, 0.0) - current
-    sigma = np.maximum(np.where(known, prior.sigma, LOOSE_SIGMA_S), _SMALLEST_SIGMA_S)
+    sigma = np.maximum(np.where(known, prior.sigma, LOOSE_SIGMA_S), _PRIOR_SIGMA_S)
     precision = np.diag(sigma**-2.0)
     free = np.arange(count) != prior.master
     all_innovations = [found for s in sightings if (found := _Innovations.of(s, times)) is not None]

@@ -47,6 +47,7 @@ log = logging.getLogger(__name__)
 # Contact is estimated, the energy descended, and so on: the first round moves the most.
 _ROUNDS = (6, 4, 3)
 _SETTLED = 0.1  # largest change of a contact probability after which nothing new is to be learnt
+_RETIMED_S = 0.001  # a change of the cameras' time offsets that the fit has to follow
 _UNTRACKED_SIGMA = 0.5  # of the object's position where the track is lost, metres
 
 
@@ -135,7 +136,7 @@ def run(
     for rounds in _ROUNDS:
         problem.probability = found.probability
         data.refresh(state)
-        data.refine_offsets(known_offsets)
+        retimed = data.take_offsets(data.estimate_offsets(known_offsets).offset)  # seconds
         problem.refresh(state)
         if not before:
             before = problem.equations(state).energy
@@ -144,12 +145,12 @@ def run(
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
         before_round, found = found, _contact(problem, state, contact, joint_sigma, object_sigma)
         change = np.abs(found.probability - before_round.probability).max()
-        if minimum.converged and change < _SETTLED:
+        if minimum.converged and change < _SETTLED and retimed < _RETIMED_S:
             break
     after = minimum.equations.energy
     flagged, reasons = _flags(failed, bridged, lost, disagree, problem, state)
     report = data.residuals(state)
-    offsets = data.refine_offsets(known_offsets)
+    offsets = data.estimate_offsets(known_offsets)
 
     with artefacts.write(
         output,
