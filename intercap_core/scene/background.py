@@ -2,8 +2,8 @@
 
 What moves in front of the scene is nearer than it, so a pixel's background is the *farthest*
 depth that it holds steadily, not the median: someone who stands still for most of a recording
-does not become background. Someone or something that never moves does: nothing tells it from
-furniture.
+does not become background. Someone who never leaves does not either, as long as the keypoints
+tell where (:mod:`.person_space`); a thing that never moves does: nothing tells it from furniture.
 """
 
 from __future__ import annotations
@@ -13,9 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.capture.frames import Frames
+from intercap_core.scene.person_space import person_pixels
 
 MAX_SAMPLES = 25  # sets looked at; memory is this many depth images of one camera
-STEADY_SHARE = 0.2  # of a pixel's valid samples that must agree
+STEADY_SHARE = 0.2  # of a pixel's samples that must agree
+# A pixel that often measures nothing looks past the scene: what it holds now and then, however
+# steadily, may have come by. There nearly all of it must agree.
+OFTEN_VALID = 0.75
+VALID_AGREE = 0.8  # of such a pixel's valid samples
 STATIC_SHARE = 0.5  # above this the pixel shows background most of the time
 # Samples agree within this: three standard deviations of the sensor's random error, about 1 mm +
 # 0.1 % of depth and more at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, figure of NFOV).
@@ -39,27 +44,42 @@ def sample_sets(available: np.ndarray) -> np.ndarray:
     return sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
 
 
-def background_of(frames: Frames, c: int) -> Background | None:
-    """The background of camera ``c``; None where it has no depth image."""
+def background_of(frames: Frames, c: int, joints: np.ndarray | None = None) -> Background | None:
+    """The background of camera ``c``; None where it has no depth image.
+
+    ``joints`` (T, 135, 3): the subject's keypoints at the moment that the camera's image of each
+    set shows, master frame, metres, NaN = not known; what is near them is not background.
+    """
+    camera = frames.rig[c]
     sets = sample_sets(frames.depth_available[:, c])
-    if not len(sets) or frames.rig[c].depth is None:
+    if not len(sets) or camera.depth is None:
         return None
-    images = [frames.depth(int(t), c) for t in sets]
-    return steady_background(np.stack([image for image in images if image is not None]))
+    images = np.stack([image for t in sets if (image := frames.depth(int(t), c)) is not None])
+    somebody = np.zeros(images.shape, bool)
+    if joints is not None:
+        for image, near, t in zip(images, somebody, sets, strict=True):
+            near[:] = person_pixels(image, camera.depth, camera.depth_from_master, joints[t])
+    return steady_background(images, somebody)
 
 
-def steady_background(images: np.ndarray) -> Background:
-    """The background of depth images (S, H, W) uint16 mm of one camera."""
+def steady_background(images: np.ndarray, somebody: np.ndarray | None = None) -> Background:
+    """The background of depth images (S, H, W) uint16 mm of one camera; ``somebody`` (S, H, W)
+    bool: a person may be there, which says nothing about what is behind."""
     samples, height, width = images.shape
+    told = np.full(height * width, samples)
+    if somebody is not None:
+        told -= somebody.reshape(samples, -1).sum(0)
+        images = np.where(somebody, 0, images)
     ordered = np.sort(images.reshape(samples, -1).T, axis=1)  # (pixels, S), invalid zeros first
     valid = samples - (ordered == 0).sum(1)
-    needed = np.maximum(np.ceil(STEADY_SHARE * valid), min(2, samples)).astype(int)
+    share = np.where(valid >= OFTEN_VALID * told, STEADY_SHARE, VALID_AGREE)
+    needed = np.maximum(np.ceil(share * valid), min(2, samples)).astype(int)
     depth = np.zeros(len(ordered), np.uint16)
     support = np.zeros(len(ordered))
     for count in np.unique(needed[valid >= needed]):
         rows = np.flatnonzero((needed == count) & (valid >= needed))
         depth[rows], support[rows] = _farthest_cluster(ordered[rows], int(count))
-    static = (depth > 0) & (support > STATIC_SHARE * np.maximum(valid, samples / 2))
+    static = (depth > 0) & (support > STATIC_SHARE * np.maximum(valid, told / 2))
     return Background(depth.reshape(height, width), static.reshape(height, width))
 
 

@@ -2,76 +2,219 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.capture.frames import Frames
-from intercap_core.detection.read import Detections
 from intercap_core.scene.background import Background
 from intercap_core.scene.body_constraints import BodyConstraint, body_views
-from intercap_core.scene.registration import Estimate, PairResiduals, Registration
+from intercap_core.scene.keypoint_timing import Offsets
+from intercap_core.scene.registration import (
+    MOVING,
+    OFFSET,
+    STATIC,
+    Estimate,
+    Layer,
+    OffsetInformation,
+    PairResiduals,
+    Registration,
+)
+from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surface import Surface, surface_of
 
 BACKGROUND_CELL_M = 0.03
 MAX_DEPTH_M = 5.0  # beyond, the depth's error is past a centimetre
-MIN_CONFIDENCE = 0.3
 MIN_BODY_POINTS = 50
 MUST_IMPROVE = 0.98  # of the start's held-out cost
 MAY_WORSEN = 1.02
+CONVERGED_M = 0.001
+WEAK_POINTS = 120  # held-out correspondences, background and moving together
+WEAK_RESIDUAL = 2.0  # times the median pair's
+# Keypoints of one person err together more than their own residuals tell.
+TIMING_INFLATION = 2.0
+KNOWN_OFFSET_SIGMA_S = 0.008  # an offset less certain than what devices are off by is not known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class PairTable:
+    """Held-out residuals by pair: ``pairs`` (P, 2) camera indices; for the background and for what
+    moves, ``points`` (P, 2) and medians ``before`` and ``after`` (P, 2), metres, NaN = no overlap;
+    ``weak`` (P,): few points, or residuals that stay large."""
+
+    pairs: np.ndarray
+    points: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    weak: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Refinement:
     """``poses`` (C, 4, 4) master_from_colour, ``bias`` (C,) metres to subtract from depth,
-    ``improved``, and the held-out residuals at the start and at the returned poses."""
+    ``offset`` and ``offset_sigma`` (C,) seconds, NaN sigma = not known; ``improved``: the poses are
+    better than the start's on held-out points; the pairs, the verdict and each camera's note, in
+    words."""
 
     poses: np.ndarray
     bias: np.ndarray
+    offset: np.ndarray
+    offset_sigma: np.ndarray
     improved: bool
-    before: PairResiduals
-    after: PairResiduals
+    converged: bool
+    pairs: PairTable
+    verdict: str
+    notes: tuple[str, ...]
 
 
 def refine(
-    frames: Frames, detections: Detections, surfaces: dict[int, Surface], master: int
+    rig: Rig,
+    master: int,
+    static: dict[int, Surface],
+    moving: Sequence[dict[int, Surface]],
+    subject: SubjectViews,
+    times: np.ndarray,
+    timing: Offsets,
+    *,
+    free_poses: bool,
 ) -> Refinement:
-    """Refine all cameras' poses but the ``master``'s; the start is kept where held-out points and
-    keypoints together do not get better. ``surfaces`` as :func:`background_surfaces` gives."""
-    rig = frames.rig
-    start = Estimate(rig.master_from_colour.copy(), np.zeros(len(rig)))
-    views = body_views(detections, rig, frames.time_s, min_confidence=MIN_CONFIDENCE)
-    registration = Registration(rig, surfaces, master)
+    """Refine all cameras' poses but the ``master``'s, their depth bias and time offsets.
+
+    ``static`` and ``moving`` are surfaces as :func:`background_surfaces` and
+    :func:`.moving.moving_surfaces` give; ``subject`` is by moment; ``timing`` is what its keypoints
+    say of the offsets. The start's poses are kept where held-out points and keypoints together do
+    not get better, and where not ``free_poses``.
+    """
+    layers = [Layer(static, STATIC), *(Layer(at_once, MOVING) for at_once in moving)]
+    registration = Registration(rig, layers, master)
+    views = body_views(subject, times)
     body = BodyConstraint(views, rig) if len(views.points) >= MIN_BODY_POINTS else None
-    before = registration.residuals(start)
-    found = registration.solve(start, [body] if body else [])
-    after = registration.residuals(found)
-    if _better(before, after, body, start.poses, found.poses):
-        return Refinement(found.poses, found.bias, True, before, after)
-    return Refinement(start.poses, start.bias, False, before, before)
+    known = OffsetInformation(
+        timing.information / TIMING_INFLATION**2, timing.vector / TIMING_INFLATION**2
+    )
+    constraints = [body] if body else []
+    held = registration.solve(Estimate.start(rig), (), known, free_poses=False)
+    found, improved, ratios = held, False, []
+    if free_poses and len(rig) > 1:
+        freed = registration.solve(Estimate.start(rig), constraints, known)
+        ratios = _ratios(registration, body, held.estimate, freed.estimate)
+        if _better(ratios, freed.estimate):
+            found, improved = freed, True
+    pairs = _pair_table(registration, held.estimate, found.estimate)
+    sigma = np.sqrt(np.diagonal(found.covariance[:, OFFSET, :, OFFSET]))
+    unknown = sigma > KNOWN_OFFSET_SIGMA_S
+    sigma = np.where(unknown, np.nan, sigma)
+    sigma[master] = 0.0
+    converged = found.last_step_m < CONVERGED_M
+    return Refinement(
+        found.estimate.poses,
+        found.estimate.bias,
+        np.where(unknown, 0.0, found.estimate.offset),
+        sigma,
+        improved,
+        converged,
+        pairs,
+        _verdict(rig, pairs, ratios, improved, converged, free_poses),
+        _notes(rig, master, pairs, views.weights, improved),
+    )
 
 
-def _better(
-    before: PairResiduals,
-    after: PairResiduals,
-    body: BodyConstraint | None,
-    start: np.ndarray,
-    found: np.ndarray,
-) -> bool:
-    if not np.isfinite(found).all():
-        return False
+def _ratios(
+    registration: Registration, body: BodyConstraint | None, start: Estimate, found: Estimate
+) -> list[float]:
+    """Held-out costs over the start's: background, what moves, and keypoints, where there are any.
+
+    The start has the depth bias and the time offsets that suit it best: poses alone are judged.
+    """
     ratios = []
-    if len(before.pairs) and len(after.pairs):
-        ratios.append(_cost(after) / max(_cost(before), 1e-9))
+    for kind in (STATIC, MOVING):
+        before, after = (registration.residuals(at, kind) for at in (start, found))
+        if len(before.pairs) and len(after.pairs):
+            ratios.append(_cost(after) / max(_cost(before), 1e-9))
     if body is not None:
-        ratios.append(body.median_error(found) / max(body.median_error(start), 1e-9))
-    return bool(ratios) and min(ratios) <= MUST_IMPROVE and max(ratios) <= MAY_WORSEN
+        before_px, after_px = (body.median_error(at.poses, at.offset) for at in (start, found))
+        ratios.append(after_px / max(before_px, 1e-9))
+    return ratios
 
 
 def _cost(residuals: PairResiduals) -> float:
     """Mean of the pairs' medians: every pair counts the same, however much it overlaps."""
     return float(residuals.median.mean())
+
+
+def _better(ratios: list[float], found: Estimate) -> bool:
+    if not ratios or not np.isfinite(found.poses).all():
+        return False
+    return min(ratios) <= MUST_IMPROVE and max(ratios) <= MAY_WORSEN
+
+
+def _pair_table(registration: Registration, start: Estimate, found: Estimate) -> PairTable:
+    kinds = [
+        [registration.residuals(at, kind) for at in (start, found)] for kind in (STATIC, MOVING)
+    ]
+    pairs = sorted({tuple(pair) for both in kinds for r in both for pair in r.pairs})
+    place = {pair: row for row, pair in enumerate(pairs)}
+    points = np.zeros((len(pairs), 2), np.int64)
+    medians = np.full((2, len(pairs), 2), np.nan)
+    for k, both in enumerate(kinds):
+        for when, residuals in enumerate(both):
+            rows = [place[tuple(pair)] for pair in residuals.pairs]
+            medians[when, rows, k] = residuals.median
+            points[rows, k] = residuals.count
+    after = medians[1]
+    usual = np.array([np.nanmedian(a) if np.isfinite(a).any() else np.nan for a in after.T])
+    large = (after > WEAK_RESIDUAL * usual).any(1)
+    weak = large | (points.sum(1) < WEAK_POINTS)
+    return PairTable(np.array(pairs, np.int32).reshape(-1, 2), points, medians[0], after, weak)
+
+
+def _verdict(
+    rig: Rig,
+    pairs: PairTable,
+    ratios: list[float],
+    improved: bool,
+    converged: bool,
+    free_poses: bool,
+) -> str:
+    if len(rig) == 1:
+        return "one camera: nothing to refine"
+    if not free_poses:
+        return "refinement is switched off: poses as given"
+    if not ratios:
+        return "no two cameras share a surface or a person: poses as given"
+    if not improved:
+        return "held-out points do not get better: poses as given"
+    said = "refined" if converged else "refined, not fully converged"
+    for k, kind in enumerate(("background", "moving surfaces")):
+        if np.isfinite(pairs.after[:, k]).any():
+            before, after = (1e3 * float(np.nanmean(x[:, k])) for x in (pairs.before, pairs.after))
+            said += f"; {kind} {before:.1f} to {after:.1f} mm"
+    names = [f"{rig.names[a]}-{rig.names[b]}" for a, b in pairs.pairs[pairs.weak]]
+    return f"{said}; weak pairs: {', '.join(names)}" if names else said
+
+
+def _notes(
+    rig: Rig, master: int, pairs: PairTable, body_weights: np.ndarray, improved: bool
+) -> tuple[str, ...]:
+    """What each camera's pose rests on, where that is less than the others'."""
+    linked = {master}
+    while True:
+        more = {
+            int(c) for pair in pairs.pairs if linked & {int(i) for i in pair} for c in pair
+        } - linked
+        if not more:
+            break
+        linked |= more
+    notes = []
+    for c in range(len(rig)):
+        if c in linked or len(rig) == 1:
+            notes.append("")
+        elif improved and len(body_weights) and (body_weights[:, c] > 0).sum() >= MIN_BODY_POINTS:
+            notes.append("shares no surface with the others: its pose rests on the keypoints")
+        else:
+            notes.append("shares no surface and no keypoints with the others: its pose is as given")
+    return tuple(notes)
 
 
 def background_surfaces(rig: Rig, backgrounds: list[Background | None]) -> dict[int, Surface]:

@@ -8,8 +8,7 @@ import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
 
-NORMAL_STEP_PX = 4  # half the base line of a normal, at the full depth resolution
-REFERENCE_WIDTH = 640
+NORMAL_STEP_RAD = 0.008  # half the base line of a normal: 4 px of the unbinned depth camera
 MAX_KINK_M_PER_M = 0.008  # a pixel this far off its neighbours' middle, per depth, is an edge
 MIN_COSINE = 0.26  # surfaces seen at a grazing angle of more than 75 degrees are left out
 
@@ -17,18 +16,20 @@ MIN_COSINE = 0.26  # surfaces seen at a grazing angle of more than 75 degrees ar
 @dataclass(frozen=True, eq=False)
 class Surface:
     """``points`` (N, 3) metres, ``normals`` (N, 3) unit, towards the camera, ``rays`` (N, 3) what a
-    point moves by for one metre of depth: all in one camera's depth frame, float64."""
+    point moves by for one metre of depth: all in one camera's depth frame, float64. ``speed``
+    (N,) m/s along the normal, 0 of what stands still."""
 
     points: np.ndarray
     normals: np.ndarray
     rays: np.ndarray
+    speed: np.ndarray
 
     def __len__(self) -> int:
         return len(self.points)
 
     def subset(self, rows: np.ndarray) -> Surface:
         """The rows chosen."""
-        return Surface(self.points[rows], self.normals[rows], self.rays[rows])
+        return Surface(self.points[rows], self.normals[rows], self.rays[rows], self.speed[rows])
 
 
 def surface_of(
@@ -36,20 +37,22 @@ def surface_of(
     lens: Intrinsics,
     *,
     keep: np.ndarray | None = None,
+    window: tuple[slice, slice] = (slice(None), slice(None)),
     cell_m: float,
     max_depth_m: float,
 ) -> Surface:
     """Thin a depth image (H, W) uint16 mm to one mean point and normal a cell of ``cell_m``.
 
-    ``keep`` (H, W) bool says which pixels take part. Edges, grazing views and what is farther than
-    ``max_depth_m`` are left out.
+    ``keep`` (H, W) bool says which pixels take part, ``window`` (rows, columns) which part of the
+    image is looked at. Edges, grazing views and what is farther than ``max_depth_m`` are left out.
     """
+    depth, table = depth[window], lens.rays[window]
     usable = (depth > 0) & (depth <= max_depth_m * 1000)
     if keep is not None:
-        usable &= keep
+        usable &= keep[window]
     z = depth.astype(np.float32) * np.float32(1e-3)
-    grid = np.dstack([lens.rays * z[..., None], z])
-    step = max(1, round(NORMAL_STEP_PX * lens.width / REFERENCE_WIDTH))
+    grid = np.dstack([table * z[..., None], z])
+    step = max(1, round(NORMAL_STEP_RAD * lens.fx))
     middle = np.s_[step:-step, step:-step]
     left, right = np.s_[step:-step, : -2 * step], np.s_[step:-step, 2 * step :]
     up, down = np.s_[: -2 * step, step:-step], np.s_[2 * step :, step:-step]
@@ -67,8 +70,9 @@ def surface_of(
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
     good = np.isfinite(points).all(1) & (facing >= MIN_COSINE)
-    rays = np.column_stack([lens.rays[row, column], np.ones(len(row))])
-    return thinned(Surface(points[good], normals[good], rays[good]), cell_m)
+    along_z = np.column_stack([table[row, column], np.ones(len(row))])
+    still = np.zeros(np.count_nonzero(good))
+    return thinned(Surface(points[good], normals[good], along_z[good], still), cell_m)
 
 
 def thinned(surface: Surface, cell_m: float) -> Surface:
@@ -87,4 +91,5 @@ def thinned(surface: Surface, cell_m: float) -> Surface:
     length = np.linalg.norm(normals, axis=1)
     whole = length > 0.8  # a cell over an edge has no one normal
     normals = normals[whole] / length[whole, None]
-    return Surface(mean(surface.points)[whole], normals, mean(surface.rays)[whole])
+    speed = np.bincount(inverse, surface.speed, len(counts)) / counts
+    return Surface(mean(surface.points)[whole], normals, mean(surface.rays)[whole], speed[whole])

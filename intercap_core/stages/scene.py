@@ -1,4 +1,4 @@
-"""Stage ``scene``: refined camera poses, the static background and the floor."""
+"""Stage ``scene``: refined camera poses and times, the static background and the floor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ from intercap_core.scene.extrinsics import (
     refine,
 )
 from intercap_core.scene.ground import Ground, annotated_ground, fit_ground, zup_from_master
-from intercap_core.scene.registration import PairResiduals
+from intercap_core.scene.keypoint_timing import keypoint_offsets
+from intercap_core.scene.moving import moving_surfaces
+from intercap_core.scene.slips import Slips, find_slips
+from intercap_core.scene.subject_views import SubjectViews, subject_views
 from intercap_core.scene.surface import Surface
 from intercap_core.schemas import SCENE
 
@@ -36,9 +39,9 @@ def run(
 ) -> None:
     """Write the scene artefact of one sequence.
 
-    ``floor`` are annotated floor points, master frame, metres, which override the fit. Slips and
-    time offsets are written as zeros: nothing here estimates them. Raises UserError where the
-    recording has no image at all, or the annotated points give no plane.
+    ``floor`` are annotated floor points, master frame, metres, which override the fit. Raises
+    UserError where the recording has no image at all, the two artefacts are of different
+    recordings, or the annotated points give no plane.
     """
     with Frames.open(frames) as source:
         if not source.available.any():
@@ -46,26 +49,43 @@ def run(
                 f"{frames}: sequence {source.sequence} has no image of any camera; check its "
                 "recordings and the dropped frames of its annotation, then re-run stage 'frames'"
             )
-        backgrounds = [background_of(source, c) for c in range(len(source.rig))]
-        surfaces = background_surfaces(source.rig, backgrounds)
-        found = _refined(source, detections, surfaces, settings)
-        rig = source.rig.moved(found.poses)
-        ground = _ground(source, rig, surfaces, found.bias, settings, floor)
-        _write(output, source, rig, backgrounds, found, ground, settings)
+        people = Detections.load(detections)
+        if people.camera_names != source.rig.names or people.num_sets != source.num_sets:
+            raise UserError(
+                f"{detections}: has {people.num_sets} frame sets of cameras "
+                f"{', '.join(people.camera_names)}, expected {source.num_sets} of "
+                f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
+            )
+        rig, master = source.rig, source.rig.names.index(source.master)
+        subject = subject_views(people, rig, source.time_s)
+        found = find_slips(subject.keypoints, rig, source.time_s, source.fps, master=master)
+        image_of = images_of_moments(found.slip, source.available)
+        timing = keypoint_offsets(subject.keypoints, found.slip, rig, source.time_s, master=master)
+        subject = subject.showing(image_of, rig)
+        backgrounds = _backgrounds(source, subject, found.slip)
+        surfaces = background_surfaces(rig, backgrounds)
+        refined = refine(
+            rig,
+            master,
+            surfaces,
+            moving_surfaces(source, image_of, backgrounds),
+            subject,
+            source.time_s,
+            timing,
+            free_poses=settings.refine_extrinsics,
+        )
+        rig = rig.moved(refined.poses)
+        ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
+        _write(output, source, rig, backgrounds, found, image_of, refined, ground, settings)
 
 
-def _refined(
-    source: Frames,
-    detections: Path,
-    surfaces: dict[int, Surface],
-    settings: SceneSettings,
-) -> Refinement:
-    rig = source.rig
-    if settings.refine_extrinsics and len(rig) > 1:
-        found = Detections.load(detections)
-        return refine(source, found, surfaces, rig.names.index(source.master))
-    none = PairResiduals(np.zeros((0, 2), np.int32), np.zeros(0, np.int64), np.zeros(0))
-    return Refinement(rig.master_from_colour, np.zeros(len(rig)), False, none, none)
+def _backgrounds(
+    source: Frames, subject: SubjectViews, slip: np.ndarray
+) -> list[Background | None]:
+    """Each camera's background; the person is sought where it was when the image was taken."""
+    last = source.num_sets - 1
+    moment = np.clip(np.arange(source.num_sets)[:, None] - slip, 0, last)
+    return [background_of(source, c, subject.joints[moment[:, c]]) for c in range(len(source.rig))]
 
 
 def _ground(
@@ -106,11 +126,13 @@ def _write(
     source: Frames,
     rig: Rig,
     backgrounds: list[Background | None],
-    found: Refinement,
+    slips: Slips,
+    image_of: np.ndarray,
+    refined: Refinement,
     ground: Ground,
     settings: SceneSettings,
 ) -> None:
-    pairs, before, after = _common_pairs(found.before, found.after)
+    pairs = refined.pairs
     with artefacts.write(
         output,
         SCENE,
@@ -118,7 +140,9 @@ def _write(
         sequence=source.sequence,
         master=source.master,
         fps=source.fps,
-        extrinsics_refined=found.improved,
+        extrinsics_refined=refined.improved,
+        extrinsics_converged=refined.converged,
+        verdict=refined.verdict,
         ground_found=ground.found,
         ground_source=ground.source,
         ground_rms=ground.rms,
@@ -130,16 +154,19 @@ def _write(
         writer.put("times", source.time_s)
         writer.put("master_from_colour", rig.master_from_colour)
         writer.put("master_from_colour_start", source.rig.master_from_colour)
-        writer.put("depth_bias", found.bias)
-        writer.put("pairs", pairs)
-        writer.put("pair_points", before.count)
-        writer.put("pair_residual_before", before.median)
-        writer.put("pair_residual_after", after.median)
-        writer.put("time_offset", np.zeros(len(rig)))
-        writer.put("time_offset_sigma", np.full(len(rig), np.nan))
-        slip = np.zeros((source.num_sets, len(rig)), np.int32)
-        writer.put("slip", slip)
-        writer.put("image_of", images_of_moments(slip, source.available))
+        writer.put("depth_bias", refined.bias)
+        writer.put("note", _notes(source, refined, slips))
+        writer.put("pairs", pairs.pairs)
+        for k, kind in enumerate(("pair", "pair_moving")):
+            residual = "pair_residual" if k == 0 else kind
+            writer.put(f"{kind}_points", pairs.points[:, k])
+            writer.put(f"{residual}_before", pairs.before[:, k])
+            writer.put(f"{residual}_after", pairs.after[:, k])
+        writer.put("pair_weak", pairs.weak)
+        writer.put("time_offset", refined.offset)
+        writer.put("time_offset_sigma", refined.offset_sigma)
+        writer.put("slip", slips.slip)
+        writer.put("image_of", image_of)
         writer.put("ground_point", ground.point)
         writer.put("ground_normal", ground.normal)
         writer.put("zup_from_master", zup_from_master(ground, rig, source.gravity))
@@ -148,16 +175,15 @@ def _write(
                 writer.put(f"cameras/{camera.name}/background", background.depth)
 
 
-def _common_pairs(
-    before: PairResiduals, after: PairResiduals
-) -> tuple[np.ndarray, PairResiduals, PairResiduals]:
-    """Keep the pairs that overlap both before and after."""
-    kept = sorted({tuple(p) for p in before.pairs} & {tuple(p) for p in after.pairs})
-    chosen = []
-    for residuals in (before, after):
-        place = {tuple(p): i for i, p in enumerate(residuals.pairs)}
-        rows = np.array([place[p] for p in kept], int)
-        chosen.append(
-            PairResiduals(residuals.pairs[rows], residuals.count[rows], residuals.median[rows])
+def _notes(source: Frames, refined: Refinement, slips: Slips) -> list[str]:
+    """What each camera's pose and time rest on, and where it slips."""
+    notes = [[note] if note else [] for note in refined.notes]
+    for interval in slips.intervals:
+        frames = "1 frame" if interval.slip == 1 else f"{interval.slip} frames"
+        notes[interval.camera].append(
+            f"its images are {frames} late in sets {interval.first} to {interval.last}"
         )
-    return chosen[0].pairs, chosen[0], chosen[1]
+    for c, present in enumerate(source.present):
+        if present and np.isnan(refined.offset_sigma[c]):
+            notes[c].append("its time offset could not be told")
+    return ["; ".join(lines) for lines in notes]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,7 +20,7 @@ from synthetic_people import seen_by, walking
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.detection.triangulation import triangulate
 from intercap_core.scene.body_constraints import BodyConstraint, BodyViews
-from intercap_core.scene.registration import Estimate, Registration
+from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
 from intercap_core.scene.surface import surface_of
 
 TRUTH, UP = ring()
@@ -36,8 +38,12 @@ def surfaces(seed: int, bias_m: float = 0.0, boxes=FURNITURE, walls=3.6):
     return found, bias
 
 
-def start_of(rig) -> Estimate:
-    return Estimate(rig.master_from_colour.copy(), np.zeros(len(rig)))
+def registration_of(rig, found) -> Registration:
+    return Registration(rig, [Layer(found, STATIC)], 0)
+
+
+def none() -> np.ndarray:
+    return np.zeros(len(TRUTH))
 
 
 def views_of(seed: int, noise_px: float) -> BodyViews:
@@ -49,7 +55,7 @@ def views_of(seed: int, noise_px: float) -> BodyViews:
     pixels = np.swapaxes(keypoints[..., :2], 1, 2).reshape(-1, 6, 2)
     pixels = pixels + rng.normal(0, noise_px, pixels.shape)
     points = apply(invert(UP), body.reshape(-1, 3))
-    return BodyViews(pixels, np.ones(pixels.shape[:2]), points)
+    return BodyViews(pixels, np.ones(pixels.shape[:2]), points, np.zeros(points.shape))
 
 
 def test_surfaces_lie_on_the_room_and_face_the_camera():
@@ -67,22 +73,23 @@ def test_surfaces_lie_on_the_room_and_face_the_camera():
 def test_a_furnished_room_brings_perturbed_cameras_back(seed):
     found, _ = surfaces(seed, bias_m=0.002)
     start = perturbed(TRUTH, np.random.default_rng(seed), 0.01, 0.3)
-    registration = Registration(start, found, 0)
-    refined = registration.solve(start_of(start), [])
+    registration = registration_of(start, found)
+    refined = registration.solve(Estimate.start(start)).estimate
     before = extrinsics_error(start, TRUTH, MIDDLE)
     after = extrinsics_error(start.moved(refined.poses), TRUTH, MIDDLE)
     assert after[1:].mean() < 0.006 < 0.01 < before[1:].mean()
     assert after.max() < 0.012
     np.testing.assert_array_equal(refined.poses[0], start.master_from_colour[0])
-    residuals = registration.residuals(start_of(start)), registration.residuals(refined)
+    residuals = [registration.residuals(at, STATIC) for at in (Estimate.start(start), refined)]
     assert residuals[1].median.mean() < 0.5 * residuals[0].median.mean()
 
 
 def test_depth_bias_of_one_camera_is_found():
     found, _ = surfaces(0)
     biased = found[2]
-    shifted = type(biased)(biased.points + 0.006 * biased.rays, biased.normals, biased.rays)
-    refined = Registration(TRUTH, {**found, 2: shifted}, 0).solve(start_of(TRUTH), [])
+    shifted = replace(biased, points=biased.points + 0.006 * biased.rays)
+    registration = registration_of(TRUTH, {**found, 2: shifted})
+    refined = registration.solve(Estimate.start(TRUTH)).estimate
     others = np.delete(refined.bias, 2)
     assert refined.bias[2] - others.mean() > 0.003
     error = extrinsics_error(TRUTH.moved(refined.poses), TRUTH, MIDDLE)
@@ -92,10 +99,10 @@ def test_depth_bias_of_one_camera_is_found():
 def test_the_body_ties_down_what_a_bare_floor_leaves_free():
     found, _ = surfaces(1, boxes=np.zeros((0, 2, 3)), walls=None)
     start = perturbed(TRUTH, np.random.default_rng(3), 0.01, 0.3)
-    registration = Registration(start, found, 0)
-    alone = registration.solve(start_of(start), [])
+    registration = registration_of(start, found)
+    alone = registration.solve(Estimate.start(start)).estimate
     body = BodyConstraint(views_of(0, 3.0), TRUTH)
-    together = registration.solve(start_of(start), [body])
+    together = registration.solve(Estimate.start(start), [body]).estimate
     errors = [
         extrinsics_error(start.moved(e.poses), TRUTH, MIDDLE)[1:].mean() for e in (alone, together)
     ]
@@ -106,8 +113,8 @@ def test_body_equations_are_the_derivatives_of_the_reprojection():
     views = views_of(1, 2.0)
     poses = perturbed(TRUTH, np.random.default_rng(0), 0.005, 0.2).master_from_colour
     body = BodyConstraint(views, TRUTH)
-    body(poses)
-    residual, by_point, _, by_pose = body._linearised(poses)
+    body(poses, none())
+    residual, by_point, _, by_pose = body._linearised(poses, none())
     step = 1e-6
     for axis in range(6):
         moved = poses.copy()
@@ -116,19 +123,20 @@ def test_body_equations_are_the_derivatives_of_the_reprojection():
             moved[:, :3, :3] = turn @ moved[:, :3, :3]
         else:
             moved[:, axis - 3, 3] += step
-        numeric = (body._linearised(moved)[0] - residual) / step
+        numeric = (body._linearised(moved, none())[0] - residual) / step
         np.testing.assert_allclose(by_pose[..., axis], numeric, rtol=1e-3, atol=0.05)
     body._points = body._points + np.array([step, 0, 0])
-    numeric = (body._linearised(poses)[0] - residual) / step
+    numeric = (body._linearised(poses, none())[0] - residual) / step
     np.testing.assert_allclose(by_point[..., 0], numeric, rtol=1e-3, atol=0.05)
 
 
 def test_moving_all_cameras_together_costs_the_body_nothing():
     views = views_of(2, 0.0)
-    matrix, gradient = BodyConstraint(views, TRUTH)(TRUTH.master_from_colour)
+    matrix, gradient = BodyConstraint(views, TRUTH)(TRUTH.master_from_colour, none())
     together = np.zeros((6, 6, 3))
     together[:, 3:] = np.eye(3)  # every camera translated alike
     motion = together.reshape(36, 3)
+    matrix = matrix.reshape(36, 36)
     np.testing.assert_allclose(matrix @ motion, 0, atol=1e-3 * np.abs(matrix).max())
     assert np.abs(gradient).max() < 1e-3 * np.abs(matrix).max() * 1e-3
 
@@ -136,7 +144,7 @@ def test_moving_all_cameras_together_costs_the_body_nothing():
 def test_triangulated_points_agree_with_the_constraints_own():
     views = views_of(3, 1.0)
     body = BodyConstraint(views, TRUTH)
-    body(TRUTH.master_from_colour)
+    body(TRUTH.master_from_colour, none())
     found = triangulate(views.pixels, views.weights, TRUTH, max_error_px=20)
     np.testing.assert_allclose(body._points, found.points, atol=0.002)
 
@@ -144,7 +152,16 @@ def test_triangulated_points_agree_with_the_constraints_own():
 def test_cameras_that_share_nothing_stay_where_they_were():
     found, _ = surfaces(0)
     start = perturbed(TRUTH, np.random.default_rng(1), 0.01, 0.3)
-    only = Registration(start, {3: found[3]}, 0)
-    refined = only.solve(start_of(start), [])
+    only = registration_of(start, {3: found[3]})
+    refined = only.solve(Estimate.start(start)).estimate
     np.testing.assert_array_equal(refined.poses, start.master_from_colour)
-    assert len(only.residuals(refined).pairs) == 0
+    assert len(only.residuals(refined, STATIC).pairs) == 0
+
+
+def test_poses_can_be_held_while_bias_is_found():
+    found, bias = surfaces(0, bias_m=0.004)
+    held = registration_of(TRUTH, found).solve(Estimate.start(TRUTH), free_poses=False)
+    np.testing.assert_array_equal(held.estimate.poses, TRUTH.master_from_colour)
+    assert held.last_step_m == 0
+    left = held.estimate.bias - bias
+    assert np.std(left) < 0.5 * np.std(bias)

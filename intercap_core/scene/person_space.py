@@ -1,0 +1,56 @@
+"""Which pixels of a depth image a person may be in, from the triangulated keypoints alone.
+
+Somebody who stands in one place for a whole recording is as steady as furniture: only the
+keypoints tell.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.transforms import apply
+
+REDUCTION = 8  # the mask is worked out on every eighth pixel
+# Bones and how far from them skin, clothing and hair reach, metres; hands reach past the wrist.
+BONES = (
+    ("neck", "mid_hip", 0.26), ("right_shoulder", "right_hip", 0.20),
+    ("left_shoulder", "left_hip", 0.20), ("nose", "neck", 0.22), ("left_ear", "right_ear", 0.20),
+    ("right_hip", "right_knee", 0.18), ("left_hip", "left_knee", 0.18),
+    ("right_knee", "right_ankle", 0.15), ("left_knee", "left_ankle", 0.15),
+    ("right_ankle", "right_big_toe", 0.14), ("left_ankle", "left_big_toe", 0.14),
+    ("right_ankle", "right_heel", 0.14), ("left_ankle", "left_heel", 0.14),
+    ("right_shoulder", "right_elbow", 0.16), ("left_shoulder", "left_elbow", 0.16),
+    ("right_elbow", "right_wrist", 0.14), ("left_elbow", "left_wrist", 0.14),
+    ("right_wrist", "right_wrist", 0.24), ("left_wrist", "left_wrist", 0.24),
+)  # fmt: skip
+_FIRST = np.array([KEYPOINT_NAMES.index(a) for a, _, _ in BONES])
+_SECOND = np.array([KEYPOINT_NAMES.index(b) for _, b, _ in BONES])
+_REACH = np.array([reach for _, _, reach in BONES])
+
+
+def person_pixels(
+    depth: np.ndarray, lens: Intrinsics, depth_from_master: np.ndarray, joints: np.ndarray
+) -> np.ndarray:
+    """Tell for a depth image (H, W) uint16 mm which pixels (H, W) lie within a bone's reach.
+
+    ``joints`` (K, 3): the keypoints of the 135-point order, at least the body's 25, master frame,
+    metres, NaN = not known.
+    """
+    ends = [apply(depth_from_master, joints[index]) for index in (_FIRST, _SECOND)]
+    known = np.isfinite(ends[0]).all(1) & np.isfinite(ends[1]).all(1)
+    result = np.zeros(depth.shape, bool)
+    if not known.any():
+        return result
+    start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
+    small = np.s_[REDUCTION // 2 :: REDUCTION, REDUCTION // 2 :: REDUCTION]
+    z = depth[small].astype(np.float64) * 1e-3
+    points = np.dstack([lens.rays[small] * z[..., None], z]).reshape(-1, 1, 3)
+    length = np.maximum((along**2).sum(1), 1e-9)
+    share = np.clip(((points - start) * along).sum(-1) / length, 0, 1)
+    away = ((points - start - share[..., None] * along) ** 2).sum(-1)
+    near = ((away < reach**2).any(1) & (z.ravel() > 0)).reshape(z.shape)
+    size = (depth.shape[1], depth.shape[0])
+    return cv2.resize(near.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
