@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.detection.read import Detections
-from intercap_core.detection.sides import BODY_POINTS, swapped
-from intercap_core.detection.triangulation import midpoints, pixel_scale, reproject
+from intercap_core.detection.sides import BODY_POINTS, PARTNER
+from intercap_core.detection.triangulation import midpoints, pixel_scale, reproject, view_pairs
 
 NOBODY = -1
 MIN_COMMON_POINTS = 5  # fewer body points do not tell two people apart
@@ -31,6 +30,8 @@ CENTRE_RANGE_M = 1.5  # support counts half as much this far from the ring's mid
 MAX_GAP_S = 2.0  # tracks are joined over at most this long
 LIFTED_SUPPORT = 0.5  # of a point that one view sees, with depth; two views give about two
 
+_MIRRORED = PARTNER[BODY_POINTS]  # the body's points with left and right exchanged
+_Proposal = tuple[float, np.ndarray, tuple[int, int], tuple[int, int]]
 Lift = Callable[[int, int, np.ndarray], np.ndarray]
 """Points (P, 25, 3), master frame, NaN = not known, of the people (P, 25, 3) that view c sees in
 set t, by its depth alone: called with t, c and the people."""
@@ -103,8 +104,10 @@ def _groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) ->
         directions = rig[c].colour.unproject(found[..., :2]) if len(found) else np.zeros((0, 25, 3))
         rays.append(directions @ rig[c].master_from_colour[:3, :3].T)
         seen.append(found[..., 2] >= min_confidence)
+    pairs, rest = view_pairs(rig)
+    proposals = _pair_proposals(pairs, rays, seen, rig) or _pair_proposals(rest, rays, seen, rig)
     grown: list[Group] = []
-    for _, points, first, second in sorted(_pair_proposals(rays, seen, rig), key=lambda p: p[0]):
+    for _, points, first, second in sorted(proposals, key=lambda p: p[0]):
         if any(
             g.members[first[0]] == first[1] and g.members[second[0]] == second[1] for g in grown
         ):
@@ -137,37 +140,35 @@ def _lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[Group]:
 
 
 def _pair_proposals(
-    rays: list[np.ndarray], seen: list[np.ndarray], rig: Rig
-) -> list[tuple[float, np.ndarray, tuple[int, int], tuple[int, int]]]:
+    pairs: list[tuple[int, int]], rays: list[np.ndarray], seen: list[np.ndarray], rig: Rig
+) -> list[_Proposal]:
     """Two views' people whose rays meet: the median gap, metres, points (25, 3) and (view, person)
     of both."""
     centres = rig.master_from_colour[:, :3, 3]
     result = []
-    for a, b in combinations(range(len(rig)), 2):
-        for i in range(len(rays[a])):
-            for j in range(len(rays[b])):
-                # A detector may take a back for a front: also try one view mirrored.
-                for mirrored in (False, True):
-                    other, other_seen = rays[b][j], seen[b][j]
-                    if mirrored:
-                        other, other_seen = _mirror(other), _mirror(other_seen[:, None])[:, 0]
-                    points, gap = midpoints(rays[a][i], other, centres[a], centres[b])
-                    common = seen[a][i] & other_seen & np.isfinite(gap)
-                    if common.sum() < MIN_COMMON_POINTS:
-                        continue
-                    middle_gap = float(np.median(gap[common]))
-                    if middle_gap < SAME_PERSON_GAP_M:
-                        points[~common] = np.nan
-                        result.append((middle_gap, points, (a, i), (b, j)))
-                        break
+    for a, b in pairs:
+        if not len(rays[a]) or not len(rays[b]):
+            continue
+        # A detector may take a back for a front: also try one view mirrored.
+        other = np.stack([rays[b], rays[b][:, _MIRRORED]])
+        other_seen = np.stack([seen[b], seen[b][:, _MIRRORED]])
+        points, gap = midpoints(rays[a][:, None], other[:, None], centres[a], centres[b])
+        common = seen[a][:, None] & other_seen[:, None] & np.isfinite(gap)  # (2, Pa, Pb, 25)
+        enough = common.sum(-1) >= MIN_COMMON_POINTS
+        for i, j in np.argwhere(enough.any(0)):
+            for side in np.flatnonzero(enough[:, i, j]):
+                at = (side, i, j)
+                middle_gap = float(np.median(gap[at][common[at]]))
+                if middle_gap < SAME_PERSON_GAP_M:
+                    known = np.where(common[at][:, None], points[at], np.nan)
+                    result.append((middle_gap, known, (a, int(i)), (b, int(j))))
+                    break
     return result
 
 
 def _mirror(body: np.ndarray) -> np.ndarray:
     """Exchange left and right of body points (25, n)."""
-    whole = np.zeros((135, body.shape[1]), body.dtype)
-    whole[BODY_POINTS] = body
-    return swapped(whole, BODY_POINTS)[BODY_POINTS]
+    return body[_MIRRORED]
 
 
 def _grow(

@@ -18,6 +18,8 @@ from intercap_core.camera.transforms import apply
 MIN_PARALLAX_DEG = 4.0  # two rays closer in direction than this do not give a depth
 REFINE_STEPS = 4
 HUBER_PX_AT_1080P = 4.0  # about what good 2D detectors scatter by
+PARTNERS = 5  # of each camera, whose rays are crossed with its own before those of others
+BEST_PARALLAX_DEG = 70.0
 _BLOCK = 20_000  # points at once: bounds memory at some 100 MB with six views
 
 
@@ -77,6 +79,26 @@ def midpoints(
     point = np.where(good[..., None], (on_first + on_second) / 2, np.nan)
     gap = np.where(good, np.linalg.norm(on_first - on_second, axis=-1), np.nan)
     return point, gap
+
+
+def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Pairs of cameras (a, b), a < b: those to try first, and the rest.
+
+    First come each camera's :data:`PARTNERS` whose viewing directions differ from its own most
+    nearly by :data:`BEST_PARALLAX_DEG`: up to six cameras these are all pairs, beyond their number
+    grows with the cameras', not with its square.
+    """
+    axes = rig.master_from_colour[:, :3, 2]
+    angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    first = {
+        (min(a, int(b)), max(a, int(b)))
+        for a, row in enumerate(np.abs(angle - BEST_PARALLAX_DEG))
+        for b in np.argsort(np.where(np.arange(len(rig)) == a, np.inf, row), kind="stable")[
+            : min(PARTNERS, len(rig) - 1)
+        ]
+    }
+    every = list(combinations(range(len(rig)), 2))
+    return [p for p in every if p in first], [p for p in every if p not in first]
 
 
 def reproject(points: np.ndarray, rig: Rig) -> np.ndarray:
@@ -151,15 +173,17 @@ def _best_proposal(
     centres = rig.master_from_colour[:, :3, 3]
     best = np.full((len(pixels), 3), np.nan)
     best_cost = np.full(len(pixels), np.inf)
-    for a, b in combinations(range(len(rig)), 2):
-        rows = np.flatnonzero((weights[:, a] > 0) & (weights[:, b] > 0))
-        if not len(rows):
-            continue
-        proposal, _ = midpoints(rays[a, rows], rays[b, rows], centres[a], centres[b])
-        error = _errors(proposal, pixels[rows], weights[rows], rig)
-        cost = (weights[rows] * np.minimum(error / limit, 1.0) ** 2).sum(1)
-        better = np.isfinite(proposal[:, 0]) & (cost < best_cost[rows])
-        best[rows[better]], best_cost[rows[better]] = proposal[better], cost[better]
+    for pairs in view_pairs(rig):
+        rest = np.isinf(best_cost)
+        for a, b in pairs:
+            rows = np.flatnonzero(rest & (weights[:, a] > 0) & (weights[:, b] > 0))
+            if not len(rows):
+                continue
+            proposal, _ = midpoints(rays[a, rows], rays[b, rows], centres[a], centres[b])
+            error = _errors(proposal, pixels[rows], weights[rows], rig)
+            cost = (weights[rows] * np.minimum(error / limit, 1.0) ** 2).sum(1)
+            better = np.isfinite(proposal[:, 0]) & (cost < best_cost[rows])
+            best[rows[better]], best_cost[rows[better]] = proposal[better], cost[better]
     return best
 
 

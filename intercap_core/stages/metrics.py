@@ -150,7 +150,7 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
     reasons = merge_reasons(
         [
             (unseen, "no images"),
-            (missing & ~unseen, "person seen in fewer than two views"),
+            (missing & ~unseen, "person seen in fewer than two views, without depth"),
             (lost & alone, "object lost"),
             (disagree & ~lost & alone, "object passes disagree"),
             (failed & alone, "body fit failed"),

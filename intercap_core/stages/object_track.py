@@ -65,7 +65,8 @@ class _Recording:
                 for candidate in self._detections.candidates(t, c)
             ]
             depth = self._frames.depth(t, c)
-            found.append(View.build(geometry, depth, self._masks[t][c], candidates))
+            detected = bool(self._detections.candidates_found[t, c])
+            found.append(View.build(geometry, depth, self._masks[t][c], candidates, detected))
         return found
 
     def labels(self) -> list[list[list[str]]]:

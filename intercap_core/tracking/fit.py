@@ -48,7 +48,7 @@ class Fit:
         """Agreement over all views, 0 to 1, each view by the pixels it could show.
 
         A view without a candidate counts with overlap 0: a pose that no detector supports is not
-        as good as one that six do.
+        as good as one that six do. Where no detector has looked, depth alone counts.
         """
         total, weight = 0.0, 0.0
         for view in self.views:
@@ -56,6 +56,10 @@ class Fit:
                 continue
             overlap = 0.0 if np.isnan(view.overlap) else view.overlap
             agreement = overlap if np.isnan(view.depth_agreement) else view.depth_agreement
+            if not view.detected:
+                if np.isnan(view.depth_agreement):
+                    continue
+                overlap = agreement
             total += view.visible_px * 0.5 * (overlap + agreement)
             weight += view.visible_px
         return total / weight if weight else 0.0

@@ -34,7 +34,8 @@ TURN_FRAMES, TURN_RIVALS = 8, 5  # frames and turned tracks that are compared by
 TURN_GAIN = 0.003  # of the mean score, for which the track is turned
 LOST_SCORE = 0.20
 DOUBT = 0.55  # of the usual score: below, a search may find better
-RECOVERY_CONFIDENCE = 0.40
+RECOVERY_CONFIDENCE = 0.40  # with a ring of cameras
+RING = 6
 RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
 SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
 AGREE_M, AGREE_DEG = 0.02, 10.0
@@ -319,7 +320,9 @@ class Tracker:
         if not found:
             return None
         best = max(found[:3], key=lambda fit: fit.confidence - _leap(self._mesh, last, fit.pose))
-        needed = max(RECOVERY_CONFIDENCE, 1.15 * result.fit.confidence)
+        # few cameras can never be as sure as a ring
+        surest = min(1.0, (1 - 0.5 ** len(self._views(t))) / (1 - 0.5**RING))
+        needed = max(RECOVERY_CONFIDENCE * surest, 1.15 * result.fit.confidence)
         if best.confidence < needed or self._result(best).lost:
             return None
         return FrameResult(best, False)

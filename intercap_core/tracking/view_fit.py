@@ -36,7 +36,8 @@ class ViewReport:
 
     ``overlap`` IoU of candidate and visible render (NaN: no candidate); ``depth_residual_m`` and
     ``contour_residual_px`` medians (NaN: none); ``visible_px`` rendered pixels that nothing
-    hides; ``depth_agreement`` how close to the render they are measured, 0 to 1 (NaN: no depth).
+    hides; ``depth_agreement`` how close to the render they are measured, 0 to 1 (NaN: no depth);
+    ``detected``: candidates are known for this image, so that none says something.
     """
 
     candidate: int
@@ -45,6 +46,7 @@ class ViewReport:
     contour_residual_px: float
     visible_px: int
     depth_agreement: float
+    detected: bool = True
 
 
 @dataclass(frozen=True)
@@ -339,7 +341,9 @@ class ViewFit:
             if hidden:
                 visible = 0
         number = self._candidate.index if self._candidate is not None else -1
-        return ViewReport(number, overlap, depth_residual, contour, visible, agreement)
+        return ViewReport(
+            number, overlap, depth_residual, contour, visible, agreement, self._view.detected
+        )
 
 
 def draw_silhouette(mesh: ObjectMesh, view: View, pose: np.ndarray) -> Rendering:
@@ -417,7 +421,8 @@ def quick_report(
         if hidden:
             visible = 0
     number = candidate.index if candidate else -1
-    return ViewReport(number, overlap, float("nan"), float("nan"), visible, agreement)
+    nothing = float("nan")
+    return ViewReport(number, overlap, nothing, nothing, visible, agreement, view.detected)
 
 
 def depth_agreement(

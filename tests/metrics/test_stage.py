@@ -123,7 +123,7 @@ def test_the_floor_of_cloud_distances_is_below_the_fit(measured: dict[str, np.nd
 
 def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
     assert measured["flag_reason"].tolist() == [
-        "object lost", "", "", "", "person seen in fewer than two views",
+        "object lost", "", "", "", "person seen in fewer than two views, without depth",
     ]  # fmt: skip
     assert measured["flagged"].tolist() == [True, False, False, False, True]
 
