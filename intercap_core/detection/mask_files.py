@@ -59,10 +59,12 @@ def read_mask(file: MaskFile, size: tuple[int, int]) -> Instance | None:
 def release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
     """Person masks of one camera as the InterCap release's tools keep them, by image number.
 
-    ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png`` with 0 for the person and 255
-    for the background; None where there is no such folder.
+    ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png``, without ``_<n>`` for camera 1,
+    with 0 for the person and 255 for the background; None where there is no such folder.
     """
-    for name in (camera, f"BodyIndexColor_{camera[1:]}"):
+    number = camera[1:]
+    names = [camera, f"BodyIndexColor_{number}", *(["BodyIndexColor"] if number == "1" else [])]
+    for name in names:
         folder = candidates / name
         if folder.is_dir():
             matches = ((path, _NUMBERED.fullmatch(path.name)) for path in sorted(folder.iterdir()))

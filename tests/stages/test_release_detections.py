@@ -155,7 +155,8 @@ def test_the_rows_own_detections_go_before_behaves(behave, tmp_path):
     assert len(read.people(0, 0)) == 1
 
 
-def test_release_files_belong_to_the_number_in_the_images_name(tmp_path):
+@pytest.mark.parametrize("first_folder", ["k1", "BodyIndexColor", "BodyIndexColor_1"])
+def test_release_files_belong_to_the_number_in_the_images_name(tmp_path, first_folder):
     recordings, calibration = write_intercap(
         tmp_path, rig_of(2), numbers=[0, 2, 3], colour=distinct_jpeg, depth=no_depth
     )
@@ -165,7 +166,7 @@ def test_release_files_belong_to_the_number_in_the_images_name(tmp_path):
         path = keypoints / "k1" / f"{number:05d}_keypoints.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"people": people}))
-    for folder in ("k1", "BodyIndexColor_2"):
+    for folder in (first_folder, "BodyIndexColor_2"):
         (candidates / folder).mkdir(parents=True)
         for number in (1, 2, 3):
             mask = square(10 * number, 30, inside=0, outside=255)
