@@ -98,15 +98,16 @@ class Hand:
     def _finger(self, f: int, flexion: np.ndarray, hand: HandShape) -> np.ndarray:
         """Rotation vectors (B, 3, 3) of one finger for flexions (B, 3), degrees."""
         vectors = self._axes[f] * np.radians(flexion)[..., None]
+        bent = Rotation.from_rotvec(vectors[:, 0])
         if f < 4:
             sideways = np.cross(self.out, self.radial) * np.radians(hand.spread[f])
-            first = turn(sideways) @ turn(vectors[:, 0])
+            first = Rotation.from_rotvec(sideways) * bent
         else:
             bone = self.rest.rest[self.first + 13] - self.rest.rest[self.first + 12]
             lift = unit(np.cross(bone, self.palm)) * np.radians(hand.opposition)
             roll = unit(bone) * np.radians(0.5 * hand.opposition) * self.out[0]
-            first = turn(vectors[:, 0]) @ (turn(lift) @ turn(roll))
-        vectors[:, 0] = Rotation.from_matrix(first).as_rotvec()
+            first = bent * (Rotation.from_rotvec(lift) * Rotation.from_rotvec(roll))
+        vectors[:, 0] = first.as_rotvec()
         return vectors
 
     def local(self, hand: HandShape) -> np.ndarray:

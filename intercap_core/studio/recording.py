@@ -120,7 +120,10 @@ class Kinect:
                 files.write(Shot(t, self.device_time_us(t), jpeg, recorded_depth, inertial))
                 hidden[t] = _hidden(cast, colour_view, points[t])
                 seen[t] = int((cast.identity == OBJECT).sum())
-                whole[t] = colour_view.count(surfaces[1])
+                same = order and np.array_equal(
+                    surfaces[1].stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
+                )
+                whole[t] = whole[self.sets[order - 1]] if same else colour_view.count(surfaces[1])
                 truth = Labels(cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1))
                 found = masks.candidates(t, truth)
                 folder.add_masks(name, t, stage.fps, found, segmenter.label)

@@ -27,6 +27,7 @@ _DRIVERS = tuple(
     for side in ("left", "right")
 )
 _TIP_JOINTS = [*range(27, 40, 3), *range(42, 55, 3)]
+_PARENTS = np.array(PARENTS)
 _DUAL_QUATERNION_SHARE = 0.5
 _LARGEST_BULGE = 1.6  # times the displacement at 90 degrees
 
@@ -137,9 +138,7 @@ class Subject:
         """Half linear, half dual-quaternion blend skinning, (B,V,3)."""
         batch = len(world)
         real = Rotation.from_matrix(world.reshape(-1, 3, 3)).as_quat().reshape(batch, -1, 4)
-        for k in range(1, NUM_JOINTS):  # q and -q are one rotation: stay on the parent's side
-            flip = (real[:, k] * real[:, PARENTS[k]]).sum(-1, keepdims=True) < 0
-            real[:, k] = np.where(flip, -real[:, k], real[:, k])
+        _face_parents(real, _PARENTS)
         dual = 0.5 * _quaternion_product(offsets, real)
         out = np.empty_like(rest)
         for b in range(batch):
@@ -180,6 +179,15 @@ def _normals(vertices, faces):
             for axis in range(3):
                 normals[b, v, axis] /= length
     return normals
+
+
+@numba.njit(cache=True)
+def _face_parents(quaternions, parents):
+    """q and -q are one rotation: bring (B,55,4) to their parents' side, in place."""
+    for b in range(len(quaternions)):
+        for k in range(1, quaternions.shape[1]):
+            if (quaternions[b, k] * quaternions[b, parents[k]]).sum() < 0:
+                quaternions[b, k] *= -1
 
 
 @numba.njit(cache=True)
