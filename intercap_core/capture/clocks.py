@@ -7,6 +7,7 @@ import numpy as np
 from intercap_core.capture.synchronise import distance_to
 
 WRONG = -1
+EARLIER_IS_ENOUGH = 0.5  # of the images of the fullest stretch
 
 
 def epochs(times_us: np.ndarray) -> np.ndarray:
@@ -39,14 +40,18 @@ def epochs(times_us: np.ndarray) -> np.ndarray:
 def best_epoch(
     times_us: np.ndarray, stretch: np.ndarray, reference_us: np.ndarray, within_us: float
 ) -> int:
-    """Return the stretch with the most images near a reference time; the longest without any.
+    """Return the stretch that lies in the others' time; the longest where none does.
 
     ``stretch`` (N,) is what :func:`epochs` says of ``times_us`` (N,); ``reference_us`` (M,) are
-    increasing. Of equals the first wins.
+    increasing times of the others. A reset takes a clock out of step with them, so that of several
+    stretches among their times the earlier is right: the first one with at least half as many
+    images near a reference time as any other.
     """
     near = (distance_to(times_us, reference_us) <= within_us) & (stretch >= 0)
-    pool = stretch[near] if near.any() else stretch[stretch >= 0]
-    return int(np.argmax(np.bincount(pool)))
+    if not near.any():
+        return int(np.argmax(np.bincount(stretch[stretch >= 0])))
+    counts = np.bincount(stretch[near])
+    return int(np.argmax(counts >= counts.max() * EARLIER_IS_ENOUGH))
 
 
 def drift_us(times_us: np.ndarray, skew_us: np.ndarray) -> float:

@@ -126,7 +126,7 @@ def _straighten_clocks(views: list[View], master: int) -> None:
     straight = [view for view in present if stretches[view.name].max() == 0]
     if not straight:
         first = views[master] if views[master].present else present[0]
-        _keep_one_stretch(first, stretches[first.name], first.colour_times)
+        _keep_one_stretch(first, stretches[first.name], np.zeros(0))
         straight = [first]
         present.remove(first)
     reference = np.concatenate([view.usable_times for view in straight])

@@ -97,6 +97,7 @@ def stays(missing=(), depth=True, count=TICKS):
         (with_clock(1, 7, 500_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
         (with_clock(1, 4, 500_000), 1, "jump back 1 times: 8 images", stays(range(4, 12))),
         (with_clock(1, 7, 3_150_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
+        (with_clock(1, 5, 3_000_000), 1, "jump back 1 times: 7 images", stays(range(5, 12))),
         (with_clock(0, 7, 500_000), 0, "jump back 1 times: 5 images", stays(range(7, 12))),
         (one_wrong_time, 1, "1 images with device times out of order", stays(missing=[5])),
     ],
@@ -230,6 +231,10 @@ def test_the_stretch_in_the_others_time_wins_over_the_longer_one():
     assert best_epoch(times, stretch, np.array([-50, -8, 70]), 0.5) == 1
     assert best_epoch(times, stretch, np.array([100, 200]), 0.5) == 0
     assert best_epoch(times, stretch, np.zeros(0), 0.5) == 0
+    times = np.array([5, 6, 7, 8, 5, 6, 7, 8, 9])  # both among the others': the reset is at fault
+    assert best_epoch(times, epochs(times), np.arange(20), 0.5) == 0
+    times = np.array([7, 5, 6, 7, 8, 9])  # an image left from before the common start
+    assert best_epoch(times, epochs(times), np.arange(20), 0.5) == 1
 
 
 def test_drift_ignores_jitter_and_gaps():
