@@ -93,10 +93,10 @@ SCENE = Schema(
         "extrinsics_refined": "the refined extrinsics are better on held-out points and were kept",
         "extrinsics_converged": "the last step moved no point by a millimetre",
         "verdict": "what became of the extrinsics, in words",
-        "ground_found": "a floor was seen or annotated",
-        "ground_source": "'fitted', 'annotated' or 'none'",
+        "ground_found": "a floor was seen, annotated or stood on",
+        "ground_source": "'fitted' to depth, 'annotated', 'feet' (where the subject stands) or 'none'",
         "ground_rms": "RMS distance of the floor's inliers to the plane, metres",
-        "ground_inliers": "number of floor points that support the plane",
+        "ground_inliers": "number of floor points, or of sets with a standing foot, that support the plane",
     },
     fields={
         **_CAMERA_MODELS,

@@ -20,13 +20,18 @@ BELOW_M = 0.10  # a point this far under the plane speaks against it
 BELOW_COST = 3.0  # how many inliers such a point outweighs
 MIN_AREA_M2 = 0.5
 REFINE_STEPS = 8
+FOOT_HEIGHT_M = 0.014  # of the lowest of heel and toes over the floor: the open body's, standing
+FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor
+MIN_FOOT_SETS = 5
+MIN_FOOT_SPREAD_M = 0.15  # standard deviation, across: of feet that show a floor's tilt
 SPREAD_MIN_M = 0.02  # annotated points this close to one line give no plane
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
     """``point`` (3,) and unit ``normal`` (3,), up, master frame; ``rms`` metres over the
-    ``inliers`` points within the tolerance; NaN and 0 where there is no floor."""
+    ``inliers`` points, or sets in which someone stands, within the tolerance; NaN and 0 where
+    there is no floor."""
 
     point: np.ndarray
     normal: np.ndarray
@@ -122,6 +127,36 @@ def _refined(
     inlier = (np.abs(distance) < tolerance_m) & (normals @ normal >= NORMAL_COSINE)
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2))) if inlier.any() else float("nan")
     return Ground(point, normal, rms, int(inlier.sum()), "fitted")
+
+
+def ground_of_feet(feet: np.ndarray, rig: Rig, gravity: np.ndarray) -> Ground:
+    """The floor that someone stands on: from heels and toes (T, F, 3), NaN = not known.
+
+    In each set the lowest of the feet stands, in most of them on the floor. Gravity gives the
+    normal; where none is measured the feet do, if they have been far enough apart. For scenes
+    whose floor no camera measures; its height is as good as the keypoints, a centimetre or two.
+    """
+    up, _ = up_hint(rig, gravity)
+    known = np.isfinite(feet[..., 0]).sum(1) >= 3
+    if known.sum() < MIN_FOOT_SETS:
+        return NO_GROUND
+    height = np.where(np.isfinite(feet[..., 0]), feet @ up, np.inf)[known]
+    standing = feet[known][np.arange(known.sum()), height.argmin(1)]
+    inlier = np.abs(standing @ up - np.median(standing @ up)) < FOOT_TOLERANCE_M
+    standing = standing[inlier]
+    if len(standing) < MIN_FOOT_SETS:
+        return NO_GROUND
+    point, normal = np.median(standing, 0), up
+    if not np.isfinite(gravity).all(1).any():
+        point = standing.mean(0)
+        _, spread, axes = np.linalg.svd(standing - point, full_matrices=False)
+        if spread[1] / np.sqrt(len(standing)) < MIN_FOOT_SPREAD_M:
+            return NO_GROUND
+        normal = axes[2] * np.sign(axes[2] @ up)
+    distance = (standing - point) @ normal
+    point = point + (np.median(distance) - FOOT_HEIGHT_M) * normal
+    rms = float(np.sqrt(np.mean((distance - np.median(distance)) ** 2)))
+    return Ground(point, normal, rms, len(standing), "feet")
 
 
 def annotated_ground(

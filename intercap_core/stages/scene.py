@@ -23,14 +23,21 @@ from intercap_core.scene.extrinsics import (
     background_surfaces,
     refine,
 )
-from intercap_core.scene.ground import Ground, annotated_ground, fit_ground, zup_from_master
+from intercap_core.scene.ground import (
+    Ground,
+    annotated_ground,
+    fit_ground,
+    ground_of_feet,
+    zup_from_master,
+)
 from intercap_core.scene.keypoint_timing import keypoint_offsets
 from intercap_core.scene.moving import moving_surfaces
 from intercap_core.scene.slips import Slips, find_slips
-from intercap_core.scene.subject_views import SubjectViews, subject_views
+from intercap_core.scene.subject_views import SubjectViews, subject_views, triangulated
 from intercap_core.scene.surface import Surface
 from intercap_core.schemas import SCENE
 
+FEET = slice(19, 25)  # toes and heels among the body's keypoints
 Floor = Sequence[tuple[float, float, float]]
 
 
@@ -76,6 +83,9 @@ def run(
         )
         rig = rig.moved(refined.poses)
         ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
+        if not ground.found:
+            feet = triangulated(subject.keypoints, rig).joints[:, FEET]
+            ground = ground_of_feet(feet, rig, source.gravity)
         _write(output, source, rig, backgrounds, found, image_of, refined, ground, settings)
 
 

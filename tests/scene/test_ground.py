@@ -9,9 +9,11 @@ from synthetic_capture import ring
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
 from intercap_core.scene.ground import (
+    FOOT_HEIGHT_M,
     NO_GROUND,
     annotated_ground,
     fit_ground,
+    ground_of_feet,
     up_hint,
     zup_from_master,
 )
@@ -107,3 +109,30 @@ def test_z_up_puts_the_floor_at_zero_under_the_middle():
     without = zup_from_master(NO_GROUND, RIG, NO_GRAVITY)
     np.testing.assert_allclose(without[:3, 3], 0, atol=1e-12)
     assert without[2, :3] @ UP[2, :3] > 0.999
+
+
+def walking_feet(sets: int = 40) -> np.ndarray:
+    """(T, 6, 3), master frame: one foot stands, the other swings; every seventh set is lost."""
+    rng = np.random.default_rng(3)
+    feet = np.zeros((sets, 6, 3))
+    way = np.linspace(-1.5, 1.5, sets)
+    feet[..., 0] = way[:, None] + np.tile([0.2, 0.17, -0.05], 2)
+    feet[..., 1] = 0.8 * np.sin(2 * way)[:, None] + np.repeat([0.1, -0.1], 3)
+    lifted = np.where((np.arange(sets) // 5 % 2)[:, None] == np.repeat([0, 1], 3), 0.12, 0.0)
+    feet[..., 2] = FOOT_HEIGHT_M + lifted + np.tile([0, 0, 0.008], 2)
+    feet += rng.normal(0, 0.003, feet.shape)
+    feet[::7] = np.nan
+    return apply(invert(UP), feet.reshape(-1, 3)).reshape(feet.shape)
+
+
+def test_a_floor_that_nobody_measures_is_where_the_feet_stand():
+    feet = walking_feet()
+    for gravity in (GRAVITY, NO_GRAVITY):
+        ground = ground_of_feet(feet, RIG, gravity)
+        assert ground.source == "feet" and ground.found and ground.inliers > 25
+        assert np.degrees(np.arccos(min(1, ground.normal @ UP[2, :3]))) < 0.5
+        assert abs(apply(UP, ground.point[None])[0, 2]) < 0.01
+    still = np.repeat(feet[1:2], 40, 0)  # without gravity one place shows no tilt
+    assert ground_of_feet(still, RIG, GRAVITY).found
+    assert not ground_of_feet(still, RIG, NO_GRAVITY).found
+    assert not ground_of_feet(np.full_like(feet, np.nan), RIG, GRAVITY).found
