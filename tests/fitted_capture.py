@@ -246,7 +246,7 @@ def _write_scene(capture: Capture, name: str) -> None:
         writer.put("ground_point", [0.0, floor, 2.4])
         writer.put("ground_normal", [0.0, -1.0, 0.0])
         writer.put("zup_from_master", zup)
-        _fill(writer, SCENE, T=total, C=count)
+        _fill(writer, SCENE, T=total, C=count, P=3)
         for camera in rig:
             shape = (camera.depth.height, camera.depth.width)
             writer.put(f"cameras/{camera.name}/background", np.full(shape, 4000))

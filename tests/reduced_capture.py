@@ -75,7 +75,7 @@ class Reduction:
         """A whole dataset with its T and C axes cut and what is taken away blanked out."""
         if key in ("mask_offsets", "mask_rle"):
             return self._masks(old, names, kept)[key == "mask_rle"]
-        if key in ("pairs", "pair_points", "pair_residual_before", "pair_residual_after"):
+        if key == "pairs" or key.startswith("pair_"):
             return old[key][:0]
         values = old[key].copy()
         dims = old._schema.field_of(key).dims
