@@ -47,10 +47,14 @@ def person_pixels(
     start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
     small = np.s_[REDUCTION // 2 :: REDUCTION, REDUCTION // 2 :: REDUCTION]
     z = depth[small].astype(np.float64) * 1e-3
-    points = np.dstack([lens.rays[small] * z[..., None], z]).reshape(-1, 1, 3)
+    points = np.dstack([lens.rays[small] * z[..., None], z])
+    low = np.minimum(start, start + along).min(0) - reach.max()
+    high = np.maximum(start, start + along).max(0) + reach.max()
+    near = (z > 0) & ((points >= low) & (points <= high)).all(-1)
+    chosen = points[near][:, None]
     length = np.maximum((along**2).sum(1), 1e-9)
-    share = np.clip(((points - start) * along).sum(-1) / length, 0, 1)
-    away = ((points - start - share[..., None] * along) ** 2).sum(-1)
-    near = ((away < reach**2).any(1) & (z.ravel() > 0)).reshape(z.shape)
+    share = np.clip(((chosen - start) * along).sum(-1) / length, 0, 1)
+    away = ((chosen - start - share[..., None] * along) ** 2).sum(-1)
+    near[near] = (away < reach**2).any(1)
     size = (depth.shape[1], depth.shape[0])
     return cv2.resize(near.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

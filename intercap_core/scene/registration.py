@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,7 +23,9 @@ from intercap_core.scene.surface import Surface
 MIN_AGREE_COSINE = 0.85  # normals of one surface, seen by two cameras
 MIN_PAIR_POINTS = 60  # fewer correspondences are chance
 HELD_OUT_EVERY = 4  # of each surface's cells
-GATES_M = (0.08, 0.05, 0.03, 0.02, 0.02, 0.015, 0.015, 0.015)  # distance to the plane, annealed
+GATES_M = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)  # distance to the plane, annealed
+HELD_GATES_M = (0.08, 0.04, 0.04)  # where the poses are held
+APART_M = 10.0  # between moments, in the search tree
 SEARCH_M = 0.12  # distance to the nearest cell
 SIGMA_FLOOR_M = 0.003
 # Weak prior on the start: what a careful calibration is wrong by.
@@ -109,13 +112,29 @@ class PairResiduals:
 
 
 @dataclass(frozen=True)
-class _Sought:
-    """``queries`` and ``held_out`` cells of one camera, to be sought in another one's surface."""
+class _Seen:
+    """All of one kind that one camera sees, of all moments: ``moment`` (N,) sets moments apart in
+    the search tree; ``queries`` and ``held_out`` are the rows that are sought in other cameras."""
 
-    queries: Surface
-    held_out: Surface
-    target: Surface
+    surface: Surface
+    moment: np.ndarray
     tree: cKDTree
+    queries: np.ndarray
+    held_out: np.ndarray
+
+    @classmethod
+    def of(cls, surfaces: Sequence[tuple[int, Surface]], queries: int) -> _Seen:
+        surface = Surface.joined([surface for _, surface in surfaces])
+        moment = np.repeat([APART_M * at for at, _ in surfaces], [len(s) for _, s in surfaces])
+        tree = cKDTree(np.column_stack([surface.points, moment]), balanced_tree=False)
+        order = np.random.default_rng(0).permutation(len(surface))
+        return cls(
+            surface,
+            moment,
+            tree,
+            np.delete(order, np.s_[::HELD_OUT_EVERY])[:queries],
+            order[::HELD_OUT_EVERY][: max(1, queries // HELD_OUT_EVERY)],
+        )
 
 
 @dataclass(frozen=True)
@@ -130,11 +149,6 @@ class _Match:
     other_ray: np.ndarray
     speed: np.ndarray
 
-    @classmethod
-    def joined(cls, parts: Sequence[_Match]) -> _Match:
-        names = ("residual", "points", "normals", "own_ray", "other_ray", "speed")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
 
 class Registration:
     """Holds the surfaces and their search trees; estimates a rig from them.
@@ -145,18 +159,16 @@ class Registration:
     def __init__(self, rig: Rig, layers: Sequence[Layer], master: int) -> None:
         self.rig = rig
         self._master = master
-        self._sought: dict[tuple[Kind, int, int], list[_Sought]] = {}
-        kinds = [layer.kind for layer in layers]
-        for layer in layers:
-            share = 1 / kinds.count(layer.kind)
-            seen = {c: surface for c, surface in sorted(layer.surfaces.items()) if len(surface)}
-            trees = {c: cKDTree(s.points, balanced_tree=False) for c, s in seen.items()}
-            parts = {c: _split(s, round(share * layer.kind.queries)) for c, s in seen.items()}
-            for a in seen:
-                for b in seen:
-                    if a != b:
-                        pair = _Sought(*parts[a], seen[b], trees[b])
-                        self._sought.setdefault((layer.kind, a, b), []).append(pair)
+        self._seen: dict[Kind, dict[int, _Seen]] = {}
+        for kind in dict.fromkeys(layer.kind for layer in layers):
+            by_camera: dict[int, list[tuple[int, Surface]]] = {}
+            for moment, layer in enumerate(layers):
+                for camera, surface in layer.surfaces.items():
+                    if layer.kind == kind and len(surface):
+                        by_camera.setdefault(camera, []).append((moment, surface))
+            self._seen[kind] = {
+                c: _Seen.of(surfaces, kind.queries) for c, surfaces in sorted(by_camera.items())
+            }
 
     def solve(
         self,
@@ -174,7 +186,7 @@ class Registration:
         current = Estimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
         rows = self._free_rows(free_poses)
-        for gate in GATES_M:
+        for gate in GATES_M if free_poses else HELD_GATES_M:
             matrix = np.zeros((count, FREEDOMS, count, FREEDOMS))
             gradient = np.zeros((count, FREEDOMS))
             self._add_surfaces(matrix, gradient, current, gate)
@@ -200,14 +212,14 @@ class Registration:
 
     def residuals(self, at: Estimate, kind: Kind) -> PairResiduals:
         """Median |point to plane| of every pair of cameras over the held-out points."""
-        by_pair: dict[tuple[int, int], list[np.ndarray]] = {}
-        for (of, a, b), layers in self._sought.items():
-            if of == kind:
-                found = [self._match(a, b, s, s.held_out, at, SEARCH_M) for s in layers]
-                distances = np.abs(_Match.joined(found).residual)
-                by_pair.setdefault((min(a, b), max(a, b)), []).append(distances)
-        values = {k: np.concatenate(v) for k, v in sorted(by_pair.items())}
-        values = {k: v for k, v in values.items() if len(v) >= MIN_PAIR_POINTS / HELD_OUT_EVERY}
+        values = {}
+        for a, b in combinations(self._seen.get(kind, {}), 2):
+            ways = (
+                self._match(kind, *way, at, SEARCH_M, held_out=True) for way in ((a, b), (b, a))
+            )
+            distances = np.concatenate([np.abs(match.residual) for match in ways])
+            if len(distances) >= MIN_PAIR_POINTS / HELD_OUT_EVERY:
+                values[a, b] = distances
         return PairResiduals(
             pairs=np.array(list(values), np.int32).reshape(-1, 2),
             count=np.array([len(v) for v in values.values()], np.int64),
@@ -215,24 +227,25 @@ class Registration:
         )
 
     def _match(
-        self, a: int, b: int, sought: _Sought, queries: Surface, at: Estimate, gate: float
+        self, kind: Kind, a: int, b: int, at: Estimate, gate: float, *, held_out: bool = False
     ) -> _Match:
-        """Correspondences within reach of camera a's ``queries`` on camera b's surface."""
+        """Correspondences within reach of camera a's points on camera b's surface."""
         source, target = (at.poses[c] @ self._colour_from_depth(c) for c in (a, b))
-        other = sought.target
+        own, other = self._seen[kind][a], self._seen[kind][b]
+        rows = own.held_out if held_out else own.queries
+        queries, surface = own.surface.subset(rows), other.surface
         points = apply(source, queries.points - at.bias[a] * queries.rays)
         # The tree holds the target's points as measured: its bias is undone for the search.
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
-        distance, nearest = sought.tree.query(
-            in_target * (1 + at.bias[b] / depth), distance_upper_bound=SEARCH_M
-        )
+        sought = np.column_stack([in_target * (1 + at.bias[b] / depth), own.moment[rows]])
+        distance, nearest = other.tree.query(sought, distance_upper_bound=SEARCH_M)
         hit = np.flatnonzero(np.isfinite(distance))
         nearest, points = nearest[hit], points[hit]
-        normals = other.normals[nearest] @ target[:3, :3].T
+        normals = surface.normals[nearest] @ target[:3, :3].T
         own_normals = queries.normals[hit] @ source[:3, :3].T
-        on_target = apply(target, other.points[nearest] - at.bias[b] * other.rays[nearest])
-        speed = (queries.speed[hit] + other.speed[nearest]) / 2
+        on_target = apply(target, surface.points[nearest] - at.bias[b] * surface.rays[nearest])
+        speed = (queries.speed[hit] + surface.speed[nearest]) / 2
         good = (normals * own_normals).sum(1) >= MIN_AGREE_COSINE
         # The mean normal: two points of one circle are then at distance 0, however far apart
         # (Rusinkiewicz, A symmetric objective function for ICP, 2019).
@@ -246,7 +259,7 @@ class Registration:
             points[good],
             normals[good],
             queries.rays[hit[good]] @ source[:3, :3].T,
-            other.rays[nearest[good]] @ target[:3, :3].T,
+            surface.rays[nearest[good]] @ target[:3, :3].T,
             speed[good],
         )
 
@@ -258,14 +271,11 @@ class Registration:
     def _add_surfaces(
         self, matrix: np.ndarray, gradient: np.ndarray, at: Estimate, gate: float
     ) -> None:
-        for (kind, a, b), forth in self._sought.items():
-            if a > b:
-                continue
-            back = self._sought[kind, b, a]
-            found = [
-                _Match.joined([self._match(i, j, s, s.queries, at, gate) for s in layers])
-                for i, j, layers in ((a, b, forth), (b, a, back))
-            ]
+        pairs = [
+            (kind, *pair) for kind, seen in self._seen.items() for pair in combinations(seen, 2)
+        ]
+        for kind, a, b in pairs:
+            found = [self._match(kind, *way, at, gate) for way in ((a, b), (b, a))]
             residual = np.concatenate([match.residual for match in found])
             if len(residual) < 2 * MIN_PAIR_POINTS:
                 continue
@@ -335,11 +345,3 @@ def _stepped(at: Estimate, step: np.ndarray) -> Estimate:
     poses[:, :3, :3] = Rotation.from_rotvec(step[:, ROTATION]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += step[:, TRANSLATION]
     return Estimate(poses, at.bias + step[:, BIAS], at.offset + step[:, OFFSET])
-
-
-def _split(surface: Surface, queries: int) -> tuple[Surface, Surface]:
-    """Queries and held-out points: every fourth cell is held out, both thinned evenly."""
-    order = np.random.default_rng(0).permutation(len(surface))
-    held_out = order[::HELD_OUT_EVERY][: max(1, queries // HELD_OUT_EVERY)]
-    rest = np.delete(order, np.s_[::HELD_OUT_EVERY])[:queries]
-    return surface.subset(rest), surface.subset(held_out)

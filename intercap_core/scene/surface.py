@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,12 @@ class Surface:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Surface]) -> Surface:
+        """All parts (one or more), end to end."""
+        names = ("points", "normals", "rays", "speed")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def subset(self, rows: np.ndarray) -> Surface:
         """The rows chosen."""

@@ -21,8 +21,8 @@ OFFSET = np.array([0.0, 0.006, -0.007, 0.004, 0.008, -0.003])
 def box_at(seconds: float) -> np.ndarray:
     """A crate (1, 2, 3) on its way through the room; it turns back after a third of a second."""
     way = seconds if seconds < 1 / 3 else 2 / 3 - seconds
-    middle = np.array([-0.1, 0.1, 0.9]) + VELOCITY * way
-    return np.stack([middle - (0.25, 0.3, 0.35), middle + (0.25, 0.3, 0.35)])[None]
+    middle, half = np.array([-0.1, 0.1, 0.9]) + VELOCITY * way, np.array([0.25, 0.3, 0.35])
+    return np.stack([middle - half, middle + half])[None]
 
 
 @pytest.fixture(scope="module")
