@@ -61,13 +61,17 @@ class CameraFacts:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two cameras whose surfaces overlap; residuals in metres."""
+    """Two cameras whose surfaces overlap; residuals in metres, NaN = no overlap.
+
+    ``moving`` is before, after and points of what moves.
+    """
 
     name: str
     before: float
     after: float
     points: int
     weak: bool
+    moving: tuple[float, float, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +113,7 @@ def read_capture(frames: Path, scene: Path) -> CaptureFacts:
             cameras=_cameras(recorded, refined),
             pairs=_pairs(refined, names),
             ground=_ground(refined),
-            verdict=_verdict(refined),
+            verdict=str(refined.attributes["verdict"]),
             pictures=pictures,
             note=note,
             gaps=gaps(times, fps),
@@ -146,7 +150,7 @@ def context(facts: CaptureFacts) -> dict[str, Any]:
         "frame": drawn.frame if drawn else None,
         "pictures": [row for row in pictures if row],
         "profiles": _profile_charts(drawn) if drawn else [],
-        "pairs": _pair_chart(facts.pairs),
+        "pairs": _pair_charts(facts.pairs),
         "pairs_left_out": max(0, len(facts.pairs) - _MAX_PAIRS),
         "timeline": _timeline(facts),
         "states": [(state, _WORDS[state]) for state in STATES],
@@ -167,7 +171,7 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
         refined[key] for key in ("time_offset", "time_offset_sigma", "depth_bias")
     )
     has_depth = refined["depth_size"][:, 0] > 0
-    notes = zip(recorded.text("note"), _scene_notes(refined), strict=True)
+    notes = zip(recorded.text("note"), refined.text("note"), strict=True)
     result = []
     for c, (name, words) in enumerate(zip(recorded.text("camera_names"), notes, strict=True)):
         there = np.flatnonzero(colour[:, c] | depth[:, c])
@@ -190,18 +194,16 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
 
 
 def _pairs(scene: artefacts.Artefact, names: Sequence[str]) -> list[Pair]:
-    rows = zip(
-        scene["pairs"],
-        scene["pair_residual_before"],
-        scene["pair_residual_after"],
-        scene["pair_points"],
-        _weak(scene),
-        strict=True,
-    )
+    columns = ("residual_before", "residual_after", "points", "weak",
+               "moving_before", "moving_after", "moving_points")  # fmt: skip
+    rows = zip(scene["pairs"], *(scene[f"pair_{column}"] for column in columns), strict=True)
     return [
-        Pair(f"{names[i]}–{names[j]}", float(before), float(after), int(points), bool(weak))
-        for (i, j), before, after, points, weak in rows
-    ]
+        Pair(
+            f"{names[i]}–{names[j]}", float(before), float(after), int(points), bool(weak),
+            (float(moving_before), float(moving_after), int(moving_points)),
+        )
+        for (i, j), before, after, points, weak, moving_before, moving_after, moving_points in rows
+    ]  # fmt: skip
 
 
 def _ground(scene: artefacts.Artefact) -> str:
@@ -213,18 +215,28 @@ def _ground(scene: artefacts.Artefact) -> str:
     return f"{words}, RMS {rms:.1f} mm" if np.isfinite(rms) else words
 
 
-def _pair_chart(pairs: Sequence[Pair]) -> str:
-    if not pairs:
-        return ""
+def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
+    """Residuals of the static surfaces, and of what moves: (caption, SVG)."""
     worst = sorted(pairs, key=lambda pair: -np.nan_to_num(pair.after, nan=-1.0))[:_MAX_PAIRS]
-    rows = [
-        charts.BarPair(
-            pair.name, 1e3 * pair.before, 1e3 * pair.after, f"{pair.points:,} points", pair.weak
+    shown = [pair for pair in pairs if pair in worst]
+    static = [(pair, pair.before, pair.after, pair.points) for pair in shown]
+    moving = [(pair, *pair.moving) for pair in shown]
+    return [
+        (
+            what,
+            charts.bar_pairs(
+                [
+                    charts.BarPair(
+                        pair.name, 1e3 * before, 1e3 * after, f"{points:,} points", pair.weak
+                    )
+                    for pair, before, after, points in rows
+                ],
+                "median distance, mm",
+            ),
         )
-        for pair in pairs
-        if pair in worst
+        for what, rows in (("static surfaces", static), ("the person and what moves", moving))
+        if any(points for *_, points in rows)
     ]
-    return charts.bar_pairs(rows, "median distance between the two cameras' surfaces, mm")
 
 
 def _timeline(facts: CaptureFacts) -> str:
@@ -313,15 +325,3 @@ def _colour(c: int) -> str:
 
 def _sets(count: int) -> str:
     return "set" if count == 1 else "sets"
-
-
-def _verdict(scene: artefacts.Artefact) -> str:
-    return str(scene.attributes.get("verdict", ""))
-
-
-def _scene_notes(scene: artefacts.Artefact) -> list[str]:
-    return scene.text("note") if "note" in scene else [""] * len(scene["present"])
-
-
-def _weak(scene: artefacts.Artefact) -> np.ndarray:
-    return scene["pair_weak"] if "pair_weak" in scene else scene["pair_points"] < 300

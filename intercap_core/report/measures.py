@@ -171,7 +171,8 @@ def cameras(
     else:
         rows = []
         for name, pairs in residuals.items():
-            values = 1e3 * np.array([pair[1:] for pair in pairs]).reshape(-1, 2)
+            known = [pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()]
+            values = 1e3 * np.array(known).reshape(-1, 2)
             before, after = np.median(values, axis=0) if len(values) else (np.nan, np.nan)
             rows.append((name, float(before), float(after)))
         rows.sort(key=lambda row: -np.nan_to_num(row[2], nan=-1.0))

@@ -169,9 +169,10 @@ def _residuals(scene: Path) -> list[tuple[str, float, float]]:
 
 
 def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
-    if not pairs:
+    known = np.array([pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()])
+    if not len(known):
         return float("nan"), float("nan")
-    before, after = np.median(np.array([pair[1:] for pair in pairs]), axis=0)
+    before, after = np.median(known, axis=0)
     return float(before), float(after)
 
 

@@ -143,6 +143,8 @@ def test_page_shows_overlays_heatmaps_flags_and_failures(page: _Reader) -> None:
     captions = [str(image["alt"]) for image in page.images]
     assert sum(c.startswith("camera ") for c in captions) == 2 * 2 * 4  # sequences, cameras, frames
     assert {"front", "back", "left hand, palm", "right hand, back", "one side"} <= set(captions)
+    for name in ("s01_o03", "s01_o09"):
+        assert sum(c.startswith(f"{name}, frame ") for c in captions) == 6  # two sides, one slice
     for part in (FAILED["s03_o01"], "object lost", "Against truth", "InterCap, as published"):
         assert part in text
 
