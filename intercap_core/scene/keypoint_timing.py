@@ -20,15 +20,19 @@ from intercap_core.scene.keypoint_noise import MISSING, TimeNoise, fit_noise
 
 WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
 POSE_SIGMA = np.r_[np.full(3, np.radians(1.0)), np.full(3, 0.02)]  # of the poses as they are given
+MIN_SETS = 8
 OFFSET_SIGMA_S = 0.05
 KNOWN_SIGMA_S = 0.02  # an offset less certain than this is not known
+SPEED_ERROR = 0.08  # of an offset: paths are smoothed by a little too much or too little
+# Which of POINTS err together: each of the body's on its own, each hand, the face.
+CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
     """``offset`` (C,) s and ``sigma`` (C,) s, NaN = too little evidence; ``information`` (C, C)
     1/s^2 and ``vector`` (C,) 1/s: the normal equations ``information @ offset = vector`` of all
-    cameras' offsets without the master's being 0 and without any prior on them."""
+    cameras' offsets, before the master's is set to 0 and without any prior on them."""
 
     offset: np.ndarray
     sigma: np.ndarray
@@ -46,17 +50,63 @@ def keypoint_offsets(
     """
     shown = by_moment(keypoints, slip)
     views = len(rig)
-    empty = Offsets(np.zeros(views), np.full(views, np.nan), np.zeros((views, views)),
-                    np.zeros(views))  # fmt: skip
-    if len(times) < 3 or views < 2:
-        return empty
+    if len(times) < MIN_SETS or views < 2:
+        unknown = np.where(np.arange(views) == master, 0.0, np.nan)
+        return Offsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
     return offsets_of(build_motion(shown, rig, times), master)
 
 
 def offsets_of(motion: Motion, master: int) -> Offsets:
     """The offsets that a motion's residuals say."""
-    information, vector = _normal_equations(motion)
-    return _solved(information, vector, master)
+    views = len(motion.rig)
+    matrices, vectors = _normal_equations(motion)  # of each keypoint
+    prior = np.r_[np.full(views, OFFSET_SIGMA_S**-2.0), np.tile(POSE_SIGMA**-2.0, views)]
+    free = np.flatnonzero(np.arange(7 * views) != master)
+    matrix, vector = matrices.sum(0), vectors.sum(0)
+    covariance = np.linalg.inv((matrix + np.diag(prior))[np.ix_(free, free)])
+    found = np.zeros(7 * views)
+    found[free] = covariance @ vector[free]
+    own = np.searchsorted(free, np.delete(np.arange(views), master))
+    inflation = _inflation(matrices, vectors, found, covariance, free, own)
+    poses = (matrix + np.diag(prior))[views:, views:]
+    solved = np.linalg.solve(poses, matrix[views:, :views])
+    information = matrix[:views, :views] - matrix[:views, views:] @ solved
+    offset, sigma = np.zeros(views), np.zeros(views)
+    offset[free[own]] = found[free[own]]
+    random = inflation * np.diag(covariance)[own]
+    sigma[free[own]] = np.sqrt(random + (SPEED_ERROR * offset[free[own]]) ** 2)
+    unknown = sigma > KNOWN_SIGMA_S
+    offset[unknown], sigma[unknown] = 0.0, np.nan
+    return Offsets(
+        offset,
+        sigma,
+        (information + information.T) / 2 / inflation,
+        (vector[:views] - solved.T @ vector[views:]) / inflation,
+    )
+
+
+def _inflation(
+    matrices: np.ndarray,
+    vectors: np.ndarray,
+    found: np.ndarray,
+    covariance: np.ndarray,
+    free: np.ndarray,
+    own: np.ndarray,
+) -> float:
+    """How much more the offsets scatter than the noise's model says.
+
+    From how the keypoints disagree at the solution (the sandwich estimator with clusters: a hand's
+    or the face's points err together), as a mean over the cameras.
+    """
+    scores = (vectors - matrices @ found)[:, free]
+    groups = np.zeros((CLUSTER.max() + 1, len(free)))
+    np.add.at(groups, CLUSTER, scores)
+    taking_part = (np.abs(groups).sum(1) > 0).sum()
+    if taking_part < 3:
+        return 1.0
+    spread = (groups @ covariance[:, own]) ** 2
+    ratio = spread.sum(0) / np.diag(covariance)[own] * taking_part / (taking_part - 1)
+    return max(1.0, float(ratio.mean()))
 
 
 def by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
@@ -97,29 +147,22 @@ def precisions(motion: Motion, noise: TimeNoise, part: slice) -> np.ndarray:
 
 
 def _normal_equations(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Information (C, C) and vector (C,) of the offsets; the poses' errors are eliminated."""
-    views = len(motion.rig)
+    """Each keypoint's matrix (K, n, n) and vector (K, n) in the unknowns of :func:`_columns`."""
     noise = noise_of(motion)
     columns = _columns(motion)  # (n, T, K, 2C)
     residual = series_of(motion.projected(motion.residual))
-    size = len(columns)
-    matrix, right = np.zeros((size, size)), np.zeros(size)
+    size, _, count, _ = columns.shape
+    matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
     for part in windows(len(motion.times)):
         precision = precisions(motion, noise, part)
-        for k in range(precision.shape[0]):
-            for c in range(views):
-                if not motion.valid[part, c, k].any():
-                    continue
+        for k in range(count):
+            for c in np.flatnonzero(motion.valid[part, :, k].any(0)):
                 both = slice(2 * c, 2 * c + 2)
                 rows = columns[:, part, k, both].transpose(2, 1, 0)  # (2, W, n)
                 weighted = precision[k, c] @ rows
-                matrix += np.einsum("xtm,xtn->mn", rows, weighted, optimize=True)
-                right += np.einsum("xtn,xt->n", weighted, residual[k, both, part])
-    prior = np.diag(np.tile(POSE_SIGMA**-2.0, views))
-    poses = matrix[views:, views:] + prior
-    solved = np.linalg.solve(poses, matrix[views:, :views])
-    information = matrix[:views, :views] - matrix[:views, views:] @ solved
-    return (information + information.T) / 2, right[:views] - solved.T @ right[views:]
+                matrices[k] += (np.swapaxes(rows, 1, 2) @ weighted).sum(0)
+                vectors[k] += np.einsum("xtn,xt->n", weighted, residual[k, both, part])
+    return matrices, vectors
 
 
 def _columns(motion: Motion) -> np.ndarray:
@@ -137,16 +180,3 @@ def _columns(motion: Motion) -> np.ndarray:
         pixels = np.einsum("tkij,ptkj->ptki", by_point, moved)
         poses += [motion.projected_of(c, pixels[p]) for p in range(6)]
     return np.stack(offsets + poses)
-
-
-def _solved(information: np.ndarray, vector: np.ndarray, master: int) -> Offsets:
-    views = len(vector)
-    free = np.flatnonzero(np.arange(views) != master)
-    reduced = information[np.ix_(free, free)] + OFFSET_SIGMA_S**-2.0 * np.eye(len(free))
-    covariance = np.linalg.inv(reduced)
-    offset, sigma = np.zeros(views), np.zeros(views)
-    offset[free] = covariance @ vector[free]
-    sigma[free] = np.sqrt(np.diag(covariance))
-    unknown = sigma > KNOWN_SIGMA_S
-    offset[unknown], sigma[unknown] = 0.0, np.nan
-    return Offsets(offset, sigma, information, vector)

@@ -17,6 +17,7 @@ import numpy as np
 from intercap_core.camera.rig import Rig
 from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA, Motion, build_motion, seeing
 from intercap_core.scene.keypoint_timing import (
+    MIN_SETS,
     by_moment,
     noise_of,
     offsets_of,
@@ -26,14 +27,14 @@ from intercap_core.scene.keypoint_timing import (
 
 # In log likelihood, without the keypoints that gain most: limbs that a detector confuses, or
 # places, fit a slip by chance, but never all over the body.
-MIN_GAIN = 45.0
+# Chance finds are short: what is beyond doubt depends on how many sets say it.
+MIN_GAIN, MIN_GAIN_OF_SET = 15.0, 60.0
 LEFT_OUT = 4
 GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
 CLEAR_GAIN = 10.0  # an interval must gain this much over the whole recording's being late
 WORTH = 0.2  # of the best interval's gain makes another worth taking at once
 APART_S = 1.0
 MAX_ROUNDS = 12
-MIN_SETS = 8
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,11 @@ class Interval:
     slip: int
     gain: float
     sure: float
+
+    @property
+    def beyond_doubt(self) -> bool:
+        """Whether it gains more than chance ever would."""
+        return self.sure >= MIN_GAIN + MIN_GAIN_OF_SET / (self.last - self.first + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,27 +210,22 @@ class _Evidence:
                 )
         step = max(self._steps, key=lambda s: _sure(always[s]))
         whole = Interval(camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step]))
-        if whole.sure >= MIN_GAIN and (top is None or whole.gain > top.gain - CLEAR_GAIN):
+        if whole.beyond_doubt and (top is None or whole.gain > top.gain - CLEAR_GAIN):
             return whole
         return top
 
 
 def _best_of_window(cases: dict[int, _Slipped]) -> Interval | None:
     """The interval, by place in the window, that gains most, if it is beyond doubt."""
-    best: tuple[float, int, int] | None = None
-    for case in cases.values():
-        first, last, gains = case.best()
-        if _sure(gains) >= MIN_GAIN and (best is None or gains.sum() > best[0]):
-            best = float(gains.sum()), first, last
-    if best is None:
+    found = [case.best(step) for step, case in cases.items()]
+    found = [interval for interval in found if interval.beyond_doubt]
+    if not found:
         return None
-    _, first, last = best
+    most = max(found, key=lambda i: i.gain)
     # The gain tells best that and when images are late, the misfit by how much.
-    step = min(cases, key=lambda s: cases[s].misfit(first, last + 1))
-    first, last, gains = cases[step].best()
-    if _sure(gains) < MIN_GAIN:
-        return None
-    return Interval(0, first, last, step, float(gains.sum()), _sure(gains))
+    step = min(cases, key=lambda s: cases[s].misfit(most.first, most.last + 1))
+    chosen = cases[step].best(step)
+    return chosen if chosen.beyond_doubt else None
 
 
 def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
@@ -286,12 +287,13 @@ class _Slipped:
         left = self.series[:, first:end] - self.change[:, first:end]
         return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMA**2).sum())
 
-    def best(self) -> tuple[int, int, np.ndarray]:
-        """First and last set of the interval of greatest gain, and the keypoints' gains (K,)."""
+    def best(self, step: int) -> Interval:
+        """The interval of greatest gain, by place in the window, of camera 0."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
         gain = interval_gains(self.linear.sum(0) - GAIN_PER_SET, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
-        return first, end - 1, self.gains(first, end)
+        gains = self.gains(first, end)
+        return Interval(0, first, end - 1, step, float(gains.sum()), _sure(gains))
 
 
 def interval_gains(linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
