@@ -25,7 +25,7 @@ from intercap_core.config import Annotation, ObjectEntry, StudioCapture, StudioS
 from intercap_core.errors import UserError
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.schemas import TRUTH
-from intercap_core.studio.capture import make_capture
+from intercap_core.studio.capture import MARK, make_capture
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.rig import build_rig
 
@@ -72,12 +72,17 @@ def images(path: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def test_same_arguments_same_bytes(capture: Path, tmp_path: Path, object_entry: Entry) -> None:
-    again = make(tmp_path / "again", object_entry("stool"))
+    """Also in a folder that lost its manifest: a workflow deletes what a job declares."""
+    left = tmp_path / "again"
+    left.mkdir()
+    (left / MARK).touch()
+    (left / "k9.mkv").write_bytes(b"half a recording")
+    again = make(left, object_entry("stool"))
     first, second = ((p / "capture.json").read_bytes() for p in (capture, again))
     assert first == second
     listed = json.loads(first)["files"]
     found = {p.relative_to(capture).as_posix() for p in capture.rglob("*") if p.is_file()}
-    assert set(listed) == found - {"capture.json"}
+    assert set(listed) == found - {"capture.json", MARK}
 
 
 def test_layout(capture: Path) -> None:

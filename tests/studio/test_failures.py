@@ -145,4 +145,4 @@ def test_a_capture_that_cannot_be_made_is_told(capture: dict[str, object], says:
 
 def test_a_single_camera_has_no_faults() -> None:
     with pytest.raises(UserError, match="need a second camera"):
-        check_faults(("dead_half",), cameras=1, frames=9)
+        check_faults(("dead_half",), layout="k4a", cameras=1, frames=9)
