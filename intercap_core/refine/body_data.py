@@ -109,6 +109,11 @@ class BodyData:
         cloud[self._fitter.frames] = metres.cpu().numpy()
         return Residuals(keypoint, cloud)
 
+    @property
+    def time_offset(self) -> np.ndarray:
+        """(C,) seconds by which the predictions take the cameras to expose late."""
+        return self._fitter.evidence.seen.time_offset
+
     def estimate_offsets(self, prior: OffsetPrior) -> TimeOffsets:
         """Estimate the cameras' time offsets at the state of the last :meth:`refresh`."""
         evidence, problem = self._fitter.evidence, self._problem
@@ -118,14 +123,14 @@ class BodyData:
             if found is not None
         ]
         times = evidence.seen.times[evidence.frames]
-        offsets = estimate_offsets(sightings, times, evidence.seen.time_offset, prior)
+        offsets = estimate_offsets(sightings, times, self.time_offset, prior)
         log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
         return offsets
 
     def take_offsets(self, offset: np.ndarray) -> float:
         """Predict with other offsets (C,) from now on; the largest change, seconds."""
         evidence = self._fitter.evidence
-        change = float(np.abs(offset - evidence.seen.time_offset).max())
+        change = float(np.abs(offset - self.time_offset).max())
         if change > _OFFSET_SAME_S:
             evidence.seen = replace(evidence.seen, time_offset=offset)
             self._fitter.observe(self._problem)

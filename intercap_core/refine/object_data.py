@@ -7,13 +7,15 @@ tracker does not believe stays near where it was bridged unless contact and its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.camera.transforms import rigid
 from intercap_core.refine.equations import NormalEquations
 from intercap_core.refine.state import OBJECT, State
+from intercap_core.rigid.twist import moved, twists
 
 # The tracker's views share calibration errors, so its minimum is never surer than this.
 _FLOOR = np.repeat([np.radians(0.3), 0.002], 3)
@@ -25,11 +27,18 @@ _DISAGREE = np.repeat([np.radians(10.0), 0.002], 3)
 @dataclass(frozen=True)
 class TrackedPoses:
     """``rotation`` (T, 3, 3), ``translation`` (T, 3) and ``information`` (T, 6, 6), the inverse
-    covariance of (turn on the left, shift)."""
+    covariance of (turn on the left, shift).
+
+    ``twist`` (T, 6) is the motion in a second, ``share`` (T, C) how far a pose rests on each camera
+    and ``time_offset`` (C,) what the tracker took the cameras' to be, seconds.
+    """
 
     rotation: np.ndarray
     translation: np.ndarray
     information: np.ndarray
+    twist: np.ndarray
+    share: np.ndarray
+    time_offset: np.ndarray
 
     @classmethod
     def from_track(
@@ -39,14 +48,30 @@ class TrackedPoses:
         covariance: np.ndarray,
         lost: np.ndarray,
         disagree: np.ndarray,
+        *,
+        seen: np.ndarray,
+        times: np.ndarray,
+        time_offset: np.ndarray,
     ) -> TrackedPoses:
         """Take over an object track whose lost frames are bridged; ``covariance`` (T, 6, 6),
-        ``lost`` and ``disagree`` (T,)."""
+        ``lost`` and ``disagree`` (T,), ``seen`` (T, C) the views that show the object, ``times``
+        (T,) s."""
         known = ~lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(known[:, None, None], covariance, 0.0)
         floor = np.where(disagree[:, None], np.hypot(_FLOOR, _DISAGREE), _FLOOR)
         total += np.eye(6) * np.where(known[:, None], floor, _BRIDGED)[:, None, :] ** 2
-        return cls(rotation, translation, np.linalg.inv(total))
+        twist = twists(rigid(rotation, translation), ~lost, times)
+        share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+        return cls(rotation, translation, np.linalg.inv(total), twist, share, time_offset)
+
+    def at(self, time_offset: np.ndarray) -> TrackedPoses:
+        """The poses had the cameras these offsets (C,): as much earlier as their views are later
+        in the mean."""
+        late = self.share @ (time_offset - self.time_offset)
+        poses = moved(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
+        return replace(
+            self, rotation=poses[:, :3, :3], translation=poses[:, :3, 3], time_offset=time_offset
+        )
 
     def add(self, state: State, out: NormalEquations) -> None:
         """Add E_O at ``state``."""

@@ -85,13 +85,21 @@ def run(
     with (
         artefacts.read(body_fit, BODY_FIT) as body,
         artefacts.read(object_track, OBJECT_TRACK) as track,
+        artefacts.read(scene, SCENE) as source,
     ):
         start, model = _start(body, track, body_models, device)
         joint_sigma = body["joint_sigma"].astype(float)
         failed, bridged = body["failed"], body["bridged"]
         lost, disagree = track["lost"], track["disagree"]
         tracked = TrackedPoses.from_track(
-            start.rotation, start.translation, track["covariance"], lost, disagree
+            start.rotation,
+            start.translation,
+            track["covariance"],
+            lost,
+            disagree,
+            seen=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
+            times=source["times"],
+            time_offset=source["time_offset"],
         )
         object_sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
         object_sigma = np.where(lost | ~np.isfinite(object_sigma), _UNTRACKED_SIGMA, object_sigma)
@@ -105,7 +113,6 @@ def run(
             state=start,
             settings=body_settings,
         )
-    with artefacts.read(scene, SCENE) as source:
         floor = (
             Ground(source["ground_point"], source["ground_normal"])
             if source.attributes["ground_found"]
@@ -137,6 +144,7 @@ def run(
         problem.probability = found.probability
         data.refresh(state)
         retimed = data.take_offsets(data.estimate_offsets(known_offsets).offset)  # seconds
+        problem.data = (data.add, tracked.at(data.time_offset).add)
         problem.refresh(state)
         if not before:
             before = problem.equations(state).energy

@@ -89,7 +89,29 @@ def _problem(
 def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
     covariance = np.repeat(np.eye(6)[None] * sigma**2, len(state), axis=0)
     agree = np.zeros_like(lost)
-    return TrackedPoses.from_track(state.rotation, state.translation, covariance, lost, agree)
+    return TrackedPoses.from_track(
+        state.rotation, state.translation, covariance, lost, agree,
+        seen=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
+        time_offset=np.zeros(3),
+    )  # fmt: skip
+
+
+def test_tracked_poses_follow_the_views_that_they_rest_on():
+    """Two cameras found to be 2 and 4 ms later than the tracker took them: the pose is 3 ms late,
+    where both see the object."""
+    times = np.arange(6) / 15
+    way = np.outer(times, [1.0, 0.0, 0.5])
+    seen = np.zeros((6, 3), bool)
+    seen[:, 1], seen[:3, 2] = True, True
+    lost = np.arange(6) == 5
+    tracked = TrackedPoses.from_track(
+        np.repeat(np.eye(3)[None], 6, 0), way, np.repeat(np.eye(6)[None], 6, 0), lost, lost,
+        seen=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
+    )  # fmt: skip
+    found = tracked.at(np.array([0.0, 0.003, 0.004])).translation - way
+    late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
+    assert found == pytest.approx(-late[:, None] * [1.0, 0.0, 0.5])
+    assert np.array_equal(tracked.at(tracked.time_offset).translation, way)
 
 
 def test_contact_closes_a_gap_between_hand_and_object(model, box):
