@@ -198,6 +198,8 @@ class StudioCapture(Model):
     """How the recordings are laid out; the same as in the table of sequences."""
     depth: bool = True
     """Whether the cameras record depth."""
+    video: bool = False
+    """Plain recordings as one video a camera instead of a folder of images."""
     faults: tuple[StudioFault, ...] = ()
     """What is broken in this recording on top of the usual errors; see docs/studio.md."""
 

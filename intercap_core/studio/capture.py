@@ -51,9 +51,7 @@ def make_capture(
     output.mkdir(parents=True)
     (output / MARK).touch()
     stage = Stage(capture, settings, objects)
-    folder = FOLDERS[capture.layout](
-        output, capture.faults, stage.failures.broken, depth=capture.depth
-    )
+    folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
     detector = Detector.build(stage.noise, stage.frames)
     segmenter = Segmenter(stage.noise, stage.frames, objects.name)
     recorded = [

@@ -10,7 +10,8 @@ import numpy as np
 
 from intercap_core.config import LayoutName
 from intercap_core.errors import UserError
-from intercap_core.studio.layouts import FOLDERS, SWAPPED
+from intercap_core.studio.capture_folder import SWAPPED
+from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.noise import NoiseSource
 
 CLOCK_JITTER_S = 100e-6  # of a subordinate's device times, at noise 1

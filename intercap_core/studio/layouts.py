@@ -8,126 +8,35 @@ folder, ``calibration`` is :attr:`CaptureFolder.calibration` in it.
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
+import av
 import cv2
-import numpy as np
 import yaml
 from pycocotools import mask as coco
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
 from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.config import LayoutName, StudioFault
+from intercap_core.camera.rig import Rig
+from intercap_core.config import LayoutName
 from intercap_core.studio.alignment import Aligner
 from intercap_core.studio.calibration import write_calibration
+from intercap_core.studio.capture_folder import (
+    CameraFiles,
+    CaptureFolder,
+    Device,
+    ImageFiles,
+    Shot,
+)
 from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.rig import STAGGER_S
 
 RELEASE_FPS = 30  # the number in the name of an image of InterCap's counts periods of this rate
-WRONG_SIZE = 1.5  # of the images that a wrong calibration is for
-SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
 BEHAVE_DATE = "Date01"
-
-
-@dataclass(frozen=True)
-class Device:
-    """One camera of the rig: ``camera`` as it claims to be, always with depth; ``depth`` says
-    whether it records any; ``first_us`` is its first device time."""
-
-    index: int
-    camera: Camera
-    serial: str
-    colour_mode: str
-    depth_mode: str
-    depth: bool
-    fps: int
-    first_us: int
-
-
-@dataclass(frozen=True)
-class Shot:
-    """What a device delivers of set ``t``: a JPEG, depth (H, W) uint16 mm or None, and inertial
-    samples (acceleration, turning rate, device time)."""
-
-    t: int
-    time_us: int
-    jpeg: bytes
-    depth: np.ndarray | None
-    inertial: list[tuple[np.ndarray, np.ndarray, int]]
-
-
-class CameraFiles(ABC):
-    """One camera's files, open; use as a context manager."""
-
-    @abstractmethod
-    def write(self, shot: Shot) -> None:
-        """Add a shot."""
-
-    def close(self) -> None:  # noqa: B027 (folders have nothing to close)
-        """Finish the files."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-
-class CaptureFolder(ABC):
-    """A capture below ``path`` with ``faults``; ``broken``: fault to the camera that has it."""
-
-    calibration: str
-    """File or folder of the calibration."""
-    own_faults: frozenset[StudioFault]
-    """Faults that recordings of this layout can have, beside those that any can."""
-
-    def __init__(
-        self, path: Path, faults: Sequence[StudioFault], broken: dict[str, int], *, depth: bool
-    ) -> None:
-        self.path, self.faults, self.broken, self.depth = path, faults, broken, depth
-
-    @abstractmethod
-    def open(self, device: Device) -> CameraFiles:
-        """Begin one camera's files."""
-
-    @abstractmethod
-    def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """Write the calibration as it is claimed to be."""
-
-    def image_number(self, t: int, order: int, fps: int) -> int:
-        """What files of keypoints and candidates call the image of set ``t``, the ``order``-th."""
-        return order
-
-    def add_keypoints(self, camera: str, t: int, fps: int, content: str) -> None:  # noqa: B027
-        """Lay a file of keypoints beside the images, where the layout has them there."""
-
-    def add_masks(  # noqa: B027
-        self, camera: str, t: int, fps: int, candidates: list[dict[str, Any]], label: str
-    ) -> None:
-        """The same for masks of the person and of the object, COCO label ``label``."""
-
-    def lenses(self, claimed: Rig) -> list[Intrinsics]:
-        """The colour lenses as the calibration has them: wrong where a fault says so."""
-        found = [camera.colour for camera in claimed]
-        if "swapped_lenses" in self.faults:
-            a, b = SWAPPED
-            found[a], found[b] = found[b], found[a]
-        if "wrong_resolution" in self.broken:
-            at = self.broken["wrong_resolution"]
-            found[at] = found[at].scaled(WRONG_SIZE)
-        return found
+MICROSECOND = Fraction(1, 1_000_000)
 
 
 class KinectFolder(CaptureFolder):
@@ -181,27 +90,6 @@ class _KinectFile(CameraFiles):
         self._writer.close()
 
 
-class _ImageFiles(CameraFiles):
-    """Colour and depth as single files; ``aligner`` where depth lies on the colour grid."""
-
-    def __init__(self, aligner: Aligner | None) -> None:
-        self._aligner = aligner
-
-    def _paths(self, shot: Shot) -> tuple[Path, Path]:
-        raise NotImplementedError
-
-    def write(self, shot: Shot) -> None:
-        colour, depth = self._paths(shot)
-        colour.parent.mkdir(parents=True, exist_ok=True)
-        colour.write_bytes(shot.jpeg)
-        if shot.depth is None:
-            return
-        image = shot.depth if self._aligner is None else self._aligner.align(shot.depth)
-        depth.parent.mkdir(parents=True, exist_ok=True)
-        packed = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        depth.write_bytes(packed.tobytes())
-
-
 class ReleaseFolder(CaptureFolder):
     """InterCap's release: ``Frames_Cam<n>/color/%05d.jpg``, aligned depth beside it, and a folder
     of ``Color*.json``. There are no times but the numbers of the images."""
@@ -239,7 +127,7 @@ def _release_number(t: int, fps: int) -> int:
     return t * RELEASE_FPS // fps
 
 
-class _ReleaseFiles(_ImageFiles):
+class _ReleaseFiles(ImageFiles):
     def __init__(self, folder: Path, aligner: Aligner | None, fps: int) -> None:
         super().__init__(aligner)
         self._folder, self._fps = folder, fps
@@ -296,7 +184,7 @@ def _behave_frame(folder: Path, t: int, fps: int) -> Path:
     return folder / f"t{t / fps:08.3f}"
 
 
-class _BehaveFiles(_ImageFiles):
+class _BehaveFiles(ImageFiles):
     def __init__(self, folder: Path, name: str, aligner: Aligner | None, fps: int) -> None:
         super().__init__(aligner)
         self._folder, self._name, self._fps = folder, name, fps
@@ -307,14 +195,16 @@ class _BehaveFiles(_ImageFiles):
 
 
 class PlainFolder(CaptureFolder):
-    """``<camera>/`` with numbered JPEG files and timestamps, depth in its own lens below, and a
-    calibration in OpenCV's terms."""
+    """``<camera>/`` with numbered JPEG files, or a video, and timestamps; depth in its own lens;
+    a calibration in OpenCV's terms."""
 
     calibration = "calibration.yaml"
     own_faults = frozenset({"backwards_clock", "wrong_resolution"})
 
     def open(self, device: Device) -> CameraFiles:
-        """The camera's own folder."""
+        """The camera's own folder, or its video."""
+        if self.capture.video:
+            return _PlainVideo(self.path / device.camera.name, device)
         return _PlainFiles(self.path / device.camera.name)
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
@@ -323,7 +213,7 @@ class PlainFolder(CaptureFolder):
         for camera, lens in zip(claimed, self.lenses(claimed), strict=True):
             pose = camera.colour_from_master
             entry = {**_opencv(lens), "R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
-            if self.depth:
+            if self.capture.depth:
                 assert camera.depth is not None and camera.colour_from_depth is not None
                 between = {"colour_from_depth": camera.colour_from_depth.tolist()}
                 entry["depth"] = {**_opencv(camera.depth), **between}
@@ -332,7 +222,7 @@ class PlainFolder(CaptureFolder):
         (self.path / self.calibration).write_text(yaml.safe_dump(content, sort_keys=False))
 
 
-class _PlainFiles(_ImageFiles):
+class _PlainFiles(ImageFiles):
     def __init__(self, folder: Path) -> None:
         super().__init__(None)
         self._folder = folder
@@ -348,6 +238,38 @@ class _PlainFiles(_ImageFiles):
 
     def close(self) -> None:
         (self._folder / "timestamps.csv").write_text("".join(self._times))
+
+
+class _PlainVideo(ImageFiles):
+    """``<camera>.mp4`` of JPEG packets; depth is numbered as the images of the video are."""
+
+    def __init__(self, folder: Path, device: Device) -> None:
+        super().__init__(None)
+        self._folder, self._first_us = folder, device.first_us
+        self._times: list[str] = []
+        self._container = av.open(str(folder.with_suffix(".mp4")), "w")
+        self._stream = self._container.add_stream("mjpeg", rate=device.fps)
+        self._stream.width, self._stream.height = (
+            device.camera.colour.width,
+            device.camera.colour.height,
+        )
+        self._stream.pix_fmt = "yuvj420p"
+
+    def _paths(self, shot: Shot) -> tuple[Path | None, Path]:
+        return None, self._folder / "depth" / f"{len(self._times):06d}.png"
+
+    def write(self, shot: Shot) -> None:
+        super().write(shot)
+        packet = av.Packet(shot.jpeg)
+        packet.stream, packet.time_base = self._stream, MICROSECOND
+        packet.pts = packet.dts = shot.time_us - self._first_us
+        self._container.mux(packet)
+        self._times.append(f"{shot.time_us / 1e6:.6f}\n")
+
+    def close(self) -> None:
+        self._container.close()
+        times = self._folder.with_name(f"{self._folder.name}_timestamps.csv")
+        times.write_text("".join(self._times))
 
 
 def _opencv(lens: Intrinsics) -> dict[str, object]:

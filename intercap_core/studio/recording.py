@@ -11,9 +11,9 @@ import numpy as np
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import invert
 from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
+from intercap_core.studio.capture_folder import CaptureFolder, Device, Shot
 from intercap_core.studio.failures import CLOCK_FALLS_BACK_SETS
 from intercap_core.studio.keypoints import Detector, to_json
-from intercap_core.studio.layouts import CaptureFolder, Device, Shot
 from intercap_core.studio.looks import body_colours
 from intercap_core.studio.masks import Labels, Segmenter
 from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View

@@ -162,6 +162,11 @@ def check_capture(capture: StudioCapture, settings: StudioSettings, object_name:
             f"studio: no subject {capture.subject!r}, there are {', '.join(subject_names())}; "
             "correct 'subject' of the capture"
         )
+    if capture.video and capture.layout != "plain":
+        raise UserError(
+            f"studio: recordings of layout {capture.layout!r} are no videos; take 'video' out or "
+            "set layout: plain"
+        )
     check_faults(
         capture.faults, layout=capture.layout, cameras=settings.cameras, frames=capture.frames
     )

@@ -24,8 +24,9 @@ from intercap_core.config import (
 from intercap_core.errors import UserError
 from intercap_core.studio.alignment import Aligner
 from intercap_core.studio.capture import make_capture
+from intercap_core.studio.capture_folder import Device, Shot
 from intercap_core.studio.failures import check_faults
-from intercap_core.studio.layouts import FOLDERS, Device, Shot, camera_names
+from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.rig import StudioRig, build_rig
 
 FPS, SETS = 15, (0, 1, 4)
@@ -40,13 +41,16 @@ def rig_of(layout: LayoutName, cameras: int = 3) -> StudioRig:
 
 
 def write(folder: Path, layout: LayoutName, faults: tuple[str, ...] = (),
-          broken: dict[str, int] | None = None, cameras: int = 3,
+          broken: dict[str, int] | None = None, cameras: int = 3, video: bool = False,
           ) -> tuple[StudioRig, bytes, np.ndarray]:  # fmt: skip
     """A recording of a grey wall, two metres before every depth camera."""
     rig = rig_of(layout, cameras)
     jpeg = cv2.imencode(".jpg", np.full((720, 1280, 3), 90, np.uint8))[1].tobytes()
     depth = np.full((576, 640), 2000, np.uint16)
-    place = FOLDERS[layout](folder, faults, broken or {}, depth=True)  # type: ignore[arg-type]
+    capture = StudioCapture(
+        interaction="cup_drink", subject="s01", seed=1, layout=layout, faults=faults, video=video
+    )
+    place = FOLDERS[layout](folder, capture, broken or {})
     for index, camera in enumerate(rig.claimed):
         device = Device(index, camera, f"{index}", "720P", "NFOV_UNBINNED", True, FPS, 1_000_000)
         with place.open(device) as files:
@@ -70,9 +74,11 @@ def images_of(folder: Path, layout: LayoutName, name: str) -> tuple[Camera, list
         return recording.camera, list(recording.images())
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_what_is_written_is_read(tmp_path: Path, layout: LayoutName) -> None:
-    rig, jpeg, depth = write(tmp_path, layout)
+@pytest.mark.parametrize(
+    ("layout", "video"), [*((layout, False) for layout in LAYOUTS), ("plain", True)]
+)
+def test_what_is_written_is_read(tmp_path: Path, layout: LayoutName, video: bool) -> None:
+    rig, jpeg, depth = write(tmp_path, layout, video=video)
     found = open_layout(row_of(tmp_path, layout))
     assert found.extrinsics.master == rig.claimed.names[0]
     assert sorted(found.names) == sorted(rig.claimed.names)
