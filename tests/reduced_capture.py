@@ -16,7 +16,11 @@ from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact, Schema, Writer, pack_ragged, unpack_ragged
 
 STAGES = {
-    s.name: s for s in (schemas.FRAMES, schemas.DETECTIONS, schemas.SCENE, schemas.PERSON)
+    s.name: s
+    for s in (
+        schemas.FRAMES, schemas.DETECTIONS, schemas.SCENE, schemas.PERSON, schemas.OBJECT_TRACK,
+        schemas.BODY_FIT, schemas.JOINT,
+    )
 }  # fmt: skip
 _OF_DEPTH_LENS = {
     "depth_size": 0,
@@ -47,17 +51,18 @@ class Reduction:
     candidates: Collection[str] | None = None
 
     def apply(self, paths: Mapping[str, Path], folder: Path) -> dict[str, Path]:
-        """Write the reduced artefacts of ``paths`` (by stage) into ``folder``; others are left."""
+        """Write the reduced artefacts of ``paths`` (by stage, frames at least) into ``folder``."""
         folder.mkdir(parents=True, exist_ok=True)
+        with artefacts.read(paths["frames"], schemas.FRAMES) as frames:
+            names = frames.text("camera_names")
         return {
-            stage: self._copy(paths[stage], schema, folder / f"{stage}.h5")
+            stage: self._copy(paths[stage], schema, names, folder / f"{stage}.h5")
             for stage, schema in STAGES.items()
             if stage in paths
         }
 
-    def _copy(self, source: Path, schema: Schema, path: Path) -> Path:
+    def _copy(self, source: Path, schema: Schema, names: list[str], path: Path) -> Path:
         with artefacts.read(source, schema) as old:
-            names = old.text("camera_names")
             kept = [c for c, n in enumerate(names) if self.cameras is None or n in self.cameras]
             attributes = {name: old.attributes[name] for name in schema.attributes}
             digest = str(old.attributes["settings_digest"])
@@ -89,6 +94,10 @@ class Reduction:
                 values[until:, c] = -1
             if until is not None and key in ("keypoints_found", "candidates_found"):
                 values[until:, c] = False
+            if key == "candidate" and not _has(self.candidates, name):
+                values[:, c] = -1
+            if until is not None and key == "candidate":
+                values[until:, c] = -1
             if key == "keypoints_found" and not _has(self.keypoints, name):
                 values[:, c] = False
             if key == "candidates_found" and not _has(self.candidates, name):

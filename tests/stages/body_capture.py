@@ -183,6 +183,7 @@ def _write_scene(path: Path, rig: Rig, times: np.ndarray, time_offset: np.ndarra
     cameras = len(rig)
     with artefacts.write(
         path, SCENE, sequence="test", master="k1", fps=FPS, extrinsics_refined=False,
+        extrinsics_converged=False, verdict="",
         ground_found=False, ground_source="none", ground_rms=float("nan"), ground_inliers=0,
     ) as writer:  # fmt: skip
         for key, values in rig.datasets().items():
@@ -193,9 +194,10 @@ def _write_scene(path: Path, rig: Rig, times: np.ndarray, time_offset: np.ndarra
         writer.put("times", times)
         writer.put("depth_bias", np.zeros(cameras))
         writer.put("pairs", np.zeros((0, 2), np.int32))
-        writer.put("pair_points", np.zeros(0, np.int64))
-        writer.put("pair_residual_before", np.zeros(0))
-        writer.put("pair_residual_after", np.zeros(0))
+        writer.put("note", [""] * cameras)
+        for key in SCENE.fields:
+            if key.startswith("pair_"):
+                writer.put(key, np.zeros(0, int))
         writer.put("time_offset", time_offset)
         writer.put("time_offset_sigma", np.full(cameras, np.nan))
         writer.put("slip", np.zeros((len(times), cameras), np.int32))

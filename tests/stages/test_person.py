@@ -27,6 +27,7 @@ BODY = walking(T, np.array([-0.2, 0.1]), np.array([0.01, 0]))
 def write_scene(path: Path, rig: Rig, sets: int, slip: np.ndarray | None = None) -> Path:
     attributes = {
         "sequence": "test", "master": "k1", "fps": 15.0, "extrinsics_refined": False,
+        "extrinsics_converged": False, "verdict": "",
         "ground_found": False, "ground_source": "none", "ground_rms": 0.0, "ground_inliers": 0,
     }  # fmt: skip
     count = len(rig)
@@ -44,8 +45,10 @@ def write_scene(path: Path, rig: Rig, sets: int, slip: np.ndarray | None = None)
         writer.put("slip", slip)
         writer.put("image_of", images_of_moments(slip, np.ones(slip.shape, bool)))
         writer.put("pairs", np.zeros((0, 2), int))
-        for key in ("pair_points", "pair_residual_before", "pair_residual_after"):
-            writer.put(key, np.zeros(0, int))
+        writer.put("note", [""] * count)
+        for key in SCENE.fields:
+            if key.startswith("pair_"):
+                writer.put(key, np.zeros(0, int))
         writer.put("ground_point", np.full(3, np.nan))
         writer.put("ground_normal", np.full(3, np.nan))
         writer.put("zup_from_master", np.eye(4))

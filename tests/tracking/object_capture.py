@@ -175,6 +175,8 @@ class ObjectCapture:
             master="k1",
             fps=FPS,
             extrinsics_refined=False,
+            extrinsics_converged=False,
+            verdict="",
             ground_found=True,
             ground_source="fitted",
             ground_rms=0.0,
@@ -188,9 +190,10 @@ class ObjectCapture:
             w.put("times", times)
             w.put("depth_bias", np.zeros(cameras))
             w.put("pairs", np.zeros((0, 2), np.int32))
-            w.put("pair_points", np.zeros(0, np.int64))
-            w.put("pair_residual_before", np.zeros(0))
-            w.put("pair_residual_after", np.zeros(0))
+            w.put("note", [""] * cameras)
+            for key in SCENE.fields:
+                if key.startswith("pair_"):
+                    w.put(key, np.zeros(0, int))
             w.put("time_offset", self.time_offset[:cameras])
             w.put("time_offset_sigma", np.full(cameras, np.nan))
             w.put("slip", np.zeros((count, cameras), np.int32))

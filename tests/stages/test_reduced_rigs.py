@@ -1,0 +1,290 @@
+"""Stages on rigs of 1 to 16 cameras, with depth, with little of it and with none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fitted_capture as fitted
+import numpy as np
+import pytest
+from body_capture import ring, write_capture
+from reduced_capture import Reduction
+from test_body_fit import motion
+
+from intercap_core import artefacts
+from intercap_core.body.model import BodyModel
+from intercap_core.camera.rig import Rig
+from intercap_core.config import (
+    BodyFitSettings,
+    BodyModels,
+    ExportSettings,
+    JointSettings,
+    MetricsSettings,
+    ObjectTrackSettings,
+    PersonSettings,
+    ReportSettings,
+    SubjectEntry,
+)
+from intercap_core.errors import UserError
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
+from intercap_core.stages import body_fit, dataset, export, joint, metrics, object_track, person
+from tests.rigid.conftest import catalogue
+from tests.tracking.object_capture import ObjectCapture
+
+SUBJECT = SubjectEntry(subject="s01", gender="neutral")
+FAST = BodyFitSettings(points_per_frame=600, hands=False, face=False)
+SETS = 3
+
+
+# --- the person and the body -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return BodyModel.load()
+
+
+def detected(paths: dict[str, Path], rig: Rig, path: Path) -> Path:
+    """Detections that hold exactly the keypoints and masks of a person artefact."""
+    with artefacts.read(paths["person"], PERSON) as known:
+        keypoints = known["keypoints"]
+        masks = artefacts.unpack_ragged(known["mask_offsets"], known["mask_rle"])
+    sets, views = keypoints.shape[:2]
+    with artefacts.write(path, DETECTIONS, sequence="test") as writer:
+        writer.put("camera_names", list(rig.names))
+        writer.put("colour_size", np.array([(c.colour.width, c.colour.height) for c in rig]))
+        writer.put("note", [""] * views)
+        for key in ("keypoints_found", "candidates_found"):
+            writer.put(key, np.ones((sets, views), bool))
+        for c, name in enumerate(rig.names):
+            group = f"cameras/{name}"
+            offsets, rle = artefacts.pack_ragged(masks[c::views])
+            writer.put(f"{group}/people_offsets", np.arange(sets + 1))
+            writer.put(f"{group}/people", keypoints[:, c])
+            writer.put(f"{group}/candidate_offsets", np.arange(sets + 1))
+            writer.put(f"{group}/candidate_labels", ["person"] * sets)
+            writer.put(f"{group}/candidate_scores", np.ones(sets))
+            writer.put(f"{group}/candidate_boxes", np.zeros((sets, 4)))
+            writer.put(f"{group}/rle_offsets", offsets)
+            writer.put(f"{group}/rle", rle)
+    return path
+
+
+class People:
+    """Somebody who turns in a ring of cameras; ``joints`` (T, 55, 3) are true."""
+
+    def __init__(self, model: BodyModel, folder: Path, cameras: int, sets: int = SETS) -> None:
+        rig = ring(cameras)
+        output = model.forward(model.parameters(motion(model, sets)))
+        self.joints = output.joints.numpy()
+        made = write_capture(
+            folder, rig, output.vertices.double().numpy(), model.faces.numpy(),
+            model.keypoints(output).double().numpy(), pixel_noise=0.5, depth_noise_mm=2.0,
+        )  # fmt: skip
+        self.paths = {"frames": made.frames, "scene": made.scene, "person": made.person}
+        self.paths["detections"] = detected(self.paths, rig, folder / "detections.h5")
+        del self.paths["person"]
+
+    def placed(self, reduction: Reduction, folder: Path) -> dict[str, Path]:
+        """The reduced artefacts and the person stage's."""
+        paths = reduction.apply(self.paths, folder)
+        person.run(**paths, output=folder / "person.h5", settings=PersonSettings())
+        return paths | {"person": folder / "person.h5"}
+
+    def fitted_mm(self, paths: dict[str, Path], folder: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Mean error of 22 joints (T,) of the body's fit, mm, and which frames failed."""
+        body_fit.run(
+            frames=paths["frames"], scene=paths["scene"], person=paths["person"],
+            output=folder / "body_fit.h5", subject=SUBJECT, body_models=BodyModels(),
+            settings=FAST,
+        )  # fmt: skip
+        with artefacts.read(folder / "body_fit.h5", BODY_FIT) as found:
+            error = np.linalg.norm(found["joints"] - self.joints[: len(found["joints"])], axis=2)
+            return 1000 * error[:, :22].mean(1), found["failed"]
+
+
+@pytest.fixture(scope="module")
+def people(model: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> People:
+    return People(model, tmp_path_factory.mktemp("people"), 6)
+
+
+@pytest.mark.parametrize(
+    ("reduction", "limit_mm"),
+    [
+        (Reduction(depth=["k2", "k5"]), 15),
+        (Reduction(depth=[]), 20),
+        (Reduction(cameras=["k1", "k3"]), 25),
+        (Reduction(cameras=["k1"]), 60),
+        (Reduction(cameras=["k1", "k4", "k5"], images_until={"k1": 1}), 25),
+        (Reduction(keypoints=["k1", "k3"]), 25),
+    ],
+    ids=["some depth", "no depth", "two", "one", "a camera that dies", "keypoints in two views"],
+)
+def test_body_on_reduced_rigs(people, tmp_path, reduction, limit_mm):
+    paths = people.placed(reduction, tmp_path)
+    with artefacts.read(paths["person"], PERSON) as found:
+        assert not found["missing"].any()
+    error, failed = people.fitted_mm(paths, tmp_path)
+    assert not failed.any() and error.max() < limit_mm
+
+
+def test_points_of_one_view_are_lifted_by_its_depth(people, tmp_path):
+    with artefacts.read(
+        people.placed(Reduction(cameras=["k1"]), tmp_path)["person"], PERSON
+    ) as found:
+        joints, views = found["joints"], found["joint_views"]
+        assert set(np.unique(views)) == {0, 1} and (views[:, :25].mean(1) > 0.6).all()
+        assert np.isnan(found["joint_error"]).all()
+        np.testing.assert_array_equal(found["inlier"].sum(1), views)
+    neck = np.linalg.norm(joints[:, 1] - people.joints[:, 12], axis=1)
+    assert neck.max() < 0.08
+
+
+def test_one_camera_without_depth_is_told_why_it_is_not_enough(people, tmp_path):
+    with pytest.raises(UserError, match=r"camera k1 alone sees anybody, without depth.*second"):
+        people.placed(Reduction(cameras=["k1"], depth=[]), tmp_path)
+    with pytest.raises(UserError, match="no image has keypoints of anybody"):
+        people.placed(Reduction(keypoints=[]), tmp_path)
+
+
+def test_sixteen_cameras_place_the_person(model, tmp_path):
+    many = People(model, tmp_path / "many", 16, sets=2)
+    with artefacts.read(many.placed(Reduction(), tmp_path / "all")["person"], PERSON) as found:
+        assert found["joint_views"][:, :25].min() >= 12
+        neck = np.linalg.norm(found["joints"][:, 1] - many.joints[:, 12], axis=1)
+        assert neck.max() < 0.01
+
+
+# --- the object --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def glide() -> ObjectCapture:
+    mesh = ObjectMesh.load(catalogue()["suitcase"]).simplified(600)
+    return ObjectCapture.make(mesh, SETS, cameras=6)
+
+
+@pytest.fixture(scope="module")
+def seen(glide, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return glide.write(tmp_path_factory.mktemp("glide"))
+
+
+def tracked(paths: dict[str, Path], output: Path) -> Path:
+    object_track.run(
+        **paths, output=output, object_=catalogue()["suitcase"], settings=ObjectTrackSettings()
+    )
+    return output
+
+
+@pytest.mark.parametrize(
+    ("reduction", "limit_mm"),
+    [
+        (Reduction(depth=["k2", "k5"]), 6),
+        (Reduction(depth=[]), 10),
+        (Reduction(cameras=["k1", "k2"], depth=[]), 25),
+        (Reduction(cameras=["k1"]), 15),
+        (Reduction(images_until={"k1": 1, "k3": 2}), 6),
+        (Reduction(candidates=["k1", "k3"]), 6),
+    ],
+    ids=["some depth", "no depth", "two without", "one", "cameras that die", "few candidates"],
+)
+def test_object_on_reduced_rigs(glide, seen, tmp_path, reduction, limit_mm):
+    paths = reduction.apply(seen, tmp_path)
+    with artefacts.read(tracked(paths, tmp_path / "object_track.h5"), OBJECT_TRACK) as track:
+        assert track.attributes["seed_source"] == "search" and not track["lost"].any()
+        for t in range(SETS):
+            # at the object's middle: a turn that hardly shows must not count twice
+            middle = glide.poses[t, :3, :3].T @ (track["translation"][t] - glide.poses[t, :3, 3])
+            assert 1000 * np.linalg.norm(middle) < limit_mm
+            angle = glide.mesh.symmetry.rotation_error_deg(
+                track["rotation"][t], glide.poses[t, :3, :3]
+            )
+            if reduction.depth != [] or reduction.cameras is None:
+                assert angle < 10  # two silhouettes do not tell a box's front from its back
+
+
+def test_object_that_nothing_can_place_is_told(seen, tmp_path):
+    for name, reduction in (
+        ("alone", Reduction(cameras=["k1"], depth=[])),
+        ("none", Reduction(candidates=[])),
+    ):
+        paths = reduction.apply(seen, tmp_path / name)
+        with pytest.raises(UserError, match=r"found in no frame .* with depth or in two views"):
+            tracked(paths, tmp_path / name / "object_track.h5")
+
+
+def test_object_in_sixteen_views(glide, tmp_path):
+    many = ObjectCapture.make(glide.mesh, 1, cameras=16)
+    paths = many.write(tmp_path)
+    with artefacts.read(tracked(paths, tmp_path / "object_track.h5"), OBJECT_TRACK) as track:
+        assert track["views"][0] >= 10
+        assert np.linalg.norm(track["translation"][0] - many.poses[0, :3, 3]) < 0.004
+
+
+# --- from the joint fit to the report ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "reduction",
+    [
+        Reduction(depth=[]),
+        Reduction(cameras=["k1"]),
+        Reduction(depth=["k1"], images_until={"k1": 1}),
+    ],
+    ids=["no depth", "one camera", "depth for one set"],
+)
+def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
+    capture = fitted.make_capture(tmp_path / "whole", total=SETS)
+    paths = reduction.apply(capture.paths, tmp_path / "reduced")
+    common = {"object_": capture.object_, "body_models": fitted.BODY_MODELS}
+    common["subject"] = fitted.SUBJECT
+    measured = tmp_path / "metrics.h5"
+    metrics.run(
+        **paths, **common, output=measured, settings=MetricsSettings(), truth=capture.paths["truth"]
+    )
+    with artefacts.read(measured, METRICS) as found:
+        seen = np.isfinite(found["body_visible_to_cloud"])
+        depth = 0 if reduction.depth == [] else 1 if reduction.images_until else SETS
+        assert seen.sum() == depth
+        assert (found["truth/joint/body_pve"] < 0.02).all()
+    export.run(
+        joint=paths["joint"], scene=paths["scene"], output=tmp_path / "export",
+        settings=ExportSettings(), **common,
+    )  # fmt: skip
+    dataset.run(
+        dataset="small",
+        sequences={
+            "cap": dataset.SequenceArtefacts(
+                metrics=measured,
+                **{s: paths[s] for s in ("frames", "scene", "object_track", "joint")},
+            )
+        },
+        objects={capture.object_.name: capture.object_},
+        subjects={"p01": fitted.SUBJECT},
+        body_models=fitted.BODY_MODELS,
+        settings=ReportSettings(frames=1, cameras=1),
+        report=tmp_path / "report.html",
+        summary=tmp_path / "summary.json",
+        heatmaps=tmp_path / "heatmaps.h5",
+        tables_folder=tmp_path / "tables",
+    )
+    assert "NaN" not in (tmp_path / "summary.json").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert ">nan<" not in page.lower()
+
+
+def test_the_joint_fit_needs_no_depth(people, seen, glide, tmp_path):
+    paths = people.placed(Reduction(depth=[]), tmp_path)
+    people.fitted_mm(paths, tmp_path)
+    track = tracked(Reduction(depth=[]).apply(seen, tmp_path / "object"), tmp_path / "track.h5")
+    joint.run(
+        frames=paths["frames"], scene=paths["scene"], person=paths["person"], object_track=track,
+        body_fit=tmp_path / "body_fit.h5", output=tmp_path / "joint.h5",
+        object_=catalogue()["suitcase"], subject=SUBJECT, body_models=BodyModels(),
+        settings=JointSettings(), body_settings=FAST,
+    )  # fmt: skip
+    with artefacts.read(tmp_path / "joint.h5", JOINT) as found:
+        assert np.isnan(found["cloud_residual"]).all()
+        error = np.linalg.norm(found["joints"] - people.joints, axis=2)[:, :22].mean(1)
+    assert error.max() < 0.025
