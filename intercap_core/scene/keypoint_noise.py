@@ -21,16 +21,18 @@ MIN_SHARE = 0.9  # of a series must be valid for it to help choose
 @dataclass(frozen=True)
 class TimeNoise:
     """``kind`` "rough" exp(-|d| / length) or "smooth" exp(-d^2 / (2 length^2)); ``length`` s;
-    ``fast`` share of the variance that is new in each image; ``scale``: standard deviation."""
+    ``fast`` share of the variance that is new in each image; ``scale``: standard deviation;
+    ``constant``: variance of what never changes, of the rest's."""
 
     kind: str
     length: float
     fast: float
     scale: float
+    constant: float = CONSTANT
 
     def covariance(self, times: np.ndarray) -> np.ndarray:
         """(T, T), of unit ``scale``, with the constant part."""
-        return _covariance(times, self.kind, self.length, self.fast) + CONSTANT
+        return _covariance(times, self.kind, self.length, self.fast) + self.constant
 
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Inverse covariances (N, T, T) of N series, in units of ``scale``; ``variance`` (N, T) is

@@ -168,8 +168,13 @@ def _normal_equations(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
 def _columns(motion: Motion) -> np.ndarray:
     """How the projected residuals (T, K, 2C) change with each camera's offset, then with each
     camera's six pose errors: (7C, T, K, 2C)."""
-    views = len(motion.rig)
-    offsets = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
+    offsets = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(len(motion.rig))]
+    return np.concatenate([np.stack(offsets), pose_columns(motion)])
+
+
+def pose_columns(motion: Motion) -> np.ndarray:
+    """How the projected residuals change with each camera's turn about its centre, rad, and its
+    move, m, in the master's axes: (6C, T, K, 2C)."""
     poses = []
     for c, camera in enumerate(motion.rig):
         arm = np.nan_to_num(motion.paths.points - camera.master_from_colour[:3, 3])
@@ -179,4 +184,4 @@ def _columns(motion: Motion) -> np.ndarray:
         moved = np.concatenate([turned, np.broadcast_to(-np.eye(3)[:, None, None], turned.shape)])
         pixels = np.einsum("tkij,ptkj->ptki", by_point, moved)
         poses += [motion.projected_of(c, pixels[p]) for p in range(6)]
-    return np.stack(offsets + poses)
+    return np.stack(poses)

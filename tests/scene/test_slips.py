@@ -1,0 +1,139 @@
+"""Silent slips and time offsets from keypoints, on studio captures and on walking stick people."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
+from synthetic_capture import ring
+from synthetic_people import stick_person
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.detection.triangulation import reproject
+from intercap_core.scene.keypoint_timing import keypoint_offsets
+from intercap_core.scene.slips import find_slips, interval_gains
+
+FPS = 15.0
+RIG, UP = ring()
+TIMES = np.arange(40) / FPS
+
+
+def walker(times: np.ndarray) -> np.ndarray:
+    """(T, 135, 3), z up: a stick person who walks to and fro and swings the arms."""
+    person = stick_person()
+    result = np.broadcast_to(person, (len(times), 135, 3)).copy()
+    result[:, :, 0] += 0.4 * np.sin(1.9 * times)[:, None]
+    result[:, :, 1] += 0.2 * np.sin(3.1 * times + 1)[:, None]
+    swing = 0.2 * np.sin(5.0 * times)[:, None]
+    result[:, 2:5, 0] += swing
+    result[:, 5:8, 0] -= swing
+    return result
+
+
+def seen(exposures: np.ndarray, seed: int = 0, moving: bool = True) -> np.ndarray:
+    """Keypoints (T, C, 135, 3) at ``exposures`` (T, C) s, scattered by 2 px."""
+    rng = np.random.default_rng(seed)
+    keypoints = np.full((*exposures.shape, 135, 3), 0.9)
+    for c in range(exposures.shape[1]):
+        points = walker(exposures[:, c] if moving else 0 * exposures[:, c])
+        in_master = apply(invert(UP), points.reshape(-1, 3))
+        pixels = reproject(in_master, RIG)[:, c].reshape(len(points), 135, 2)
+        keypoints[:, c, :, :2] = pixels + rng.normal(0, 2, pixels.shape)
+    return keypoints
+
+
+def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0) -> np.ndarray:
+    return TIMES[:, None] - slip / FPS + offset
+
+
+@pytest.fixture(scope="module")
+def captures() -> list[KeypointCapture]:
+    return [
+        keypoint_capture("stool_sit", seed=9301, subject="s02"),
+        keypoint_capture("suitcase_carry", seed=9302, subject="s03", family="b"),
+    ]
+
+
+def test_all_slips_of_studio_captures_are_found_and_no_others(captures):
+    for capture in captures:
+        keypoints = subject_keypoints(capture)
+        found = find_slips(keypoints, capture.rig, capture.times, capture.fps)
+        true = [(c, int(capture.slip[:, c].max())) for c in range(6) if capture.slip[:, c].any()]
+        assert len(true) == 2
+        assert sorted((i.camera, i.slip) for i in found.intervals) == true
+        assert not ((capture.slip == 0) & (found.slip != 0)).any()
+
+
+def test_offsets_of_studio_captures(captures):
+    errors, normalised = [], []
+    for capture in captures:
+        found = keypoint_offsets(
+            subject_keypoints(capture), capture.slip, capture.rig, capture.times
+        )
+        assert found.offset[0] == 0 and np.isfinite(found.sigma).all()
+        errors.append((found.offset - capture.offset)[1:])
+        normalised.append(errors[-1] / found.sigma[1:])
+    assert np.sqrt(np.mean(np.square(errors))) < 0.002
+    assert np.sqrt(np.mean(np.square(normalised))) < 2.0
+
+
+def test_nothing_is_found_where_nothing_slips():
+    for seed in range(2):
+        assert not find_slips(seen(exposures(np.zeros((40, 6))), seed), RIG, TIMES, FPS).intervals
+
+
+def test_two_cameras_may_slip_at_once():
+    slip = np.zeros((40, 6), np.int32)
+    slip[12:24, 2], slip[18:30, 4] = 3, 1
+    found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
+    np.testing.assert_array_equal(found.slip, slip)
+
+
+def test_whole_frames_of_delay_count_from_the_master():
+    slip = np.zeros((40, 6), np.int32)
+    slip[:, 3] = 2
+    found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
+    np.testing.assert_array_equal(found.slip, slip)
+    slip[:, 3], slip[:, 0] = 0, 2
+    found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
+    np.testing.assert_array_equal(found.slip, slip - slip[:, :1])
+
+
+def test_a_slip_while_nobody_moves_is_not_reported():
+    slip = np.zeros((40, 6), np.int32)
+    slip[10:20, 1] = 2
+    assert not find_slips(seen(exposures(slip), moving=False), RIG, TIMES, FPS).intervals
+    found = keypoint_offsets(seen(exposures(slip), moving=False), slip, RIG, TIMES)
+    assert np.isnan(found.sigma[1:]).all() and not found.offset.any()
+
+
+def test_offsets_are_seconds_after_the_master():
+    true = np.array([0.003, -0.004, 0.008, 0.0, -0.002, 0.006])
+    found = keypoint_offsets(seen(exposures(np.zeros((40, 6)), true)), np.zeros((40, 6), int),
+                             RIG, TIMES, master=1)  # fmt: skip
+    np.testing.assert_allclose(found.offset, true - true[1], atol=0.0015)
+    free = np.delete(np.arange(6), 1)
+    alone = np.linalg.solve(found.information[np.ix_(free, free)], found.vector[free])
+    np.testing.assert_allclose(alone, found.offset[free], atol=2e-4)
+
+
+def test_three_cameras_with_unequal_frame_counts_suffice():
+    rig = replace(RIG, cameras=RIG.cameras[:3])
+    slip = np.zeros((40, 3), np.int32)
+    slip[15:28, 1] = 3
+    keypoints = seen(exposures(slip))
+    keypoints[36:, 1] = 0
+    keypoints[:3, 0] = 0
+    np.testing.assert_array_equal(find_slips(keypoints, rig, TIMES, FPS).slip, slip)
+    offsets = keypoint_offsets(keypoints, slip, rig, TIMES)
+    assert np.abs(offsets.offset).max() < 0.004
+
+
+def test_interval_gains_are_sums_over_intervals():
+    rng = np.random.default_rng(0)
+    linear, quadratic = rng.normal(size=7), rng.normal(size=(7, 7))
+    gains = interval_gains(linear, quadratic)
+    assert gains[2, 5] == pytest.approx(linear[2:5].sum() - quadratic[2:5, 2:5].sum() / 2)
+    assert np.isneginf(gains[4, 4])
