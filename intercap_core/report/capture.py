@@ -39,11 +39,13 @@ _WORDS = {
 class CameraFacts:
     """One camera of a capture; seconds, metres, NaN = not known.
 
-    ``state`` (T,) of STATES; ``turned_deg`` and ``moved`` by refinement.
+    ``state`` (T,) of STATES; ``slip`` (T,) whole frames; ``turned_deg`` and ``moved`` by
+    refinement.
     """
 
     name: str
     state: Sequence[str]
+    slip: Sequence[int]
     start: float
     end: float
     offset: float
@@ -180,6 +182,7 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
             CameraFacts(
                 name=name,
                 state=camera_states(colour[:, c], depth[:, c], slip[:, c], dropped),
+                slip=slip[:, c].tolist(),
                 start=float(first),
                 end=float(last),
                 offset=float(offset[c]),
@@ -242,10 +245,16 @@ def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
 def _timeline(facts: CaptureFacts) -> str:
     rows = []
     for camera in facts.cameras:
+        said = [
+            f"slipped by {slip}" if state == "slipped" else state
+            for state, slip in zip(camera.state, camera.slip, strict=True)
+        ]
         runs = []
-        for first, last, state in flags.ranges(camera.state):
+        for first, last, words in flags.ranges(said):
+            state, _, frames = words.partition(" by ")
             at = f"{first}" if first == last else f"{first}–{last}"
-            runs.append((first, last, state, f"{at}: {_WORDS[state]}"))
+            late = f", {frames} {_frames(int(frames))} before" if frames else ""
+            runs.append((first, last, state, f"{at}: {_WORDS[state]}{late}"))
         rows.append(charts.StateRow(camera.name, runs, _beside(camera)))
     marks = [(t, f"{count} {_sets(count)} without any image") for t, count in facts.gaps]
     return charts.state_timeline(rows, len(facts.times), marks)
@@ -258,12 +267,20 @@ def _beside(camera: CameraFacts) -> str:
     parts = [f"{camera.start:.2f}–{camera.end:.2f} s"]
     parts += [
         f"{count} {word}"
-        for state, word in (("missing",) * 2, ("slipped",) * 2, ("part", "incomplete"))
+        for state, word in (("missing",) * 2, ("slipped", _slipped(camera)), ("part", "incomplete"))
         if (count := list(camera.state).count(state))
     ]
     if np.isfinite(camera.offset_sigma):
         parts.append(f"{_offset(camera)} ms")
     return " · ".join(parts)
+
+
+def _slipped(camera: CameraFacts) -> str:
+    """By how many frames its images are late, e.g. "slipped by 2 or 3"."""
+    late = {
+        slip for state, slip in zip(camera.state, camera.slip, strict=True) if state == "slipped"
+    }
+    return f"slipped by {' or '.join(map(str, sorted(late)))}"
 
 
 def _offset(camera: CameraFacts) -> str:
@@ -298,8 +315,8 @@ def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
     high = max(float(p.along.max()) for p in every)
     return [
         (
-            f"the floor in a strip through the middle, {when} refinement" if when
-            else "the floor in a strip through the middle",
+            f"the floor along a strip near the middle, {when} refinement" if when
+            else "the floor along a strip near the middle",
             _profile_chart(profiles, (low, high), top),
         )
         for when, profiles in zip(drawn.when, drawn.profiles, strict=True)
@@ -321,6 +338,10 @@ def _profile_chart(
 
 def _colour(c: int) -> str:
     return CAMERA_COLOURS[c % len(CAMERA_COLOURS)]
+
+
+def _frames(count: int) -> str:
+    return "frame" if count == 1 else "frames"
 
 
 def _sets(count: int) -> str:

@@ -48,6 +48,8 @@ _FEW_IN_SLICE = 40
 _SCALE_BAR_M = 0.1
 _DOT_PX = 2
 _STRIP_M, _STRIP_BIN_M, _STRIP_HEIGHT_M = 0.3, 0.08, 0.08
+_STRIPS_M = (0.0, 0.3, -0.3, 0.6, -0.6)  # from the middle
+_STANDING_M = 0.4  # up to this height something stands on the strip
 _FEW_IN_BIN = 5
 _INK, _SHADOW = (235, 235, 235), (10, 12, 16)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -139,9 +141,15 @@ def choose_set(images: Frames) -> int:
 
 
 def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
-    """Median heights of the floor in a strip along x through the middle, camera by camera."""
-    low = np.abs(cloud.points[:, 2]) < _STRIP_HEIGHT_M
-    low &= (np.abs(cloud.points[:, 1] - centre[1]) < _STRIP_M / 2) & (cloud.normals[:, 2] > 0.9)
+    """Median heights of the floor in a strip along x near the middle, camera by camera.
+
+    ``centre`` (2,) is the middle. Of several strips that one is taken on which least stands.
+    """
+    height, beside = cloud.points[:, 2], cloud.points[:, 1] - centre[1]
+    standing = beside[(height > _STRIP_HEIGHT_M) & (height < _STANDING_M)]
+    least = min(_STRIPS_M, key=lambda at: int((np.abs(standing - at) < _STRIP_M / 2).sum()))
+    low = (np.abs(height) < _STRIP_HEIGHT_M) & (cloud.normals[:, 2] > 0.9)
+    low &= np.abs(beside - least) < _STRIP_M / 2
     profiles = []
     for c in np.unique(cloud.camera[low]):
         points = cloud.points[low & (cloud.camera == c)]

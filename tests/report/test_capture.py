@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -97,6 +98,19 @@ def test_states_of_a_cameras_frames() -> None:
     assert without == ["recorded", "recorded", "missing", "missing", "recorded", "dropped"]
 
 
+def test_the_timeline_tells_how_late_slipped_images_are(made: fitted.Capture) -> None:
+    facts = capture.read_capture(made.paths["frames"], made.paths["scene"])
+    late = replace(
+        facts.cameras[1],
+        state=["recorded", "slipped", "slipped", "slipped", "missing", "recorded"],
+        slip=[0, 2, 2, 1, 0, 0],
+    )
+    drawn = capture.context(replace(facts, cameras=[facts.cameras[0], late]))["timeline"]
+    assert "1–2: shows an older moment, 2 frames before" in drawn
+    assert "3: shows an older moment, 1 frame before" in drawn
+    assert "3 slipped by 1 or 2" in drawn and "1 missing" in drawn
+
+
 def test_gaps_are_where_time_runs_on() -> None:
     assert capture.gaps(np.array([0, 1, 2, 5, 6]) / 15, 15) == [(2, 2)]
     assert capture.gaps(np.zeros(1), 15) == []
@@ -172,3 +186,15 @@ def test_floor_profiles_are_median_heights_by_camera() -> None:
     (profile,) = floor_profiles(FusedCloud(points, up, up, camera), np.zeros(2))
     assert profile.height == pytest.approx(0.01 * profile.along, abs=3e-4)
     assert not floor_profiles(FusedCloud(points, -up, up, camera), np.zeros(2))
+
+
+def test_floor_profiles_keep_clear_of_what_stands_there() -> None:
+    x, y = np.meshgrid(np.linspace(-1, 1, 200), np.linspace(-0.8, 0.8, 65))
+    box = (np.abs(x) < 0.2) & (np.abs(y) < 0.1)
+    z = np.where(box, 0.07, 0)
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], 1).astype(np.float32)
+    leg = np.float32([[0, 0, 0.2]])
+    up = np.tile(np.float32([0, 0, 1]), (len(points) + 1, 1))
+    cloud = FusedCloud(np.concatenate([points, leg]), up, up, np.zeros(len(up), np.int32))
+    (profile,) = floor_profiles(cloud, np.zeros(2))
+    assert profile.height == pytest.approx(0 * profile.along)
