@@ -159,67 +159,74 @@ def test_sixteen_cameras_place_the_person(model, tmp_path):
 # --- the object --------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def glide() -> ObjectCapture:
-    mesh = ObjectMesh.load(catalogue()["suitcase"]).simplified(600)
-    return ObjectCapture.make(mesh, SETS, cameras=6)
+def gliding(name: str, frames: int = 2, cameras: int = 6) -> ObjectCapture:
+    entry = catalogue()[name]
+    mesh = ObjectMesh.load(entry).simplified(600)
+    return ObjectCapture.make(mesh, frames, cameras=cameras, label=entry.labels[0])
+
+
+class Gliding:
+    """One object's capture and its artefacts."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self.name, self.made = name, gliding(name)
+        self.paths = self.made.write(folder)
 
 
 @pytest.fixture(scope="module")
-def seen(glide, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return glide.write(tmp_path_factory.mktemp("glide"))
+def objects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Gliding]:
+    return {name: Gliding(name, tmp_path_factory.mktemp(name)) for name in ("suitcase", "football")}
 
 
-def tracked(paths: dict[str, Path], output: Path) -> Path:
+def tracked(paths: dict[str, Path], output: Path, name: str = "suitcase") -> Path:
     object_track.run(
-        **paths, output=output, object_=catalogue()["suitcase"], settings=ObjectTrackSettings()
+        **paths, output=output, object_=catalogue()[name], settings=ObjectTrackSettings()
     )
     return output
 
 
 @pytest.mark.parametrize(
-    ("reduction", "limit_mm"),
+    ("name", "reduction", "limit_mm"),
     [
-        (Reduction(depth=["k2", "k5"]), 6),
-        (Reduction(depth=[]), 10),
-        (Reduction(cameras=["k1", "k2"], depth=[]), 25),
-        (Reduction(cameras=["k1"]), 15),
-        (Reduction(images_until={"k1": 1, "k3": 2}), 6),
-        (Reduction(candidates=["k1", "k3"]), 6),
+        ("suitcase", Reduction(depth=["k2", "k5"]), 6),
+        ("suitcase", Reduction(depth=[]), 10),
+        ("suitcase", Reduction(cameras=["k1"]), 15),
+        ("football", Reduction(cameras=["k1", "k2"], depth=[]), 15),
+        ("football", Reduction(images_until={"k1": 1, "k3": 1}), 6),
+        ("football", Reduction(candidates=["k1", "k3"]), 6),
     ],
-    ids=["some depth", "no depth", "two without", "one", "cameras that die", "few candidates"],
+    ids=["some depth", "no depth", "one", "two without", "cameras that die", "few candidates"],
 )
-def test_object_on_reduced_rigs(glide, seen, tmp_path, reduction, limit_mm):
-    paths = reduction.apply(seen, tmp_path)
-    with artefacts.read(tracked(paths, tmp_path / "object_track.h5"), OBJECT_TRACK) as track:
+def test_object_on_reduced_rigs(objects, tmp_path, name, reduction, limit_mm):
+    capture = objects[name].made
+    paths = reduction.apply(objects[name].paths, tmp_path)
+    with artefacts.read(tracked(paths, tmp_path / "object_track.h5", name), OBJECT_TRACK) as track:
         assert track.attributes["seed_source"] == "search" and not track["lost"].any()
-        for t in range(SETS):
-            # at the object's middle: a turn that hardly shows must not count twice
-            middle = glide.poses[t, :3, :3].T @ (track["translation"][t] - glide.poses[t, :3, 3])
-            assert 1000 * np.linalg.norm(middle) < limit_mm
-            angle = glide.mesh.symmetry.rotation_error_deg(
-                track["rotation"][t], glide.poses[t, :3, :3]
-            )
-            if reduction.depth != [] or reduction.cameras is None:
-                assert angle < 10  # two silhouettes do not tell a box's front from its back
+        away = np.linalg.norm(track["translation"] - capture.poses[:, :3, 3], axis=1)
+        assert 1000 * away.max() < limit_mm
+        angle = capture.mesh.symmetry.rotation_error_deg(
+            track["rotation"], capture.poses[:, :3, :3]
+        )
+        assert np.max(angle) < 10
 
 
-def test_object_that_nothing_can_place_is_told(seen, tmp_path):
+def test_object_that_nothing_can_place_is_told(objects, tmp_path):
     for name, reduction in (
         ("alone", Reduction(cameras=["k1"], depth=[])),
         ("none", Reduction(candidates=[])),
     ):
-        paths = reduction.apply(seen, tmp_path / name)
+        paths = reduction.apply(objects["suitcase"].paths, tmp_path / name)
         with pytest.raises(UserError, match=r"found in no frame .* with depth or in two views"):
             tracked(paths, tmp_path / name / "object_track.h5")
 
 
-def test_object_in_sixteen_views(glide, tmp_path):
-    many = ObjectCapture.make(glide.mesh, 1, cameras=16)
+def test_object_in_sixteen_views(tmp_path):
+    many = gliding("football", frames=1, cameras=16)
     paths = many.write(tmp_path)
-    with artefacts.read(tracked(paths, tmp_path / "object_track.h5"), OBJECT_TRACK) as track:
-        assert track["views"][0] >= 10
-        assert np.linalg.norm(track["translation"][0] - many.poses[0, :3, 3]) < 0.004
+    track = tracked(paths, tmp_path / "object_track.h5", "football")
+    with artefacts.read(track, OBJECT_TRACK) as found:
+        assert found["views"][0] >= 10
+        assert np.linalg.norm(found["translation"][0] - many.poses[0, :3, 3]) < 0.004
 
 
 # --- from the joint fit to the report ----------------------------------------------------------
@@ -274,17 +281,19 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
     assert ">nan<" not in page.lower()
 
 
-def test_the_joint_fit_needs_no_depth(people, seen, glide, tmp_path):
-    paths = people.placed(Reduction(depth=[]), tmp_path)
+def test_the_joint_fit_needs_no_depth(people, objects, tmp_path):
+    no_depth = Reduction(sets=2, depth=[])
+    paths = people.placed(no_depth, tmp_path)
     people.fitted_mm(paths, tmp_path)
-    track = tracked(Reduction(depth=[]).apply(seen, tmp_path / "object"), tmp_path / "track.h5")
+    ball = no_depth.apply(objects["football"].paths, tmp_path / "object")
+    track = tracked(ball, tmp_path / "track.h5", "football")
     joint.run(
         frames=paths["frames"], scene=paths["scene"], person=paths["person"], object_track=track,
         body_fit=tmp_path / "body_fit.h5", output=tmp_path / "joint.h5",
-        object_=catalogue()["suitcase"], subject=SUBJECT, body_models=BodyModels(),
+        object_=catalogue()["football"], subject=SUBJECT, body_models=BodyModels(),
         settings=JointSettings(), body_settings=FAST,
     )  # fmt: skip
     with artefacts.read(tmp_path / "joint.h5", JOINT) as found:
         assert np.isnan(found["cloud_residual"]).all()
-        error = np.linalg.norm(found["joints"] - people.joints, axis=2)[:, :22].mean(1)
+        error = np.linalg.norm(found["joints"] - people.joints[:2], axis=2)[:, :22].mean(1)
     assert error.max() < 0.025
