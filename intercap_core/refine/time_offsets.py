@@ -32,7 +32,7 @@ PART_POINTS = 4.0  # points of one part count as at most so many: they err toget
 _GAP = 1.5  # of the usual time step: rows farther apart are no neighbours
 _LEAST_ROWS = 50
 # What is known before comes from the same keypoints: it is not taken as surer than this.
-_PRIOR_SIGMA_S = 0.001
+_PRIOR_SIGMA_S = 0.0005
 
 
 @dataclass(frozen=True, eq=False)
