@@ -1,7 +1,7 @@
 """Hundreds of poses aligned at once to what a group of candidates shows of the object.
 
-Point-to-plane ICP to the measured points, and the reach of the silhouettes where a view measures
-none. Robust (Geman-McClure), with a scale that shrinks from the size of the search grid's error.
+Point-to-plane ICP to the measured points, and the reach of the silhouettes where views measure none
+or few views leave many poses that fit the points. Robust (Geman-McClure), with a scale that shrinks from the size of the search grid's error.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from intercap_core.tracking.groups import Group, centre_of
 CLOUD_POINTS = 150
 ICP_STEPS = 6
 ICP_SCALES_M = (0.08, 0.015)
+FEW_VIEWS = 2
 FARTHEST_M = 0.05  # residuals beyond count as this much
 _MAX_TURN, _MAX_SHIFT_M = np.radians(15), 0.05  # of a step
 
@@ -32,7 +33,8 @@ def align(
     """Align every rotation (N, 3, 3): poses (N, 4, 4) and robust mean residual (N,) in metres."""
     count = len(rotations)
     cloud, eyes = _cloud(group, views)
-    shapes = [s.outline for s in group if s.outline is not None]
+    few = len(group) <= FEW_VIEWS
+    shapes = [s.outline for s in group if s.outline and (few or s.centre is None)]
     hull = outlines.hull_vertices(mesh) if shapes else np.zeros((0, 3))
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

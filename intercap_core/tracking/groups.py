@@ -28,8 +28,8 @@ SMALLEST, LARGEST = 0.12, 1.25
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One candidate of one image: measured ``points`` (N, 3), master frame, with their ``centre``
-    (3,), or the ``outline`` alone where the view has no depth."""
+    """One candidate of one image: its ``outline`` (None where all of it is cut off) and, where the
+    view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,)."""
 
     view: int
     candidate: Candidate
@@ -172,5 +172,6 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
             if len(points) < MIN_POINTS or spread > 0.75 * diameter:
                 continue
             likely = not labels or candidate.label in labels
-            found.append(Sighting(number, candidate, likely, points, centre, None))
+            outline = Outline.of(view, candidate)
+            found.append(Sighting(number, candidate, likely, points, centre, outline))
     return found
