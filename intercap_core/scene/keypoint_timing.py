@@ -8,7 +8,7 @@ where the joints are and how the cameras' poses err are unknowns of the same pro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.scene.keypoint_motion import Motion, build_motion
-from intercap_core.scene.keypoint_noise import MISSING, TimeNoise, fit_noise
+from intercap_core.scene.keypoint_noise import CONSTANT, MISSING, TimeNoise, fit_noise
 
 WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
 POSE_SIGMA = np.r_[np.full(3, np.radians(1.0)), np.full(3, 0.02)]  # of the poses as they are given
@@ -59,7 +59,7 @@ def keypoint_offsets(
 def offsets_of(motion: Motion, master: int) -> Offsets:
     """The offsets that a motion's residuals say."""
     views = len(motion.rig)
-    matrices, vectors = _normal_equations(motion)  # of each keypoint
+    matrices, vectors = keypoint_equations(motion, motion.residual, _columns(motion))
     prior = np.r_[np.full(views, OFFSET_SIGMA_S**-2.0), np.tile(POSE_SIGMA**-2.0, views)]
     free = np.flatnonzero(np.arange(7 * views) != master)
     matrix, vector = matrices.sum(0), vectors.sum(0)
@@ -146,22 +146,30 @@ def precisions(motion: Motion, noise: TimeNoise, part: slice) -> np.ndarray:
     return np.swapaxes(found.reshape(views, count, size, size), 0, 1)
 
 
-def _normal_equations(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Each keypoint's matrix (K, n, n) and vector (K, n) in the unknowns of :func:`_columns`."""
-    noise = noise_of(motion)
-    columns = _columns(motion)  # (n, T, K, 2C)
-    residual = series_of(motion.projected(motion.residual))
+def keypoint_equations(
+    motion: Motion, residual: np.ndarray, columns: np.ndarray, constant: float = CONSTANT
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each keypoint's normal matrix (K, n, n) and vector (K, n).
+
+    ``columns`` (n, T, K, 2C) are projected residuals' derivatives by the unknowns, ``residual`` (T,
+    C, K, 2) px; ``constant``: see :class:`TimeNoise`.
+    """
+    noise = replace(noise_of(motion), constant=constant)
+    series = series_of(motion.projected(residual))
     size, _, count, _ = columns.shape
     matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
-    for part in windows(len(motion.times)):
-        precision = precisions(motion, noise, part)
+    parts = windows(len(motion.times))
+    # A constant that is not free lasts beyond a window: windows do not add up.
+    share = 1.0 if constant >= CONSTANT else 1 / len(parts)
+    for part in parts:
+        precision = precisions(motion, noise, part) * share
         for k in range(count):
             for c in np.flatnonzero(motion.valid[part, :, k].any(0)):
                 both = slice(2 * c, 2 * c + 2)
                 rows = columns[:, part, k, both].transpose(2, 1, 0)  # (2, W, n)
                 weighted = precision[k, c] @ rows
                 matrices[k] += (np.swapaxes(rows, 1, 2) @ weighted).sum(0)
-                vectors[k] += np.einsum("xtn,xt->n", weighted, residual[k, both, part])
+                vectors[k] += np.einsum("xtn,xt->n", weighted, series[k, both, part])
     return matrices, vectors
 
 

@@ -9,7 +9,7 @@ turned camera, so the verdict is as good as the poses are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,23 +18,22 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.scene.keypoint_motion import Motion, build_motion
 from intercap_core.scene.keypoint_timing import (
+    CLUSTER,
     MIN_SETS,
-    noise_of,
+    keypoint_equations,
     pose_columns,
-    precisions,
-    series_of,
-    windows,
 )
 
 VIEW_BIAS = 2.0  # variance of a keypoint's constant error in a view, of its other errors'
-MIN_GAIN = 45.0  # log likelihood; what hidden joints and tails bring by chance stays well below
+MIN_GAIN = 15.0  # log likelihood; chance brings up to 9
 FIT_RANGE = (0.5, 1.5)  # how much of the pattern must be there
 
 
 @dataclass(frozen=True)
 class LensPair:
-    """Cameras ``first`` and ``second`` have each other's lenses; ``gain`` in log likelihood,
-    ``share`` of the exchange's pattern that the residuals hold."""
+    """Cameras ``first`` and ``second`` have each other's lenses; ``gain`` in log likelihood, less
+    where the keypoints disagree by more than their noise; ``share`` of the exchange's pattern that
+    the residuals hold."""
 
     first: int
     second: int
@@ -91,22 +90,28 @@ def lens_gains(
     whole = np.where(motion.seen[..., None], motion.residual + motion.bias, 0.0)
     patterns = [motion.projected_of(a, _with_lens(motion, a, b)) for a, b in orders]
     columns = np.concatenate([np.stack(patterns), pose_columns(motion)])
-    matrix, vector = _normal_equations(motion, whole, columns)
+    matrices, vectors = keypoint_equations(motion, whole, columns, constant=VIEW_BIAS)
     number = len(orders)
-    prior = np.diag(
-        np.tile(np.repeat([rotation_sigma**-2.0, translation_sigma**-2.0], 3), len(rig))
-    )
-    solved = np.linalg.solve(matrix[number:, number:] + prior, matrix[number:, :number])
-    matrix = matrix[:number, :number] - matrix[:number, number:] @ solved
-    vector = vector[:number] - solved.T @ vector[number:]
+    prior = np.tile(np.repeat([rotation_sigma**-2.0, translation_sigma**-2.0], 3), len(rig))
+    matrix, vector = matrices.sum(0), vectors.sum(0)
+    poses = np.linalg.inv(matrix[number:, number:] + np.diag(prior))
     place = {order: i for i, order in enumerate(orders)}
     found = []
     for a, b in orders:
-        if a < b:
-            both = [place[a, b], place[b, a]]
-            linear = float(vector[both].sum())
-            energy = max(float(matrix[np.ix_(both, both)].sum()), 1e-12)
-            found.append(LensPair(a, b, linear - energy / 2, linear / energy))
+        if a > b:
+            continue
+        pattern = np.zeros(len(matrix))
+        pattern[[place[a, b], place[b, a]]] = 1.0
+        # The part of the pattern that no poses explain, and the poses beside a share of it.
+        pattern[number:] = -poses @ (matrix @ pattern)[number:]
+        energy = float(pattern @ matrix @ pattern + prior @ pattern[number:] ** 2) + 1e-12
+        linear = float(pattern @ vector)
+        fitted = pattern * linear / energy
+        fitted[number:] += poses @ vector[number:]
+        scores = (vectors - matrices @ fitted) @ pattern
+        disagreement = float((np.bincount(CLUSTER, scores) ** 2).sum()) / energy
+        gain = (linear - energy / 2) / max(1.0, disagreement)
+        found.append(LensPair(a, b, gain, linear / energy))
     return found
 
 
@@ -118,24 +123,3 @@ def _with_lens(motion: Motion, camera: int, other: int) -> np.ndarray:
         in_camera, lenses[camera]
     )
     return np.where(motion.seen[:, camera, :, None], moved, 0.0)
-
-
-def _normal_equations(
-    motion: Motion, residual: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (n, n) and vector (n,) of ``columns`` (n, T, K, 2C) against pixels (T, C, K, 2)."""
-    noise = replace(noise_of(motion), constant=VIEW_BIAS)
-    series = series_of(motion.projected(residual))
-    size = len(columns)
-    matrix, vector = np.zeros((size, size)), np.zeros(size)
-    parts = windows(len(motion.times))
-    for part in parts:
-        precision = precisions(motion, noise, part) / len(parts)  # the constant part is shared
-        for k in range(len(precision)):
-            for c in np.flatnonzero(motion.valid[part, :, k].any(0)):
-                both = slice(2 * c, 2 * c + 2)
-                rows = columns[:, part, k, both].transpose(2, 1, 0)
-                weighted = precision[k, c] @ rows
-                matrix += (np.swapaxes(rows, 1, 2) @ weighted).sum(0)
-                vector += np.einsum("xtn,xt->n", weighted, series[k, both, part])
-    return matrix, vector

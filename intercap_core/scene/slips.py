@@ -34,6 +34,7 @@ GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
 CLEAR_GAIN = 10.0  # an interval must gain this much over the whole recording's being late
 WORTH = 0.2  # of the best interval's gain makes another worth taking at once
 APART_S = 1.0
+MANY_VIEWS = 4  # suffice for the body's motion without those that slip
 MAX_ROUNDS = 12
 
 
@@ -83,18 +84,26 @@ def find_slips(
         return Slips(slip, ())
     steps = [s for s in range(-max_slip, max_slip + 1) if s]
     motion = build_motion(keypoints, rig, times)
-    offset = np.zeros(len(rig))
+    offset: np.ndarray | None = None
     for _ in range(MAX_ROUNDS):
-        evidence = _Evidence(motion.at_offsets(offset), steps, fps)
+        seen = motion if offset is None else motion.at_offsets(offset)
+        evidence = _Evidence(seen, steps, fps)
         best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
-        if not best and offset.any():
-            break
-        if not best:
+        if best:
+            for interval in _apart(best, times):
+                _apply(slip, interval)
+            motion = build_motion(by_moment(keypoints, slip), rig, times, motion.paths.points)
+        elif offset is None:
             # Slips are large against offsets, but weak ones hide behind them: look once more.
             offset = offsets_of(motion, master).offset
-        for interval in _apart(best, times):
-            _apply(slip, interval)
-        motion = build_motion(by_moment(keypoints, slip), rig, times, motion.paths.points)
+        else:
+            break
+    if slip.any():
+        undisturbed = keypoints.copy()
+        if len(rig) >= MANY_VIEWS:
+            undisturbed[slip != _constant(slip)] = 0
+        motion = build_motion(by_moment(undisturbed, slip), rig, times, motion.paths.points)
+    offset = np.zeros(len(rig)) if offset is None else offset
     slip, intervals = _polished(slip, keypoints, motion, offset, steps, fps)
     always = [i.slip for i in intervals if i.camera == master and _whole(i, len(times))]
     return Slips(slip - np.int32(sum(always)), tuple(sorted(intervals, key=lambda i: -i.gain)))
@@ -102,6 +111,11 @@ def find_slips(
 
 def _whole(interval: Interval, sets: int) -> bool:
     return interval.last - interval.first + 1 == sets
+
+
+def _constant(slip: np.ndarray) -> np.ndarray:
+    """What all images of each camera (C,) are late by."""
+    return np.where((slip != 0).all(0), np.median(slip, 0), 0).astype(np.int32)
 
 
 def _apply(slip: np.ndarray, interval: Interval) -> None:
@@ -138,7 +152,7 @@ def _polished(
     """Find each interval once more, against the motion that no slip disturbs any longer."""
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
-        constant = np.int32(np.median(slip[:, c])) if (slip[:, c] != 0).all() else np.int32(0)
+        constant = _constant(slip)[c]
         if constant:
             whole = Interval(c, 0, len(slip) - 1, int(constant), np.inf, np.inf)
             intervals.append(whole)
@@ -223,9 +237,7 @@ def _best_of_window(cases: dict[int, _Slipped]) -> Interval | None:
         return None
     most = max(found, key=lambda i: i.gain)
     # The gain tells best that and when images are late, the misfit by how much.
-    step = min(cases, key=lambda s: cases[s].misfit(most.first, most.last + 1))
-    chosen = cases[step].best(step)
-    return chosen if chosen.beyond_doubt else None
+    return min(found, key=lambda i: cases[i.slip].misfit(most.first, most.last + 1))
 
 
 def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
