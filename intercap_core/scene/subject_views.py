@@ -12,6 +12,7 @@ from intercap_core.detection.read import Detections
 from intercap_core.detection.sides import BODY_POINTS
 from intercap_core.detection.subject import NOBODY, find_subject
 from intercap_core.detection.swaps import triangulate_people
+from intercap_core.scene.late_views import with_late_views
 
 MIN_CONFIDENCE = 0.3
 LOOSE_PX_AT_1080P = 40.0  # poses that are a centimetre off are not yet consistent
@@ -39,10 +40,28 @@ class SubjectViews:
 def subject_views(detections: Detections, rig: Rig, times: np.ndarray) -> SubjectViews:
     """Find the subject at the start's poses; all 0 and NaN where no two views agree on anybody."""
     index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE)
+    found = triangulated(_keypoints_of(detections, index), rig)
+    if len(times) < 2:
+        return found
+    late = with_late_views(
+        index,
+        detections,
+        found.joints,
+        rig,
+        times,
+        fps=1 / float(np.median(np.diff(times))),
+        min_confidence=MIN_CONFIDENCE,
+    )
+    if np.array_equal(late, index):
+        return found
+    return triangulated(_keypoints_of(detections, late), rig)
+
+
+def _keypoints_of(detections: Detections, index: np.ndarray) -> np.ndarray:
     keypoints = np.zeros((*index.shape, NUM_KEYPOINTS, 3))
     for t, c in np.argwhere(index != NOBODY):
         keypoints[t, c] = detections.people(t, c)[index[t, c]]
-    return triangulated(keypoints, rig)
+    return keypoints
 
 
 def triangulated(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
