@@ -1,7 +1,8 @@
 """Hundreds of poses aligned at once to what a group of candidates shows of the object.
 
 Point-to-plane ICP to the measured points, and the reach of the silhouettes where views measure none
-or few views leave many poses that fit the points. Robust (Geman-McClure), with a scale that shrinks from the size of the search grid's error.
+or few views leave many poses that fit the points. Robust (Geman-McClure), with a scale that shrinks
+from the size of the search grid's error.
 """
 
 from __future__ import annotations
