@@ -213,10 +213,11 @@ def _scatter(size: np.ndarray, known: np.ndarray) -> np.ndarray:
     few samples count little against the view's others."""
     of_point = _nanmedian(np.where(known, size, np.nan)) / 1.177  # of a Rayleigh median
     number = known.sum(0)
-    of_view = np.nanmedian(np.where(number > 0, of_point, np.nan), 1, keepdims=True)
-    of_view = np.where(np.isfinite(of_view), of_view, np.inf)
+    of_view = _nanmedian(np.where(number > 0, of_point, np.nan).T)[:, None]
+    of_view = np.where(number.any(1, keepdims=True), of_view, np.inf)
     share = number / (number + 5.0)
-    return np.where(number > 0, share * of_point + (1 - share) * of_view, of_view)
+    few = np.where(number > 0, of_view, 0.0)
+    return np.where(number > 0, share * of_point + (1 - share) * few, of_view)
 
 
 def _nanmedian(values: np.ndarray) -> np.ndarray:

@@ -120,7 +120,7 @@ def by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
 def windows(sets: int) -> list[slice]:
     """Slices of about equal length, at most :data:`WINDOW_SETS` long."""
     edges = np.linspace(0, sets, -(-sets // WINDOW_SETS) + 1).round().astype(int)
-    return [slice(a, b) for a, b in pairwise(edges)]
+    return [slice(a, b) for a, b in pairwise(edges.tolist())]
 
 
 def series_of(values: np.ndarray) -> np.ndarray:

@@ -85,6 +85,7 @@ def find_slips(
     steps = [s for s in range(-max_slip, max_slip + 1) if s]
     motion = build_motion(keypoints, rig, times)
     offset: np.ndarray | None = None
+    always: list[Interval] = []
     for _ in range(MAX_ROUNDS):
         seen = motion if offset is None else motion.at_offsets(offset)
         evidence = _Evidence(seen, steps, fps)
@@ -92,6 +93,8 @@ def find_slips(
         if best:
             for interval in _apart(best, times):
                 _apply(slip, interval)
+                if _whole(interval, len(times)):
+                    always.append(interval)
             motion = build_motion(by_moment(keypoints, slip), rig, times, motion.paths.points)
         elif offset is None:
             # Slips are large against offsets, but weak ones hide behind them: look once more.
@@ -105,8 +108,9 @@ def find_slips(
         motion = build_motion(by_moment(undisturbed, slip), rig, times, motion.paths.points)
     offset = np.zeros(len(rig)) if offset is None else offset
     slip, intervals = _polished(slip, keypoints, motion, offset, steps, fps)
-    always = [i.slip for i in intervals if i.camera == master and _whole(i, len(times))]
-    return Slips(slip - np.int32(sum(always)), tuple(sorted(intervals, key=lambda i: -i.gain)))
+    intervals = sorted([*always, *intervals], key=lambda i: -i.gain)
+    of_master = sum(i.slip for i in always if i.camera == master)
+    return Slips(slip - np.int32(of_master), tuple(intervals))
 
 
 def _whole(interval: Interval, sets: int) -> bool:
@@ -141,6 +145,12 @@ def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
     return taken
 
 
+def _runs(chosen: np.ndarray) -> list[np.ndarray]:
+    """The places of each unbroken run of True."""
+    places = np.flatnonzero(chosen)
+    return np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
+
+
 def _polished(
     slip: np.ndarray,
     keypoints: np.ndarray,
@@ -153,13 +163,7 @@ def _polished(
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
         constant = _constant(slip)[c]
-        if constant:
-            whole = Interval(c, 0, len(slip) - 1, int(constant), np.inf, np.inf)
-            intervals.append(whole)
-        differs = np.flatnonzero(slip[:, c] != constant)
-        for run in (
-            np.split(differs, np.flatnonzero(np.diff(differs) > 1) + 1) if len(differs) else ()
-        ):
+        for run in _runs(slip[:, c] != constant):
             before = slip.copy()
             before[run, c] = constant
             shown = seeing(motion, by_moment(keypoints, before))

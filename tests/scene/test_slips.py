@@ -12,7 +12,7 @@ from synthetic_people import stick_person
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.detection.triangulation import reproject
-from intercap_core.scene.keypoint_timing import keypoint_offsets
+from intercap_core.scene.keypoint_timing import WINDOW_SETS, keypoint_offsets
 from intercap_core.scene.slips import find_slips, interval_gains
 
 FPS = 15.0
@@ -45,7 +45,7 @@ def seen(exposures: np.ndarray, seed: int = 0, moving: bool = True) -> np.ndarra
 
 
 def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0) -> np.ndarray:
-    return TIMES[:, None] - slip / FPS + offset
+    return np.arange(len(slip))[:, None] / FPS - slip / FPS + offset
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +89,13 @@ def test_two_cameras_may_slip_at_once():
     slip[12:24, 2], slip[18:30, 4] = 3, 1
     found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
     np.testing.assert_array_equal(found.slip, slip)
+
+
+def test_a_slip_may_lie_over_the_edge_of_a_window():
+    slip = np.zeros((WINDOW_SETS + 14, 6), np.int32)
+    slip[45:70, 2], slip[80:, 5] = 2, 1
+    times = np.arange(len(slip)) / FPS
+    np.testing.assert_array_equal(find_slips(seen(exposures(slip)), RIG, times, FPS).slip, slip)
 
 
 def test_whole_frames_of_delay_count_from_the_master():
