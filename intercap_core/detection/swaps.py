@@ -2,7 +2,8 @@
 
 A view's limb counts as exchanged when the points that the views agree on fit it much better with
 the sides exchanged. Each set stands alone: where most views exchange a limb at once, it is taken
-to be as they say.
+to be as they say. One or two views cannot outvote each other: there the limb's motion in the image
+decides, which an exchange makes jump and jump back.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from intercap_core.detection.triangulation import (
 ROUNDS = 2
 MUCH_BETTER = 0.5  # exchanged cost over cost as detected
 MIN_POINTS = 2
+FEW_VIEWS = 2
+EXCHANGED_PX_AT_1080P = 3.0  # what a set exchanged costs: detectors are mostly right
+JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
 
 
 def triangulate_people(
@@ -40,6 +44,44 @@ def triangulate_people(
             break
         found = _triangulate(keypoints, rig, min_confidence, max_error_px)
     return keypoints, found
+
+
+def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
+    """Exchange back limbs that jump to the other side for a while, where few views see the subject.
+
+    ``keypoints`` (T, C, 135, 3); each view and limb on its own: the sides that move least over all
+    sets, by dynamic programming. Returns them exchanged in sets that at most two views see.
+    """
+    result = keypoints.copy()
+    few = (keypoints[..., 2] > 0).any(2).sum(1) <= FEW_VIEWS
+    for c, scale in enumerate(pixel_scale(rig)):
+        sets = np.flatnonzero((keypoints[:, c, :, 2] > 0).any(1))
+        if len(sets) < 3 or not few[sets].any():
+            continue
+        for limb in LIMBS:
+            options = np.stack([keypoints[sets, c][:, side] for side in (limb, PARTNER[limb])])
+            wrong = sets[_least_motion(options, scale, min_confidence)]
+            wrong = wrong[few[wrong]]
+            result[wrong[:, None], c, limb] = keypoints[wrong[:, None], c, PARTNER[limb]]
+    return result
+
+
+def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
+    """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
+    price = EXCHANGED_PX_AT_1080P * scale
+    total, came_from = np.array([0.0, price]), []
+    seen = options[..., 2] >= min_confidence
+    for t in range(1, options.shape[1]):
+        both = seen[:, None, t - 1] & seen[None, :, t]  # (before, now, n)
+        moved = np.linalg.norm(options[:, None, t - 1, :, :2] - options[None, :, t, :, :2], axis=-1)
+        moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
+        reach = total[:, None] + moved / np.maximum(both.sum(-1), 1) + [0.0, price]
+        came_from.append(reach.argmin(0))
+        total = reach.min(0)
+    chosen = [int(total.argmin())]
+    for back in reversed(came_from):
+        chosen.append(int(back[chosen[-1]]))
+    return np.array(chosen[::-1], bool)
 
 
 def exchange(

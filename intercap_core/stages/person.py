@@ -17,7 +17,7 @@ from intercap_core.detection.person_masks import choose_mask
 from intercap_core.detection.read import Detections
 from intercap_core.detection.sides import BODY_POINTS
 from intercap_core.detection.subject import NOBODY, find_subject
-from intercap_core.detection.swaps import triangulate_people
+from intercap_core.detection.swaps import steady_sides, triangulate_people
 from intercap_core.detection.triangulation import Triangulation, reproject
 from intercap_core.errors import UserError
 from intercap_core.project import digest
@@ -49,6 +49,7 @@ def run(
         lifter = Lifter(images.showing(image_of), source, min_confidence=confident)
         person = find_subject(found, rig, times, min_confidence=confident, lift=lifter.people)
         keypoints = subject_keypoints(found, person)
+        keypoints = steady_sides(keypoints, rig, min_confidence=confident)
         # rays of one moment meet; what is written down is where each camera saw the points
         moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
         moved, points = triangulate_people(

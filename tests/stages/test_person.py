@@ -15,6 +15,8 @@ from intercap_core.camera.transforms import apply, invert
 from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import PersonSettings
 from intercap_core.detection import masks
+from intercap_core.detection.sides import LEGS, swapped
+from intercap_core.detection.swaps import steady_sides
 from intercap_core.errors import UserError
 from intercap_core.schemas import PERSON, SCENE
 from intercap_core.stages import person
@@ -159,3 +161,15 @@ def test_nobody_and_other_captures_are_named(tmp_path, detected):
     people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
     with pytest.raises(UserError, match=r"camera k1, frame 0, candidate 0 \(cup\).*re-run"):
         run(tmp_path, people, {(0, 0): [("cup", b"11")]})
+
+
+def test_two_views_do_not_take_a_passing_exchange_of_sides(detected):
+    views = Rig(RIG.cameras[:2])
+    exchanged = detected[:, :2].copy()
+    exchanged[3:6, 0] = swapped(exchanged[3:6, 0], LEGS)
+    found = steady_sides(exchanged, views, min_confidence=0.3)
+    np.testing.assert_array_equal(found, detected[:, :2])
+    # with more views their vote decides
+    six = detected.copy()
+    six[3:6, 0] = swapped(six[3:6, 0], LEGS)
+    np.testing.assert_array_equal(steady_sides(six, RIG, min_confidence=0.3), six)
