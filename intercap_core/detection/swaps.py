@@ -2,7 +2,7 @@
 
 A view's limb counts as exchanged when the points that the views agree on fit it much better with
 the sides exchanged. Each set stands alone: where most views exchange a limb at once, it is taken
-to be as they say. One or two views cannot outvote each other: there the limb's motion in the image
+to be as they say. Few views do not outvote each other: there the limb's motion in the image
 decides, which an exchange makes jump and jump back.
 """
 
@@ -22,7 +22,7 @@ from intercap_core.detection.triangulation import (
 ROUNDS = 2
 MUCH_BETTER = 0.5  # exchanged cost over cost as detected
 MIN_POINTS = 2
-FEW_VIEWS = 2
+FEW_VIEWS = 4
 EXCHANGED_PX_AT_1080P = 3.0  # what a set exchanged costs: detectors are mostly right
 JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
 
@@ -50,7 +50,7 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
     """Exchange back limbs that jump to the other side for a while, where few views see the subject.
 
     ``keypoints`` (T, C, 135, 3); each view and limb on its own: the sides that move least over all
-    sets, by dynamic programming. Returns them exchanged in sets that at most two views see.
+    sets, by dynamic programming. Returns them exchanged in sets that few views see.
     """
     result = keypoints.copy()
     few = (keypoints[..., 2] > 0).any(2).sum(1) <= FEW_VIEWS
