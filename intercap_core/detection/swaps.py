@@ -24,6 +24,8 @@ MUCH_BETTER = 0.5  # exchanged cost over cost as detected
 MIN_POINTS = 2
 FEW_VIEWS = 4
 EXCHANGED_PX_AT_1080P = 3.0  # what a set exchanged costs: detectors are mostly right
+# An exchange that the recording begins or ends with shows one jump alone, as a fast turn does.
+OPEN_PX_AT_1080P = 100.0
 JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
 
 
@@ -69,7 +71,8 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
     """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
     price = EXCHANGED_PX_AT_1080P * scale
-    total, came_from = np.array([0.0, price]), []
+    open_price = np.array([0.0, OPEN_PX_AT_1080P * scale])
+    total, came_from = open_price + np.array([0.0, price]), []
     seen = options[..., 2] >= min_confidence
     for t in range(1, options.shape[1]):
         both = seen[:, None, t - 1] & seen[None, :, t]  # (before, now, n)
@@ -78,7 +81,7 @@ def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> n
         reach = total[:, None] + moved / np.maximum(both.sum(-1), 1) + [0.0, price]
         came_from.append(reach.argmin(0))
         total = reach.min(0)
-    chosen = [int(total.argmin())]
+    chosen = [int((total + open_price).argmin())]
     for back in reversed(came_from):
         chosen.append(int(back[chosen[-1]]))
     return np.array(chosen[::-1], bool)
