@@ -16,6 +16,7 @@ from intercap_core.camera.transforms import invert
 from intercap_core.detection.sides import BODY_POINTS
 from intercap_core.scene.subject_views import SubjectViews
 
+MIN_BODY_POINTS = 50  # fewer do not constrain a rig
 MIN_VIEWS = 3  # two views say nothing about their own relative pose along most motions
 SIGMA_FLOOR_PX = 3.0
 # A detector's error at one joint lasts about this long; sets closer together count as one.

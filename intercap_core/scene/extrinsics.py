@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.scene.background import Background
-from intercap_core.scene.body_constraints import BodyConstraint, body_views
+from intercap_core.scene.body_constraints import MIN_BODY_POINTS, BodyConstraint, body_views
 from intercap_core.scene.keypoint_timing import Offsets
 from intercap_core.scene.registration import (
     MOVING,
@@ -22,11 +21,8 @@ from intercap_core.scene.registration import (
     Registration,
 )
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.scene.surface import Surface, surface_of
+from intercap_core.scene.surface import Surface
 
-BACKGROUND_CELL_M = 0.03
-MAX_DEPTH_M = 5.0  # beyond, the depth's error is past a centimetre
-MIN_BODY_POINTS = 50
 MUST_IMPROVE = 0.98  # of the start's held-out cost
 MAY_WORSEN = 1.02
 CONVERGED_M = 0.001
@@ -81,7 +77,7 @@ def refine(
 ) -> Refinement:
     """Refine all cameras' poses but the ``master``'s, their depth bias and time offsets.
 
-    ``static`` and ``moving`` are surfaces as :func:`background_surfaces` and
+    ``static`` and ``moving`` are surfaces as :func:`.surface.background_surfaces` and
     :func:`.moving.moving_surfaces` give; ``subject`` is by moment; ``timing`` is what its keypoints
     say of the offsets. The start's poses are kept where held-out points and keypoints together do
     not get better, and where not ``free_poses``.
@@ -182,7 +178,7 @@ def _verdict(
     if not free_poses:
         return "refinement is switched off: poses as given"
     if not ratios:
-        return "no two cameras share a surface or a person: poses as given"
+        return "too little is seen by several cameras at once: poses as given"
     if not improved:
         return "held-out points do not get better: poses as given"
     said = "refined" if converged else "refined, not fully converged"
@@ -215,19 +211,3 @@ def _notes(
         else:
             notes.append("shares no surface and no keypoints with the others: its pose is as given")
     return tuple(notes)
-
-
-def background_surfaces(rig: Rig, backgrounds: list[Background | None]) -> dict[int, Surface]:
-    """The static surface that each camera sees, in its depth camera's frame, by camera index."""
-    surfaces = {}
-    for c, background in enumerate(backgrounds):
-        lens = rig[c].depth
-        if background is not None and lens is not None:
-            surfaces[c] = surface_of(
-                background.depth,
-                lens,
-                keep=background.static,
-                cell_m=BACKGROUND_CELL_M,
-                max_depth_m=MAX_DEPTH_M,
-            )
-    return surfaces

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.scene.background import Background
 from intercap_core.scene.surface import Surface, surface_of
@@ -28,12 +29,13 @@ POINT_STEP = 2  # of the neighbouring sets' pixels, every second in both directi
 
 
 def moving_surfaces(
-    frames: Frames, image_of: np.ndarray, backgrounds: list[Background | None]
+    frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
 ) -> list[dict[int, Surface]]:
     """The moving surfaces of up to :data:`MOMENTS` sets, by camera index, depth camera's frame.
 
-    ``image_of`` (T, C): the set whose image of a camera shows each set's moment, -1 = none.
-    Surfaces whose speed cannot be told, for want of a set before or after, are left out.
+    ``rig`` has the lenses; ``image_of`` (T, C): the set whose image of a camera shows each set's
+    moment, -1 = none. Surfaces whose speed cannot be told, for want of a set before or after, are
+    left out.
     """
     depth_image = _with_depth(frames, image_of)
     whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after
@@ -45,7 +47,7 @@ def moving_surfaces(
     for t in usable:
         at_once = {}
         for c in np.flatnonzero(whole[t]):
-            background, lens = backgrounds[c], frames.rig[int(c)].depth
+            background, lens = backgrounds[c], rig[int(c)].depth
             if background is None or lens is None:
                 continue
             images = [frames.depth(int(depth_image[k, c]), int(c)) for k in (t - 1, t, t + 1)]

@@ -8,9 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Rig
+from intercap_core.scene.background import Background
 
 NORMAL_STEP_RAD = 0.008  # half the base line of a normal: 4 px of the unbinned depth camera
 MAX_KINK_M_PER_M = 0.008  # a pixel this far off its neighbours' middle, per depth, is an edge
+BACKGROUND_CELL_M = 0.03
+MAX_DEPTH_M = 5.0  # beyond, the depth's error is past a centimetre
 MIN_COSINE = 0.26  # surfaces seen at a grazing angle of more than 75 degrees are left out
 
 
@@ -100,3 +104,19 @@ def thinned(surface: Surface, cell_m: float) -> Surface:
     normals = normals[whole] / length[whole, None]
     speed = np.bincount(inverse, surface.speed, len(counts)) / counts
     return Surface(mean(surface.points)[whole], normals, mean(surface.rays)[whole], speed[whole])
+
+
+def background_surfaces(rig: Rig, backgrounds: Sequence[Background | None]) -> dict[int, Surface]:
+    """The static surface that each camera sees, in its depth camera's frame, by camera index."""
+    surfaces = {}
+    for c, background in enumerate(backgrounds):
+        lens = rig[c].depth
+        if background is not None and lens is not None:
+            surfaces[c] = surface_of(
+                background.depth,
+                lens,
+                keep=background.static,
+                cell_m=BACKGROUND_CELL_M,
+                max_depth_m=MAX_DEPTH_M,
+            )
+    return surfaces

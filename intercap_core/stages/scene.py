@@ -17,12 +17,7 @@ from intercap_core.detection.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.scene.background import Background, background_of
-from intercap_core.scene.extrinsics import (
-    BACKGROUND_CELL_M,
-    Refinement,
-    background_surfaces,
-    refine,
-)
+from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.ground import (
     Ground,
     annotated_ground,
@@ -31,10 +26,11 @@ from intercap_core.scene.ground import (
     zup_from_master,
 )
 from intercap_core.scene.keypoint_timing import keypoint_offsets
+from intercap_core.scene.lens_exchange import Exchange, exchange_lenses
 from intercap_core.scene.moving import moving_surfaces
 from intercap_core.scene.slips import Slips, find_slips
 from intercap_core.scene.subject_views import SubjectViews, subject_views, triangulated
-from intercap_core.scene.surface import Surface
+from intercap_core.scene.surface import BACKGROUND_CELL_M, Surface, background_surfaces
 from intercap_core.schemas import SCENE
 
 FEET = slice(19, 25)  # toes and heels among the body's keypoints
@@ -70,12 +66,13 @@ def run(
         timing = keypoint_offsets(subject.keypoints, found.slip, rig, source.time_s, master=master)
         subject = subject.showing(image_of, rig)
         backgrounds = _backgrounds(source, subject, found.slip)
+        rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
         refined = refine(
             rig,
             master,
             surfaces,
-            moving_surfaces(source, image_of, backgrounds),
+            moving_surfaces(source, rig, image_of, backgrounds),
             subject,
             source.time_s,
             timing,
@@ -86,7 +83,10 @@ def run(
         if not ground.found:
             feet = triangulated(subject.keypoints, rig).joints[:, FEET]
             ground = ground_of_feet(feet, rig, source.gravity)
-        _write(output, source, rig, backgrounds, found, image_of, refined, ground, settings)
+        notes = _notes(source, refined, found, exchanges)
+        _write(
+            output, source, rig, backgrounds, found.slip, image_of, refined, ground, notes, settings
+        )
 
 
 def _backgrounds(
@@ -136,10 +136,11 @@ def _write(
     source: Frames,
     rig: Rig,
     backgrounds: list[Background | None],
-    slips: Slips,
+    slip: np.ndarray,
     image_of: np.ndarray,
     refined: Refinement,
     ground: Ground,
+    notes: list[str],
     settings: SceneSettings,
 ) -> None:
     pairs = refined.pairs
@@ -165,7 +166,7 @@ def _write(
         writer.put("master_from_colour", rig.master_from_colour)
         writer.put("master_from_colour_start", source.rig.master_from_colour)
         writer.put("depth_bias", refined.bias)
-        writer.put("note", _notes(source, refined, slips))
+        writer.put("note", notes)
         writer.put("pairs", pairs.pairs)
         for k, kind in enumerate(("pair", "pair_moving")):
             residual = "pair_residual" if k == 0 else kind
@@ -175,7 +176,7 @@ def _write(
         writer.put("pair_weak", pairs.weak)
         writer.put("time_offset", refined.offset)
         writer.put("time_offset_sigma", refined.offset_sigma)
-        writer.put("slip", slips.slip)
+        writer.put("slip", slip)
         writer.put("image_of", image_of)
         writer.put("ground_point", ground.point)
         writer.put("ground_normal", ground.normal)
@@ -185,9 +186,21 @@ def _write(
                 writer.put(f"cameras/{camera.name}/background", background.depth)
 
 
-def _notes(source: Frames, refined: Refinement, slips: Slips) -> list[str]:
-    """What each camera's pose and time rest on, and where it slips."""
+def _notes(
+    source: Frames, refined: Refinement, slips: Slips, exchanges: Sequence[Exchange]
+) -> list[str]:
+    """What each camera's lens, pose and time rest on, and where it slips."""
     notes = [[note] if note else [] for note in refined.notes]
+    for one in exchanges:
+        what = "its lens" if one.whole else "its focal length and principal point"
+        shown = "by the keypoints"
+        if np.isfinite(one.before):
+            shown = f"background {1e3 * one.before:.1f} to {1e3 * one.after:.1f} mm"
+        for own, other in ((one.first, one.second), (one.second, one.first)):
+            notes[own].append(
+                f"{what} and those of {source.rig.names[other]} are exchanged in the calibration "
+                f"and were put right ({shown})"
+            )
     for interval in slips.intervals:
         frames = "1 frame" if interval.slip == 1 else f"{interval.slip} frames"
         notes[interval.camera].append(

@@ -40,7 +40,7 @@ def layers(tmp_path_factory):
     image_of = np.tile(np.arange(T)[:, None], len(TRUTH))
     with Frames.open(path) as frames:
         backgrounds = [background_of(frames, c) for c in range(len(TRUTH))]
-        return moving_surfaces(frames, image_of, backgrounds)
+        return moving_surfaces(frames, TRUTH, image_of, backgrounds)
 
 
 def test_speed_is_that_of_the_crate_along_its_faces(layers):
