@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
