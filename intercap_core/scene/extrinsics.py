@@ -9,11 +9,13 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.scene.body_constraints import MIN_BODY_POINTS, BodyConstraint, body_views
+from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.keypoint_timing import Offsets
 from intercap_core.scene.registration import (
     MOVING,
     OFFSET,
     STATIC,
+    Constraint,
     Estimate,
     Layer,
     OffsetInformation,
@@ -73,13 +75,15 @@ def refine(
     times: np.ndarray,
     timing: Offsets,
     *,
+    floor: FloorConstraint | None,
     free_poses: bool,
 ) -> Refinement:
     """Refine all cameras' poses but the ``master``'s, their depth bias and time offsets.
 
     ``static`` and ``moving`` are surfaces as :func:`.surface.background_surfaces` and
     :func:`.moving.moving_surfaces` give; ``subject`` is by moment; ``timing`` is what its keypoints
-    say of the offsets. The start's poses are kept where held-out points and keypoints together do
+    say of the offsets; ``floor`` ties cameras that share no surface with the others. The start's
+    poses are kept where held-out points and keypoints together do
     not get better, and where not ``free_poses``.
     """
     layers = [Layer(static, STATIC), *(Layer(at_once, MOVING) for at_once in moving)]
@@ -89,7 +93,11 @@ def refine(
     known = OffsetInformation(
         timing.information / TIMING_INFLATION**2, timing.vector / TIMING_INFLATION**2
     )
-    constraints = [body] if body else []
+    overlapping = [registration.residuals(Estimate.start(rig), k).pairs for k in (STATIC, MOVING)]
+    linked = _linked(np.concatenate(overlapping), master)
+    constraints: list[Constraint] = [body] if body else []
+    if floor is not None and len(linked) < len(rig):
+        constraints.append(floor)  # where cameras overlap, their surfaces tell more
     held = registration.solve(Estimate.start(rig), (), known, free_poses=False)
     found, improved, ratios = held, False, []
     if free_poses and len(rig) > 1:
@@ -194,20 +202,25 @@ def _notes(
     rig: Rig, master: int, pairs: PairTable, body_weights: np.ndarray, improved: bool
 ) -> tuple[str, ...]:
     """What each camera's pose rests on, where that is less than the others'."""
-    linked = {master}
-    while True:
-        more = {
-            int(c) for pair in pairs.pairs if linked & {int(i) for i in pair} for c in pair
-        } - linked
-        if not more:
-            break
-        linked |= more
+    linked = _linked(pairs.pairs, master)
     notes = []
     for c in range(len(rig)):
         if c in linked or len(rig) == 1:
             notes.append("")
         elif improved and len(body_weights) and (body_weights[:, c] > 0).sum() >= MIN_BODY_POINTS:
-            notes.append("shares no surface with the others: its pose rests on the keypoints")
+            notes.append(
+                "shares no surface with the others: its pose rests on the keypoints and the floor"
+            )
         else:
             notes.append("shares no surface and no keypoints with the others: its pose is as given")
     return tuple(notes)
+
+
+def _linked(pairs: np.ndarray, master: int) -> set[int]:
+    """The cameras that a chain of ``pairs`` (P, 2) joins to the master, itself included."""
+    linked = {master}
+    while True:
+        touching = [{int(c) for c in pair} for pair in pairs if linked & {int(c) for c in pair}]
+        if set().union(*touching) <= linked:
+            return linked
+        linked = linked.union(*touching)

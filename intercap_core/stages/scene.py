@@ -18,6 +18,7 @@ from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.scene.background import Background, background_of
 from intercap_core.scene.extrinsics import Refinement, refine
+from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import (
     Ground,
     annotated_ground,
@@ -76,6 +77,9 @@ def run(
             subject,
             source.time_s,
             timing,
+            floor=FloorConstraint.of(
+                rig, surfaces, _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
+            ),
             free_poses=settings.refine_extrinsics,
         )
         rig = rig.moved(refined.poses)

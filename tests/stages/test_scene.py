@@ -108,3 +108,29 @@ def test_a_recording_without_images_and_a_floor_on_one_line_are_named(tmp_path):
     write_frames(paths["frames"], TRUTH, num_sets=T, colour_index=np.full((T, 6), -1))
     with pytest.raises(UserError, match="no image of any camera"):
         scene.run(**paths, settings=SceneSettings(), floor=None)
+
+
+@pytest.mark.parametrize("with_people", [True, False])
+def test_a_rig_without_any_overlap_is_told_and_not_made_worse(tmp_path, with_people):
+    start = perturbed(TRUTH, np.random.default_rng(5), 0.01, 0.3)
+    paths = capture(tmp_path, start, np.zeros((0, 2, 3)), None)
+    rng, depths = np.random.default_rng(1), []
+    for c, camera in enumerate(TRUTH):
+        depth = room_depth(camera, UP, np.zeros((0, 2, 3)), None)
+        rays = np.dstack([camera.depth.rays, np.ones(depth.shape)]) * depth[..., None]
+        world = apply(UP @ camera.master_from_depth, rays.reshape(-1, 3)).reshape(rays.shape)
+        sector = np.arctan2(world[..., 1], world[..., 0]) - 2 * np.pi * c / 6
+        depth[np.abs((sector + np.pi) % (2 * np.pi) - np.pi) > np.radians(20)] = 0
+        depths.append(np.stack([to_millimetres(depth, rng) for _ in range(T)]))
+    write_frames(paths["frames"], start, num_sets=T, depths=depths)
+    if not with_people:
+        nobody = [[[] for _ in TRUTH] for _ in range(T)]
+        write_detections(paths["detections"], TRUTH, nobody)
+    scene.run(**paths, settings=SceneSettings(), floor=None)
+    with artefacts.read(paths["output"], SCENE) as found:
+        notes, refined = found.text("note"), found.attributes["extrinsics_refined"]
+        assert len(found["pairs"]) == 0 and refined == with_people
+    assert all("shares no surface" in note for note in notes[1:])
+    before = extrinsics_error(start, TRUTH, MIDDLE)[1:].mean()
+    after = extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE)[1:].mean()
+    assert after < (0.6 * before if with_people else before + 1e-9)
