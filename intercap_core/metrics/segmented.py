@@ -70,7 +70,7 @@ def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarr
     x1, y1 = (int(np.ceil(v + margin)) + 1 for v in pixels.max(0))
     window = depth[y0:y1, x0:x1]
     wanted = (window > 1e3 * max(nearest, 0.0)) & (window < 1e3 * farthest)
-    step = int(np.ceil(np.sqrt(np.count_nonzero(wanted) / _POINTS_PER_VIEW)))
+    step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(wanted) / _POINTS_PER_VIEW))))
     rows, columns = np.nonzero(wanted[::step, ::step])
     return (rows * step + y0) * lens.width + columns * step + x0
 
