@@ -102,6 +102,11 @@ class FilesRecording(CameraRecording):
         super().__init__(source, camera, fps=fps)
         self._shots = shots
 
+    @property
+    def colour_files(self) -> list[tuple[int, Path]]:
+        """Device time, microseconds, and path of every colour file, also of damaged ones."""
+        return [(shot.time_us, shot.colour) for shot in self._shots if shot.colour is not None]
+
     def images(self) -> Iterator[Image]:
         """Images in the order of the shots; damaged ones are left out and counted."""
         return read_shots(self, self._shots)

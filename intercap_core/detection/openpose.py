@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,12 @@ def keypoint_files(folder: Path) -> dict[int, Path]:
             )
         found[number] = path
     return found
+
+
+def named_keypoint_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Find the files of one camera that are named after its images, ``<name>_keypoints.json``."""
+    paths = {name: folder / f"{name}_keypoints.json" for name in names}
+    return {name: path for name, path in paths.items() if path.is_file()}
 
 
 def read_people(path: Path) -> np.ndarray:

@@ -9,8 +9,10 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
+from intercap_core.capture.image_files import FilesRecording
 from intercap_core.capture.intercap import numbers_of
-from intercap_core.config import DetectionsSettings, LayoutName, SequenceEntry
+from intercap_core.capture.plain import PlainLayout
+from intercap_core.config import DetectionsSettings, SequenceEntry
 from intercap_core.detection import openpose
 from intercap_core.detection.coco import Instance, boxes_of, read_candidates
 from intercap_core.detection.mask_files import (
@@ -33,13 +35,15 @@ class CameraImages:
     """The colour images that the T frame sets hold of one camera.
 
     ``number`` (T,) is what files of keypoints and candidates call the image, -1 = no image;
-    ``time_us`` (T,) its device time.
+    ``time_us`` (T,) its device time. ``stems`` are the names of its image files without suffix, in
+    the order that ``number`` counts, where keypoints may be named after them.
     """
 
     name: str
     size: tuple[int, int]
     number: np.ndarray
     time_us: np.ndarray
+    stems: tuple[str, ...] = ()
 
     @property
     def sets(self) -> list[int]:
@@ -64,13 +68,14 @@ def run(
     """Read the sequence's OpenPose and COCO files and write the detections artefact.
 
     A file belongs to the colour image of its number: in the camera's own recording, or in the
-    image file's name where the layout is the InterCap release's. BEHAVE's keypoints and masks lie
-    beside its images and are read from there unless the row names others. Missing or cut files and
-    missing cameras are noted, not fatal. Raises UserError where neither keypoints nor candidates
-    are found for any image, or a file has another layout than it must.
+    image file's name where the layout is the InterCap release's. Of a plain folder of images,
+    damaged ones count too, and keypoint files may be named after the images. BEHAVE's keypoints
+    and masks lie beside its images and are read from there unless the row names others. Missing or
+    cut files and missing cameras are noted, not fatal. Raises UserError where neither keypoints
+    nor candidates are found for any image, or a file has another layout than it must.
     """
     with artefacts.read(frames, FRAMES) as source:
-        images = _images(source, sequence.layout)
+        images = _images(source, sequence)
     cameras = [camera.name for camera in images]
     beside = None
     if sequence.layout == "behave":
@@ -113,19 +118,50 @@ def _offsets(per_set: list[np.ndarray] | list[list[Instance]]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([len(entries) for entries in per_set])]).astype(np.int64)
 
 
-def _images(source: artefacts.Artefact, layout: LayoutName) -> list[CameraImages]:
+def _images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[CameraImages]:
     indices = np.where(source["dropped"][:, None], -1, source["colour_index"])
+    plain = PlainLayout(sequence) if sequence.layout == "plain" else None
     images = []
     for c, name in enumerate(source.text("camera_names")):
         width, height = (int(n) for n in source["colour_size"][c])
         index = number = indices[:, c]
         times = np.full(len(index), -1, np.int64)
-        if layout in ("intercap", "behave") and (index >= 0).any():
+        stems: tuple[str, ...] = ()
+        if sequence.layout != "k4a" and (index >= 0).any():
             times = np.where(index >= 0, source[f"cameras/{name}/colour_time"][index], -1)
-        if layout == "intercap":
+            if plain is not None:
+                number, stems = _plain_numbers(plain, name, index, times)
+        if sequence.layout == "intercap":
             number = np.where(index >= 0, numbers_of(times), -1)
-        images.append(CameraImages(name, (width, height), number, times))
+        images.append(CameraImages(name, (width, height), number, times, stems))
     return images
+
+
+def _plain_numbers(
+    layout: PlainLayout, name: str, index: np.ndarray, times_us: np.ndarray
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Places (T,) among all image files of a camera, -1 = no image, and the files' stems.
+
+    ``index`` counts only the images that could be copied, so that a damaged file would move all
+    keypoints after it to another image. Of a video it is the place.
+    """
+    with layout.open(name) as recording:
+        if not isinstance(recording, FilesRecording):
+            return index, ()
+        files = recording.colour_files
+    places = {time_us: place for place, (time_us, _) in reversed(list(enumerate(files)))}
+    held = times_us[index >= 0].tolist()
+    lost = [time_us for time_us in held if time_us not in places]
+    if lost:
+        raise UserError(
+            f"sequence {layout.sequence.sequence!r}: none of the {len(files)} images of camera "
+            f"{name} in {recording.source} was taken at {lost[0] / 1e6:.6f} s as the frames "
+            "artefact says; images, timestamps or calibration have changed, so run the frames "
+            "stage again"
+        )
+    number = np.full(len(index), -1)
+    number[index >= 0] = [places[time_us] for time_us in held]
+    return number, tuple(path.stem for _, path in files)
 
 
 def _read_camera(
@@ -146,8 +182,7 @@ def _read_camera(
     if sequence.keypoints is not None:
         folder = sequence.keypoints / name
         if folder.is_dir():
-            files = openpose.keypoint_files(folder)
-            _add_people(result, {t: files.get(int(images.number[t])) for t in images.sets})
+            _add_people(result, _keypoint_files(folder, images))
         else:
             result.notes.append(f"no folder of keypoints {folder.parent.name}/{folder.name}")
     elif beside is not None:
@@ -159,6 +194,16 @@ def _read_camera(
         times = {t: int(images.time_us[t]) for t in images.sets}
         _add_masks(result, {t: beside.masks(time, name) for t, time in times.items()}, images.size)
     return result
+
+
+def _keypoint_files(folder: Path, images: CameraImages) -> dict[int, Path | None]:
+    """The file of each frame set: by the image's name where any is so named, else by number."""
+    numbers = {t: int(images.number[t]) for t in images.sets}
+    named = openpose.named_keypoint_files(folder, images.stems)
+    if named:
+        return {t: named.get(images.stems[number]) for t, number in numbers.items()}
+    numbered = openpose.keypoint_files(folder)
+    return {t: numbered.get(number) for t, number in numbers.items()}
 
 
 def _add_people(result: CameraDetections, files: dict[int, Path | None]) -> None:

@@ -1,0 +1,104 @@
+"""Which image a keypoint file of a plain recording belongs to."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
+from intercap_core.detection.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.stages import detections, frames
+
+SIZE, FPS = (64, 48), 10
+CUT, ABSENT = 2, 4  # numbers of the right camera's damaged image and of the one that is not there
+
+
+def keypoints(path: Path, x: float) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    people = [{"pose_keypoints_2d": [x, 5.0, 0.9] * 25}]
+    path.write_text(json.dumps({"people": people}))
+
+
+@pytest.fixture
+def capture(tmp_path) -> SequenceEntry:
+    """Two folders of images 1 to 6; of the right one, one is cut off and one is absent."""
+    lens = {
+        "image_size": SIZE,
+        "camera_matrix": [[60, 0, 32], [0, 60, 24], [0, 0, 1]],
+        "distortion_coefficients": [0, 0, 0, 0],
+    }
+    cameras = {}
+    for c, name in enumerate(("left", "right")):
+        cameras[name] = lens | {"R": [0, 0, 0], "T": [c, 0, 0]}
+        (tmp_path / "recordings" / name).mkdir(parents=True)
+        for number in range(1, 7):
+            path = tmp_path / "recordings" / name / f"shot_{number:04d}.jpg"
+            cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0], 3), 30 * number + c, np.uint8))
+    right = tmp_path / "recordings" / "right"
+    (right / f"shot_{ABSENT:04d}.jpg").unlink()
+    cut = right / f"shot_{CUT:04d}.jpg"
+    cut.write_bytes(cut.read_bytes()[:200])
+    (tmp_path / "rig.json").write_text(json.dumps({"fps": FPS, "cameras": cameras}))
+    return SequenceEntry(
+        sequence="s1", subject="a", object="b", layout="plain",
+        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
+        keypoints=tmp_path / "keypoints",
+    )  # fmt: skip
+
+
+def found(capture: SequenceEntry) -> dict[str, list[float]]:
+    """By camera the first x of each frame set's person; 0 = nobody."""
+    out = capture.recordings.parent
+    frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())
+    detections.run(
+        frames=out / "frames.h5", output=out / "detections.h5", sequence=capture,
+        settings=DetectionsSettings(),
+    )  # fmt: skip
+    read = Detections.load(out / "detections.h5")
+    people = {
+        name: [read.people(t, c) for t in range(read.num_sets)]
+        for c, name in enumerate(("left", "right"))
+    }
+    return {
+        name: [float(persons[0, 0, 0]) if len(persons) else 0.0 for persons in in_sets]
+        for name, in_sets in people.items()
+    }
+
+
+def test_files_named_after_the_images_follow_them(capture):
+    for name in ("left", "right"):
+        for number in range(1, 7):
+            path = capture.keypoints / name / f"shot_{number:04d}_keypoints.json"
+            if name == "left" or number != ABSENT:
+                keypoints(path, number)
+    people = found(capture)
+    assert people["left"] == [1, 2, 3, 4, 5, 6]
+    assert people["right"] == [1, 0, 3, 0, 5, 6]
+
+
+def test_files_numbered_by_place_count_damaged_images(capture):
+    for place in range(6):
+        keypoints(capture.keypoints / "left" / f"{place:012d}_keypoints.json", place + 1)
+    for place, number in enumerate(n for n in range(1, 7) if n != ABSENT):
+        keypoints(capture.keypoints / "right" / f"{place:012d}_keypoints.json", number)
+    people = found(capture)
+    assert people["left"] == [1, 2, 3, 4, 5, 6]
+    assert people["right"] == [1, 0, 3, 0, 5, 6]
+
+
+def test_times_that_changed_since_the_frames_are_told(capture):
+    keypoints(capture.keypoints / "left" / "shot_0001_keypoints.json", 1)
+    found(capture)
+    content = json.loads(capture.calibration.read_text()) | {"fps": 7}
+    capture.calibration.write_text(json.dumps(content))
+    out = capture.recordings.parent
+    with pytest.raises(UserError, match=r"images of camera left in .*run the frames stage again"):
+        detections.run(
+            frames=out / "frames.h5", output=out / "again.h5", sequence=capture,
+            settings=DetectionsSettings(),
+        )  # fmt: skip
