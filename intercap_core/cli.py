@@ -74,10 +74,12 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     Example: intercap check config/demo/config.yaml
     """
     from intercap_core.project import load_project
-    from intercap_core.project_check import check_device, faults_of_sequences
+    from intercap_core.project_check import check_device, faults_of_sequences, notes_of_sequences
 
     project = load_project(settings)
     check_device(project)
+    for note in notes_of_sequences(project):
+        typer.echo(f"note: {note}")
     faults = faults_of_sequences(project)
     for fault in faults:
         typer.echo(f"problem: {fault}", err=True)

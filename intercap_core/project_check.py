@@ -59,6 +59,59 @@ def faults_of_sequences(project: Project) -> list[Fault]:
     return faults
 
 
+def notes_of_sequences(project: Project) -> list[Fault]:
+    """Say what a run survives and hardly anybody means: cameras without recording or detections.
+
+    Recordings that the studio makes are not looked at, nor are those that cannot be used at all.
+    """
+    return [
+        Fault(name, message)
+        for name, row in project.sequences.items()
+        if project.recordings_made(name) is None
+        and row.recordings.is_dir()
+        and row.calibration.exists()
+        for message in _notes_of_cameras(row)
+    ]
+
+
+def _notes_of_cameras(row: SequenceEntry) -> list[str]:
+    from intercap_core.capture.layouts import open_layout
+    from intercap_core.detection.mask_files import release_masks
+
+    try:
+        layout = open_layout(row)
+    except UserError:
+        return []
+    known = list(layout.extrinsics.master_from_colour)
+    notes = []
+    absent = [name for name in known if name not in layout.names]
+    if absent and layout.names:
+        notes.append(
+            f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
+            f"{', '.join(absent)}: add these recordings, or correct their names, if there are any"
+        )
+    recorded = [name for name in known if name in layout.names]
+    beside = row.layout == "behave"
+    if row.keypoints is None and row.candidates is None and recorded and not beside:
+        notes.append(
+            "its row names neither keypoints nor candidates, without which only the frames can be "
+            "computed; run the detectors and add the columns"
+        )
+    if row.keypoints is not None and row.keypoints.is_dir():
+        folder = row.keypoints
+        without = [name for name in recorded if not (folder / name).is_dir()]
+        notes += [f"{folder} has no folder {name}; add this camera's keypoints" for name in without]
+    if row.candidates is not None and row.candidates.is_dir():
+        folder = row.candidates
+        without = [
+            name
+            for name in recorded
+            if not (folder / f"{name}.json").is_file() and release_masks(folder, name) is None
+        ]
+        notes += [f"{folder} has no {name}.json; add this camera's candidates" for name in without]
+    return notes
+
+
 def _annotations_of_nobody(project: Project) -> list[Fault]:
     folder = tidy(project.path.parent / project.config.annotations)
     known = {folder / f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}

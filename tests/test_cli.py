@@ -25,7 +25,7 @@ from intercap_core.camera.rig import Camera
 from intercap_core.cli import STAGES
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
-from intercap_core.project_check import check_device, faults_of_sequences
+from intercap_core.project_check import check_device, faults_of_sequences, notes_of_sequences
 from intercap_core.run import Watcher
 from intercap_core.schemas import DETECTIONS
 from intercap_core.step import READS, SEQUENCE_STAGES
@@ -192,6 +192,33 @@ def test_ready_means_that_the_files_can_be_used(
     (fault,) = faults_of_sequences(project)
     assert says in f"problem: {fault}"
     assert "\n" not in str(fault)
+
+
+def test_check_notes_cameras_without_recording_or_detections(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    exclude = {"exclude": ["bad", "empty"]}
+    (note,) = notes_of_sequences(load_project(Path("config.yaml"), exclude))
+    assert str(note).startswith("sequence 'good': its row names neither keypoints nor candidates")
+
+    write_rig_file(Path("rig.json"), Extrinsics("k1", {"k1": np.eye(4), "k2": np.eye(4)}))
+    table = Path("sequences.tsv")
+    head, good, *others = table.read_text().splitlines()
+    lines = [f"{head}\tkeypoints\tcandidates", f"{good}\tpoints\tmasks"]
+    table.write_text("\n".join([*lines, *(f"{line}\t\t" for line in others)]) + "\n")
+    (small_project / "points" / "camera1").mkdir(parents=True)
+    (small_project / "masks").mkdir()
+    missing = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml"), exclude))]
+    assert [text.partition(": ")[2].partition(";")[0] for text in missing] == [
+        "rec records k1", "points has no folder k1", "masks has no k1.json",
+    ]  # fmt: skip
+    assert "rig.json also has k2" in missing[0]
+    (small_project / "points" / "k1").mkdir()
+    (small_project / "masks" / "k1.json").write_text("[]")
+    assert len(notes_of_sequences(load_project(Path("config.yaml"), exclude))) == 1
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert "note: sequence 'good': rec records k1" in done.stdout
 
 
 def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
