@@ -29,6 +29,7 @@ from intercap_core.errors import UserError
 SUFFIXES = (".json", ".yaml", ".yml")
 COEFFICIENTS = (4, 5, 8)
 ALIGNED = "aligned"
+MAX_LENSES_APART_M = 1.0  # colour and depth lens of one camera; farther: the file is in millimetres
 MAX_OFF_CENTRE = 0.25  # of the image's width or height, of a principal point; 0.03 is usual
 
 
@@ -157,6 +158,12 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
             raise UserError(
                 f"{where}: depth.colour_from_depth is no rigid 4x4 transform (x_colour = R x_depth "
                 "+ t, metres, last row 0 0 0 1); correct it"
+            )
+        apart = float(np.linalg.norm(between[:3, 3]))
+        if apart > MAX_LENSES_APART_M:
+            raise UserError(
+                f"{where}: depth.colour_from_depth moves by {apart:.4g} m, expected at most "
+                f"{MAX_LENSES_APART_M:.0f} m, so it is likely in millimetres; write it in metres"
             )
     elif depth is not None:
         raise UserError(

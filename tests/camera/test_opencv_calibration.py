@@ -177,6 +177,9 @@ def test_a_wide_lens_is_not_cut_at_the_default_radius():
     assert np.isfinite(lens.rays).all()
 
 
+MILLIMETRES = [[1, 0, 0, 32.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
 def change(path: str, value: object):
     """Set (or with ... remove) the entry at a dotted path."""
 
@@ -214,6 +217,7 @@ def change(path: str, value: object):
         (change("cameras.right.R", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "R is no rotation"),
         (change("cameras.right.depth", "yes"), "depth is 'yes', expected 'aligned'"),
         (change("cameras.right.depth.colour_from_depth", ...), "colour_from_depth is"),
+        (change("cameras.right.depth.colour_from_depth", MILLIMETRES), "moves by 32 m"),
         (change("cameras.right.time_offset", "late"), "time_offset is 'late'"),
         (change("cameras.right", 3), "camera 'right': expected a name of"),
     ],
