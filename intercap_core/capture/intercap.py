@@ -145,8 +145,9 @@ def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
     finite = all(np.isfinite(values).all() for values in (focal, centre, k))
     if len(k) not in (4, 5, 8) or not finite or focal.min() <= 0:
         raise UserError(
-            f"{where}: 'f', 'c' or 'k' cannot be a lens (f {focal.tolist()}, c {centre.tolist()}, "
-            f"{len(k)} coefficients); get the file from the release again"
+            f"{where}: 'f', 'c' or 'k' cannot be a lens (f {focal.round(1).tolist()}, "
+            f"c {centre.round(1).tolist()}, "
+            f"{len(k)} coefficients, expected 4, 5 or 8); get the file from the release again"
         )
     if (np.abs(centre / size - 0.5) > FARTHEST_CENTRE).any():
         raise UserError(

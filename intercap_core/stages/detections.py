@@ -84,7 +84,8 @@ def run(
     if not any(d.keypoints_found.any() or d.candidates_found.any() for d in found):
         raise UserError(
             f"sequence {sequence.sequence}: no detections for any of its images (keypoints "
-            f"{sequence.keypoints}, candidates {sequence.candidates}); expected "
+            f"{sequence.keypoints or 'not named'}, candidates "
+            f"{sequence.candidates or 'not named'}); expected "
             f"<keypoints>/{cameras[0]}/<image>_keypoints.json and <candidates>/{cameras[0]}.json; "
             "run the detectors or correct the paths in the table of sequences"
         )

@@ -186,8 +186,8 @@ def _set_aside_other_clocks(views: list[View], clock: int) -> None:
         )
         view.notes.append(
             f"its device times ({mine[0]:.1f} to {mine[1]:.1f} s) do not overlap those of "
-            f"{views[clock].name} ({other[0]:.1f} to {other[1]:.1f} s); connect the sync cables "
-            "and record again"
+            f"{views[clock].name} ({other[0]:.1f} to {other[1]:.1f} s); give times of one clock, "
+            "or connect the sync cables and record again"
         )
         view.camera = None
 
