@@ -26,7 +26,7 @@ FPS = 30.0
 CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)
 COLOUR_FOLDER = re.compile(r"colou?r", re.IGNORECASE)
 DEPTH_FOLDER = re.compile(r"depth.*", re.IGNORECASE)
-NUMBERED = re.compile(r"\D*(\d{1,9})\.(?:jpe?g|png)", re.IGNORECASE)
+NUMBERED = re.compile(r"(?!\.)\D*(\d{1,9})\.(?:jpe?g|png)", re.IGNORECASE)
 # A principal point farther than this share of the image's width or height from its middle is that
 # of another resolution: the release's lie within 3 %.
 FARTHEST_CENTRE = 0.15

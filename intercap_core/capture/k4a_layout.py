@@ -21,7 +21,7 @@ class KinectLayout(Layout):
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
         self.extrinsics = read_extrinsics(sequence.calibration)
-        self.names = sorted(path.stem for path in sequence.recordings.glob("*.mkv"))
+        self.names = sorted(path.stem for path in sequence.recordings.glob("[!.]*.mkv"))
 
     def open(self, name: str) -> KinectRecording:
         """Open ``<name>.mkv``; raises UserError as :class:`Recording` does."""

@@ -100,7 +100,8 @@ class PlainLayout(Layout):
 def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in visible if path.suffix.lower() in suffixes)
 
 
 def _colour(folder: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from intercap_core.capture.image_files import Shot
 from intercap_core.errors import UserError
 
 SUFFIXES = (".csv", ".txt")
+LATEST_S = 1e11  # beyond all clocks that count seconds, and within 64 bits in microseconds
 LONGEST_STEP_S = 5.0  # a usual step above this is no second
 NUMBER = re.compile(r"\d+(?=\D*$)")  # the last number of a name
 Timestamps = Mapping[str | int, float]  # seconds by name, or by place where lines have no names
@@ -98,6 +99,12 @@ def shots_of(
         seconds = {key: key / fps for key in keys}
     else:
         seconds = _stated(found, times, source)
+    latest = max(map(abs, seconds.values()), default=0.0)
+    if latest > LATEST_S:
+        raise UserError(
+            f"{source}: an image would be taken at {latest:.3g} s, so the numbers in the names are "
+            "likely times; write a timestamps.csv in seconds"
+        )
     return [
         Shot(round((seconds[key] + offset_s) * 1e6), *found[key]) for key in keys if key in seconds
     ]

@@ -38,7 +38,7 @@ _BEHAVE_LISTS = {
     "face_keypoints_2d": "face_joints",
 }
 _JAW_LINE, _INNER_FACE = slice(0, 17), slice(17, 68)
-_FILE_NAME = re.compile(r"(?:.*?_)?(\d+)_keypoints\.json")
+_FILE_NAME = re.compile(r"(?!\.)(?:.*?_)?(\d+)_keypoints\.json")
 
 
 class UnreadableJson(Exception):

@@ -159,6 +159,12 @@ def test_a_master_on_another_clock_leaves_the_others(capture):
         assert frames.num_sets == TICKS and frames.available[:, 1:].all()
 
 
+def test_hidden_files_of_other_systems_are_passed_over(capture):
+    (capture.recordings / "._k2.mkv").write_bytes(b"\0\5\x16\7")
+    with Frames.open(run(capture)) as frames:
+        assert frames.rig.names == ("k1", "k2", "k3") and frames.available.all()
+
+
 def test_a_moment_that_no_camera_has_is_noted(capture):
     for camera in range(3):
         record(capture.recordings, camera, [t for t in range(TICKS) if t not in (5, 6, 9)])

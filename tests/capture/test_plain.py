@@ -142,6 +142,15 @@ def test_missing_numbers_are_gaps(capture):
     assert "no camera has an image for 1 periods in 1 places" in notes["left"]
 
 
+def test_hidden_files_of_other_systems_are_passed_over(capture):
+    (capture.recordings / "left" / "._00003.jpg").write_bytes(b"\0\5\x16\7")
+    (capture.recordings / "left" / "depth" / "._00003.png").write_bytes(b"\0\5\x16\7")
+    output = run(capture)
+    assert notes_of(output)["left"] == ""
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 8 and frames.available.all()
+
+
 def test_timestamps_override_numbers(capture):
     times = 100 + np.arange(8) / 10 + 0.001 * np.arange(8)
     for name in ("left", "top"):
@@ -276,9 +285,15 @@ def unnamed_image(capture):
     (capture.recordings / "top" / "timestamps.txt").write_text(text)
 
 
+def times_as_names(capture):
+    for path in sorted((capture.recordings / "top").iterdir()):
+        path.rename(path.with_name(f"17000000000000{path.name}"))
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
+        (times_as_names, "the numbers in the names are likely times; write a timestamps.csv"),
         (other_resolution, "colour images are 64x48, the calibration of camera top is for 128x96"),
         (recorded_twice, "camera top is recorded as top.mp4 and top/"),
         (broken_video, "top.mp4: cannot be opened as a video"),

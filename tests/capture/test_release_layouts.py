@@ -373,6 +373,12 @@ def test_a_release_folder_that_cannot_be_used_fails_in_one_sentence(release, fau
         run(fault(release) or release)
 
 
+def test_hidden_files_of_other_systems_are_passed_over(release):
+    for folder in cam(release, 2).iterdir():
+        (folder / "._00001.png").write_bytes(b"\0\5\x16\7")
+    assert notes_of(run(release))["k2"] == ""
+
+
 def test_one_number_twice_sets_the_camera_aside(release):
     folder = cam(release, 2) / "color"
     shutil.copy(folder / "00001.jpg", folder / "1.jpg")

@@ -97,3 +97,9 @@ def test_files_are_found_by_their_number(tmp_path):
     (tmp_path / "3_keypoints.json").write_text("{}")
     with pytest.raises(UserError, match="image 3 has two"):
         keypoint_files(tmp_path)
+
+
+def test_hidden_files_of_other_systems_are_passed_over(tmp_path):
+    path = write(tmp_path, {"people": []})
+    (tmp_path / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert keypoint_files(tmp_path) == {0: path}
