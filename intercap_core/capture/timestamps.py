@@ -54,6 +54,8 @@ def read_timestamps(path: Path) -> Timestamps:
         name = fields[0] if len(fields) == 2 else len(times)
         if name in times:
             raise UserError(f"{path}, line {number}: {name!r} is given twice; keep one")
+        if abs(seconds) > LATEST_S:
+            raise UserError(f"{path}, line {number}: {seconds:.4g} are no seconds; write seconds")
         times[name] = seconds
     steps = np.abs(np.diff(list(times.values())))
     if len(steps) and np.median(steps) > LONGEST_STEP_S:
@@ -99,11 +101,11 @@ def shots_of(
         seconds = {key: key / fps for key in keys}
     else:
         seconds = _stated(found, times, source)
-    latest = max(map(abs, seconds.values()), default=0.0)
+    latest = max((abs(time + offset_s) for time in seconds.values()), default=0.0)
     if latest > LATEST_S:
         raise UserError(
             f"{source}: an image would be taken at {latest:.3g} s, so the numbers in the names are "
-            "likely times; write a timestamps.csv in seconds"
+            "likely times, or time_offset is no seconds; write a timestamps.csv in seconds"
         )
     return [
         Shot(round((seconds[key] + offset_s) * 1e6), *found[key]) for key in keys if key in seconds

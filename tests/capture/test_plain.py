@@ -276,6 +276,12 @@ def milliseconds(capture):
     (capture.recordings / "top" / "timestamps.txt").write_text(text)
 
 
+def one_huge_time(capture):
+    for image in sorted((capture.recordings / "top").iterdir())[1:]:
+        image.unlink()
+    (capture.recordings / "top" / "timestamps.txt").write_text("1700000000000000000\n")
+
+
 def not_a_number(capture):
     (capture.recordings / "top" / "timestamps.txt").write_text("1.0\nnoon\n")
 
@@ -293,13 +299,14 @@ def times_as_names(capture):
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (times_as_names, "the numbers in the names are likely times; write a timestamps.csv"),
+        (times_as_names, "the numbers in the names are likely times, or time_offset"),
         (other_resolution, "colour images are 64x48, the calibration of camera top is for 128x96"),
         (recorded_twice, "camera top is recorded as top.mp4 and top/"),
         (broken_video, "top.mp4: cannot be opened as a video"),
         (unknown_codec, "top.avi: holds no video that can be decoded"),
         (too_few_timestamps, "top: 2 timestamps for 8 colour images"),
         (milliseconds, "timestamps.txt: times are 40 apart, expected seconds"),
+        (one_huge_time, "timestamps.txt, line 1: 1.7e+18 are no seconds; write seconds"),
         (not_a_number, "timestamps.txt, line 2: found 'noon'"),
         (unnamed_image, "top: 1 images have no timestamp (first: 00007.png)"),
     ],
