@@ -326,7 +326,9 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("covariance", np.repeat(np.eye(6)[None] * 0.004**2, total, 0))
         writer.put("lost", lost)
         writer.put("recovered", np.zeros(total, bool))
-        writer.put("disagree", np.zeros(total, bool))
+        for key in ("disagree", "ambiguous", "resting"):
+            writer.put(key, np.zeros(total, bool))
+        writer.put("free_axis", np.zeros((total, 3)))
         _fill(writer, OBJECT_TRACK, T=total, C=count)
     identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}
     with artefacts.write(

@@ -20,8 +20,8 @@ from intercap_core.rigid.twist import moved, twists
 # The tracker's views share calibration errors, so its minimum is never surer than this.
 _FLOOR = np.repeat([np.radians(0.3), 0.002], 3)
 _BRIDGED = np.repeat([0.5, 0.15], 3)  # rad, metres
-# Where two passes ended apart, it is nearly always in the turn (on which side a handle is).
-_DISAGREE = np.repeat([np.radians(10.0), 0.002], 3)
+# Where poses apart explain a frame alike it is nearly always the turn (on which side a handle is).
+_DOUBTFUL = np.repeat([np.radians(10.0), 0.002], 3)
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,18 @@ class TrackedPoses:
         translation: np.ndarray,
         covariance: np.ndarray,
         lost: np.ndarray,
-        disagree: np.ndarray,
+        doubtful: np.ndarray,
         *,
         seen: np.ndarray,
         times: np.ndarray,
         time_offset: np.ndarray,
     ) -> TrackedPoses:
         """Take over an object track whose lost frames are bridged; ``covariance`` (T, 6, 6),
-        ``lost`` and ``disagree`` (T,), ``seen`` (T, C) the views that show the object, ``times``
+        ``lost`` and ``doubtful`` (T,), ``seen`` (T, C) the views that show the object, ``times``
         (T,) s."""
         known = ~lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(known[:, None, None], covariance, 0.0)
-        floor = np.where(disagree[:, None], np.hypot(_FLOOR, _DISAGREE), _FLOOR)
+        floor = np.where(doubtful[:, None], np.hypot(_FLOOR, _DOUBTFUL), _FLOOR)
         total += np.eye(6) * np.where(known[:, None], floor, _BRIDGED)[:, None, :] ** 2
         twist = twists(rigid(rotation, translation), ~lost, times)
         share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)

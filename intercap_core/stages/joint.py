@@ -90,13 +90,13 @@ def run(
         start, model = _start(body, track, body_models, device)
         joint_sigma = body["joint_sigma"].astype(float)
         failed, bridged = body["failed"], body["bridged"]
-        lost, disagree = track["lost"], track["disagree"]
+        lost, disagree, ambiguous = track["lost"], track["disagree"], track["ambiguous"]
         tracked = TrackedPoses.from_track(
             start.rotation,
             start.translation,
             track["covariance"],
             lost,
-            disagree,
+            disagree | ambiguous,
             seen=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
             times=source["times"],
             time_offset=source["time_offset"],
@@ -156,7 +156,7 @@ def run(
         if minimum.converged and change < _SETTLED and retimed < _RETIMED_S:
             break
     after = minimum.equations.energy
-    flagged, reasons = _flags(failed, bridged, lost, disagree, problem, state)
+    flagged, reasons = _flags(failed, bridged, lost, disagree, ambiguous, problem, state)
     report = data.residuals(state)
     offsets = data.estimate_offsets(known_offsets)
 
@@ -254,6 +254,7 @@ def _flags(
     bridged: np.ndarray,
     lost: np.ndarray,
     disagree: np.ndarray,
+    ambiguous: np.ndarray,
     problem: Problem,
     state: State,
 ) -> tuple[np.ndarray, list[str]]:
@@ -264,6 +265,7 @@ def _flags(
         (failed | bridged, "body not seen well enough, filled in"),
         (lost, "object lost, filled in"),
         (disagree, "object passes disagree"),
+        (ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
     )
     reasons = ["; ".join(text for flags, text in causes if flags[t]) for t in range(len(state))]

@@ -177,4 +177,7 @@ def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndar
         "lost": np.array([frame.lost for frame in track.frames]),
         "recovered": np.array([frame.recovered for frame in track.frames]),
         "disagree": np.array([frame.disagree for frame in track.frames]),
+        "ambiguous": np.array([frame.ambiguous for frame in track.frames]),
+        "resting": np.array([frame.resting for frame in track.frames]),
+        "free_axis": np.array([frame.free_axis for frame in track.frames]),
     }

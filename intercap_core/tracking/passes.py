@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -50,12 +50,21 @@ WORSE_SCORE = 0.98  # of a fit that allows for the motion, for which the motion 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """One frame of the track; ``disagree``: the passes ended in different poses."""
+    """One frame of the track.
+
+    ``disagree``: the passes ended in different poses and the images do not decide between them;
+    ``ambiguous``: a quite different pose explains the images nearly as well; ``free_axis`` (3,),
+    master frame: a turn about it through the object's origin changes nothing that was seen, 0 =
+    there is none.
+    """
 
     fit: Fit
     lost: bool
     recovered: bool = False
     disagree: bool = False
+    ambiguous: bool = False
+    resting: bool = False
+    free_axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -124,8 +133,13 @@ class Tracker:
             for t, result in self._pass(frames, one[start_at], known=one, may_search=False):
                 two[t] = result
         merged = [self._merge(a, b) for a, b in zip(one, two, strict=True)]
-        timed = self._timed(self._unwrapped(merged))
-        return Track(self._unwrapped(timed), seed_frame, initial is not None)
+        timed = self._unwrapped(self._timed(self._unwrapped(merged)))
+        return Track([self._with_axis(frame) for frame in timed], seed_frame, initial is not None)
+
+    def _with_axis(self, frame: FrameResult) -> FrameResult:
+        """The frame with the axis about which the object is a solid of revolution."""
+        axis = self._mesh.symmetry.axis
+        return frame if axis is None else replace(frame, free_axis=frame.fit.pose[:3, :3] @ axis)
 
     def _both_ways(self, seed_frame: int, seed: Fit) -> list[FrameResult]:
         """Every frame (T), tracked from the seed to both ends."""
