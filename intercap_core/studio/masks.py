@@ -39,9 +39,11 @@ CATEGORY_IDS = {
 BORDER_PX = 2.2  # RMS at 1080p; capped at MAX_BORDER_PX
 MAX_BORDER_PX = 5.0
 WRONG_LABEL, MERGED, SPLIT = 0.15, 0.06, 0.05
-MISS_FREE, MISS_HIDDEN = 0.03, 0.85  # chance of a miss when in full view, when all is hidden
+MISS_FREE, MISS_HIDDEN = 0.10, 0.85  # chance of a miss when in full view, when all is hidden
+MISS_BLURRED, BLUR_PX = 0.7, 12.0  # chance of a miss when blurred by much more than so many pixels
 PERSON_MISSED = 0.015
 CLUTTER = 0.35  # chance of each false instance in a frame
+TWIN = 0.85  # chance of another thing of the object's class
 EPISODE_S = (0.3, 1.0)
 AGREEMENT = 0.5
 MIN_PIXELS = 30
@@ -51,13 +53,15 @@ MARGIN_PX = 12  # room for a border that moves out, at any noise
 @dataclass(frozen=True)
 class Labels:
     """What one camera's image truly shows: ``identity`` (h, w) in a window at (x0, y0) of an image
-    of ``size`` (width, height); ``visible`` share of the object that nothing hides."""
+    of ``size`` (width, height); ``visible`` share of the object that nothing hides; ``blur_px``
+    how far it moves in the image while it is exposed."""
 
     identity: np.ndarray
     x0: int
     y0: int
     size: tuple[int, int]
     visible: float
+    blur_px: float
 
 
 class Segmenter:
@@ -73,8 +77,8 @@ class Segmenter:
         }
 
     def camera(self, name: str, clutter: np.ndarray | None, size: tuple[int, int]) -> CameraMasks:
-        """The errors of one camera; ``clutter`` (H, W) bool: a thing of the room that looks like
-        the object, or None; ``size`` width and height of its images."""
+        """The errors of one camera; ``clutter`` (H, W) bool: a thing of the room that is of the
+        object's class, or None; ``size`` width and height of its images."""
         return CameraMasks(self, name, clutter, size)
 
 
@@ -104,19 +108,18 @@ class CameraMasks:
         self._waves = noise.process(rng, frames, 24, rng.uniform(*EPISODE_S)).reshape(-1, 2, 12)
         self._directions = rng.normal(size=(2, 12, 2))
         self._phases = rng.uniform(0, 2 * np.pi, (2, 12))
-        self._clutter = self._things(clutter)
+        self._twin = clutter if clutter is not None and clutter.sum() > MIN_PIXELS else None
+        self._clutter = self._things()
+        often = [TWIN] * (self._twin is not None) + [CLUTTER] * len(self._clutter)
         self._clutter_on = np.stack(
-            [noise.episodes(rng, frames, one * CLUTTER, miss, 0.7, 0.0)[:, 0]
-             for _ in self._clutter], 1
-        ) if self._clutter else np.zeros((frames, 0), bool)  # fmt: skip
-        self._score = noise.process(rng, frames, 4 + len(self._clutter), 0.3)
+            [noise.episodes(rng, frames, one * chance, miss, 0.7, 0.0)[:, 0] for chance in often], 1
+        )
+        self._score = noise.process(rng, frames, 4 + len(often), 0.3)
 
-    def _things(self, like_object: np.ndarray | None) -> list[tuple[str, dict[str, Any]]]:
+    def _things(self) -> list[tuple[str, dict[str, Any]]]:
         """False instances of this view that stand still: label and RLE."""
         width, height = self.size
         things = []
-        if like_object is not None and like_object.sum() > MIN_PIXELS:
-            things.append((self.network.label, _encode(like_object, 0, 0, self.size)))
         for _ in range(3):
             label = OTHER_THINGS[self._rng.integers(len(OTHER_THINGS))]
             blob = np.zeros((height, width), np.uint8)
@@ -140,17 +143,28 @@ class CameraMasks:
         if person is not None and not self._person_missed[t]:
             found.append(("person", self._rle(person, truth), score[0] + 0.15))
         missed = MISS_FREE + (MISS_HIDDEN - MISS_FREE) * (1 - truth.visible) ** 2
+        blur = truth.blur_px / (BLUR_PX * self.size[0] / 1920)
+        missed = 1 - (1 - missed) * (1 - MISS_BLURRED * (1 - np.exp(-(blur**2))))
         threshold = np.clip(missed * self.noise.scale, 0, 0.97)
         rank = 0.5 * (1 + np.tanh(0.8 * self._miss[t]))
         if thing is not None and rank > threshold:
             if self._split[t]:
                 thing = self._half(thing, t)
             found.append((self._object_label(t), self._rle(thing, truth), score[1]))
-        for k, (label, rle) in enumerate(self._clutter):
-            if self._clutter_on[t, k]:
+        for k, (label, rle) in enumerate(self._standing(truth)):
+            if self._clutter_on[t, k] and coco.area(rle):
                 found.append((label, rle, score[4 + k] - 0.08))
         order = self.noise.rng("mask order", t, truth.x0, truth.y0).permutation(len(found))
         return [self._result(*found[i]) for i in order]
+
+    def _standing(self, truth: Labels) -> list[tuple[str, dict[str, Any]]]:
+        """What stands about, the object's twin first where nothing moving hides it."""
+        if self._twin is None:
+            return self._clutter
+        height, width = truth.identity.shape
+        left = self._twin.copy()
+        left[truth.y0 : truth.y0 + height, truth.x0 : truth.x0 + width] &= truth.identity == 0
+        return [(self.network.label, _encode(left, 0, 0, self.size)), *self._clutter]
 
     def _object_label(self, t: int) -> str:
         label = self.network.label

@@ -25,6 +25,7 @@ START_US = 1_000_000  # device time of the first set
 GRAVITY = 9.81
 IMU_PER_FRAME = 8
 ACCELEROMETER_NOISE, GYROSCOPE_NOISE = 0.03, 0.004  # m/s^2, rad/s
+EXPOSURE_S = 1 / 60  # of a colour image in a lit room
 # A joint lies inside the body: it is hidden only by what is nearer by more than this (metres)
 COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 
@@ -100,6 +101,7 @@ class Kinect:
         points = stage.keypoints(moment)
         hidden = np.zeros(points.shape[:2], bool)
         seen, whole = np.zeros(stage.frames, int), np.zeros(stage.frames, int)
+        blur = _blur_px(colour_view, self.exposures, moment.stage_from_object[:, :3, 3])
         empty = stage.failures.depth_empty[:, self.index]
         has_depth = ~stage.failures.depth_away[:, self.index]
         candidates = []
@@ -124,7 +126,9 @@ class Kinect:
                     surfaces[1].stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
                 )
                 whole[t] = whole[self.sets[order - 1]] if same else colour_view.count(surfaces[1])
-                truth = Labels(cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1))
+                truth = Labels(
+                    cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1), blur[t]
+                )
                 found = masks.candidates(t, truth)
                 folder.add_masks(name, t, stage.fps, found, segmenter.label)
                 image = folder.image_number(t, order, stage.fps)
@@ -184,6 +188,14 @@ def surfaces_at(
             moment.stage_from_object[t],
         ),
     )  # fmt: skip
+
+
+def _blur_px(view: View, times: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How far (T,) points (T, 3) seen at ``times`` (T,) move in the image while it is exposed."""
+    at = points @ view.camera_from_stage[:3, :3].T + view.camera_from_stage[:3, 3]
+    shift = np.linalg.norm(np.gradient(view.lens.project(at), axis=0), axis=1)
+    # a camera that slips may show one moment twice
+    return shift / np.maximum(np.abs(np.gradient(times)), EXPOSURE_S) * EXPOSURE_S
 
 
 def _hidden(cast: Cast, view: View, points: np.ndarray) -> np.ndarray:

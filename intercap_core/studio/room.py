@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,6 +18,19 @@ from intercap_core.studio.interactions.base import Box
 FLOOR_HALF_M = 6.0
 WALL_HEIGHT_M = 2.7
 WALL_DISTANCE_M = (3.0, 3.7)
+TWIN_SCALE = (0.87, 0.94, 1.07, 1.15)  # sizes of another thing of the object's class
+TWIN_DISTANCE_M = (1.5, 1.75)
+LOW_M, STAND_M = 0.35, (0.45, 0.75)  # what is lower stands on a box of such a height
+PILLAR_DISTANCE_M, PILLAR_HALF_M, PILLAR_HEIGHT_M = (1.2, 1.5), (0.03, 0.05), 1.9
+PILLARS_MAX = 3
+
+
+class Twin(NamedTuple):
+    """What another thing of the object's class looks like: vertices (V, 3) standing, z up, and
+    faces (F, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -32,16 +46,31 @@ class Room:
 
 
 def build_room(
-    rng: np.random.Generator, furniture: Sequence[Box], eyes: np.ndarray, *, bare: bool
+    rng: np.random.Generator,
+    furniture: Sequence[Box],
+    eyes: np.ndarray,
+    *,
+    bare: bool,
+    twin: Twin | None = None,
+    hidden: np.ndarray | None = None,
 ) -> Room:
     """Make a room around the stage; ``bare`` leaves only the floor and the script's ``furniture``.
 
-    ``eyes`` (C, 2): where the cameras stand; their view of the middle stays free.
+    ``eyes`` (C, 2): where the cameras stand; their view of the middle stays free but for a few
+    pillars between them and the place ``hidden`` (2,), where given. ``twin`` stands about as well.
     """
     boxes = list(furniture)
+    things: list[Twin] = []
     if not bare:
         boxes += _walls(rng) + _pieces(rng, eyes)
+        if hidden is not None:
+            boxes += _pillars(rng, eyes, hidden)
+        if twin is not None:
+            stand, thing = _twin(rng, eyes, twin)
+            boxes += stand
+            things.append(thing)
     names = list(dict.fromkeys(["floor", *(box.material for box in boxes)]))
+    names += ["distractor"] * len(things)
     vertices = [np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M]
     faces, material = [np.array([[0, 2, 1], [1, 2, 3]])], [np.zeros(2, int)]
     count = 4
@@ -51,6 +80,11 @@ def build_room(
         faces.append(triangles + count)
         material.append(np.full(len(triangles), names.index(box.material)))
         count += len(corners)
+    for thing in things:
+        vertices.append(thing.vertices)
+        faces.append(thing.faces + count)
+        material.append(np.full(len(thing.faces), names.index("distractor")))
+        count += len(thing.vertices)
     looks = tuple(_look(name, rng) for name in names)
     distractor = names.index("distractor") if "distractor" in names else -1
     return Room(np.vstack(vertices), np.vstack(faces), np.concatenate(material), looks, distractor)
@@ -75,18 +109,14 @@ def _walls(rng: np.random.Generator) -> list[Box]:
 
 
 def _pieces(rng: np.random.Generator, eyes: np.ndarray) -> list[Box]:
-    """Shelves, boxes, a table and one thing that could be taken for the object, between the
-    cameras and outside the ring of action."""
-    azimuths = np.sort(np.arctan2(eyes[:, 1], eyes[:, 0]))
-    gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
-    between = azimuths + gaps / 2
+    """Shelves, boxes and a table, between the cameras and outside the ring of action."""
+    between, gaps = _between(eyes)
     pieces = []
-    for index, kind in enumerate(("shelf", "cardboard", "wood", "distractor", "cardboard", "wood")):
+    for index, kind in enumerate(("shelf", "cardboard", "wood", "cardboard", "wood")):
         size = {
             "shelf": (0.13, 0.36, rng.uniform(0.9, 1.3)),
             "cardboard": (rng.uniform(0.15, 0.25), rng.uniform(0.15, 0.3), rng.uniform(0.25, 0.6)),
             "wood": (rng.uniform(0.22, 0.3), rng.uniform(0.25, 0.4), rng.uniform(0.4, 0.7)),
-            "distractor": (0.10, 0.17, rng.uniform(0.3, 0.45)),
         }[kind]
         gap = index % len(between)
         angle = between[gap] + gaps[gap] * rng.uniform(-0.12, 0.12)
@@ -98,6 +128,46 @@ def _pieces(rng: np.random.Generator, eyes: np.ndarray) -> list[Box]:
             Box((x - size[0], y - size[1], 0), (x + size[0], y + size[1], size[2]), angle, kind)
         )
     return pieces
+
+
+def _between(eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths (C,) in the middle between neighbouring cameras, and how wide each gap is."""
+    azimuths = np.sort(np.arctan2(eyes[:, 1], eyes[:, 0]))
+    gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
+    return azimuths + gaps / 2, gaps
+
+
+def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[Box], Twin]:
+    """Another thing of the object's class, of another size, and what it stands on."""
+    between, gaps = _between(eyes)
+    gap = int(rng.integers(len(between)))
+    angle = between[gap] + gaps[gap] * rng.uniform(-0.2, 0.2)
+    far, heading = rng.uniform(*TWIN_DISTANCE_M), rng.uniform(0, 2 * np.pi)
+    points = rng.choice(TWIN_SCALE) * twin.vertices
+    x, y = far * np.cos(angle), far * np.sin(angle)
+    stand = []
+    height = 0.0
+    if np.ptp(points[:, 2]) < LOW_M:
+        height = rng.uniform(*STAND_M)
+        half = 0.03 + np.abs(points[:, :2]).max()
+        stand.append(Box((x - half, y - half, 0), (x + half, y + half, height), angle, "cardboard"))
+    cos, sin = np.cos(heading), np.sin(heading)
+    turned = points @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).T
+    place = np.array([x, y, height - points[:, 2].min()])
+    return stand, Twin(turned + place, twin.faces)
+
+
+def _pillars(rng: np.random.Generator, eyes: np.ndarray, place: np.ndarray) -> list[Box]:
+    """Pillars before some of the cameras that hide what is at ``place`` (2,) from them."""
+    count = min(int(rng.integers(1, PILLARS_MAX + 1)), len(eyes) // 2)
+    pillars = []
+    for eye in eyes[rng.permutation(len(eyes))[:count]]:
+        towards = eye - place
+        far, half = rng.uniform(*PILLAR_DISTANCE_M), rng.uniform(*PILLAR_HALF_M)
+        x, y = place + towards / np.linalg.norm(towards) * far
+        low, high = (x - half, y - half, 0.0), (x + half, y + half, PILLAR_HEIGHT_M)
+        pillars.append(Box(low, high, float(np.arctan2(towards[1], towards[0])), "wood"))
+    return pillars
 
 
 def _box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:

@@ -22,12 +22,13 @@ from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
 from intercap_core.studio.rig import StudioRig, build_rig
-from intercap_core.studio.room import build_room
+from intercap_core.studio.room import Twin, build_room
 from intercap_core.studio.subjects import Subject, subject_names
 from intercap_core.studio.tissue import press_out
 
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
 OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
+SMALL_M = 0.35  # a smaller object may be hidden from most cameras
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,20 @@ class Stage:
         by_chance = bool(rng.random() < BARE_ROOM_SHARE)
         bare = by_chance if capture.room == "random" else capture.room == "bare"
         eyes = invert(self.rig.master_from_stage) @ self.rig.true.master_from_colour
-        self.room = build_room(rng, furniture, eyes[:, :2, 3], bare=bare)
+        self.room = build_room(
+            rng,
+            furniture,
+            eyes[:, :2, 3],
+            bare=bare,
+            twin=Twin(vertices, faces),
+            hidden=self._highlight() if np.ptp(self.bounds, 0).max() < SMALL_M else None,
+        )
         self.bare = bare
+
+    def _highlight(self) -> np.ndarray:
+        """Where the object is on the floor plan (2,) when most happens to it."""
+        played = self.interaction.perform(np.array([self.interaction.highlight]))
+        return (self.stage_from_script @ played.stage_from_object[0])[:2, 3]
 
     @cached_property
     def set_times(self) -> np.ndarray:
