@@ -149,6 +149,36 @@ def fit_pose(
     return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), reports)
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What each view of a frame set says about small motions of a pose: the weighted J'J
+    ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
+    one standard deviation; zero from a view that says nothing. No prior is in them."""
+
+    information: np.ndarray
+    gradient: np.ndarray
+
+
+def evidence_at(
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    *,
+    min_overlap: float,
+    background_term: bool,
+    labels: tuple[str, ...] = (),
+    twist: np.ndarray | None = None,
+) -> Evidence:
+    """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
+    information, gradient = np.zeros((len(views), 6, 6)), np.zeros((len(views), 6))
+    for v, (view, there) in enumerate(zip(views, _seen(pose, views, twist), strict=True)):
+        fit = ViewFit(mesh, view, there, min_overlap, labels)
+        information[v], gradient[v] = fit.normal_equations(
+            there, DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term
+        )
+    return Evidence(information, gradient)
+
+
 def assess(
     mesh: ObjectMesh,
     views: list[View],
