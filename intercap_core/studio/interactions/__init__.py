@@ -7,11 +7,13 @@ from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.cup_drink import CupDrink
 from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
+from intercap_core.studio.interactions.toolbox_carry import ToolboxCarry
 
 INTERACTIONS: dict[str, type[Interaction]] = {
     "suitcase_carry": SuitcaseCarry,
     "cup_drink": CupDrink,
     "stool_sit": StoolSit,
+    "toolbox_carry": ToolboxCarry,
 }
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from intercap_core.camera.transforms import invert
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.studio.controls import Wander
 from intercap_core.studio.motion import Puppet
@@ -111,3 +112,13 @@ def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
     """stage_from_object (4, 4) of an object that stands, turned about the vertical."""
     cos, sin = np.cos(heading), np.sin(heading)
     return transform(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([x, y, z]))
+
+
+def held_object(puppet: Puppet, world: np.ndarray, pelvis: np.ndarray, side: int,
+                object_from_wrist: np.ndarray) -> np.ndarray:  # fmt: skip
+    """stage_from_object (N, 4, 4) of what a hand holds: the posed wrist's own place decides."""
+    wrist = np.broadcast_to(np.eye(4), (len(world), 4, 4)).copy()
+    index = puppet.hands[side].wrist
+    wrist[:, :3, :3] = world[:, index]
+    wrist[:, :3, 3] = puppet.skeleton.forward(world, pelvis)[:, index]
+    return wrist @ invert(object_from_wrist)

@@ -15,6 +15,7 @@ from intercap_core.studio.interactions.base import (
     Box,
     Interaction,
     Performance,
+    held_object,
     transform,
     upright,
 )
@@ -268,13 +269,7 @@ class CupDrink(Interaction):
         ]
         puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, right))
         puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, left))
-        return Performance(world, pelvis, self._object(world, pelvis, times))
-
-    def _object(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
-        joints = self.puppet.skeleton.forward(world, pelvis)
-        index = self.puppet.hands[RIGHT].wrist
-        wrist = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
-        wrist[:, :3, :3], wrist[:, :3, 3] = world[:, index], joints[:, index]
-        held = wrist @ invert(self.object_from_wrist)
+        held = held_object(puppet, world, pelvis, RIGHT, self.object_from_wrist)
         pose = np.where((times <= ATTACH_S)[:, None, None], self.rest, held)
-        return np.where((times >= RELEASE_S)[:, None, None], self.back, pose)
+        pose = np.where((times >= RELEASE_S)[:, None, None], self.back, pose)
+        return Performance(world, pelvis, pose)

@@ -1,0 +1,187 @@
+"""Walk up to a thing that stands on the floor, take it by the handle on its top, carry it two
+steps, put it down."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from intercap_core.studio.controls import Footwork, Pose, Step, bump, plateau, ramp
+from intercap_core.studio.hands import RELAXED, HandShape, shape
+from intercap_core.studio.interactions.base import (
+    SCRIPT_S,
+    Interaction,
+    Performance,
+    held_object,
+    transform,
+    upright,
+)
+from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.skeleton import turn
+
+RIGHT, LEFT = 1, 0
+ATTACH_S, RELEASE_S = 1.08, 2.46
+
+
+class HandleCarry(Interaction):
+    """The thing stands to the right of the person's way, its handle along the way."""
+
+    highlight = 1.5
+    centre = (0.22, -0.15)
+    # What a thing asks for. Metres: half the thickness of the handle's bar; the least room between
+    # the hip and the thing's middle; where the knuckles are tried beside and below the bar. Degrees
+    # of the knuckles' flexion that are tried. The stoop: how far down and back the pelvis goes,
+    # metres, and how much more the trunk bends, rad.
+    bar_half: float
+    beside: float
+    knuckles_aside: tuple[float, ...] = (0.020, 0.025, 0.030)
+    knuckles_below: tuple[float, ...] = (0.020, 0.024, 0.028, 0.032)
+    knuckles_deg: tuple[float, ...] = (50, 58, 66, 74)
+    stoop_from: float
+    stoop_down: float
+    stoop_back: float
+    stoop_bend: float
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        side_way = -(puppet.hip_width + self.beside + rng.uniform(0, 0.02))
+        height = self.thing.standing_height
+        ahead, turned = 0.02 + rng.normal(0, 0.01), np.pi + rng.normal(0, 0.03, 2)
+        self.taken = upright(ahead, side_way, height, turned[0])
+        stride = 0.43 + 0.05 * rng.random()
+        self.put = upright(2 * stride - 0.02, side_way - 0.02, height, turned[1])
+        w = puppet.hip_width * 0.95
+        start = np.array([[-0.62, w], [-0.68, -w]])
+        steps = [
+            Step(RIGHT, 0.05, 0.46, (-0.20, -w)),
+            Step(LEFT, 0.44, 0.86, (0.10, w)),
+            Step(RIGHT, 1.20, 1.62, (stride - 0.05, -w)),
+            Step(LEFT, 1.60, 2.02, (2 * stride - 0.04, w)),
+            Step(RIGHT, 2.00, 2.34, (2 * stride - 0.22, -w)),
+        ]
+        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
+        self.pelvis_track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
+        )
+        self._grasp()
+        self.lift = self.lifted()
+
+    def lifted(self) -> float:
+        """How high the thing is carried, from the floor, metres."""
+        raise NotImplementedError
+
+    def _grasp(self) -> None:
+        """Fingers level under the handle's bar where they have most room, then curled up.
+
+        The hand comes from the thing's +y, its thumb towards -x.
+        """
+        hand, surface = self.puppet.hands[RIGHT], self.thing.surface
+        near = (np.abs(self.thing.vertices[:, :2]) < (0.04, 0.02)).all(1)
+        bar_height = self.thing.vertices[near, 2].max() - self.bar_half
+        best = (-np.inf, RELAXED, np.eye(4))
+        for knuckle_deg, tilt in product(self.knuckles_deg, np.radians((10, 20, 30))):
+            hook = shape((knuckle_deg, 6, 4), (0, 6, 8), 15, 1)
+            sin, cos = np.sin(tilt), np.cos(tilt)
+            rotation = self.puppet.wrist_rotation(
+                RIGHT, np.array([0, -sin, -cos]), np.array([0, -cos, sin])
+            )
+            knuckle = rotation @ hand.knuckles.mean(0)
+            for aside, below in product(self.knuckles_aside, self.knuckles_below):
+                at = np.array([0.0, aside, bar_height - below])
+                grip = transform(rotation, at - knuckle)
+                gap = hand.gap(hook, surface, grip)
+                if gap > best[0]:
+                    best = (gap, hook, grip)
+        _, self.hook, self.object_from_wrist = best
+        knuckle_limit = float(self.hook.flexion[0, 0]) + 5
+        limits = {"finger": (knuckle_limit, 98.0, 62.0), "thumb": (40.0, 55.0, 60.0)}
+        self.grip_shape, self.grip_gaps = hand.close(
+            self.hook, limits, surface, self.object_from_wrist
+        )
+
+    def _trunk(self, times: np.ndarray) -> Trunk:
+        track = self.pelvis_track(times)
+        sway, shift = self.sway(times), self.weight_shift(times)
+        stoop = plateau(times, self.stoop_from, 1.02, 1.10, 1.50)
+        stoop = stoop + plateau(times, 1.95, 2.40, 2.52, 2.95)
+        carry = plateau(times, 1.15, 1.5, 1.9, 2.3)
+        pelvis = track[:, :3] + shift
+        pelvis[:, 2] -= self.stoop_down * stoop
+        pelvis[:, 0] -= self.stoop_back * stoop
+        bend = 0.6 * sway[:, :3]
+        bend[:, 0] += 0.04 + self.stoop_bend * stoop
+        bend[:, 2] += 0.10 * stoop - 0.10 * carry
+        bend[:, 1] -= 0.10 * stoop
+        head = 1.5 * sway[:, 3:]
+        head[:, 0] += 0.12 + 0.45 * stoop
+        head[:, 1] -= 0.35 * plateau(times, 0.2, 0.7, 1.2, 1.6) + 0.25 * plateau(
+            times, 1.8, 2.2, 2.5, 2.9
+        )
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        count = len(times)
+        swing = 0.10 * bump(times, 0.35, 0.9) + self.arm_swing(times)[:, 0]
+        idle = self.puppet.idle_wrist(world, pelvis, RIGHT, swing)
+        first, last = self.taken @ self.object_from_wrist, self.put @ self.object_from_wrist
+        aside = np.array([0.0, -0.085, 0.0])
+        before, after = first.copy(), last.copy()
+        before[:3, 3] += aside
+        after[:3, 3] += aside
+        over, off = before.copy(), after.copy()
+        over[:3, 3] += (-0.03, -0.03, 0.13)
+        off[:3, 3] += (-0.02, -0.04, 0.15)
+        held = np.array([0.0, first[1, 3], first[2, 3] + self.lift])
+        along = pelvis[:, 0] + (first[0, 3] - self.taken[0, 3]) - 0.02
+        position = np.broadcast_to(held, (count, 3)).copy()
+        share = ramp(times, 1.2, 2.3)
+        position[:, 0] = along
+        position[:, 1] += share * (last[1, 3] - first[1, 3])
+        position[:, 2] += 0.006 * np.sin(2 * np.pi * times / 0.41)
+        tilt = np.zeros((count, 3))
+        tilt[:, 1] = (
+            0.05 * np.sin(2 * np.pi * (times - 1.2) / 0.82) * plateau(times, 1.2, 1.5, 1.9, 2.2)
+        )
+        between = Pose.still(first, count).towards(Pose.still(last, count), share)
+        carried = Pose(position, turn(tilt) @ between.rotation)
+        wrist = idle.towards(Pose.still(over, count), ramp(times, 0.35, 0.78))
+        wrist = wrist.towards(Pose.still(before, count), ramp(times, 0.70, 0.94))
+        wrist = wrist.towards(Pose.still(first, count), ramp(times, 0.94, 1.04))
+        wrist = wrist.towards(carried, ramp(times, ATTACH_S, 1.55))
+        wrist = wrist.towards(Pose.still(last, count), ramp(times, 1.95, RELEASE_S - 0.02))
+        wrist = wrist.towards(Pose.still(after, count), ramp(times, 2.53, 2.65))
+        wrist = wrist.towards(Pose.still(off, count), ramp(times, 2.62, 2.86))
+        return wrist.towards(idle, ramp(times, 2.80, 3.15))
+
+    def perform(self, times: np.ndarray) -> Performance:
+        puppet = self.puppet
+        trunk, feet = self._trunk(times), self.footwork.feet(times)
+        world = puppet.trunk(trunk)
+        needs = plateau(times, 0.5, 0.95, 2.6, 2.95)
+        for _ in range(2):
+            right = self._right_wrist(world, trunk.pelvis, times)
+            trunk = puppet.assist(trunk, {RIGHT: (right, needs)})
+            trunk = puppet.settled(trunk, feet[0])
+            world = puppet.trunk(trunk)
+        pelvis = trunk.pelvis
+        right = self._right_wrist(world, pelvis, times)
+        puppet.legs(world, pelvis, *feet)
+        puppet.arm_to(world, pelvis, RIGHT, right)
+        swing = -0.10 * bump(times, 0.0, 0.5) + 0.14 * bump(times, 1.2, 1.7)
+        left = puppet.idle_wrist(world, pelvis, LEFT, swing + self.arm_swing(times)[:, 1])
+        balance = plateau(times, 0.7, 1.0, 2.5, 2.9)[:, None]
+        left = Pose(left.position + balance * np.array([0.06, 0.10, 0.05]), left.rotation)
+        puppet.arm_to(world, pelvis, LEFT, left)
+        stages: list[tuple[np.ndarray, HandShape]] = [
+            (ramp(times, 0.5, 0.88), self.hook),
+            (ramp(times, 0.98, 1.07), self.grip_shape),
+            (ramp(times, 2.46, 2.53), self.hook),
+            (ramp(times, 2.63, 2.9), RELAXED),
+        ]
+        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, stages))
+        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
+        carried = held_object(puppet, world, pelvis, RIGHT, self.object_from_wrist)
+        pose = np.where((times <= ATTACH_S)[:, None, None], self.taken, carried)
+        pose = np.where((times >= RELEASE_S)[:, None, None], self.put, pose)
+        return Performance(world, pelvis, pose)
