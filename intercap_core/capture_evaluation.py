@@ -10,11 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from intercap_core.errors import UserError
 from intercap_core.metrics import capture
 from intercap_core.metrics.capture import CaptureErrors
 from intercap_core.project import Project
-from intercap_core.run import run_workflow
+from intercap_core.stage_evaluation import take_to
 
 _WIDTH = 112
 
@@ -35,25 +34,13 @@ def evaluate_captures(project: Project, *, cores: int = 0) -> CaptureEvaluation:
 
     Raises UserError where a sequence has no truth to hold it to, or none has a scene.
     """
-    without = [name for name, row in project.sequences.items() if row.truth is None]
-    if without:
-        raise UserError(
-            f"{project.path}: sequence {without[0]!r} has no truth to be evaluated against; leave "
-            "it out, or name its truth in the table"
-        )
-    scenes = {name: project.artefact(name, "scene") for name in project.sequences}
-    targets = [str(path) for path in scenes.values()]
-    status = run_workflow(project.path, cores=cores, arguments=targets)
+    taken = take_to(project, "scene", cores=cores)
     errors = [
-        capture.measure(project.artefact(name, "frames"), scene, row.truth)
-        for (name, scene), row in zip(scenes.items(), project.sequences.values(), strict=True)
-        if scene.is_file() and row.truth is not None
+        capture.measure(project.artefact(name, "frames"), scene, taken.truths[name])
+        for name, scene in taken.artefacts.items()
     ]
-    if not errors:
-        raise UserError(f"{project.path}: no sequence has a scene; look into {project.logs}")
-    missing = [name for name, scene in scenes.items() if not scene.is_file()]
     area = project.config.dataset
-    return CaptureEvaluation(area, errors, capture.figures(errors), missing, status)
+    return CaptureEvaluation(area, errors, capture.figures(errors), taken.missing, taken.status)
 
 
 def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:

@@ -56,11 +56,16 @@ class Part(StrEnum):
 
     sequences = "sequences"
     captures = "captures"
+    objects = "objects"
 
 
 DEFAULT_SETTINGS = Path("config/config.yaml")
 CAPTURE_SETTINGS = [
     Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
+]
+OBJECT_SETTINGS = [
+    Path(f"config/object/{name}.yaml")
+    for name in ("config", "no_detector", "noise_05", "noise_2", "family_b")
 ]
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
 SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
@@ -181,8 +186,15 @@ def evaluate(
         list[Path],
         typer.Option(metavar="SETTINGS", help="Recordings taken to the scene alone; may repeat."),
     ] = CAPTURE_SETTINGS,
+    objects: Annotated[
+        list[Path],
+        typer.Option(
+            metavar="SETTINGS", help="Recordings taken to the object track; may repeat."
+        ),
+    ] = OBJECT_SETTINGS,
     only: Annotated[
-        Part | None, typer.Option(help="One part: what is taken to the end, or to the scene.")
+        Part | None,
+        typer.Option(help="One part: taken to the end, to the scene, or to the object's track."),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
         "results/evaluation.json"
@@ -191,14 +203,15 @@ def evaluate(
 ) -> None:
     """Run the evaluation captures and print the tables against truth.
 
-    Examples: intercap evaluate; intercap evaluate --only captures --output capture.json
+    Examples: intercap evaluate; intercap evaluate --only objects --output object.json
     """
     from intercap_core.evaluation import evaluate as run_evaluation
 
     _check_output(output, replace_any=True)
-    whole = None if only is Part.captures else settings
-    parts = [] if only is Part.sequences else captures
-    raise typer.Exit(run_evaluation(whole, parts, output, cores=cores))
+    whole = settings if only in (None, Part.sequences) else None
+    scenes = captures if only in (None, Part.captures) else []
+    tracks = objects if only in (None, Part.objects) else []
+    raise typer.Exit(run_evaluation(whole, scenes, tracks, output, cores=cores))
 
 
 @app.command(rich_help_panel=WHOLE)

@@ -14,6 +14,7 @@ from intercap_core.capture_evaluation import evaluate_captures, print_captures
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
 from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.object_evaluation import evaluate_objects, print_objects
 from intercap_core.project import Project, load_project
 from intercap_core.run import run_workflow
 
@@ -21,17 +22,24 @@ PLAIN, ANNOTATED = "no annotations", "annotated"
 
 
 def evaluate(
-    settings: Path | None, captures: Sequence[Path], output: Path, *, cores: int = 0
+    settings: Path | None,
+    captures: Sequence[Path],
+    objects: Sequence[Path],
+    output: Path,
+    *,
+    cores: int = 0,
 ) -> int:
     """Bring the evaluation captures up to date, print the tables and write ``output``.
 
     ``settings`` are of recordings that are taken to the end, ``captures`` of those that are taken
-    to the scene alone. ``output`` is flat JSON with keys ``area.measure``: areas of annotated
-    recordings end in ``_annotated``, those of ``captures`` have their dataset's name. Returns the
+    to the scene alone, ``objects`` of those that are taken to the object's track. ``output`` is
+    flat JSON with keys ``area.measure``: areas of annotated recordings end in ``_annotated``, those
+    of ``captures`` have their dataset's name, that of ``objects`` is ``object``. Returns the
     workflow's exit status; sequences that failed are left out of the figures and named. Raises
     UserError where a project's settings are wrong, or none of its sequences has a result.
     """
-    projects = [load_project(path) for path in captures]  # faults are told before any work
+    # faults are told before any work
+    projects, tracked = ([load_project(path) for path in paths] for paths in (captures, objects))
     status, flat = 0, dict[str, float]()
     if settings is not None:
         status, flat = _evaluate_sequences(settings, cores)
@@ -41,6 +49,12 @@ def evaluate(
         flat |= _flattened(captured.area, captured.figures)
     if found:
         print_captures(found)
+    tracks = [evaluate_objects(project, cores=cores) for project in tracked]
+    for track in tracks:
+        status = status or track.status
+        flat |= {key: _rounded(value) for key, value in track.flat().items()}
+    if tracks:
+        print_objects(tracks)
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     print(output)
@@ -64,10 +78,14 @@ def _evaluate_sequences(settings: Path, cores: int) -> tuple[int, dict[str, floa
 
 def _flattened(area: str, measures: dict[str, float]) -> dict[str, float]:
     return {
-        f"{area}.{measure}": float(f"{value:.6g}")
+        f"{area}.{measure}": _rounded(value)
         for measure, value in measures.items()
         if math.isfinite(value)
     }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def measured_groups(project: Project) -> dict[str, list[SequenceMetrics]]:

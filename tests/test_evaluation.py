@@ -11,6 +11,8 @@ from intercap_core.capture_evaluation import CaptureEvaluation, evaluate_capture
 from intercap_core.errors import UserError
 from intercap_core.metrics import capture
 from intercap_core.metrics.capture import CaptureErrors, SlipCounts
+from intercap_core.metrics.object_errors import ObjectErrors
+from intercap_core.object_evaluation import ObjectEvaluation, print_objects
 from intercap_core.project import load_project
 
 CONFIGS = sorted(Path("config/capture").glob("*.yaml"))
@@ -49,5 +51,33 @@ def test_every_capture_and_figure_is_printed(capsys: pytest.CaptureFixture[str])
     print_captures([found])
     printed = capsys.readouterr().out
     for words in ("many", "alone", "broken", "1 of 2", "1.50", "extrinsics_floor_only_mm"):
+        assert words in printed
+    assert "nan" not in printed
+
+
+def test_keys_of_a_variant_come_after_the_area_and_the_object() -> None:
+    count = 3
+    cup = ObjectErrors(
+        "a", "cup", 15.0, np.array([0.002, 0.003, 0.1]), np.zeros(count), np.full(count, np.nan),
+        np.zeros((count, 3)), np.zeros((count, 3)), np.array([6, 2, 1]), np.ones(count, bool),
+        np.zeros(count, bool),
+    )  # fmt: skip
+    flat = ObjectEvaluation("object", [cup], [], 0).flat()
+    assert flat["object.translation_median_mm"] == pytest.approx(2.5)
+    assert flat["object.cup.lost_share"] == flat["object.views_0_to_1.lost_share"] / 3
+    flat = ObjectEvaluation("object_noise2", [cup], [], 0).flat()
+    assert flat["object.noise2_translation_median_mm"] == pytest.approx(2.5)
+    assert flat["object.cup.noise2_lost_share"] == pytest.approx(1 / 3)
+    assert flat["object.noise2_views_2.frames"] == 1
+
+
+def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    cup = ObjectErrors(
+        "a", "cup", 15.0, np.array([0.0021]), np.array([0.5]), np.full(1, np.nan),
+        np.zeros((1, 3)), np.zeros((1, 3)), np.array([4]), np.zeros(1, bool), np.zeros(1, bool),
+    )  # fmt: skip
+    print_objects([ObjectEvaluation("object", [cup], ["kick_s09"], 1)])
+    printed = capsys.readouterr().out
+    for words in ("cup", "all", "kick_s09: no track", "2.1", "0.50"):
         assert words in printed
     assert "nan" not in printed

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.metrics import contact, motion, object_pose, penetration
+from intercap_core.metrics import contact, object_errors, penetration
+from intercap_core.metrics.object_errors import ObjectErrors
 from intercap_core.schemas import METRICS
 
 STAGES = ("object_track", "body_fit", "joint")
@@ -119,7 +120,6 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
         "acceleration_hands_mm": over("acceleration_hands"),
         "acceleration_object_mm": over("acceleration_object"),
         "joint_normalised_median": over("joint_normalised", np.nanmedian, 1.0),
-        "object_normalised_median": over("object_normalised", np.nanmedian, 1.0),
     }
     body = figures["acceleration_body_mm"]
     figures["acceleration_error"] = body if np.isfinite(body) else figures["acceleration_object_mm"]
@@ -132,7 +132,7 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     for s in sequences:
         if not s.has_truth:
             continue
-        wrong = _lost(s, "joint")
+        wrong = _object_errors(s, "joint").lost
         if "truth/joint/body_pve" in s.values:
             wrong = wrong | (s.values["truth/joint/body_pve"] > BAD_BODY_M)
         flagged.append(s.values["flagged"])
@@ -199,59 +199,37 @@ def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
     return 1e3 * float(held.mean()) if len(held) else float("nan")
 
 
-def _lost(s: SequenceMetrics, stage: str) -> np.ndarray:
+def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:
     key = f"truth/{stage}/object_"
-    return object_pose.lost(s.values[key + "translation"], s.values[key + "rotation"])
+    of, true = s.values, "truth/object_"
+    return ObjectErrors(
+        sequence=s.name,
+        object_=s.object_,
+        fps=s.fps,
+        translation=of[key + "translation"],
+        rotation=of[key + "rotation"],
+        turn=of[key + "turn"],
+        centre=of[key + "centre"],
+        true_centre=of[true + "centre"],
+        views=of[true + "views"],
+        moves=of[true + "moving"],
+        flagged=of[key + "flagged"],
+        normalised=of.get(key + "normalised"),
+    )
 
 
 def _object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
-    key = f"truth/{stage}/object_"
-    have = [s for s in sequences if f"{key}translation" in s.values]
-    if not have:
-        return {}
-    seen = np.concatenate([s.values["truth/object_views"] >= 2 for s in have])
-    lost = np.concatenate([_lost(s, stage) for s in have])
-    flagged = np.concatenate([s.values[f"{key}flagged"] for s in have])
-    figures: Figures = {"lost_share": float(lost.mean())}
-    figures["lost_unnoticed_share"] = float((lost & ~flagged).mean())
-    for name, scale in (("translation", 1e3), ("rotation", 1.0)):
-        unit = "mm" if name == "translation" else "deg"
-        values = scale * np.concatenate([s.values[key + name] for s in have])[seen]
-        if len(values):
-            figures[f"object_{name}_{unit}"] = float(np.median(values))
-            figures[f"object_{name}_p95_{unit}"] = float(np.percentile(values, 95))
-    first = [
-        object_pose.first_seen_found(
-            s.values[key + "translation"], s.values[key + "rotation"],
-            s.values["truth/object_views"],
-        )
-        for s in have
-    ]  # fmt: skip
-    counted = [f for f in first if f is not None]
-    if counted:
-        figures["first_frame_success"] = float(np.mean(counted))
-    return figures | _promptness_figures(have, key)
-
-
-def _promptness_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
-    """Jitter over all frames of rest, and by how much the track errs at the start of motion."""
-    figures: Figures = {}
-    steps, turns, lags = [np.zeros(0)], [np.zeros(0)], []
-    for s in sequences:
-        centre, true = s.values[key + "centre"], s.values["truth/object_centre"]
-        moves = s.values["truth/object_moving"]
-        resting = motion.resting_steps(moves)
-        steps.append(motion.steps(centre, true)[resting])
-        turns.append(s.values[key + "turn"][1:][resting])
-        lags += motion.motion_onset_lags(centre, true, moves, s.fps)
-    for name, values, scale in (("mm", steps, 1e3), ("deg", turns, 1.0)):
-        pooled_steps = np.concatenate(values).astype(np.float64)
-        if len(pooled_steps):
-            figures[f"rest_jitter_{name}"] = scale * float(np.sqrt((pooled_steps**2).mean()))
-    if lags:
-        figures["motion_onset_frames"] = float(np.abs(lags).mean())
-        figures["motion_onset_late_frames"] = float(np.mean(lags))
-    return figures
+    """The figures of :func:`object_errors.figures` by the names of this module's tables."""
+    have = [s for s in sequences if f"truth/{stage}/object_translation" in s.values]
+    found = object_errors.figures([_object_errors(s, stage) for s in have])
+    names = {
+        "translation_median_mm": "object_translation_mm",
+        "translation_p95_mm": "object_translation_p95_mm",
+        "rotation_median_deg": "object_rotation_deg",
+        "rotation_p95_deg": "object_rotation_p95_deg",
+        "normalised_median": "object_normalised_median",
+    }
+    return {names.get(key, key): value for key, value in found.items()}
 
 
 def _contact_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi
 
 from intercap_core.metrics.body import MEDIAN_CHI_3
 from intercap_core.rigid.symmetry import SymmetryGroup
@@ -11,6 +13,7 @@ LOST_TRANSLATION_M = 0.050
 LOST_ROTATION_DEG = 20.0
 FOUND_TRANSLATION_M = 0.020
 FOUND_ROTATION_DEG = 10.0
+UNKNOWN_TURN_DEG = 30.0  # a deviation beyond this states that a turn is not known
 
 
 def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -70,3 +73,28 @@ def normalised_translation_error(
     solved = np.linalg.solve(block[known], error[known][..., None])[..., 0]
     length[known] = np.sqrt(np.einsum("ti,ti->t", error[known], solved))
     return length / MEDIAN_CHI_3
+
+
+def normalised_rotation_error(
+    rotation: np.ndarray,
+    true_rotation: np.ndarray,
+    covariance: np.ndarray,
+    symmetry: SymmetryGroup,
+) -> np.ndarray:
+    """As :func:`normalised_translation_error` of the turn (T,) between poses (T, 3, 3).
+
+    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` say nothing and are left out; NaN
+    where all are.
+    """
+    truly = symmetry.nearest_equivalent(true_rotation, rotation)
+    error = Rotation.from_matrix(rotation @ np.swapaxes(truly, 1, 2)).as_rotvec()
+    result = np.full(len(error), np.nan)
+    for t, block in enumerate(covariance[:, :3, :3]):
+        if not np.isfinite(block).all():
+            continue
+        variance, axes = np.linalg.eigh(block)
+        known = (variance > 0) & (variance < np.radians(UNKNOWN_TURN_DEG) ** 2)
+        if known.any():
+            length = np.sqrt(((error[t] @ axes[:, known]) ** 2 / variance[known]).sum())
+            result[t] = length / chi(int(known.sum())).median()
+    return result

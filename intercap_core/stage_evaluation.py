@@ -1,0 +1,44 @@
+"""Recordings with truth that are taken to one stage, for `intercap evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from intercap_core.errors import UserError
+from intercap_core.project import Project
+from intercap_core.run import run_workflow
+
+
+@dataclass(frozen=True)
+class Taken:
+    """The artefacts of one stage and the truths by sequence, sequences that have no artefact, and
+    the workflow's exit status."""
+
+    artefacts: dict[str, Path]
+    truths: dict[str, Path]
+    missing: Sequence[str]
+    status: int
+
+
+def take_to(project: Project, stage: str, *, cores: int = 0) -> Taken:
+    """Bring ``stage`` of all sequences up to date; no later stage is run.
+
+    Raises UserError where a sequence has no truth to hold it to, or none has come to the stage.
+    """
+    truths = {name: row.truth for name, row in project.sequences.items() if row.truth is not None}
+    without = [name for name in project.sequences if name not in truths]
+    if without:
+        raise UserError(
+            f"{project.path}: sequence {without[0]!r} has no truth to be evaluated against; leave "
+            "it out, or name its truth in the table"
+        )
+    wanted = {name: project.artefact(name, stage) for name in project.sequences}
+    status = run_workflow(
+        project.path, cores=cores, arguments=[str(path) for path in wanted.values()]
+    )
+    made = {name: path for name, path in wanted.items() if path.is_file()}
+    if not made:
+        raise UserError(f"{project.path}: no sequence has a {stage}; look into {project.logs}")
+    return Taken(made, truths, [name for name in wanted if name not in made], status)
