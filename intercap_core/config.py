@@ -66,10 +66,23 @@ class FramesSettings(Model):
 
 
 class DetectionsSettings(Model):
-    """Keypoints and segmentation candidates, read from files."""
+    """Keypoints and segmentation candidates, from files or from a model; see docs/detectors.md."""
 
     min_score: Fraction = 0.05
     """Candidates below this detector score are left out."""
+    category_names: Literal["coco", "coco80"] | Path = "coco"
+    """Which class a number in a file of candidates means, where the file does not list its classes:
+    COCO's published ids from 1 to 90, its 80 classes from 0, or a file of class names."""
+    segmentation_model: Path | None = None
+    """ONNX model for instance segmentation (Mask R-CNN, PointRend or YOLO-seg exports); it sees the
+    images of which no file of candidates says anything."""
+    segmentation_labels: Path | None = None
+    """File of the model's class names; without one, the names in the model or COCO's."""
+    segmentation_input: Literal["auto", "rgb", "bgr255", "bgr_mean"] = "auto"
+    """Pixel values that the model takes: RGB from 0 to 1, BGR from 0 to 255 (detectron2), BGR less
+    the mean of ImageNet (maskrcnn-benchmark); auto = by the kind of its outputs."""
+    segmentation_device: Literal["cpu", "cuda"] = "cpu"
+    """Where the model runs; cuda needs the package onnxruntime-gpu."""
 
 
 class SceneSettings(Model):
