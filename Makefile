@@ -1,8 +1,8 @@
 # make demo      three virtual recordings, everything computed, the report's path at the end
 # make test      the whole test suite
 # make lint      ruff, snakefmt, mypy, snakemake --lint
-# make evaluate  the evaluation captures against truth (those of config/capture to the scene alone),
-#                tables and results/evaluation.json
+# make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
+#                of config/object to the object's track), tables and results/evaluation.json
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
