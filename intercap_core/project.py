@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
+from intercap_core.detection.label_maps import read_label_map
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
 
@@ -139,7 +140,12 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     }
     if not sequences:
         raise UserError(f"{table}: holds no sequence (or all are excluded); add at least one row")
-    config = config.model_copy(update={"body_models": _absolute(config.body_models, path.parent)})
+    config = config.model_copy(
+        update={
+            "body_models": _absolute(config.body_models, path.parent),
+            "detections": _absolute(config.detections, path.parent),
+        }
+    )
     project = Project(config, path, sequences, subjects, objects)
     _check_files(project)
     _check_studio(project, rows, table)
@@ -173,6 +179,21 @@ def _check_files(project: Project) -> None:
                 f"{project.path}: body_models.{gender} is {file}, and there is no such file; "
                 "correct the path, or remove the line to use the open body"
             )
+    _check_detectors(project)
+
+
+def _check_detectors(project: Project) -> None:
+    """The model and the class names are shared by sequences as well."""
+    settings = project.config.detections
+    for field in ("segmentation_model", "segmentation_labels", "category_names"):
+        file = getattr(settings, field)
+        if isinstance(file, Path) and not file.is_file():
+            raise UserError(
+                f"{project.path}: detections.{field} is {file}, and there is no such file; correct "
+                "the path"
+            )
+        if isinstance(file, Path) and field != "segmentation_model":
+            read_label_map(file)
 
 
 def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path) -> None:

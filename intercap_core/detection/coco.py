@@ -1,217 +1,254 @@
-"""Instance segmentations in COCO's result format, one JSON file a camera.
+"""Instance segmentations as JSON: COCO's result format and what other detectors make of it.
 
-The file is a list of results or a whole COCO data set (``images``, ``annotations``,
-``categories``). ``image_id`` is the number of the colour image in the camera's own recording. A
-segmentation is a compressed or an uncompressed RLE, or polygons.
+A file is a list of results or a data set (``images``, ``annotations``, ``categories``). A result
+says which image it belongs to (``image_id``, a number or a name, or ``file_name``) unless the file
+holds one image alone, its class by number or by name, a score, and a segmentation in any form that
+:func:`intercap_core.detection.instance.to_rle` knows. Keys are those of detectron2, torchvision
+users, ultralytics, Segment Anything and Grounded SAM.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from intercap_core.detection import masks
-from intercap_core.errors import UserError
+from intercap_core.detection.instance import Instance, to_rle
+from intercap_core.detection.label_maps import label_text, names_of
 
-# COCO's 80 classes, and their published ids, which have gaps.
-_CLASSES = (
-    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
-    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
-    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella",
-    "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball", "kite",
-    "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket", "bottle",
-    "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich", "orange",
-    "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch", "potted plant",
-    "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard", "cell phone",
-    "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
-    "teddy bear", "hair drier", "toothbrush",
-)  # fmt: skip
+MAX_BYTES = 1 << 29  # parsed JSON takes about six times its size in memory
 _LARGEST_ID = 2**31 - 1
-_UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-COCO_NAMES: dict[int, str] = dict(
-    zip([i for i in range(1, 91) if i not in _UNUSED_IDS], _CLASSES, strict=True)
-)
+_NAME_KEYS = ("category_name", "category", "class_name", "class", "label", "name")
+_NUMBER_KEYS = ("category_id", "class", "class_id", "label")
+_SCORE_KEYS = ("score", "confidence", "predicted_iou")
 
 
-@dataclass(frozen=True)
-class Instance:
-    """One result: label, score, box (x, y, width, height, px), compressed RLE."""
+class UnreadableCandidates(Exception):
+    """The file as a whole is of no use; says why, in words that fit after its name."""
 
-    label: str
-    score: float
-    box: tuple[float, float, float, float]
-    rle: bytes
+
+class ImageKey(NamedTuple):
+    """How a file calls an image: by number, by name, or both."""
+
+    number: int | None
+    name: str | None
 
 
 @dataclass
 class CandidateFile:
-    """The results of one camera, by image number.
+    """The results of one file.
 
-    ``images`` are the images that the file speaks about, or None where it does not say: then an
-    image without results has none.
+    ``results`` are pairs of image and instance in the file's order. ``images`` are the images that
+    the file speaks about, or None where it does not say: then an image without results has none.
+    ``faults`` say which entries are left out and why, ``faulty`` their images; ``entries`` counts
+    all that have at least the wanted score. ``scaled`` counts masks of another resolution.
     """
 
-    instances: dict[int, list[Instance]] = field(default_factory=dict)
-    images: frozenset[int] | None = None
+    results: list[tuple[ImageKey, Instance]] = field(default_factory=list)
+    images: list[ImageKey] | None = None
+    faults: list[str] = field(default_factory=list)
+    faulty: list[ImageKey] = field(default_factory=list)
+    entries: int = 0
+    scaled: int = 0
 
 
-def read_candidates(path: Path, *, width: int, height: int, min_score: float) -> CandidateFile:
-    """Read one camera's results for images of ``width`` x ``height``, in the file's order.
+@dataclass(frozen=True)
+class _Stated:
+    """What a file says about all of its entries."""
 
-    Results under ``min_score`` are left out. Raises UserError naming file, image and entry where
-    one has no segmentation that fits the image.
+    names: Mapping[int, str]  # of classes, by number
+    files: Mapping[int, str]  # of images, by id
+    sizes: Mapping[int, tuple[int, int]]  # of images, by id
+    size: tuple[int, int] | None  # of all images
+    corners: bool  # boxes are x, y of two corners
+
+
+def read_candidates(
+    path: Path,
+    *,
+    width: int,
+    height: int,
+    min_score: float,
+    names: Mapping[int, str],
+    one_image: bool = False,
+) -> CandidateFile:
+    """Read results for images of ``width`` x ``height``, in the file's order.
+
+    ``names`` are the classes by number, where the file does not list them. ``one_image``: entries
+    need not say their image. Results under ``min_score`` are left out; so are those that cannot be
+    used, which the result tells. Raises :class:`UnreadableCandidates` where nothing can be used.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"{path}: not valid JSON ({error}); write the candidates of this camera again"
-        ) from None
-    names = dict(COCO_NAMES)
-    images: frozenset[int] | None = None
+    content = read_json(path)
     entries = content
+    images: list[ImageKey] | None = None
+    stated = _Stated(names, {}, {}, None, False)
     if isinstance(content, dict):
         entries = content.get("annotations")
-        names.update(_categories(content.get("categories", []), path))
-        if "images" in content:
-            images = _image_ids(content["images"], path)
+        stated, images = _stated(content, names)
     if not isinstance(entries, list):
-        raise UserError(f"{path}: expected a list of COCO results, or 'annotations' with one")
-    result = CandidateFile(images=images)
+        raise UnreadableCandidates(
+            f"holds {_short(content)}, expected a list of results, or 'annotations' with one"
+        )
+    found = CandidateFile(images=images)
     for index, entry in enumerate(entries):
-        where = f"{path}, entry {index}"
-        if not isinstance(entry, dict) or type(entry.get("image_id")) is not int:
-            found = entry.get("image_id") if isinstance(entry, dict) else entry
-            raise UserError(
-                f"{where}: image_id must be the whole number of a colour image, found "
-                f"{_short(found)}"
+        image = ImageKey(None, None)
+        try:
+            if not isinstance(entry, dict):
+                raise ValueError(f"expected a result, found {_short(entry)}")
+            image = _image(entry, stated, one_image)
+            score = _score(entry)
+            if score < min_score:
+                continue
+            instance, scaled = _instance(entry, score, image, stated, (width, height))
+        except ValueError as error:
+            told = image.name if image.name is not None else image.number
+            found.faults.append(
+                f"entry {index}{f' (image {told})' if told is not None else ''}: {error}"
             )
-        image = entry["image_id"]
-        if not 0 <= image <= _LARGEST_ID:
-            raise UserError(
-                f"{where}: image_id must be the number of a colour image from 0, found "
-                f"{_short(image)}; write the candidates of this camera again"
+            found.faulty.append(image)
+        else:
+            found.results.append((image, instance))
+            found.scaled += scaled
+        found.entries += 1
+    return found
+
+
+def read_json(path: Path) -> Any:
+    """Parse a file; raises :class:`UnreadableCandidates` where it is no JSON or too large."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise UnreadableCandidates(
+                f"has {size / 1e6:.0f} MB, at most {MAX_BYTES / 1e6:.0f} are read; write masks as "
+                "compressed RLE, or one file an image"
             )
-        score = _score(entry, where)
-        if score < min_score:
-            continue
-        instance = _instance(entry, score, names, f"{where} (image {image})", width, height)
-        result.instances.setdefault(image, []).append(instance)
-    return result
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise UnreadableCandidates(f"cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise UnreadableCandidates(f"is not valid JSON ({error}); write it again") from None
+
+
+def _stated(
+    content: dict[str, Any], names: Mapping[int, str]
+) -> tuple[_Stated, list[ImageKey] | None]:
+    own: dict[int, str] = {}
+    if content.get("categories"):
+        try:
+            own = names_of(content["categories"])
+        except ValueError as error:
+            raise UnreadableCandidates(
+                f"'categories' must list objects with id and name ({error})"
+            ) from None
+    size = _size(content.get("img_width"), content.get("img_height"))
+    corners = content.get("box_format") == "xyxy"
+    if "images" not in content:
+        return _Stated({**names, **own}, {}, {}, size, corners), None
+    images, files, sizes = [], {}, {}
+    values = content["images"]
+    if not isinstance(values, list):
+        raise UnreadableCandidates("'images' must be a list of objects with id")
+    for value in values:
+        number = value.get("id") if isinstance(value, dict) else None
+        if type(number) is not int or not 0 <= number <= _LARGEST_ID:
+            raise UnreadableCandidates(f"'images' must list objects with id, found {_short(value)}")
+        name = value.get("file_name")
+        if isinstance(name, str):
+            files[number] = name
+        own_size = _size(value.get("width"), value.get("height"))
+        if own_size is not None:
+            sizes[number] = own_size
+        images.append(ImageKey(number, files.get(number)))
+    return _Stated({**names, **own}, files, sizes, size, corners), images
+
+
+def _size(width: Any, height: Any) -> tuple[int, int] | None:
+    if type(width) is int and type(height) is int and min(width, height) > 0:
+        return width, height
+    return None
+
+
+def _image(entry: dict[str, Any], stated: _Stated, one_image: bool) -> ImageKey:
+    value, name = entry.get("image_id"), entry.get("file_name", entry.get("image_path"))
+    if isinstance(value, str):
+        value, name = None, value
+    if not isinstance(name, str):
+        name = None
+    if value is None and (one_image or name is not None):
+        return ImageKey(None, name)
+    if type(value) is not int or not 0 <= value <= _LARGEST_ID:
+        raise ValueError(
+            "image_id must be the whole number of a colour image from 0, or its file's name, "
+            f"found {_short(value)}"
+        )
+    return ImageKey(value, stated.files.get(value) if name is None else name)
 
 
 def _instance(
-    entry: dict[str, Any], score: float, names: dict[int, str], where: str, width: int, height: int
-) -> Instance:
-    rle = _segmentation(entry.get("segmentation"), where, width, height)
-    try:
-        runs = masks.Runs(rle, height, width)
-    except ValueError as error:
-        raise UserError(f"{where}: {error}; write the candidates of this camera again") from None
-    box = entry.get("bbox")
-    if box is None:
-        box = runs.box
+    entry: dict[str, Any], score: float, image: ImageKey, stated: _Stated, size: tuple[int, int]
+) -> tuple[Instance, bool]:
+    label = _label(entry, stated.names)
+    own_size = stated.sizes.get(-1 if image.number is None else image.number, stated.size)
+    segmentation = entry.get("segmentation", entry.get("segments"))
+    rle, (x_scale, y_scale) = to_rle(segmentation, size, own_size)
+    scaled = (x_scale, y_scale) != (1.0, 1.0)
+    box = entry.get("bbox", entry.get("box"))
+    if box is None or scaled:
+        box = masks.Runs(rle, size[1], size[0]).box
+        return Instance(label, score, (*map(float, box),), rle), scaled  # type: ignore[arg-type]
+    corners = stated.corners
+    if isinstance(box, dict):
+        box, corners = [box.get(key) for key in ("x1", "y1", "x2", "y2")], True
     try:
         x, y, w, h = (float(v) for v in box)
     except (TypeError, ValueError, OverflowError):
-        raise UserError(f"{where}: bbox is {_short(box)}, expected x, y, width, height") from None
+        raise ValueError(f"bbox is {_short(box)}, expected x, y, width, height") from None
     if not all(math.isfinite(v) for v in (x, y, w, h)):
-        raise UserError(f"{where}: bbox is {_short(box)}, expected finite numbers")
-    return Instance(_label(entry, names, where), score, (x, y, w, h), rle)
+        raise ValueError(f"bbox is {_short(box)}, expected finite numbers")
+    if corners:
+        w, h = w - x, h - y
+    masks.Runs(rle, size[1], size[0])  # raises where the string is no mask of the image
+    return Instance(label, score, (x, y, w, h), rle), scaled
 
 
-def _segmentation(value: Any, where: str, width: int, height: int) -> bytes:
-    """The compressed RLE of any of COCO's forms; whether it fills the image is checked later."""
-    if isinstance(value, dict):
-        size = value.get("size")
-        if size != [height, width]:
-            raise UserError(
-                f"{where}: the mask's size is {size}, expected [{height}, {width}] (height, "
-                "width of the colour image); segment the images as recorded"
-            )
-        counts = value.get("counts")
-        if isinstance(counts, str):
-            try:
-                return counts.encode("utf-8")
-            except UnicodeEncodeError:
-                raise UserError(
-                    f"{where}: its RLE holds characters that COCO's alphabet does not have; write "
-                    "the candidates of this camera again"
-                ) from None
-        value = counts
-        if isinstance(counts, list):
-            return _checked(masks.from_counts, counts, where, width, height)
-    if isinstance(value, list) and all(isinstance(p, list) for p in value):
-        return _checked(masks.from_polygons, value, where, width, height)
-    raise UserError(
-        f"{where}: has no segmentation; expected an RLE with size and counts, or polygons"
-    )
-
-
-def _checked(make: Any, value: list[Any], where: str, width: int, height: int) -> bytes:
+def _score(entry: dict[str, Any]) -> float:
+    value = next((entry[key] for key in _SCORE_KEYS if key in entry), 1.0)
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
     try:
-        return bytes(make(value, height, width))
-    except (ValueError, TypeError, OverflowError) as error:
-        raise UserError(f"{where}: {error}; write the candidates of this camera again") from None
-
-
-def _score(entry: dict[str, Any], where: str) -> float:
-    score = entry.get("score", 1.0)
-    try:
-        value = float(score) if type(score) in (int, float) else math.nan
+        score = float(value) if type(value) in (int, float) else math.nan
     except OverflowError:
-        value = math.inf
-    if not math.isfinite(value):
-        raise UserError(f"{where}: score is {_short(score)}, expected a number")
-    return value
+        score = math.inf
+    if not math.isfinite(score):
+        raise ValueError(f"score is {_short(value)}, expected a number")
+    return score
 
 
-def _label(entry: dict[str, Any], names: dict[int, str], where: str) -> str:
-    for key in ("category_name", "category", "label"):
+def _label(entry: dict[str, Any], names: Mapping[int, str]) -> str:
+    """The class's name; "" where the detector knows no classes."""
+    for key in _NAME_KEYS:
         if isinstance(entry.get(key), str):
-            return _text(entry[key], where)
-    number = entry.get("category_id")
-    if type(number) is not int:
-        raise UserError(f"{where}: has neither category_id nor category_name")
-    return names.get(number, f"category {_short(number)}")
-
-
-def _text(value: str, where: str) -> str:
-    try:
-        value.encode("utf-8")
-    except UnicodeEncodeError:
-        raise UserError(
-            f"{where}: the category's name {value!r:.80} is not valid text; write the candidates "
-            "of this camera again"
-        ) from None
-    return value
+            return label_text(entry[key])
+    present = [key for key in _NUMBER_KEYS if key in entry]
+    if not present:
+        return ""
+    for key in present:
+        if type(entry[key]) is int:
+            return names.get(entry[key], f"category {_short(entry[key])}")
+    raise ValueError(
+        f"{present[0]} is {_short(entry[present[0]])}, expected a class's number or name; "
+        "category_id or category_name says it"
+    )
 
 
 def _short(value: Any) -> str:
     """A found value in words of bounded length."""
+    if isinstance(value, dict):
+        keys = ", ".join(str(key)[:40] for key in list(value)[:5])
+        return f"an object with {keys}" if keys else "an empty object"
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:60]}... ({len(text)} characters)"
-
-
-def _categories(values: Any, path: Path) -> dict[int, str]:
-    try:
-        return {int(v["id"]): _text(str(v["name"]), str(path)) for v in values}
-    except (TypeError, KeyError, ValueError, OverflowError):
-        raise UserError(f"{path}: 'categories' must list objects with id and name") from None
-
-
-def _image_ids(values: Any, path: Path) -> frozenset[int]:
-    try:
-        return frozenset(int(v["id"]) for v in values)
-    except (TypeError, KeyError, ValueError, OverflowError):
-        raise UserError(f"{path}: 'images' must list objects with id") from None
-
-
-def boxes_of(instances: list[Instance]) -> np.ndarray:
-    """(N, 4) float32."""
-    return np.array([i.box for i in instances], np.float32).reshape(-1, 4)

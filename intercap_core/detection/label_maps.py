@@ -1,0 +1,123 @@
+"""Which class a detector's number means: COCO's two numberings, or a file that lists the classes.
+
+A file is a COCO or LVIS data set (its ``categories``), a mapping of numbers to names, a list of
+names from 0 (JSON, or YAML, also under ``names`` as YOLO keeps it), or text with a name a line.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from intercap_core.errors import UserError
+
+# COCO's 80 classes, and their published ids, which have gaps.
+_CLASSES = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
+    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
+    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella",
+    "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball", "kite",
+    "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket", "bottle",
+    "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich", "orange",
+    "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch", "potted plant",
+    "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard", "cell phone",
+    "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
+    "teddy bear", "hair drier", "toothbrush",
+)  # fmt: skip
+_UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+COCO_NAMES: dict[int, str] = dict(
+    zip([i for i in range(1, 91) if i not in _UNUSED_IDS], _CLASSES, strict=True)
+)
+COCO_NAMES_FROM_0: dict[int, str] = dict(enumerate(_CLASSES))
+COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
+BUILT_IN = {"coco": COCO_NAMES, "coco80": COCO_NAMES_FROM_0}
+
+MAX_LABEL = 200  # characters; the artefact keeps all labels at the length of the longest
+_MAX_BYTES = 1 << 26  # a list of classes is some kB; a whole data set's annotations are not needed
+
+
+def class_names(setting: str | Path) -> dict[int, str]:
+    """Names by number of the setting ``category_names``: a built-in numbering or a file.
+
+    Raises UserError as :func:`read_label_map` does.
+    """
+    if isinstance(setting, str) and setting in BUILT_IN:
+        return BUILT_IN[setting]
+    return read_label_map(Path(setting))
+
+
+def read_label_map(path: Path) -> dict[int, str]:
+    """Read a file of class names. Raises UserError naming what is wrong with it."""
+    try:
+        size = path.stat().st_size
+        if size > _MAX_BYTES:
+            raise UserError(
+                f"{path}: has {size / 1e6:.0f} MB, expected a list of classes; keep the data set's "
+                "'categories' alone, as docs/detectors.md shows"
+            )
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is no text in UTF-8; write the class names again") from None
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".json":
+            return names_of(json.loads(text))
+        if suffix in (".yaml", ".yml"):
+            return names_of(yaml.safe_load(text))
+        return names_of([line.strip() for line in text.strip().splitlines()])
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        words = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path}: is no list of classes ({words}); expected 'categories' as COCO has them, a "
+            "mapping of numbers to names, or names in order"
+        ) from None
+
+
+def names_of(content: Any) -> dict[int, str]:
+    """Class names by number of parsed JSON or YAML.
+
+    Raises ValueError, in words that fit after a file's name.
+    """
+    if isinstance(content, dict):
+        for key in ("categories", "names"):
+            if isinstance(content.get(key), list | dict):
+                return names_of(content[key])
+    if isinstance(content, list) and content and all(isinstance(v, dict) for v in content):
+        return _unique([(v.get("id"), v.get("name")) for v in content])
+    if isinstance(content, list):
+        return _unique(list(enumerate(content)))
+    if isinstance(content, dict):
+        return _unique(list(content.items()))
+    raise ValueError(f"it holds {type(content).__name__}")
+
+
+def _unique(pairs: Sequence[tuple[Any, Any]]) -> dict[int, str]:
+    names: dict[int, str] = {}
+    for number, name in pairs:
+        if isinstance(number, str) and number.isdecimal() and len(number) < 10:
+            number = int(number)
+        if type(number) is not int or not isinstance(name, str):
+            raise ValueError(f"class {number!r:.40} has the name {name!r:.40}")
+        if number in names:
+            raise ValueError(f"two classes have the number {number}")
+        names[number] = label_text(name)
+    if not names:
+        raise ValueError("it lists none")
+    return names
+
+
+def label_text(name: str) -> str:
+    """The name as it is; raises ValueError where it is no text or longer than ``MAX_LABEL``."""
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise ValueError(f"the category's name {name!r:.80} is not valid text") from None
+    if len(name) > MAX_LABEL:
+        raise ValueError(f"a category's name has {len(name)} characters, at most {MAX_LABEL}")
+    return name
