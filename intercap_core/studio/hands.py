@@ -19,6 +19,7 @@ from intercap_core.studio.skeleton import Skeleton, turn, unit
 from intercap_core.studio.subjects import Subject
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of the joints
+THUMB = FINGERS.index("thumb")
 TISSUE_M = 0.0012  # a finger closes until its skin is pressed in by this much
 SCAN_DEG = 5.0
 BISECTIONS = 8
@@ -77,6 +78,8 @@ class Hand:
         distal = finger[..., ::-1].cumsum(-1)[..., ::-1]  # moved by this joint or a further one
         self.moved = [[np.flatnonzero(distal[:, f, j] > 0.5) for j in range(3)] for f in range(5)]
         self.palm_ids = np.flatnonzero(share[self.vertex_ids, 0] > 0.6)
+        self.thumb_ids = self.moved[THUMB][0]
+        self.but_thumb_ids = np.setdiff1d(np.arange(len(self.vertex_ids)), self.thumb_ids)
         self._tips = subject.rest_tips[5 * side : 5 * side + 5]
 
     @cached_property
@@ -124,14 +127,16 @@ class Hand:
 
     def close(self, start: HandShape, limits: dict[str, tuple[float, float, float]],
               surface: DistanceField, object_from_wrist: np.ndarray,
-              tissue: float = TISSUE_M) -> tuple[HandShape, np.ndarray]:  # fmt: skip
+              tissue: float = TISSUE_M, fingers: tuple[int, ...] = (1, 3, 0, 2, THUMB)
+              ) -> tuple[HandShape, np.ndarray]:  # fmt: skip
         """Flex joint after joint until the skin meets the object or the limit is reached.
 
-        ``object_from_wrist`` (4, 4) takes the hand's rest frame at the wrist to the object's.
-        Returns the shape and the least signed distance (5,) of each finger.
+        ``object_from_wrist`` (4, 4) takes the hand's rest frame at the wrist to the object's;
+        ``fingers`` are closed, in this order. Returns the shape and the least signed distance
+        (5,) of each finger.
         """
         flexion = start.flexion.copy()
-        for f in (1, 3, 0, 2, 4):
+        for f in fingers:
             largest = limits["finger" if f < 4 else "thumb"]
             for j in range(3):
                 moved = self.moved[f][j]
@@ -170,9 +175,10 @@ class Hand:
         ]
         return closed, np.array(gaps)
 
-    def gap(self, hand: HandShape, surface: DistanceField, object_from_wrist: np.ndarray) -> float:
-        """Least signed distance of the whole hand to the object, metres."""
-        skin = self.skin(self.local(hand)[None])
+    def gap(self, hand: HandShape, surface: DistanceField, object_from_wrist: np.ndarray,
+            ids: np.ndarray | slice = slice(None)) -> float:  # fmt: skip
+        """Least signed distance of the hand, or of its vertices ``ids``, to the object, metres."""
+        skin = self.skin(self.local(hand)[None])[:, ids]
         return float(self._distance(skin, surface, object_from_wrist)[0])
 
     @staticmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from intercap_core.errors import UserError
 from intercap_core.studio.interactions.base import Interaction
+from intercap_core.studio.interactions.bottle_drink import BottleDrink
 from intercap_core.studio.interactions.cup_drink import CupDrink
 from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
@@ -12,6 +13,7 @@ from intercap_core.studio.interactions.toolbox_carry import ToolboxCarry
 INTERACTIONS: dict[str, type[Interaction]] = {
     "suitcase_carry": SuitcaseCarry,
     "cup_drink": CupDrink,
+    "bottle_drink": BottleDrink,
     "stool_sit": StoolSit,
     "toolbox_carry": ToolboxCarry,
 }

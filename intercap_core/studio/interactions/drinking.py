@@ -1,0 +1,195 @@
+"""Step up to a plinth, take a vessel around its wall, drink, put it back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.studio.controls import Pose, Step, plateau, ramp
+from intercap_core.studio.hands import OPEN, RELAXED, HandShape, part_of
+from intercap_core.studio.interactions.base import transform, upright
+from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, backed_off, wrapped
+from intercap_core.studio.interactions.handling import FINGERS_REST_M, LEFT, RIGHT, Handling
+from intercap_core.studio.motion import Trunk
+from intercap_core.studio.skeleton import turn
+
+ATTACH_S, RELEASE_S = 1.06, 2.50
+PLINTH_OF_HEIGHT = 0.565  # its top, as a share of the person's height
+PLINTH_HALF_M = 0.17
+LIP_GAP_M = 0.0008  # the vessel rests this close to the lips
+HOVER_M = (0.007, 0.018)  # how near the other hand comes without touching
+
+
+class Drinking(Handling):
+    """The vessel's x axis points to the person's left; the right hand holds the wall."""
+
+    highlight = 1.75
+    centre = (0.18, -0.05)
+    tilt_deg = (42.0, 52.0)  # how far the vessel leans at the lips
+    head_back = 0.22  # rad
+    grip_height_m = 0.0  # of the palm, from the vessel's origin
+    lips_at_edge = True  # the lips touch the rim's near edge, else the middle of the mouth
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        self.top = PLINTH_OF_HEIGHT * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
+        self.table((0.38 + PLINTH_HALF_M, -0.12), (PLINTH_HALF_M, PLINTH_HALF_M), self.top)
+        self.taken = upright(
+            0.46 + rng.uniform(0, 0.03), -0.13 + rng.uniform(-0.03, 0.03),
+            self.top + self.thing.standing_height, np.radians(95) + rng.normal(0, 0.15),
+        )  # fmt: skip
+        self.put = upright(
+            self.taken[0, 3] + rng.uniform(-0.01, 0.04),
+            self.taken[1, 3] + rng.uniform(-0.03, 0.05),
+            self.taken[2, 3],
+            np.arctan2(self.taken[1, 0], self.taken[0, 0]) + rng.normal(0, 0.2),
+        )
+        w = puppet.hip_width * 1.05
+        steps = [
+            Step(RIGHT, 0.02, 0.40, (0.0, -w)),
+            Step(LEFT, 0.34, 0.72, (0.02, w)),
+        ]
+        self.walk(np.array([[-0.24, w], [-0.22, -w]]), steps)
+        self.tilt = np.radians(rng.uniform(*self.tilt_deg))
+        self.hover = rng.uniform(*HOVER_M)
+        self.grips[RIGHT] = wrapped(puppet, RIGHT, WRAP_OPEN, self.thing.surface, self.taken,
+                                    self._approaches())  # fmt: skip
+        self.hold_s[RIGHT] = (ATTACH_S, RELEASE_S)
+        self._drinking_place()
+        self._hovering_place()
+
+    # --- places found on the person's own surface ------------------------------------------
+
+    def _approaches(self) -> Iterator[Approach]:
+        """The palm against the wall, just above the plinth or higher, fingers left of ahead."""
+        at = self.taken[:3, 3] + (0, 0, self.grip_height_m)
+        for along, azimuth in product((0.030, 0.040, 0.022), np.radians((65.0, 80.0))):
+            sin, cos = np.sin(azimuth), np.cos(azimuth)
+            yield Approach(at, np.array([sin, cos, -0.10]), np.array([-cos, sin, 0.0]), along,
+                           self.top + FINGERS_REST_M)  # fmt: skip
+
+    def _drinking_place(self) -> None:
+        """head_from_thing (4, 4): the rim against the lips, tilted; rest axes at the head joint."""
+        subject = self.puppet.subject
+        head = JOINT_INDEX["head"]
+        share = np.asarray(subject.weights[:, [head, JOINT_INDEX["jaw"]]].sum(1)).ravel()
+        eyes = subject.rest_joints[JOINT_INDEX["left_eye_smplhf"], 1]
+        ids = np.flatnonzero((share > 0.9) & (subject.rest[:, 1] < eyes))
+        face = part_of(subject, ids).rest - subject.rest_joints[head]
+        middle = np.abs(face[:, 0]) < 0.012
+        corner = self.mouth - subject.rest_joints[head]
+        front = face[middle & (np.abs(face[:, 1] - corner[1]) < 0.01), 2].max()
+        # the vessel's axis leans towards the face; its near rim is at the lips
+        up = np.array([0.0, np.cos(self.tilt), -np.sin(self.tilt)])
+        side = np.array([1.0, 0, 0])
+        rotation = np.stack([side, np.cross(up, side), up], 1)
+        rim_up = self.thing.vertices[:, 2].max()
+        near_rim = rotation @ np.array([0.0, 0, rim_up])
+        if self.lips_at_edge:
+            rim = self.thing.vertices[self.thing.vertices[:, 2] > rim_up - 0.003]
+            across = np.cross(side, up)
+            across *= -np.sign(across[2])
+            near_rim = near_rim + np.linalg.norm(rim[:, :2], axis=1).max() * across
+        mouth = np.array([0.0, corner[1] - 0.003, front])
+        low, high = -0.03, 0.05
+        for _ in range(18):
+            ahead = (low + high) / 2
+            centre = mouth + np.array([0, 0, ahead]) - near_rim
+            if self.thing.surface.signed_distance((face - centre) @ rotation).min() < LIP_GAP_M:
+                low = ahead
+            else:
+                high = ahead
+        self.head_from_thing = transform(rotation, mouth + np.array([0, 0, high]) - near_rim)
+
+    @property
+    def mouth(self) -> np.ndarray:
+        """The middle of the mouth in the T-pose (3,): where the jaw's skin meets the head's."""
+        subject = self.puppet.subject
+        both = [JOINT_INDEX["head"], JOINT_INDEX["jaw"]]
+        weights = np.asarray(subject.weights[:, both].todense())
+        middle = np.abs(subject.rest[:, 0]) < 0.015
+        front = subject.rest[:, 2] > subject.rest[middle & (weights.sum(1) > 0.9), 2].max() - 0.035
+        pick = middle & front & (weights.min(1) > 0.05)
+        heights = subject.rest[pick, 1]
+        return np.array([0.0, float(np.median(heights)), float(subject.rest[pick, 2].mean())])
+
+    def _hovering_place(self) -> None:
+        """The left hand flat beside the vessel, ``hover`` away, as if to steady it."""
+        hand = self.puppet.hands[LEFT]
+        fingers = np.array([0.80, -0.45, -0.20])
+        palm = np.array([-0.45, -0.85, 0.0])
+        rotation = self.puppet.wrist_rotation(LEFT, fingers / np.linalg.norm(fingers), palm)
+        skin = hand.skin(hand.local(OPEN)[None])[0] @ rotation.T
+        place = self.taken[:3, 3] - skin[hand.palm_ids].mean(0) - 0.03 * fingers
+        place[2] = self.taken[2, 3] + 0.03 - skin[:, 2].mean()
+        self.left_place = backed_off(hand, OPEN, self.thing.surface, self.taken,
+                                     transform(rotation, place), -palm, self.hover)  # fmt: skip
+
+    # --- the script --------------------------------------------------------------------------
+
+    def trunk(self, times: np.ndarray) -> Trunk:
+        """Lean to the plinth, straighten up and put the head back to drink, lean again."""
+        track = self.pelvis_track(times)
+        sway, shift = self.sway(times), self.weight_shift(times)
+        reach = plateau(times, 0.4, 1.0, 1.1, 1.6) + plateau(times, 2.0, 2.45, 2.55, 3.0)
+        drink = plateau(times, 1.25, 1.7, 2.05, 2.4)
+        pelvis = track[:, :3] + shift
+        pelvis[:, 2] -= 0.01
+        bend = 0.6 * sway[:, :3]
+        bend[:, 0] += 0.03 + 0.16 * reach - 0.03 * drink
+        bend[:, 1] += 0.10 * reach
+        head = 1.3 * sway[:, 3:]
+        head[:, 0] += 0.10 + 0.28 * reach - self.head_back * drink
+        head[:, 1] -= 0.12 * reach
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        """From the plinth to the lips, tilted there, and back."""
+        count = len(times)
+        head = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+        head[:, :3, :3] = world[:, JOINT_INDEX["head"]]
+        head[:, :3, 3] = self.puppet.joint_on_trunk(world, pelvis, "head")
+        at_lips = head @ self.head_from_thing
+        # before and after the drink it is upright, a little lower and ahead of the lips
+        upright_share = 1 - plateau(times, 1.45, 1.80, 2.00, 2.30)
+        ease = np.zeros((count, 3))
+        ease[:, 0] = upright_share * self.tilt * 0.85
+        away = head[:, :3, :3] @ np.array([0.0, -0.035, 0.055])
+        position = at_lips[:, :3, 3] + upright_share[:, None] * away
+        drinking = Pose(position, at_lips[:, :3, :3] @ turn(ease))
+        lift = np.array([0.0, 0, 0.05])
+        thing = Pose.still(self.taken, count)
+        thing = thing.towards(drinking, ramp(times, ATTACH_S, 1.72), lift)
+        return thing.towards(Pose.still(self.put, count), ramp(times, 2.02, RELEASE_S - 0.03), lift)
+
+    def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
+              thing: np.ndarray) -> Pose:  # fmt: skip
+        """The right hand handles the vessel; the left only comes near."""
+        wrist = super().wrist(side, world, pelvis, times, thing)
+        if side == RIGHT:
+            return wrist
+        count = len(times)
+        away = self.left_place.copy()
+        away[:3, 3] += (-0.10, 0.10, 0.10)
+        near = wrist.towards(Pose.still(away, count), ramp(times, 0.2, 0.75))
+        near = near.towards(Pose.still(self.left_place, count), ramp(times, 0.65, 0.95))
+        near = near.towards(Pose.still(away, count), ramp(times, 1.02, 1.3))
+        return near.towards(wrist, ramp(times, 1.2, 1.8))
+
+    def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
+        """The left hand opens while it hovers."""
+        if side == LEFT:
+            return [(ramp(times, 0.3, 0.7), OPEN), (ramp(times, 1.2, 1.6), RELAXED)]
+        return super().finger_keys(side, times)
+
+    def needs(self, times: np.ndarray) -> dict[int, np.ndarray]:
+        """The trunk helps both hands at the plinth, none at the mouth."""
+        at_plinth = plateau(times, 0.4, 0.85, 1.1, 1.5) + plateau(times, 2.1, 2.4, 2.7, 3.0)
+        return {RIGHT: at_plinth, LEFT: plateau(times, 0.4, 0.85, 1.02, 1.4)}
+
+    def raised(self, times: np.ndarray, side: int) -> np.ndarray:
+        """The elbow is lifted a little to drink."""
+        return (0.0, 0.1)[side] * plateau(times, 1.2, 1.7, 2.0, 2.4)

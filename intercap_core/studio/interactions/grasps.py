@@ -1,0 +1,120 @@
+"""Grasps planned on the true object's surface: a hand comes near until its skin is pressed in, then
+its fingers close; of several tries the one whose fingers come nearest is kept.
+
+No contact term and no contact regions of the fit are used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from intercap_core.camera.transforms import invert
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.studio.hands import THUMB, Hand, HandShape, shape
+from intercap_core.studio.interactions.base import transform
+from intercap_core.studio.motion import Puppet
+from intercap_core.studio.skeleton import unit
+
+PALM_PRESSED_M = 0.001
+FINGER_MEETS_M = 0.002
+FAR_M = 0.03  # a finger that ends farther off counts as this far
+# The grasped surface meets the hand this far beyond the palm's middle, towards the fingers
+ALONG_FINGERS_M = 0.030
+OPPOSITIONS_DEG = (60.0, 45.0, 30.0, 75.0, 90.0, 15.0, 0.0)  # of the thumb, in the order of tries
+WRAP_OPEN = shape((10, 12, 6), (0, 4, 6), 45)
+WRAP_LIMITS = {"finger": (75.0, 95.0, 60.0), "thumb": (40.0, 50.0, 60.0)}
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A planned grasp: the hand's shape before and in it, where the wrist is, ``object_from_wrist``
+    (4, 4), and the fingers' least signed distances ``gaps`` (5,), metres."""
+
+    open: HandShape
+    closed: HandShape
+    object_from_wrist: np.ndarray
+    gaps: np.ndarray
+
+
+def backed_off(
+    hand: Hand,
+    hand_shape: HandShape,
+    surface: DistanceField,
+    stage_from_object: np.ndarray,
+    wrist: np.ndarray,
+    away: np.ndarray,
+    gap: float,
+    ids: np.ndarray | slice = slice(None),
+) -> np.ndarray:
+    """A wrist (4, 4) of the stage moved along ``away`` (3,), at most a quarter of a metre, until
+    the hand's vertices ``ids`` are ``gap`` from the object (negative: pressed)."""
+    low, high = 0.0, 0.25
+    object_from_stage = invert(stage_from_object)
+    moved = wrist.copy()
+    for _ in range(16):
+        middle = (low + high) / 2
+        moved[:3, 3] = wrist[:3, 3] + middle * away
+        if hand.gap(hand_shape, surface, object_from_stage @ moved, ids) < gap:
+            low = middle
+        else:
+            high = middle
+    moved[:3, 3] = wrist[:3, 3] + high * away
+    return moved
+
+
+@dataclass(frozen=True)
+class Approach:
+    """How a palm comes to a thing: to the point ``at`` (3,) of the stage along ``palm`` (3,), with
+    ``fingers`` (3,) ahead, ``along`` metres beyond the palm's middle, above ``floor`` metres."""
+
+    at: np.ndarray
+    fingers: np.ndarray
+    palm: np.ndarray
+    along: float = ALONG_FINGERS_M
+    floor: float = -np.inf
+
+    def wrist(self, puppet: Puppet, side: int, hand_shape: HandShape, surface: DistanceField,
+              stage_from_object: np.ndarray, *, thumb: bool = False) -> np.ndarray:  # fmt: skip
+        """The wrist (4, 4) of the stage once the palm or a finger (with ``thumb``: or the thumb) is
+        pressed against the thing."""
+        hand = puppet.hands[side]
+        fingers, palm = unit(np.asarray(self.fingers)), unit(np.asarray(self.palm))
+        rotation = puppet.wrist_rotation(side, fingers, palm)
+        skin = hand.skin(hand.local(hand_shape)[None])[0] @ rotation.T
+        place = np.asarray(self.at) - skin[hand.palm_ids].mean(0) - self.along * fingers
+        place[2] = max(place[2], self.floor - skin[:, 2].min())
+        ids = slice(None) if thumb else hand.but_thumb_ids
+        return backed_off(hand, hand_shape, surface, stage_from_object,
+                          transform(rotation, place), -palm, -PALM_PRESSED_M, ids)  # fmt: skip
+
+
+def wrapped(puppet: Puppet, side: int, open_shape: HandShape, surface: DistanceField,
+            stage_from_object: np.ndarray, approaches: Iterable[Approach]) -> Grip:  # fmt: skip
+    """Palm against the thing, fingers around it, then the thumb from where it has room.
+
+    Of ``approaches`` the first is kept in which all fingers meet the thing, else the best.
+    """
+    hand = puppet.hands[side]
+    four = (1, 3, 0, 2)
+    best: tuple[float, Grip] | None = None
+    for approach in approaches:
+        wrist = approach.wrist(puppet, side, open_shape, surface, stage_from_object)
+        pose = invert(stage_from_object) @ wrist
+        around, _ = hand.close(open_shape, WRAP_LIMITS, surface, pose, fingers=four)
+        for opposition in OPPOSITIONS_DEG:
+            opened = replace(open_shape, opposition=opposition)
+            if hand.gap(opened, surface, pose, hand.thumb_ids) < -1.5 * PALM_PRESSED_M:
+                continue
+            closed, gaps = hand.close(replace(around, opposition=opposition), WRAP_LIMITS, surface,
+                                      pose, fingers=(THUMB,))  # fmt: skip
+            score = -float(np.clip(gaps, 0, FAR_M).sum())
+            if best is None or score > best[0]:
+                best = score, Grip(opened, closed, pose, gaps)
+            if gaps.max() < FINGER_MEETS_M:
+                return best[1]
+    if best is None:
+        raise ValueError("no approach leaves the thumb room")
+    return best[1]

@@ -1,0 +1,160 @@
+"""What scripts share in which hands take a thing, move it and put it down."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from intercap_core.camera.transforms import invert
+from intercap_core.studio.controls import Footwork, Pose, Step, ramp
+from intercap_core.studio.hands import RELAXED, HandShape
+from intercap_core.studio.interactions.base import SCRIPT_S, Box, Interaction, Performance
+from intercap_core.studio.interactions.grasps import Grip
+from intercap_core.studio.motion import LEG_REACH, Trunk
+
+RIGHT, LEFT = 1, 0
+SIDES = (RIGHT, LEFT)
+CLEAR_M = 0.075  # an open hand leaves the thing by this much, away from its palm
+BACK_M = 0.03  # and towards the wrist
+OVER_M = np.array([0.0, 0.0, 0.10])  # and comes from, and goes, this much above
+EYES_M = 0.07  # the eyes above and ahead of the head's joint
+FINGERS_REST_M = 0.004  # a hand stays this far above a table
+
+
+class Handling(Interaction):
+    """One thing is taken by the leading hand, moved along a path, and put down.
+
+    ``plan`` sets where the thing is ``taken`` and ``put`` (4, 4), a grip for each hand that holds
+    it, and from when to when in ``hold_s``. The thing follows the leading hand's own pose; the
+    other hand follows the thing.
+    """
+
+    lead = RIGHT
+    taken: np.ndarray
+    put: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.grips: dict[int, Grip] = {}
+        self.hold_s: dict[int, tuple[float, float]] = {}
+        super().__post_init__()
+
+    # --- what a script decides -----------------------------------------------------------------
+
+    @abstractmethod
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        """Where the thing is wanted (N): ``taken`` until it is held, ``put`` when it is left."""
+
+    @abstractmethod
+    def trunk(self, times: np.ndarray) -> Trunk:
+        """The trunk (N), before it helps arms that are too short."""
+
+    def needs(self, times: np.ndarray) -> dict[int, np.ndarray]:
+        """How much the trunk helps each hand (N,): from shortly before to after it holds."""
+        return {
+            side: ramp(times, on - 0.5, on - 0.1) - ramp(times, off + 0.1, off + 0.4)
+            for side, (on, off) in self.hold_s.items()
+        }
+
+    def raised(self, times: np.ndarray, side: int) -> np.ndarray:
+        """How far an elbow is lifted outward (N,), as `Puppet.arm_to` takes it."""
+        return np.zeros(len(times))
+
+    # --- helpers of plans ------------------------------------------------------------------------
+
+    def walk(self, start: np.ndarray, steps: Sequence[Step]) -> None:
+        """Stand at ``start`` (2, 2), left and right, then take the steps."""
+        puppet = self.puppet
+        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
+        self.pelvis_track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
+        )
+
+    def table(self, middle: tuple[float, float], half: tuple[float, float], top: float,
+              heading: float = 0.0) -> None:  # fmt: skip
+        """Place a block: ``middle`` and ``half`` its sizes on the floor, its ``top``, metres."""
+        low = (middle[0] - half[0], middle[1] - half[1], 0.0)
+        high = (middle[0] + half[0], middle[1] + half[1], top)
+        self.furniture.append(Box(low, high, heading, "wood"))
+
+    # --- playing ----------------------------------------------------------------------------
+
+    def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
+              thing: np.ndarray) -> Pose:  # fmt: skip
+        """The wrist (N) of a hand: to the ``thing`` (N, 4, 4), with it, away from it."""
+        swing = self.arm_swing(times)[:, SIDES.index(side)]
+        idle = self.puppet.idle_wrist(world, pelvis, side, swing)
+        if side not in self.grips:
+            return idle
+        on, off = self.hold_s[side]
+        hand = self.puppet.hands[side]
+        at = thing @ self.grips[side].object_from_wrist
+        beside = at.copy()
+        beside[:, :3, 3] += at[:, :3, :3] @ (-CLEAR_M * hand.palm - BACK_M * hand.out)
+        over = beside.copy()
+        over[:, :3, 3] += OVER_M + 0.06 * (at[:, :3, :3] @ -hand.out)
+        goal, near, far = (Pose(m[:, :3, 3], m[:, :3, :3]) for m in (at, beside, over))
+        wrist = idle.towards(far, ramp(times, on - 0.90, on - 0.38))
+        wrist = wrist.towards(near, ramp(times, on - 0.50, on - 0.20))
+        wrist = wrist.towards(goal, ramp(times, on - 0.26, on - 0.06))
+        wrist = wrist.towards(near, ramp(times, off + 0.08, off + 0.26))
+        wrist = wrist.towards(far, ramp(times, off + 0.18, off + 0.44))
+        return wrist.towards(idle, ramp(times, off + 0.30, off + 0.80))
+
+    def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
+        """The shapes a hand goes through, as `Puppet.finger_track` takes them."""
+        if side not in self.grips:
+            return []
+        (on, off), grip = self.hold_s[side], self.grips[side]
+        return [
+            (ramp(times, on - 0.76, on - 0.31), grip.open),
+            (ramp(times, on - 0.12, on - 0.01), grip.closed),
+            (ramp(times, off + 0.01, off + 0.10), grip.open),
+            (ramp(times, off + 0.25, off + 0.60), RELAXED),
+        ]
+
+    def perform(self, times: np.ndarray) -> Performance:
+        """Play the script: trunk, legs, the leading arm, the thing with it, the other arm."""
+        puppet, lead = self.puppet, self.lead
+        trunk, feet = self.trunk(times), self.footwork.feet(times)
+        world = puppet.trunk(trunk)
+        needs = self.needs(times)
+        for _ in range(2):
+            thing = _matrices(self.path(world, trunk.pelvis, times))
+            targets = {
+                side: (self.wrist(side, world, trunk.pelvis, times, thing), needs[side])
+                for side in SIDES
+                if side in needs
+            }
+            trunk = puppet.settled(puppet.assist(trunk, targets), feet[0])
+            world = puppet.trunk(trunk)
+        pelvis = trunk.pelvis
+        puppet.legs(world, pelvis, *feet)
+        thing = _matrices(self.path(world, pelvis, times))
+        for side in (lead, 1 - lead):
+            wrist = self.wrist(side, world, pelvis, times, thing)
+            puppet.arm_to(world, pelvis, side, wrist, self.raised(times, side))
+            if side == lead:
+                thing = self._held(world, pelvis, times)
+        for side in SIDES:
+            track = puppet.finger_track(side, RELAXED, self.finger_keys(side, times))
+            puppet.fingers(world, side, track)
+        return Performance(world, pelvis, thing)
+
+    def _held(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """The thing (N, 4, 4): at rest, as the leading hand has it, at rest."""
+        joints = self.puppet.skeleton.forward(world, pelvis)
+        index = self.puppet.hands[self.lead].wrist
+        wrist = _matrices(Pose(joints[:, index], world[:, index]))
+        held = wrist @ invert(self.grips[self.lead].object_from_wrist)
+        on, off = self.hold_s[self.lead]
+        pose = np.where((times <= on)[:, None, None], self.taken, held)
+        return np.where((times >= off)[:, None, None], self.put, pose)
+
+
+def _matrices(pose: Pose) -> np.ndarray:
+    """(N, 4, 4) of poses (N)."""
+    result = np.broadcast_to(np.eye(4), (len(pose.position), 4, 4)).copy()
+    result[:, :3, :3], result[:, :3, 3] = pose.rotation, pose.position
+    return result
