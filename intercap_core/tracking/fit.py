@@ -153,10 +153,12 @@ def fit_pose(
 class Evidence:
     """What each view of a frame set says about small motions of a pose: the weighted J'J
     ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
-    one standard deviation; zero from a view that says nothing. No prior is in them."""
+    one standard deviation; zero from a view that says nothing. No prior is in them. ``reports`` is
+    how each view agrees with the pose."""
 
     information: np.ndarray
     gradient: np.ndarray
+    reports: tuple[ViewReport, ...]
 
 
 def evidence_at(
@@ -171,12 +173,14 @@ def evidence_at(
 ) -> Evidence:
     """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
     information, gradient = np.zeros((len(views), 6, 6)), np.zeros((len(views), 6))
+    reports = []
     for v, (view, there) in enumerate(zip(views, _seen(pose, views, twist), strict=True)):
         fit = ViewFit(mesh, view, there, min_overlap, labels)
         information[v], gradient[v] = fit.normal_equations(
             there, DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term
         )
-    return Evidence(information, gradient)
+        reports.append(fit.report(there, REPORT_SCALE * CONTOUR_SCALES_PX[1]))
+    return Evidence(information, gradient, tuple(reports))
 
 
 def assess(

@@ -120,12 +120,9 @@ def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
     ``steps`` angles a full turn; those that the symmetry group holds anyway are left out. They
     turn about the middle of its box, where a turned silhouette covers the old one best.
     """
-    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
-    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a mug's handle tilts them
-    axes = np.concatenate([np.eye(3), principal[:, new]], 1)
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     found = []
-    for axis in axes.T:
+    for axis in own_axes(mesh):
         for angle in 2 * np.pi * np.arange(1, steps) / steps:
             turn = np.eye(4)
             turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
@@ -133,6 +130,13 @@ def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
             if not same_pose(mesh, turn, np.eye(4)):
                 found.append(turn)
     return np.array(found)
+
+
+def own_axes(mesh: ObjectMesh) -> np.ndarray:
+    """Unit vectors (N, 3): the axes of the object's frame and its principal axes if others."""
+    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
+    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a mug's handle tilts them
+    return np.concatenate([np.eye(3), principal[:, new]], 1).T
 
 
 def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) -> list[int]:

@@ -1,0 +1,183 @@
+"""The most probable track over all frames, from what each frame's images say about its pose.
+
+Around the pose at which a frame was looked at, its evidence is a quadratic form of small motions.
+Neighbouring frames are tied by the accelerations that hands and gravity cause; both are robust, so
+that a frame whose evidence was taken at a wrong pose and a kick or a drop cost little. Frames that
+share a node share one pose: an object at rest. Solved by Gauss-Newton with a banded Cholesky
+factor, whose inverse is the covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.spatial.transform import Rotation
+
+from intercap_core.rigid.twist import moved
+
+ACCELERATION_M_S2 = 6.0  # of carried objects; a kick is an outlier
+ACCELERATION_RAD_S2 = 20.0
+IMPACT = 3.0  # accelerations beyond so many standard deviations count as an impact
+OUTLIER = 5.0  # evidence this many standard deviations away counts half
+STEPS = 12
+CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
+UNKNOWN = np.repeat([np.pi / np.sqrt(3), 1.0], 3)  # standard deviations of what nothing shows
+BAND = 2  # nodes that an acceleration couples to the one before
+INVERTED, MARGIN = 64, 40  # nodes inverted at once, and how far a frame's neighbours matter
+
+
+@dataclass(frozen=True)
+class Looks:
+    """The evidence of T frames: ``poses`` (T, 4, 4) at which each was looked at, J'J
+    ``information`` (T, 6, 6) and J'r ``gradient`` (T, 6) there, of (turn on the left, shift)."""
+
+    poses: np.ndarray
+    information: np.ndarray
+    gradient: np.ndarray
+
+
+def smooth(
+    looks: Looks, start: np.ndarray, node: np.ndarray, times: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T, 4, 4) and covariances (T, 6, 6) of all frames together, from ``start`` (T, 4, 4).
+
+    ``node`` (T,) numbers the frames from 0, never falling, frames at rest alike; ``times`` (T,)
+    seconds; ``centre`` (3,) of the object, whose path is smooth.
+    """
+    count = int(node[-1]) + 1
+    first = np.searchsorted(node, np.arange(count))
+    # from the mesh's origin to its centre: the shift of the one is that of the other and the turn's
+    arms = _cross(looks.poses[:, :3, :3] @ centre)
+    to_origin = np.tile(np.eye(6), (len(node), 1, 1))
+    to_origin[:, 3:, :3] = arms
+    back = to_origin.transpose(0, 2, 1)
+    information = back @ looks.information @ to_origin
+    gradient = np.einsum("tij,tj->ti", back, looks.gradient)
+    seen_at = _about_centre(looks.poses, centre)
+    # where the frame's own evidence alone would put it, for what it disagrees with
+    damped = information + np.diag(UNKNOWN**-2)
+    own = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+    state = _about_centre(start, centre)[first]
+    matrix = np.zeros((0, 0))
+    for _ in range(STEPS):
+        away = _between(seen_at, state[node])
+        distance = np.einsum("ti,tij,tj->t", away - own, information, away - own)
+        weight = 1 / (1 + distance / OUTLIER**2) ** 2
+        bands = np.zeros((BAND + 1, count, 6, 6))
+        pull = np.zeros((count, 6))
+        np.add.at(bands[0], node, weight[:, None, None] * information + np.diag(UNKNOWN**-2))
+        force = gradient + np.einsum("tij,tj->ti", information, away)
+        np.add.at(pull, node, weight[:, None] * force + away * UNKNOWN**-2)
+        _add_motion(state, node, times, bands, pull)
+        matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
+        step = -cho_solve_banded((matrix, True), pull.ravel(), check_finite=False).reshape(-1, 6)
+        step /= np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / 0.5)
+        state = moved(state, step)
+        if (np.abs(step) < CONVERGED).all():
+            break
+    covariance = _covariance(_banded(bands), count)[node]
+    poses = state[node].copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ centre
+    to_origin[:, 3:, :3] = _cross(poses[:, :3, :3] @ centre)
+    return poses, to_origin @ covariance @ to_origin.transpose(0, 2, 1)
+
+
+def _add_motion(
+    state: np.ndarray, node: np.ndarray, times: np.ndarray, bands: np.ndarray, pull: np.ndarray
+) -> None:
+    """Add the accelerations of frames t-1, t, t+1 to the normal equations."""
+    if len(node) < 3:
+        return
+    moving = node[2:] > node[:-2]
+    a, b, c = node[:-2][moving], node[1:-1][moving], node[2:][moving]
+    step = np.diff(times)
+    before, after = step[:-1][moving][:, None], step[1:][moving][:, None]
+    mean = (before + after) / 2
+    place, turn = state[:, :3, 3], state[:, :3, :3]
+    to_b, to_c = turn[b] @ turn[a].transpose(0, 2, 1), turn[c] @ turn[b].transpose(0, 2, 1)
+    shift = (place[c] - place[b]) / after - (place[b] - place[a]) / before
+    spin = Rotation.from_matrix(to_c).as_rotvec() / after
+    spin -= Rotation.from_matrix(to_b).as_rotvec() / before
+    residual = np.concatenate(
+        [spin / mean / ACCELERATION_RAD_S2, shift / mean / ACCELERATION_M_S2], axis=1
+    )
+    # of d(residual) by the steps of a, b and c
+    parts = np.zeros((3, len(a), 6, 6))
+    eye = np.eye(3)
+    one, two = (eye / before[..., None]), (eye / after[..., None])
+    for rows, sigma, by in (
+        (np.s_[:, :3, :3], ACCELERATION_RAD_S2, (to_b, to_c)),
+        (np.s_[:, 3:, 3:], ACCELERATION_M_S2, (eye, eye)),
+    ):
+        parts[0][rows] = one @ by[0] / (mean[..., None] * sigma)
+        parts[1][rows] = -(one + two @ by[1]) / (mean[..., None] * sigma)
+        parts[2][rows] = two / (mean[..., None] * sigma)
+    weight = np.ones_like(residual)
+    for part in (np.s_[:, :3], np.s_[:, 3:]):
+        size = (residual[part] ** 2).sum(1, keepdims=True)
+        weight[part] = 1 / (1 + size / IMPACT**2)
+    for i, row in enumerate((a, b, c)):
+        weighted = parts[i].transpose(0, 2, 1) * weight[:, None]
+        np.add.at(pull, row, np.einsum("tij,tj->ti", weighted, residual))
+        for j, column in enumerate((a, b, c)):
+            block = weighted @ parts[j]
+            lower = row >= column  # the upper triangle is the transpose
+            np.add.at(bands, ((row - column)[lower], column[lower]), block[lower])
+
+
+def _banded(bands: np.ndarray) -> np.ndarray:
+    """Blocks (BAND + 1, N, 6, 6), block (n + k, n), in LAPACK's lower banded layout."""
+    count = bands.shape[1]
+    result = np.zeros((6 * (BAND + 1), 6 * count))
+    for k in range(BAND + 1):
+        for row in range(6):
+            for column in range(6):
+                diagonal = 6 * k + row - column
+                if diagonal >= 0:
+                    columns = 6 * np.arange(count - k) + column
+                    result[diagonal, columns] = bands[k, : count - k, row, column]
+    return result
+
+
+def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
+    """Diagonal blocks (N, 6, 6) of the inverse; far frames do not matter to each other."""
+    found = np.zeros((count, 6, 6))
+    for start in range(0, count, INVERTED):
+        stop = min(start + INVERTED, count)
+        low, high = max(start - MARGIN, 0), min(stop + MARGIN, count)
+        part = banded[:, 6 * low : 6 * high].copy()
+        for diagonal in range(1, len(part)):
+            part[diagonal, part.shape[1] - diagonal :] = 0
+        columns = np.zeros((part.shape[1], 6 * (stop - start)))
+        wanted = np.arange(6 * (start - low), 6 * (stop - low))
+        columns[wanted, np.arange(len(wanted))] = 1
+        factor = cholesky_banded(part, lower=True, check_finite=False)
+        inverse = cho_solve_banded((factor, True), columns, check_finite=False)[wanted]
+        blocks = inverse.reshape(stop - start, 6, stop - start, 6)
+        index = np.arange(stop - start)
+        found[start:stop] = blocks[index, :, index]
+    return found
+
+
+def _about_centre(poses: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Poses (T, 4, 4) whose translation is where the object's centre is."""
+    result = poses.copy()
+    result[:, :3, 3] += poses[:, :3, :3] @ centre
+    return result
+
+
+def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Steps (T, 6) that take poses a to b (T, 4, 4)."""
+    turn = Rotation.from_matrix(b[:, :3, :3] @ a[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+    return np.concatenate([turn, b[:, :3, 3] - a[:, :3, 3]], axis=1)
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """Matrices (T, 3, 3) of the cross product with vectors (T, 3) from the left."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack(
+        [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], 1
+    )

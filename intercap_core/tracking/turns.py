@@ -1,0 +1,118 @@
+"""On which side a nearly symmetric object is: decided over all frames together.
+
+A mug looks much the same with its handle elsewhere, a box from its back. One frame may not show the
+difference, a hand hides it for a second, and a tracker then slides away with nothing to notice.
+Which turns are hard to tell apart follows from the mesh: those that bring its surface nearly back
+onto itself. Every few frames all of them are compared with the images, and dynamic programming
+(Viterbi 1967) finds the sequence of turns that explains all frames best while the object turns no
+faster than objects do; it may change freely only where the track was lost.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.tracking.search import own_axes
+
+STEPS = 12  # angles of a full turn
+FINE = np.pi / STEPS  # beside no turn, where a slow slide is caught first
+SURFACE_POINTS = 500
+PLACE_STEPS = 10
+FAR_M, FAR_SHARE = 0.003, 0.01  # a point moved farther, also of the diameter, could be noticed
+CHANGED = 0.3  # share of such points, below which a turn is hard to see
+DISTINCT_DEG = 45.0  # flips nearer than this are one
+SCORE_SIGMA = 0.02  # of the mean score's difference between two turns; errors last several frames
+SLIDE_RAD_S = np.radians(50)  # by which a tracked turn drifts from the true one in a second
+JUMP_COST, BROKEN_COST = 10.0, 1.0  # of any other change: in a sound track, and where it was lost
+
+
+def near_turns(mesh: ObjectMesh) -> np.ndarray:
+    """Turns (N, 4, 4) of the object that hardly change it, the identity first.
+
+    All angles about an axis of near symmetry, and single angles where the surface comes back to
+    itself; elements of the symmetry group left out.
+    """
+    found = [np.eye(4)]
+    if mesh.symmetry.sphere:
+        return found[0][None]
+    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
+    points = _surface(mesh)
+    far = max(FAR_M, FAR_SHARE * mesh.diameter)
+    angles = 2 * np.pi * np.arange(STEPS) / STEPS
+    flips = []
+    for axis in own_axes(mesh):
+        placed = [_placed(field, points, _about(axis, angle), far) for angle in angles]
+        moved = np.array([share for _, share in placed])
+        if moved.max() < CHANGED and mesh.symmetry.axis is None:
+            found += [_placed(field, points, _about(axis, a), far)[0] for a in (FINE, -FINE)]
+            found += [turn for turn, _ in placed[1:]]
+            continue
+        least = (moved <= np.roll(moved, 1)) & (moved <= np.roll(moved, -1)) & (moved < CHANGED)
+        flips += [placed[i][0] for i in range(1, STEPS) if least[i]]
+    kept = found
+    for turn in flips:
+        known = np.array(kept)[:, :3, :3]
+        if mesh.symmetry.rotation_error_deg(known, turn[:3, :3]).min() > DISTINCT_DEG:
+            kept.append(turn)
+    return np.array(kept)
+
+
+def choose_turns(
+    scores: np.ndarray, turns: np.ndarray, gaps: np.ndarray, broken: np.ndarray
+) -> np.ndarray:
+    """Index (K,) of the turn (N, 4, 4) that each of K key frames is best corrected by.
+
+    ``scores`` (K, N) of every turned pose, NaN rows where nothing is known; ``gaps`` (K-1,) seconds
+    to the next key frame; ``broken`` (K-1,) whether the track was lost between.
+    """
+    count = len(scores)
+    value = np.nan_to_num(scores / SCORE_SIGMA)
+    relative = turns[None, :, :3, :3].transpose(0, 1, 3, 2) @ turns[:, None, :3, :3]
+    angle = Rotation.from_matrix(relative.reshape(-1, 3, 3)).magnitude().reshape(relative.shape[:2])
+    best, came = value[0], np.zeros((count, len(turns)), int)
+    for k in range(1, count):
+        slide = 0.5 * (angle / (SLIDE_RAD_S * gaps[k - 1])) ** 2
+        cost = np.minimum(slide, BROKEN_COST if broken[k - 1] else JUMP_COST)
+        total = best[:, None] - cost
+        came[k] = total.argmax(0)
+        best = total.max(0) + value[k]
+    path = np.zeros(count, int)
+    path[-1] = best.argmax()
+    for k in range(count - 1, 0, -1):
+        path[k - 1] = came[k, path[k]]
+    return path
+
+
+def _about(axis: np.ndarray, angle: float) -> np.ndarray:
+    return Rotation.from_rotvec(angle * axis).as_matrix()
+
+
+def _placed(
+    field: DistanceField, points: np.ndarray, rotation: np.ndarray, far: float
+) -> tuple[np.ndarray, float]:
+    """The turn (4, 4) by ``rotation`` shifted so that most of the surface falls onto itself, and
+    the share of ``points`` (N, 3) that stay farther than ``far``."""
+    turned = points @ rotation.T
+    shift = points.mean(0) - turned.mean(0)
+    for _ in range(PLACE_STEPS):
+        gap = field.closest(turned + shift).points - (turned + shift)
+        weight = 1 / (1 + (gap**2).sum(1, keepdims=True) / far**2) ** 2
+        shift = shift + (weight * gap).sum(0) / weight.sum()
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = rotation, shift
+    return turn, float((field.distance(turned + shift) > far).mean())
+
+
+def _surface(mesh: ObjectMesh) -> np.ndarray:
+    """Points (N, 3) spread evenly over the surface."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
+    rng = np.random.default_rng(0)
+    at = (np.arange(SURFACE_POINTS) + 0.5) / SURFACE_POINTS * area[-1]
+    face = np.searchsorted(area, at)
+    u, v = rng.random((2, SURFACE_POINTS, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return a[face] + u * (b - a)[face] + v * (c - a)[face]
