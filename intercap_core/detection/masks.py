@@ -83,6 +83,25 @@ def encode(mask: np.ndarray) -> bytes:
     return bytes(coco_mask.encode(np.asfortranarray(mask != 0, dtype=np.uint8))["counts"])
 
 
+def encode_window(window: np.ndarray, x0: int, y0: int, height: int, width: int) -> bytes:
+    """Encode a mask (h, w) bool that lies at x0, y0 of an otherwise empty image.
+
+    The same string as of the whole image, in the time that the window takes.
+    """
+    column, row = np.divmod(np.flatnonzero(window.T), window.shape[0])
+    flat = (column + x0) * height + (row + y0)
+    if not len(flat):
+        return encode(np.zeros((height, width), np.uint8))
+    breaks = np.flatnonzero(np.diff(flat) != 1)
+    starts = flat[np.concatenate([[0], breaks + 1])]
+    ends = flat[np.concatenate([breaks, [len(flat) - 1]])] + 1
+    edges = np.concatenate([[0], np.stack([starts, ends], 1).ravel(), [height * width]])
+    lengths = np.diff(edges)
+    if lengths[-1] == 0:
+        lengths = lengths[:-1]
+    return _compress({"size": [height, width], "counts": lengths.tolist()}, height, width)
+
+
 def decode(rle: bytes, height: int, width: int) -> np.ndarray:
     """Decode to (height, width) bool. Raises ValueError as :class:`Runs` does."""
     return Runs(rle, height, width).decode()

@@ -1,8 +1,23 @@
+# Files that the settings name for all sequences: a model, and what its classes and those of files of
+# candidates are called.
+DETECTORS = [
+    path
+    for path in (
+        SETTINGS.detections.segmentation_model,
+        SETTINGS.detections.segmentation_labels,
+        SETTINGS.detections.category_names,
+    )
+    if isinstance(path, Path)
+]
+MODEL_THREADS = 8
+
+
 rule detections:
-    """Keypoints and segmentation candidates, from files."""
+    """Keypoints and segmentation candidates, from files or from a model."""
     input:
         keypoints=recorded("keypoints"),
         candidates=recorded("candidates"),
+        detectors=existing(*DETECTORS),
         frames=rules.frames.output.frames,
     output:
         detections=f"{RESULTS}/{{sequence}}/detections.h5",
@@ -12,10 +27,10 @@ rule detections:
         f"{BENCHMARKS}/{{sequence}}/detections.tsv"
     conda:
         ENVIRONMENT
-    threads: 1
+    threads: MODEL_THREADS if SETTINGS.detections.segmentation_model else 1
     resources:
-        mem_mb=memory(1500),
-        runtime=30,
+        mem_mb=memory(4000 if SETTINGS.detections.segmentation_model else 1500),
+        runtime=240 if SETTINGS.detections.segmentation_model else 30,
     params:
         settings=settings_of("detections"),
         code=code_of("detections"),

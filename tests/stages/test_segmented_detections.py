@@ -1,0 +1,113 @@
+"""A segmentation model in the stage: which images it sees, and what becomes of its instances."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime")
+tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+
+from intercap_core.config import (  # noqa: E402
+    DetectionsSettings,
+    FramesSettings,
+    ObjectEntry,
+    SequenceEntry,
+)
+from intercap_core.detection import masks  # noqa: E402
+from intercap_core.detection.read import Detections  # noqa: E402
+from intercap_core.stages import detections, frames  # noqa: E402
+
+WIDTH, HEIGHT, COUNT = 160, 96, 5
+NAMES = {"names": "{0: 'suitcase', 1: 'cup'}"}
+
+
+def thing(number: int) -> np.ndarray:
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    cv2.circle(mask, (30 + 20 * number, 45), 16, 1, -1)
+    return mask > 0
+
+
+@pytest.fixture
+def capture(tmp_path) -> SequenceEntry:
+    """Two cameras that see a red disc move; the model's candidates are those of 'left'."""
+    lens = {
+        "image_size": [WIDTH, HEIGHT],
+        "camera_matrix": [[150, 0, 80], [0, 150, 48], [0, 0, 1]],
+        "distortion_coefficients": [0, 0, 0, 0],
+    }
+    cameras = {}
+    for c, name in enumerate(("left", "right")):
+        cameras[name] = lens | {"R": [0, 0, 0], "T": [c, 0, 0]}
+        folder = tmp_path / "recordings" / name
+        folder.mkdir(parents=True)
+        for number in range(COUNT):
+            image = np.full((HEIGHT, WIDTH, 3), 110 + 5 * c, np.uint8)
+            image[thing(number)] = (20, 20, 230)
+            cv2.imwrite(str(folder / f"shot_{number + 1:04d}.jpg"), image)
+    (tmp_path / "rig.json").write_text(json.dumps({"fps": 10, "cameras": cameras}))
+    candidates = tmp_path / "candidates"
+    candidates.mkdir()
+    mask = masks.encode(thing(0)).decode()
+    entry = {"image_id": 0, "category_name": "from a file", "score": 0.5,
+             "segmentation": {"size": [HEIGHT, WIDTH], "counts": mask}}  # fmt: skip
+    (candidates / "right.json").write_text(json.dumps([entry]))
+    return SequenceEntry(
+        sequence="s1", subject="a", object="b", layout="plain", candidates=candidates,
+        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
+    )  # fmt: skip
+
+
+def run(capture, output, **settings):
+    out = capture.recordings.parent
+    if not (out / "frames.h5").exists():
+        frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())
+    detections.run(
+        frames=out / "frames.h5",
+        output=out / output,
+        sequence=capture,
+        settings=DetectionsSettings(**settings),
+        object_=ObjectEntry(name="b", mesh=out / "b.ply", labels=("umbrella",)),
+    )
+    return Detections.load(out / output)
+
+
+@pytest.mark.parametrize("make", ["yolo", "mask_rcnn"])
+def test_images_without_candidates_are_segmented(capture, tmp_path, caplog, make):
+    path = tmp_path / "model.onnx"
+    if make == "yolo":
+        tiny_onnx.yolo(path, (160, 160), NAMES)
+    else:
+        tiny_onnx.mask_rcnn(path, "detectron2")
+    with caplog.at_level(logging.INFO, "intercap_core"):
+        read = run(capture, "detections.h5", segmentation_model=path)
+    assert read.candidates_found.all() and read.notes == ("no candidates candidates/left.json", "")
+    for t in range(COUNT):
+        (left,) = read.candidates(t, 0)
+        assert left.label == "suitcase" and left.score == pytest.approx(0.9)
+        both = left.mask() & thing(t)
+        assert both.sum() / (left.mask() | thing(t)).sum() > 0.85
+    assert [c.label for c in read.candidates(0, 1)] == ["from a file"]
+    assert read.candidates(1, 1) == [], "the file says that there is nothing"
+    assert f"segmented {COUNT} of {COUNT} images" in caplog.text
+    assert "umbrella" in caplog.text and "suitcase (5)" in caplog.text
+    run(capture, "again.h5", segmentation_model=path)
+    first, second = (tmp_path / name for name in ("detections.h5", "again.h5"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_without_a_model_nothing_is_loaded(capture):
+    import subprocess
+    import sys
+
+    run(capture, "detections.h5")
+    words = (
+        "import sys, intercap_core.stages.detections; "
+        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detection.onnx_model' "
+        "in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", words]).returncode == 0
