@@ -138,7 +138,14 @@ def run_dataset(project: Project) -> Path:
             name: dataset.SequenceArtefacts(
                 **{
                     stage: project.artefact(name, stage)
-                    for stage in ("frames", "scene", "object_track", "joint", "metrics")
+                    for stage in (
+                        "frames",
+                        "scene",
+                        "detections",
+                        "object_track",
+                        "joint",
+                        "metrics",
+                    )
                 }
             )
             for name in project.sequences

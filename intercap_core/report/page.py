@@ -18,10 +18,13 @@ from markupsafe import Markup
 from intercap_core.metrics import figures, flags
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.report import capture, charts, measures
+from intercap_core.report import track as tracks
 from intercap_core.report.capture import CaptureFacts
 from intercap_core.report.capture_pictures import CapturePicture
 from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
 from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.report.track import TrackFacts
+from intercap_core.report.track_pictures import TrackSheet
 from intercap_core.schemas import METRIC_REGIONS
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -53,9 +56,9 @@ class ObjectHeat:
 class Content:
     """All that the page is made from.
 
-    ``captures`` of the sequences that are shown. ``residuals`` by sequence: name, before and after
-    of each camera pair, metres. ``trace`` by sequence: what to print of each stage. ``failed``:
-    sequences without a result and why.
+    ``captures`` and ``tracks`` of the sequences that are shown. ``residuals`` by sequence: name,
+    before and after of each camera pair, metres. ``trace`` by sequence: what to print of each
+    stage. ``failed``: sequences without a result and why.
     """
 
     dataset: str
@@ -63,6 +66,7 @@ class Content:
     table: pd.DataFrame
     details: Sequence[Detail]
     captures: Sequence[CaptureFacts]
+    tracks: Sequence[TrackFacts]
     body_heat: Sequence[HeatPicture]
     body_top: float
     body_frames: int
@@ -106,6 +110,7 @@ def _context(content: Content) -> dict[str, Any]:
         "heat": _heat(content),
         "cameras": measures.cameras(content.sequences, content.residuals),
         "captures": [_capture(facts) for facts in content.captures],
+        "tracks": [_track(facts) for facts in content.tracks],
         "worst": sorted(rows, key=lambda row: row["rank"])[:_WORST],
         "flagged_runs": runs[:_MAX_RUNS],
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
@@ -220,6 +225,14 @@ def _capture(facts: CaptureFacts) -> dict[str, Any]:
     return found
 
 
+def _track(facts: TrackFacts) -> dict[str, Any]:
+    found = tracks.context(facts)
+    if facts.sheet is not None:
+        rows = ", ".join(map(str, facts.sheet.frames))
+        found["sheet"] = _embedded(facts.sheet, f"{facts.name}, frames {rows} in every camera")
+    return found
+
+
 def _detail(content: Content, detail: Detail) -> dict[str, Any]:
     s = next(s for s in content.sequences if s.name == detail.name)
     cameras: dict[str, list[dict[str, Any]]] = {}
@@ -290,10 +303,12 @@ def _counted(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
-def _embedded(picture: HeatPicture | Overlay | CapturePicture, caption: str) -> dict[str, Any]:
+def _embedded(
+    picture: HeatPicture | Overlay | CapturePicture | TrackSheet, caption: str
+) -> dict[str, Any]:
     if isinstance(picture, CapturePicture):
         kind, data = picture.kind, picture.data
-    elif isinstance(picture, Overlay):
+    elif isinstance(picture, Overlay | TrackSheet):
         kind, data = "jpeg", picture.jpeg
     else:
         kind, data = "png", picture.png

@@ -17,6 +17,7 @@ from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, ObjectEntry, ReportSettings, SubjectEntry
+from intercap_core.detection.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
 from intercap_core.metrics.contact import CONTACT_M
@@ -27,6 +28,7 @@ from intercap_core.report.capture import read_capture
 from intercap_core.report.heat_pictures import body_pictures, object_pictures
 from intercap_core.report.overlays import Fit, choose_cameras, choose_frames, overlays
 from intercap_core.report.page import Content, Detail, ObjectHeat, render
+from intercap_core.report.track import TrackFacts, read_track
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import FRAMES, HEATMAPS, JOINT, METRICS, OBJECT_TRACK, SCENE
 
@@ -41,6 +43,7 @@ class SequenceArtefacts:
 
     frames: Path
     scene: Path
+    detections: Path
     object_track: Path
     joint: Path
     metrics: Path
@@ -87,6 +90,11 @@ def run(
         if name in shown
     ]
     captures = [read_capture(s.frames, s.scene) for name, s in sequences.items() if name in shown]
+    tracks = [
+        _track(sequences[name], s.object_, objects)
+        for name, s in zip(sequences, measured, strict=True)
+        if name in shown
+    ]
     first = next(iter(sequences.values()))
     with artefacts.read(first.joint, JOINT) as artefact:
         model = load_model(
@@ -100,6 +108,7 @@ def run(
         table=by_sequence,
         details=details,
         captures=captures,
+        tracks=tracks,
         body_heat=body_pictures(model, heat.body, body_top),
         body_top=body_top,
         body_frames=heat.body_frames,
@@ -137,6 +146,21 @@ def _detail(
     except UserError as error:  # one image that does not decode must not cost the whole report
         log.warning("%s: no overlays: %s", name, error)
         return Detail(name, [], str(error))
+
+
+def _track(
+    paths: SequenceArtefacts, object_name: str, objects: Mapping[str, ObjectEntry]
+) -> TrackFacts:
+    with artefacts.read(paths.scene, SCENE) as scene:
+        found = Detections.load(paths.detections).showing(scene["image_of"])
+    with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
+        candidate = track["candidate"]
+
+    def kept(t: int, c: int) -> bytes:
+        return found.candidates(t, c)[candidate[t, c]].rle if candidate[t, c] >= 0 else b""
+
+    mesh = ObjectMesh.load(objects[object_name])
+    return read_track(paths.frames, paths.scene, paths.object_track, mesh, kept)
 
 
 def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) -> ObjectHeat:

@@ -49,7 +49,9 @@ def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Pat
         dataset="demo",
         sequences={
             name: dataset.SequenceArtefacts(
-                **capture.inputs("frames", "scene", "object_track", "joint", "metrics")
+                **capture.inputs(
+                    "frames", "scene", "detections", "object_track", "joint", "metrics"
+                )
             )
             for name, capture in captures.items()
         },
