@@ -214,7 +214,7 @@ def _add_masks_of_camera(
         absent = [name for name in named if numbers.get(name) not in images.recorded]
         if absent:
             found.notes.append(
-                f"masks of {len(absent)} names that no image has (first: {absent[0]})"
+                f"masks of {len(absent)} images are named after no image (first: {absent[0]:.80})"
             )
         files = {numbers[name]: of for name, of in named.items() if name in numbers}
     held = [int(images.number[t]) for t in images.sets]

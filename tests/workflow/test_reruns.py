@@ -144,6 +144,21 @@ def test_a_setting_re_runs_its_own_stage(flow: Flow) -> None:
         assert flow.pending() == after | {DATASET}
 
 
+def test_another_model_re_runs_the_detections(flow: Flow) -> None:
+    """The same path counts by what the file holds."""
+    path, model = flow.folder / flow.settings, flow.folder / "config" / "test" / "model.onnx"
+    settings = yaml.safe_load(path.read_text())
+    text = yaml.safe_dump({**settings, "detections": {"segmentation_model": model.name}})
+    expected = {(name, rule) for name in (ONE, OTHER) for rule in {"detections", *AFTER_SCENE}}
+    with edited(model, "one"), edited(path, text):
+        assert flow.pending() == expected | {DATASET}
+        assert flow.run("--touch").returncode == 0  # as if all had run with this model
+        assert flow.pending() == set()
+        model.write_text("another")
+        assert flow.pending() == expected | {DATASET}
+    assert flow.run("--touch").returncode == 0
+
+
 def test_another_seed_makes_another_recording(flow: Flow) -> None:
     with replaced(flow.folder / flow.settings, "seed: 22", "seed: 23"):
         pending = flow.pending()

@@ -1,0 +1,238 @@
+"""Files of candidates that are broken or of other images: told, left out, and the rest counts."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_capture import ring, write_frames
+
+from intercap_core.config import DetectionsSettings, ObjectEntry, SequenceEntry
+from intercap_core.detection import coco, masks
+from intercap_core.detection.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.stages import detections
+
+RIG, _ = ring(2)
+WIDTH, HEIGHT, SETS = 1920, 1080, 4
+
+
+def square(x: int, scale: int = 1) -> np.ndarray:
+    mask = np.zeros((HEIGHT // scale, WIDTH // scale), np.uint8)
+    mask[100 // scale : 200 // scale, x // scale : (x + 80) // scale] = 1
+    return mask
+
+
+def result(image, x: int = 300, label: str = "cup", **changes) -> dict:
+    mask = changes.pop("mask", square(x))
+    size = [int(n) for n in mask.shape]
+    segmentation = {"size": size, "counts": masks.encode(mask).decode()}
+    entry = {"image_id": image, "category_name": label, "score": 0.5}
+    return entry | {"segmentation": segmentation} | changes
+
+
+GOOD = [result(image) for image in range(SETS)]
+
+
+@pytest.fixture
+def candidates(tmp_path) -> Path:
+    write_frames(tmp_path / "frames.h5", RIG, num_sets=SETS)
+    folder = tmp_path / "candidates"
+    folder.mkdir()
+    (folder / "k2.json").write_text(json.dumps(GOOD))
+    return folder
+
+
+def run(folder: Path, *, layout: str = "k4a", **settings) -> Detections:
+    root = folder.parent
+    detections.run(
+        frames=root / "frames.h5",
+        output=root / "detections.h5",
+        sequence=SequenceEntry(
+            sequence="test", subject="s", object="o", recordings=root, layout=layout,
+            calibration=root / "rig.json", candidates=folder,
+        ),
+        settings=DetectionsSettings(**settings),
+        object_=ObjectEntry(name="cup", mesh=root / "cup.ply", labels=("cup", "bowl")),
+    )  # fmt: skip
+    return Detections.load(root / "detections.h5")
+
+
+def broken_rle(entry: dict) -> dict:
+    counts = entry["segmentation"]["counts"]
+    return entry | {"segmentation": {"size": [HEIGHT, WIDTH], "counts": counts[:-1] + "zz"}}
+
+
+NONE, ALL = [0, 0, 0, 0], [1, 1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("content", "words", "found", "count"),
+    [
+        ("", "k1.json is not valid JSON", NONE, NONE),
+        ('[{"image_id": 0, "seg', "k1.json is not valid JSON", NONE, NONE),
+        ("3", "holds 3, expected a list of results", NONE, NONE),
+        ({"results": []}, "holds an object with results, expected a list", NONE, NONE),
+        ([GOOD[0], broken_rle(GOOD[1]), *GOOD[2:]], "1 of 4 results in candidates/k1.json left "
+         "out: entry 1 (image 1): its RLE", [1, 0, 1, 1], [1, 0, 1, 1]),
+        ([*GOOD, broken_rle(GOOD[1])], "1 of 5 results", [1, 0, 1, 1], ALL),
+        ([broken_rle(entry) for entry in GOOD], "4 of 4 results", NONE, NONE),
+        ([result(0, mask=np.ones((640, 640))), *GOOD[1:]],
+         "entry 0 (image 0): the mask has 640x640 pixels, the image 1920x1080", [0, 1, 1, 1],
+         [0, 1, 1, 1]),
+        ([result(i, mask=square(300, 2)) for i in range(SETS)], "4 masks in candidates/k1.json "
+         "scaled to the image's size", ALL, ALL),
+        ([*GOOD, result(7204)], "1 results in candidates/k1.json are of images that the recording "
+         "does not have (first: 7204; it has images 0 to 3)", ALL, ALL),
+        ([result(image + 1) for image in range(SETS)], "image numbers count from 0", ALL,
+         [0, 1, 1, 1]),
+        ([result("no name"), *GOOD], "does not have (first: no name", ALL, ALL),
+        ([], "", ALL, NONE),
+    ],
+)  # fmt: skip
+def test_one_cameras_file_never_fails_the_sequence(candidates, content, words, found, count):
+    text = content if isinstance(content, str) else json.dumps(content)
+    (candidates / "k1.json").write_text(text)
+    read = run(candidates)
+    if words.startswith("1 of 5"):
+        found = ALL  # another result of the same image is known
+    assert words in read.notes[0] and bool(words) == bool(read.notes[0])
+    assert read.candidates_found[:, 0].astype(int).tolist() == found
+    assert [len(read.candidates(t, 0)) for t in range(SETS)] == count
+    for t in range(SETS):
+        for candidate in read.candidates(t, 0):
+            np.testing.assert_array_equal(candidate.mask(), square(300) > 0)
+    assert read.notes[1] == "" and read.candidates_found[:, 1].all()
+
+
+def test_a_huge_file_is_told(candidates, monkeypatch):
+    (candidates / "k1.json").write_text(json.dumps(GOOD * 3))
+    monkeypatch.setattr(coco, "MAX_BYTES", (candidates / "k2.json").stat().st_size)
+    read = run(candidates)
+    assert "one file an image" in read.notes[0] and not read.candidates_found[:, 0].any()
+
+
+def test_reasons_are_told_where_nothing_is_left(candidates):
+    for name in ("k1", "k2"):
+        (candidates / f"{name}.json").write_text("{")
+    with pytest.raises(UserError, match=r"k2: candidates/k2\.json is not valid JSON"):
+        run(candidates)
+
+
+def test_labels_that_are_not_the_objects_are_told_and_kept(candidates, caplog):
+    with caplog.at_level(logging.WARNING):
+        run(candidates)
+    assert not caplog.text
+    entries = [result(i, label=label) for i in range(SETS) for label in ("apple", "vase")]
+    for name in ("k1", "k2"):
+        (candidates / f"{name}.json").write_text(json.dumps([*entries, result(0, label="apple")]))
+    with caplog.at_level(logging.WARNING):
+        read = run(candidates)
+    assert "no candidate has a label of object 'cup' (cup, bowl); found apple (10), vase (8)" in (
+        caplog.text
+    )
+    assert [c.label for c in read.candidates(1, 0)] == ["apple", "vase"]
+
+
+def numbered(entries: list[dict], number: int) -> list[dict]:
+    return [{**entry, "category_id": number} for entry in entries]
+
+
+@pytest.mark.parametrize(
+    ("setting", "number", "label"), [("coco", 47, "cup"), ("coco80", 41, "cup"), ("file", 5, "mug")]
+)
+def test_numbers_of_classes(candidates, setting, number, label):
+    entries = [{k: v for k, v in entry.items() if k != "category_name"} for entry in GOOD]
+    (candidates / "k1.json").write_text(json.dumps(numbered(entries, number)))
+    names = candidates.parent / "names.json"
+    names.write_text('{"categories": [{"id": 5, "name": "mug"}]}')
+    read = run(candidates, category_names=names if setting == "file" else setting)
+    assert read.candidates(0, 0)[0].label == label
+
+
+def test_a_data_set_whose_ids_are_not_its_images_numbers(candidates):
+    images = [{"id": 50 + n, "file_name": f"k1/frame_{n:05d}.jpg"} for n in range(3)]
+    annotations = [result(50 + n, x=300 + 10 * n) for n in range(2)]
+    content = {"images": images, "annotations": annotations}
+    (candidates / "k1.json").write_text(json.dumps(content))
+    read = run(candidates)
+    assert read.candidates_found[:, 0].tolist() == [True, True, True, False]
+    assert [c.box[0] for t in range(SETS) for c in read.candidates(t, 0)] == [300, 310]
+
+
+def test_names_that_number_something_else_leave_the_ids(candidates):
+    images = [{"id": n, "file_name": f"img_{n + 160530:06d}.jpg"} for n in range(SETS)]
+    content = {"images": images, "annotations": GOOD}
+    (candidates / "k1.json").write_text(json.dumps(content))
+    read = run(candidates)
+    assert read.notes[0] == "" and all(len(read.candidates(t, 0)) == 1 for t in range(SETS))
+
+
+@pytest.mark.parametrize("name", ["coco_instances_results.json", "predictions.json"])
+def test_what_detectors_call_their_file(candidates, name):
+    (candidates / "k1").mkdir()
+    (candidates / "k1" / name).write_text(json.dumps(GOOD))
+    assert run(candidates).candidates_found[:, 0].all()
+
+
+def test_one_file_an_image(candidates):
+    folder = candidates / "k1"
+    folder.mkdir()
+    sam = {k: v for k, v in GOOD[0].items() if k == "segmentation"} | {"predicted_iou": 0.75}
+    (folder / "image_0000.json").write_text(json.dumps([sam, sam]))
+    (folder / "image_0001.json").write_text(json.dumps({"annotations": GOOD[:1]}))
+    (folder / "image_0002.json").write_text("[")
+    (folder / "image_0009.json").write_text("[]")
+    (folder / "notes.json").write_text("[]")
+    read = run(candidates)
+    assert read.candidates_found[:, 0].tolist() == [True, True, False, False]
+    assert [(c.label, c.score) for c in read.candidates(0, 0)] == [("", 0.75)] * 2
+    assert [c.label for c in read.candidates(1, 0)] == ["cup"]
+    note = read.notes[0]
+    assert "k1/image_0002.json is not valid JSON" in note
+    assert "no file of candidates for 1 images" in note
+    assert "2 files of candidates belong to no image (first: image_0009.json)" in note
+
+
+def test_masks_as_images(candidates):
+    folder = candidates / "k1"
+    (folder / "image_0003").mkdir(parents=True)
+    cv2.imwrite(str(folder / "image_0000__sports ball.png"), 255 * square(300))
+    cv2.imwrite(str(folder / "image_0000__cup__2.png"), square(500))
+    cv2.imwrite(str(folder / "image_0001.png"), square(300) + 2 * square(500))
+    cv2.imwrite(str(folder / "image_0002__cup.png"), 255 * square(300, 2))
+    cv2.imwrite(str(folder / "image_0003" / "0_cup.png"), 255 * square(300))
+    cv2.imwrite(str(folder / "image_0003" / "1.png"), 255 * square(500))
+    read = run(candidates)
+    assert read.candidates_found[:, 0].all() and read.notes[0] == ""
+    labels = [[c.label for c in read.candidates(t, 0)] for t in range(SETS)]
+    assert labels == [["cup", "sports ball"], ["", ""], ["cup"], ["cup", ""]]
+    places = [[c.box[0] for c in read.candidates(t, 0)] for t in range(SETS)]
+    assert places == [[500, 300], [300, 500], [300], [300, 500]]
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.zeros((64, 64), np.uint8), "has 64x64 pixels, the image 1920x1080"),
+        (np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH), "different values"),
+        (None, "is no image"),
+    ],
+)
+def test_images_that_are_no_masks(candidates, image, words):
+    folder = candidates / "k1"
+    folder.mkdir()
+    if image is None:
+        (folder / "0001__cup.png").write_bytes(b"none")
+    else:
+        cv2.imwrite(str(folder / "0001__cup.png"), image)
+    cv2.imwrite(str(folder / "0002__cup.png"), 255 * square(300))
+    cv2.imwrite(str(folder / "9000__cup.png"), 255 * square(300))
+    read = run(candidates)
+    assert "masks not readable: k1/0001__cup.png " in read.notes[0]
+    assert words in read.notes[0] and "named after no image (first: 9000)" in read.notes[0]
+    assert read.candidates_found[:, 0].tolist() == [False, False, True, False]
