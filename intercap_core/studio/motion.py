@@ -71,8 +71,11 @@ class Puppet:
         self.skeleton = Skeleton(subject.rest_joints)
         self.hands = (Hand(subject, 0), Hand(subject, 1))
         rest = subject.rest_joints
-        self.leg = self.skeleton.length("left_hip", "left_knee", "left_ankle")
-        self.arm = self.skeleton.length("left_shoulder", "left_elbow", "left_wrist")
+        # the shorter of both sides: people are not symmetric
+        self.leg = min(self.skeleton.length(f"{s}_hip", f"{s}_knee", f"{s}_ankle") for s in SIDES)
+        self.arm = min(
+            self.skeleton.length(f"{s}_shoulder", f"{s}_elbow", f"{s}_wrist") for s in SIDES
+        )
         self.hip_width = float(rest[_J["left_hip"], 0] - rest[_J["right_hip"], 0]) / 2
         self.hip_drop = float(rest[0, 1] - rest[[1, 2], 1].mean())
         self.ankle_height = np.array([_sole_depth(subject, side) for side in (0, 1)])

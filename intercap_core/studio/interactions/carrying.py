@@ -22,6 +22,10 @@ from intercap_core.studio.skeleton import turn
 
 RIGHT, LEFT = 1, 0
 ATTACH_S, RELEASE_S = 1.08, 2.46
+KNUCKLES_DEG, TILTS_DEG = (36, 44, 52, 60), (10, 20, 30, 40)  # hands that are tried
+STRAIN_M = 0.0005  # room that 10 degrees less in the wrist are worth
+SPARSE = 3  # every third point of the skin is enough to try a hand
+WITHDRAWN_M = np.array([0.0, 0.03, 0.0])  # on its way in the hand has to pass here
 
 
 class HandleCarry(Interaction):
@@ -30,14 +34,15 @@ class HandleCarry(Interaction):
     highlight = 1.5
     centre = (0.22, -0.15)
     # What a thing asks for. Metres: half the thickness of the handle's bar; the least room between
-    # the hip and the thing's middle; where the knuckles are tried beside and below the bar. Degrees
-    # of the knuckles' flexion that are tried. The stoop: how far down and back the pelvis goes,
+    # the hip and the thing's middle; where the knuckles are tried beside and below the bar; the
+    # height above the grip from which the hand goes down to it, and to which it returns. The stoop:
+    # when it begins, s, how far down the pelvis goes, in lengths of a leg, how far back,
     # metres, and how much more the trunk bends, rad.
     bar_half: float
     beside: float
     knuckles_aside: tuple[float, ...] = (0.020, 0.025, 0.030)
     knuckles_below: tuple[float, ...] = (0.020, 0.024, 0.028, 0.032)
-    knuckles_deg: tuple[float, ...] = (50, 58, 66, 74)
+    above: float
     stoop_from: float
     stoop_down: float
     stoop_back: float
@@ -80,19 +85,23 @@ class HandleCarry(Interaction):
         near = (np.abs(self.thing.vertices[:, :2]) < (0.04, 0.02)).all(1)
         bar_height = self.thing.vertices[near, 2].max() - self.bar_half
         best = (-np.inf, RELAXED, np.eye(4))
-        for knuckle_deg, tilt in product(self.knuckles_deg, np.radians((10, 20, 30))):
-            hook = shape((knuckle_deg, 6, 4), (0, 6, 8), 15, 1)
-            sin, cos = np.sin(tilt), np.cos(tilt)
-            rotation = self.puppet.wrist_rotation(
-                RIGHT, np.array([0, -sin, -cos]), np.array([0, -cos, sin])
-            )
-            knuckle = rotation @ hand.knuckles.mean(0)
-            for aside, below in product(self.knuckles_aside, self.knuckles_below):
-                at = np.array([0.0, aside, bar_height - below])
-                grip = transform(rotation, at - knuckle)
-                gap = hand.gap(hook, surface, grip)
-                if gap > best[0]:
-                    best = (gap, hook, grip)
+        for knuckle_deg in KNUCKLES_DEG:
+            hook = shape((knuckle_deg, 4, 3), (0, -10, 0), 15, 0)
+            skin = hand.skin(hand.local(hook)[None])[0, ::SPARSE]
+            for tilt_deg in TILTS_DEG:
+                sin, cos = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
+                rotation = self.puppet.wrist_rotation(
+                    RIGHT, np.array([0, -sin, -cos]), np.array([0, -cos, sin])
+                )
+                turned = skin @ rotation.T
+                knuckle = rotation @ hand.knuckles.mean(0)
+                for aside, below in product(self.knuckles_aside, self.knuckles_below):
+                    place = np.array([0.0, aside, bar_height - below]) - knuckle
+                    on_the_way = np.concatenate([turned + place, turned + place + WITHDRAWN_M])
+                    room = float(surface.signed_distance(on_the_way).min())
+                    room -= STRAIN_M * tilt_deg / 10
+                    if room > best[0]:
+                        best = (room, hook, transform(rotation, place))
         _, self.hook, self.object_from_wrist = best
         knuckle_limit = float(self.hook.flexion[0, 0]) + 5
         limits = {"finger": (knuckle_limit, 98.0, 62.0), "thumb": (40.0, 55.0, 60.0)}
@@ -103,11 +112,11 @@ class HandleCarry(Interaction):
     def _trunk(self, times: np.ndarray) -> Trunk:
         track = self.pelvis_track(times)
         sway, shift = self.sway(times), self.weight_shift(times)
-        stoop = plateau(times, self.stoop_from, 1.02, 1.10, 1.50)
-        stoop = stoop + plateau(times, 1.95, 2.40, 2.52, 2.95)
-        carry = plateau(times, 1.15, 1.5, 1.9, 2.3)
+        stoop = plateau(times, self.stoop_from, 1.02, 1.10, 1.52)
+        stoop = stoop + plateau(times, 1.80, 2.40, 2.54, 3.30)
+        carry = plateau(times, 1.15, 1.6, 1.85, 2.3)
         pelvis = track[:, :3] + shift
-        pelvis[:, 2] -= self.stoop_down * stoop
+        pelvis[:, 2] -= self.stoop_down * self.puppet.leg * stoop
         pelvis[:, 0] -= self.stoop_back * stoop
         bend = 0.6 * sway[:, :3]
         bend[:, 0] += 0.04 + self.stoop_bend * stoop
@@ -130,8 +139,8 @@ class HandleCarry(Interaction):
         before[:3, 3] += aside
         after[:3, 3] += aside
         over, off = before.copy(), after.copy()
-        over[:3, 3] += (-0.03, -0.03, 0.13)
-        off[:3, 3] += (-0.02, -0.04, 0.15)
+        over[:3, 3] += (-0.03, -0.03, self.above)
+        off[:3, 3] += (-0.02, -0.04, self.above)
         held = np.array([0.0, first[1, 3], first[2, 3] + self.lift])
         along = pelvis[:, 0] + (first[0, 3] - self.taken[0, 3]) - 0.02
         position = np.broadcast_to(held, (count, 3)).copy()
@@ -145,20 +154,20 @@ class HandleCarry(Interaction):
         )
         between = Pose.still(first, count).towards(Pose.still(last, count), share)
         carried = Pose(position, turn(tilt) @ between.rotation)
-        wrist = idle.towards(Pose.still(over, count), ramp(times, 0.35, 0.78))
-        wrist = wrist.towards(Pose.still(before, count), ramp(times, 0.70, 0.94))
+        wrist = idle.towards(Pose.still(over, count), ramp(times, 0.25, 0.90))
+        wrist = wrist.towards(Pose.still(before, count), ramp(times, 0.62, 0.95))
         wrist = wrist.towards(Pose.still(first, count), ramp(times, 0.94, 1.04))
-        wrist = wrist.towards(carried, ramp(times, ATTACH_S, 1.55))
-        wrist = wrist.towards(Pose.still(last, count), ramp(times, 1.95, RELEASE_S - 0.02))
+        wrist = wrist.towards(carried, ramp(times, ATTACH_S, 1.70))
+        wrist = wrist.towards(Pose.still(last, count), ramp(times, 1.80, RELEASE_S - 0.02))
         wrist = wrist.towards(Pose.still(after, count), ramp(times, 2.53, 2.65))
         wrist = wrist.towards(Pose.still(off, count), ramp(times, 2.62, 2.86))
-        return wrist.towards(idle, ramp(times, 2.80, 3.15))
+        return wrist.towards(idle, ramp(times, 2.80, 3.40))
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet = self.puppet
         trunk, feet = self._trunk(times), self.footwork.feet(times)
         world = puppet.trunk(trunk)
-        needs = plateau(times, 0.5, 0.95, 2.6, 2.95)
+        needs = plateau(times, 0.2, 1.0, 2.6, 3.4)
         for _ in range(2):
             right = self._right_wrist(world, trunk.pelvis, times)
             trunk = puppet.assist(trunk, {RIGHT: (right, needs)})
@@ -175,7 +184,7 @@ class HandleCarry(Interaction):
         puppet.arm_to(world, pelvis, LEFT, left)
         stages: list[tuple[np.ndarray, HandShape]] = [
             (ramp(times, 0.5, 0.88), self.hook),
-            (ramp(times, 0.98, 1.07), self.grip_shape),
+            (ramp(times, 0.98, 1.075), self.grip_shape),
             (ramp(times, 2.46, 2.53), self.hook),
             (ramp(times, 2.63, 2.9), RELAXED),
         ]

@@ -11,8 +11,8 @@ class SuitcaseCarry(HandleCarry):
     """The case's trolley bar is on the side away from the hand."""
 
     object_class = "suitcase"
-    bar_half, beside = 0.008, 0.235
-    stoop_from, stoop_down, stoop_back, stoop_bend = 0.55, 0.19, 0.05, 0.42
+    bar_half, beside, above = 0.008, 0.235, 0.14
+    stoop_from, stoop_down, stoop_back, stoop_bend = 0.55, 0.24, 0.05, 0.42
 
     def lifted(self) -> float:
         return self.rng.uniform(*LIFT_M)

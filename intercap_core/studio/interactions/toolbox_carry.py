@@ -12,10 +12,10 @@ class ToolboxCarry(HandleCarry):
     """The grip is a hand's width above the floor: knees and back bend far down."""
 
     object_class = "toolbox"
-    bar_half, beside = 0.014, 0.225
-    knuckles_aside = (0.022, 0.028, 0.034)
-    knuckles_below = (0.022, 0.026, 0.030, 0.034, 0.038)
-    stoop_from, stoop_down, stoop_back, stoop_bend = 0.45, 0.36, 0.08, 0.70
+    bar_half, beside, above = 0.014, 0.225, 0.22
+    knuckles_aside = (0.020, 0.030, 0.040)
+    knuckles_below = (0.022, 0.028, 0.034, 0.040)
+    stoop_from, stoop_down, stoop_back, stoop_bend = 0.28, 0.50, 0.08, 0.62
 
     def lifted(self) -> float:
         """The arm hangs almost straight while it carries."""
