@@ -48,8 +48,8 @@ def size_doubt(
     ratio = max(diameter_m / typical, typical / diameter_m)
     return (
         f"the mesh is {diameter_m:.3g} m across, and what is labelled {' or '.join(labels)} "
-        f"measures {typical:.2g} m ({len(extents)} masks on depth): {ratio:.2g} times too {word}; check the "
-        "mesh's unit, or the labels"
+        f"measures {typical:.2g} m ({len(extents)} masks on depth): {ratio:.2g} times too {word}; "
+        "check the mesh's unit, or the labels"
     )
 
 
