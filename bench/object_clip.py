@@ -1,0 +1,174 @@
+"""Some frame sets of a recording, in memory, as the object's tracker sees them, and their truth.
+
+Reads the artefacts of the stages before ``object_track``; what is decoded here is not timed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import rigid
+from intercap_core.capture.frames import Frames
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.detection.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.metrics import object_pose
+from intercap_core.metrics.truth import Truth
+from intercap_core.project import Project
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.twist import moved
+from intercap_core.schemas import PERSON, SCENE
+from intercap_core.stages.object_track import TRACKING_FACES
+from intercap_core.tracking.evidence import View, ViewGeometry
+from intercap_core.tracking.passes import Tracker
+from intercap_core.tracking.reduced_mask import reduced_lens
+
+# Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
+ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)
+SEEN_VIEWS = 2  # frames that fewer truly see are not counted, as in the evaluation
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectClip:
+    """T consecutive frame sets with C views each.
+
+    ``whole`` is the object's mesh, ``mesh`` the one that is tracked; ``true_rotation`` (T, 3, 3),
+    ``true_translation`` (T, 3) and ``true_views`` (T,) are of the recording's truth.
+    """
+
+    whole: ObjectMesh
+    mesh: ObjectMesh
+    views: list[list[View]]
+    times: np.ndarray
+    up: np.ndarray | None
+    labels: tuple[str, ...]
+    settings: ObjectTrackSettings
+    true_rotation: np.ndarray
+    true_translation: np.ndarray
+    true_views: np.ndarray
+
+    @classmethod
+    def load(cls, project: Project, sequence: str, count: int, *, coarser: int = 1) -> ObjectClip:
+        """The first ``count`` frame sets from the first that shows the object well.
+
+        ``coarser`` multiplies the steps by which the images are reduced. Raises UserError where
+        the sequence has no truth or an artefact is missing.
+        """
+        row = project.sequences[sequence]
+        if row.truth is None:
+            raise UserError(f"sequence {sequence} has no truth; measure a virtual recording")
+        entry = project.objects[row.object]
+        whole = ObjectMesh.load(entry)
+        scene = project.artefact(sequence, "scene")
+        with artefacts.read(scene, SCENE) as artefact:
+            present, image_of = artefact["present"], artefact["image_of"]
+            bias, late = np.nan_to_num(artefact["depth_bias"]), artefact["time_offset"]
+            up = artefact["zup_from_master"][2, :3].copy()
+        with artefacts.read(project.artefact(sequence, "person"), PERSON) as artefact:
+            masks = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
+        rig = Rig.from_scene(scene)
+        usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
+        geometry = {
+            int(c): _coarser(
+                ViewGeometry.for_object(rig[c], whole.diameter, float(bias[c]), float(late[c])),
+                coarser,
+            )
+            for c in np.flatnonzero(usable)
+        }
+        detections = Detections.load(project.artefact(sequence, "detections")).showing(image_of)
+        views = []
+        with Frames.open(project.artefact(sequence, "frames")) as recording:
+            shown = recording.showing(image_of)
+            times = recording.time_s
+            truth = Truth.load(row.truth, times, recording.fps, 0)
+            first = int(np.argmax(truth.object_views >= SEEN_VIEWS))
+            frames = range(first, min(first + count, recording.num_sets))
+            for t in frames:
+                views.append(
+                    [
+                        View.build(
+                            seen,
+                            shown.depth(t, c),
+                            masks[t * len(rig) + c],
+                            [
+                                (k.index, k.label, k.score, k.rle)
+                                for k in detections.candidates(t, c)
+                            ],
+                            bool(detections.candidates_found[t, c]),
+                        )
+                        for c, seen in geometry.items()
+                    ]
+                )
+        kept = slice(frames.start, frames.stop)
+        return cls(
+            whole,
+            whole.simplified(TRACKING_FACES),
+            views,
+            times[kept],
+            up if np.isfinite(up).all() else None,
+            entry.labels,
+            project.config.object_track,
+            truth.rotation[kept],
+            truth.translation[kept],
+            truth.object_views[kept],
+        )
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def annotated(self) -> np.ndarray:
+        """The first frame's pose (4, 4) as a person might set it: off by 10 mm and 5 degrees."""
+        pose = rigid(self.true_rotation[0], self.true_translation[0])
+        return moved(pose, ANNOTATION_ERROR)
+
+    def tracker(self) -> Tracker:
+        """The project's tracker on these frames."""
+        labels = [[[k.label for k in view.candidates] for view in views] for views in self.views]
+        return Tracker(
+            self.mesh,
+            self.views.__getitem__,
+            labels,
+            self.settings,
+            times=self.times,
+            labels=self.labels,
+            up=self.up,
+        )
+
+    def errors(
+        self, poses: np.ndarray, frames: Sequence[int] | int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of poses (..., 4, 4) in the given frame or frames: millimetres, degrees (...)."""
+        centre = self.whole.centre_of_mass
+        rotation = np.broadcast_to(self.true_rotation[frames], (*poses.shape[:-2], 3, 3))
+        apart = object_pose.centre_error(
+            object_pose.posed_point(poses[..., :3, :3], poses[..., :3, 3], centre),
+            object_pose.posed_point(rotation, self.true_translation[frames], centre),
+        )
+        turned = object_pose.rotation_error_deg(poses[..., :3, :3], rotation, self.mesh.symmetry)
+        return 1e3 * apart, turned
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Frames (T,) bool that count: enough views truly see the object."""
+        return self.true_views >= SEEN_VIEWS
+
+
+def _coarser(geometry: ViewGeometry, factor: int) -> ViewGeometry:
+    if factor == 1:
+        return geometry
+    step, depth_step = geometry.step * factor, geometry.depth_step * factor
+    camera = geometry.camera
+    return replace(
+        geometry,
+        step=step,
+        lens=reduced_lens(camera.colour, step),
+        depth_step=depth_step,
+        depth_lens=reduced_lens(camera.depth, depth_step) if camera.depth else None,
+    )
