@@ -127,7 +127,7 @@ SCENE = Schema(
 
 PERSON = Schema(
     name="person",
-    version=2,
+    version=3,
     stage="person",
     attributes={"sequence": "sequence name"},
     fields={
@@ -141,6 +141,13 @@ PERSON = Schema(
         "missing": Field(("T",), "bool", "fewer than two views see the subject, and no depth places it"),
         "mask_offsets": Field(("M+1",), "int64", "start of each mask's RLE, in the order of (T, C)"),
         "mask_rle": Field(("B",), "uint8", "COCO compressed RLE of the person in the image that shows this moment, empty = no mask"),
+        "mask_source": Field(("T", "C"), "int8", "who segmented the image: 0 nobody, 1 a detector, 2 the images alone"),
+        "candidate_offsets": Field(("M+1",), "int64", "first candidate of each image, and the end, in the order of (T, C): what was segmented from the images alone; no candidate_ datasets where nothing was", optional=True),
+        "candidate_scores": Field(("N",), "float32", "how likely the candidate is a thing, 0 to 1", optional=True),
+        "candidate_extents": Field(("N",), "float32", "diagonal of what all views show of it; NaN = not known", "m", optional=True),
+        "candidate_things": Field(("N",), "int32", "the same number in the views of one moment that show the same thing, -1 = not known", optional=True),
+        "candidate_rle_offsets": Field(("N+1",), "int64", "start of each candidate's RLE, and the end", optional=True),
+        "candidate_rle": Field(("R",), "uint8", "COCO compressed RLE in the image that shows this moment", optional=True),
     },
 )  # fmt: skip
 

@@ -12,7 +12,10 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.detection.masks import Runs
 from intercap_core.errors import UserError
-from intercap_core.schemas import DETECTIONS
+from intercap_core.schemas import DETECTIONS, PERSON
+
+UNKNOWN_LABEL = ""  # of a candidate that no detector named
+NOBODY_LOOKED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2  # who segmented an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +23,8 @@ class Candidate:
     """One segmented instance of one image.
 
     ``index`` counts within the image, ``box`` (4,) is x, y, width, height, pixels. The mask is
-    parsed when first asked for.
+    parsed when first asked for. ``extent_m`` is the size of the thing where it was measured, NaN
+    where not.
     """
 
     index: int
@@ -29,6 +33,7 @@ class Candidate:
     box: np.ndarray
     rle: bytes
     image_size: tuple[int, int]  # width, height
+    extent_m: float = float("nan")
 
     @cached_property
     def runs(self) -> Runs:
@@ -71,6 +76,7 @@ class Detections:
         self.notes = tuple(artefact.text("note"))
         self._tables = [_read_camera(artefact, name) for name in self.camera_names]
         self._image_of: np.ndarray | None = None
+        self._from_images: dict[tuple[int, int], list[Candidate]] = {}
 
     @classmethod
     def load(cls, path: Path) -> Detections:
@@ -98,6 +104,51 @@ class Detections:
         moments.candidates_found = shown & np.take_along_axis(self.candidates_found, at, 0)
         return moments
 
+    def with_candidates_of(self, person: Path) -> Detections:
+        """The same with the candidates that stage ``person`` found in the images alone.
+
+        They replace a detector's where that stage took them (``mask_source`` 2); only of
+        detections read by the moment (:meth:`showing`). Raises UserError where the artefact cannot
+        be read or is of another recording.
+        """
+        with artefacts.read(person, PERSON) as artefact:
+            source = artefact["mask_source"]
+            if source.shape != self.candidates_found.shape:
+                sets, cameras = self.candidates_found.shape
+                raise UserError(
+                    f"{person}: holds {source.shape[0]} frame sets of {source.shape[1]} cameras, "
+                    f"expected {sets} of {cameras} as in {self.path}; re-run stage 'person' for "
+                    f"sequence {self.sequence!r}"
+                )
+            if not (source == FROM_IMAGES).any():
+                return self
+            scores, extents = artefact["candidate_scores"], artefact["candidate_extents"]
+            rle = artefacts.unpack_ragged(
+                artefact["candidate_rle_offsets"], artefact["candidate_rle"]
+            )
+            offsets = artefact["candidate_offsets"]
+        both = copy(self)
+        from_images = source == FROM_IMAGES
+        both.candidates_found = self.candidates_found | from_images
+        both._from_images = {}
+        for t, c in np.argwhere(from_images).tolist():
+            image = t * source.shape[1] + c
+            first, last = int(offsets[image]), int(offsets[image + 1])
+            width, height = (int(n) for n in self.image_sizes[c])
+            both._from_images[t, c] = [
+                Candidate(
+                    index=i - first,
+                    label=UNKNOWN_LABEL,
+                    score=float(scores[i]),
+                    box=np.array(Runs(rle[i], height, width).box),
+                    rle=rle[i],
+                    image_size=(width, height),
+                    extent_m=float(extents[i]),
+                )
+                for i in range(first, last)
+            ]
+        return both
+
     def _image(self, t: int, c: int) -> int:
         return t if self._image_of is None else int(self._image_of[t, c])
 
@@ -115,6 +166,8 @@ class Detections:
 
     def candidates(self, t: int, c: int) -> list[Candidate]:
         """The image's segmentation candidates, in the order that the artefact holds them."""
+        if (t, c) in self._from_images:
+            return self._from_images[t, c]
         table, image = self._tables[c], self._image(t, c)
         if image < 0:
             return []

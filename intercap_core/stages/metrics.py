@@ -107,7 +107,7 @@ def run(
 def _clouds(
     images: Frames, scene: artefacts.Artefact, detections: Path, person: Path, object_track: Path
 ) -> SegmentedClouds:
-    found = Detections.load(detections).showing(scene["image_of"])
+    found = Detections.load(detections).showing(scene["image_of"]).with_candidates_of(person)
     with artefacts.read(object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]
     with artefacts.read(person, PERSON) as people:

@@ -13,17 +13,22 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
 from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings
-from intercap_core.detection.read import Detections
+from intercap_core.detection.read import Candidate, Detections
 from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
 from intercap_core.tracking.evidence import View, ViewGeometry
-from intercap_core.tracking.passes import NotFound, Track, Tracker
+from intercap_core.tracking.object_size import size_doubt
+from intercap_core.tracking.passes import Track, Tracker
+from intercap_core.tracking.seed import NotFound
 
 log = logging.getLogger(__name__)
 
 TRACKING_FACES = 600  # of the mesh that is rendered; kept within 0.5 mm of the full one
+# Extents, of the object's diameter, of a component of the images that may be it: partly hidden, or
+# with something that it touches.
+SMALLEST_EXTENT, LARGEST_EXTENT, SLACK_M = 0.25, 1.4, 0.05
 
 
 class _Recording:
@@ -42,10 +47,13 @@ class _Recording:
             present = artefact["present"]
             bias, late = artefact["depth_bias"], artefact["time_offset"]
             self._frames = frames.showing(artefact["image_of"])
-            self._detections = detections.showing(artefact["image_of"])
+            moments = detections.showing(artefact["image_of"])
             self.up = artefact["zup_from_master"][2, :3].copy()
+        self._detections = moments.with_candidates_of(person)
+        self._diameter_m = diameter_m
         with artefacts.read(person, PERSON) as artefact:
             masks = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
+            self.joints = np.where(artefact["missing"][:, None, None], np.nan, artefact["joints"])
         self._masks = [masks[t * len(rig) : (t + 1) * len(rig)] for t in range(frames.num_sets)]
         usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
         self.cameras = [int(c) for c in np.flatnonzero(usable)]
@@ -62,20 +70,23 @@ class _Recording:
         for c, geometry in zip(self.cameras, self._geometry, strict=True):
             candidates = [
                 (candidate.index, candidate.label, candidate.score, candidate.rle)
-                for candidate in self._detections.candidates(t, c)
+                for candidate in self._candidates(t, c)
             ]
             depth = self._frames.depth(t, c)
             detected = bool(self._detections.candidates_found[t, c])
             found.append(View.build(geometry, depth, self._masks[t][c], candidates, detected))
         return found
 
+    def _candidates(self, t: int, c: int) -> list[Candidate]:
+        """What may be the object by its size, where that is known."""
+        low, high = SMALLEST_EXTENT * self._diameter_m, LARGEST_EXTENT * self._diameter_m + SLACK_M
+        found = self._detections.candidates(t, c)
+        return [one for one in found if not (one.extent_m < low or one.extent_m > high)]
+
     def labels(self) -> list[list[list[str]]]:
         """Labels [T][usable cameras][candidates] of what was detected."""
         return [
-            [
-                [candidate.label for candidate in self._detections.candidates(t, c)]
-                for c in self.cameras
-            ]
+            [[candidate.label for candidate in self._candidates(t, c)] for c in self.cameras]
             for t in range(self._frames.num_sets)
         ]
 
@@ -99,13 +110,17 @@ def run(
     mesh = ObjectMesh.load(object_)
     simple = mesh.simplified(TRACKING_FACES)
     with Frames.open(frames) as recording:
-        source = _Recording(recording, Detections.load(detections), scene, person, mesh.diameter)
+        detected = Detections.load(detections)
+        source = _Recording(recording, detected, scene, person, mesh.diameter)
         sequence = recording.sequence
         if not source.cameras:
             raise UserError(
                 f"sequence {sequence}: no camera has images and a pose; check the recordings and "
                 "the calibration"
             )
+        doubt = size_doubt(recording, detected, recording.rig, mesh.diameter, object_.labels)
+        if doubt:
+            log.warning("sequence %s: object %r: %s", sequence, object_.name, doubt)
         tracker = Tracker(
             simple,
             source.views,
@@ -114,6 +129,7 @@ def run(
             times=recording.time_s,
             labels=object_.labels,
             up=source.up if np.isfinite(source.up).all() else None,
+            joints=source.joints,
         )
         try:
             track = tracker.run(_start(initial, recording.num_sets, sequence))
@@ -122,7 +138,7 @@ def run(
                 f"sequence {sequence}: object {object_.name!r} was found in no frame (no "
                 "segmentation candidate, with depth or in two views, fits its size; labels "
                 f"expected: {', '.join(object_.labels) or 'any'}); check the candidates, or "
-                "annotate 'object_pose'"
+                f"annotate 'object_pose'{f'. Note: {doubt}' if doubt else ''}"
             ) from None
         names = list(recording.rig.names)
     with artefacts.write(

@@ -12,9 +12,15 @@ from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.config import PersonSettings
 from intercap_core.detection.exposure import at_set_times
+from intercap_core.detection.image_segments import ImageCandidate, ViewSegments
 from intercap_core.detection.lifting import Lifter
 from intercap_core.detection.person_masks import choose_mask
-from intercap_core.detection.read import Detections
+from intercap_core.detection.read import (
+    FROM_DETECTOR,
+    FROM_IMAGES,
+    NOBODY_LOOKED,
+    Detections,
+)
 from intercap_core.detection.sides import BODY_POINTS
 from intercap_core.detection.subject import NOBODY, find_subject
 from intercap_core.detection.swaps import steady_sides, triangulate_people
@@ -60,13 +66,15 @@ def run(
         )
         keypoints = moved[..., [3, 4, 2]]
         lifted = lifter.fill(person, keypoints, points)
-    missing = ((person != NOBODY).sum(1) < 2) & ~lifted
-    if missing.all():
-        raise UserError(
-            f"sequence {found.sequence}: the subject can be placed in no frame set: {_why(found)}"
-        )
-    masks = _masks(found, keypoints, points, rig, settings.min_confidence)
-    _write(output, found, person, keypoints, points, missing, masks, settings)
+        missing = ((person != NOBODY).sum(1) < 2) & ~lifted
+        if missing.all():
+            raise UserError(
+                f"sequence {found.sequence}: the subject can be placed in no frame set: "
+                f"{_why(found)}"
+            )
+        masks = _masks(found, keypoints, points, rig, settings.min_confidence)
+        segmented = _from_images(images.showing(image_of), source, found, points, settings)
+    _write(output, found, person, keypoints, points, missing, masks, segmented, settings)
 
 
 def _why(found: Detections) -> str:
@@ -122,6 +130,25 @@ def _masks(
     return result
 
 
+def _from_images(
+    images: Frames,
+    scene: artefacts.Artefact,
+    found: Detections,
+    points: Triangulation,
+    settings: PersonSettings,
+) -> dict[tuple[int, int], ViewSegments]:
+    """What the images alone show, by moment and camera, where the settings ask for it."""
+    wanted = images.available
+    if settings.segmentation == "auto":
+        wanted = wanted & ~found.candidates_found
+    if settings.segmentation == "detector" or not wanted.any():
+        return {}
+    from intercap_core.detection.image_segmentation import segment_images
+
+    joints = points.points.reshape(*wanted.shape[:1], NUM_KEYPOINTS, 3)
+    return segment_images(images, scene, joints, wanted)
+
+
 def _write(
     output: Path,
     detections: Detections,
@@ -130,9 +157,19 @@ def _write(
     points: Triangulation,
     missing: np.ndarray,
     masks: list[bytes],
+    segmented: dict[tuple[int, int], ViewSegments],
     settings: PersonSettings,
 ) -> None:
     sets, views = person.shape
+    mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOBODY_LOOKED)
+    if settings.segmentation == "images":
+        mask_source[:] = NOBODY_LOOKED
+        masks = [b""] * len(masks)
+    candidates: list[list[ImageCandidate]] = [[] for _ in masks]
+    for (t, c), segments in segmented.items():
+        mask_source[t, c] = FROM_IMAGES
+        masks[t * views + c] = segments.person
+        candidates[t * views + c] = segments.candidates
     offsets, rle = artefacts.pack_ragged(masks)
     inlier = np.swapaxes(points.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
     with artefacts.write(
@@ -148,3 +185,18 @@ def _write(
         writer.put("missing", missing)
         writer.put("mask_offsets", offsets)
         writer.put("mask_rle", rle)
+        writer.put("mask_source", mask_source)
+        if segmented:
+            _put_candidates(writer, candidates)
+
+
+def _put_candidates(writer: artefacts.Writer, candidates: list[list[ImageCandidate]]) -> None:
+    """Candidates of the images alone, one list an image in the order of (T, C)."""
+    every = [candidate for of_image in candidates for candidate in of_image]
+    offsets, rle = artefacts.pack_ragged([one.rle for one in every])
+    writer.put("candidate_offsets", np.cumsum([0, *map(len, candidates)]))
+    writer.put("candidate_scores", np.array([one.score for one in every], np.float32))
+    writer.put("candidate_extents", np.array([one.extent_m for one in every], np.float32))
+    writer.put("candidate_things", np.array([one.component for one in every], np.int32))
+    writer.put("candidate_rle_offsets", offsets)
+    writer.put("candidate_rle", rle)

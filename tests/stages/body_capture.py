@@ -125,6 +125,7 @@ def write_capture(
         writer.put("missing", ~present)
         writer.put("mask_offsets", offsets)
         writer.put("mask_rle", runs)
+        writer.put("mask_source", np.ones((count, cameras), int))
     return paths
 
 

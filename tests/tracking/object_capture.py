@@ -237,6 +237,7 @@ class ObjectCapture:
             w.put("missing", np.zeros(count, bool))
             w.put("mask_offsets", offsets)
             w.put("mask_rle", rle)
+            w.put("mask_source", np.ones((count, cameras), np.int8))
         return paths
 
 

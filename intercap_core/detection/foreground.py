@@ -1,0 +1,149 @@
+"""What stands before the static scene in a depth image, and what of the scene never gave way.
+
+The scene's background is the farthest depth that a pixel holds steadily. Where nothing behind can
+be measured, or a thing leaves its place for a short while only, that is the thing itself: such a
+pixel sometimes shows something farther, or nothing at all. It is not background then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from intercap_core.camera.rig import Camera
+from intercap_core.capture.frames import Frames
+
+MAX_SAMPLES = 25  # images looked at for what gives way
+GONE_SHARE = 0.08  # of them in which a pixel must show something else for that to count
+# Nearer than the background by this is before it: five standard deviations of the sensor's random
+# error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
+BEFORE_MM, BEFORE_PER_DEPTH = 15.0, 0.005
+FLOATING_MM = 30.0  # a pixel this far from nearer and from farther neighbours floats between them
+EDGE_PX = 5  # what gives way in narrower strips than this is an edge that measures badly
+_NO_DEPTH = np.float32(65535)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthBackground:
+    """The static scene of one depth camera.
+
+    ``depth`` (H, W) uint16 mm of what never gave way, 0 = unknown; ``reach`` (H, W) uint16 mm, the
+    farthest that is of interest; ``limit`` (H, W) uint16 mm: what is measured nearer stands before
+    the background.
+    """
+
+    depth: np.ndarray
+    reach: np.ndarray
+    limit: np.ndarray
+
+    @classmethod
+    def of(
+        cls, background: np.ndarray, images: list[np.ndarray], reach_mm: np.ndarray
+    ) -> DepthBackground:
+        """From the scene's ``background`` (H, W) uint16 mm and samples of the recording.
+
+        ``reach_mm`` (H, W): nothing farther is of interest.
+        """
+        tolerance = (BEFORE_MM + BEFORE_PER_DEPTH * background).astype(np.uint16)
+        behind = background + tolerance
+        gone = np.zeros(background.shape, np.uint8)
+        for image in images:
+            absent = ((image == 0) | (image > behind)).view(np.uint8)
+            gone += cv2.medianBlur(absent, 5)  # single pixels fail now and then
+        gave_way = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
+        # along the edges of furniture, pixels fail for most of a recording
+        gave_way = cv2.morphologyEx(gave_way, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+        depth = np.where(gave_way > 0, 0, background).astype(np.uint16)
+        near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
+        limit = np.where(depth > 0, near, reach_mm)
+        return cls(depth, reach_mm, np.minimum(limit, reach_mm).astype(np.uint16))
+
+    def before(self, image: np.ndarray) -> np.ndarray:
+        """Flat pixels (N,) of a depth image (H, W) uint16 mm that stand before the background.
+
+        Also those whose background nobody knows. Pixels that float at an edge are left out.
+        """
+        found = (image > 0) & (image < self.limit)
+        index = np.flatnonzero(found)
+        if not len(index):
+            return index
+        rows = np.flatnonzero(found.any(1))
+        columns = np.flatnonzero(found.any(0))
+        window = np.s_[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
+        floats = np.zeros(image.shape, bool)
+        floats[window] = _floating(image[window])
+        return index[~floats.ravel()[index]]
+
+    def shows(self, image: np.ndarray) -> np.ndarray:
+        """Pixels (H, W) bool in which the image (H, W) uint16 mm shows the background."""
+        away = cv2.absdiff(image, self.depth)
+        return (self.depth > 0) & (away <= BEFORE_MM + BEFORE_PER_DEPTH * self.depth)
+
+
+def _floating(image: np.ndarray) -> np.ndarray:
+    block = np.ones((3, 3), np.uint8)
+    values = image.astype(np.float32)
+    farthest = cv2.dilate(values, block)
+    nearest = cv2.erode(np.where(image == 0, _NO_DEPTH, values), block)
+    return (values - nearest > FLOATING_MM) & (farthest - values > FLOATING_MM)
+
+
+def sampled_images(frames: Frames, c: int) -> list[np.ndarray]:
+    """Depth images (H, W) uint16 mm of camera ``c``, at most :data:`MAX_SAMPLES`, evenly spread."""
+    sets = np.flatnonzero(frames.depth_available[:, c])
+    if len(sets) > MAX_SAMPLES:
+        sets = sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
+    images = (frames.depth(int(t), c) for t in sets)
+    return [image for image in images if image is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A depth camera's pixels as points of a given frame.
+
+    ``camera``; ``bias_m`` is subtracted from its depth; ``target_from_depth`` (4, 4).
+    """
+
+    camera: Camera
+    bias_m: float
+    target_from_depth: np.ndarray
+
+    def points(self, image: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (N, 3) float32 of flat pixels: in the target frame, and in the depth camera's.
+
+        NaN where the lens' calibration does not hold.
+        """
+        z = image.ravel()[index] * np.float32(1e-3) - np.float32(self.bias_m)
+        local = self._rays[index] * z[:, None]
+        return local @ self._rotation.T + self.target_from_depth[:3, 3].astype(np.float32), local
+
+    def reach_mm(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Depth (H, W) uint16 at which each pixel's ray leaves a box of the target frame, 0 = it
+        misses the box; ``low``, ``high`` (3,) metres."""
+        lens = self.camera.depth
+        assert lens is not None
+        along = self._rays @ self._rotation.T
+        eye = self.target_from_depth[:3, 3].astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = (np.stack([low, high]).astype(np.float32)[:, None] - eye) / along
+        enters, leaves = ends.min(0).max(1), ends.max(0).min(1)
+        found = np.where((leaves > np.maximum(enters, 0)), 1e3 * (leaves + self.bias_m), 0)
+        return (
+            np.clip(np.nan_to_num(found), 0, 65535)
+            .astype(np.uint16)
+            .reshape(lens.height, lens.width)
+        )
+
+    @cached_property
+    def _rotation(self) -> np.ndarray:
+        return self.target_from_depth[:3, :3].astype(np.float32)
+
+    @cached_property
+    def _rays(self) -> np.ndarray:
+        """(H * W, 3) float32, z = 1."""
+        assert self.camera.depth is not None
+        rays = self.camera.depth.rays.reshape(-1, 2)
+        return np.concatenate([rays, np.ones((len(rays), 1), np.float32)], 1)

@@ -1,0 +1,70 @@
+"""Background that other cameras see through: what was steady for one camera, but is no furniture.
+
+A suitcase that stands for most of a recording where one camera can measure nothing behind it looks
+like furniture to that camera. Another one that holds farther depth on the same line of sight as its
+background saw it gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.detection.foreground import DepthBackground, DepthView
+
+# The other camera's background is farther by this: calibration and the slope of grazing surfaces.
+BEHIND_M, BEHIND_PER_DEPTH = 0.05, 0.01
+AROUND_PX = 5  # pixels all of which must be so far: edges of the background are uncertain
+MIN_AREA_PX = 5  # across, of what is taken out of a background
+_UNKNOWN = np.uint16(0)
+
+
+def see_through(
+    views: list[DepthView],
+    backgrounds: list[DepthBackground],
+    low: np.ndarray,
+    high: np.ndarray,
+) -> list[DepthBackground]:
+    """The backgrounds without what another camera sees through; the box as elsewhere, z up."""
+    nearest = [
+        cv2.erode(background.depth, np.ones((AROUND_PX, AROUND_PX), np.uint8))
+        for background in backgrounds
+    ]
+    result = []
+    for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
+        index = np.flatnonzero(background.depth)
+        points, _ = view.points(background.depth, index)
+        inside = ((points > low) & (points < high)).all(1)
+        index, points = index[inside], points[inside]
+        gone = np.zeros(background.depth.shape, np.uint8)
+        for other, far in enumerate(nearest):
+            if other != number:
+                gone.ravel()[index[_before(views[other], far, points)]] = 1
+        block = np.ones((MIN_AREA_PX, MIN_AREA_PX), np.uint8)
+        gone = cv2.morphologyEx(
+            cv2.morphologyEx(gone, cv2.MORPH_CLOSE, block), cv2.MORPH_OPEN, block
+        )
+        taken = (gone > 0) & (background.depth > 0)
+        depth = np.where(taken, _UNKNOWN, background.depth)
+        result.append(
+            replace(
+                background, depth=depth, limit=np.where(taken, background.reach, background.limit)
+            )
+        )
+    return result
+
+
+def _before(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether points (N, 3) lie clearly before the background ``nearest`` (H, W) mm of a view."""
+    lens = view.camera.depth
+    assert lens is not None
+    local = apply(invert(view.target_from_depth), points)
+    seen = lens.sees(local)
+    column, row = np.rint(np.where(seen[:, None], lens.project(local), 0)).astype(int).T
+    column, row = np.clip(column, 0, lens.width - 1), np.clip(row, 0, lens.height - 1)
+    behind = nearest[row, column] * np.float32(1e-3) - view.bias_m
+    z = local[:, 2]
+    return seen & (nearest[row, column] > 0) & (behind > z + BEHIND_M + BEHIND_PER_DEPTH * z)
