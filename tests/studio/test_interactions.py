@@ -48,6 +48,21 @@ CASES = {
         "bottle", "s03", 5, {"right_hand", "mouth"}, (17, 36), ((0.0, 1.05), (2.5, 3.0)),
         on_floor=False,
     ),
+    "football_check": Case(
+        "football", "s04", 21, {"right_hand", "left_hand"}, (16, 37), ((0.0, 0.93), (2.53, 3.0)),
+        on_floor=False,
+    ),
+    "bottle_check": Case(
+        "bottle", "s01", 8, {"right_hand", "left_hand"}, (16, 37), ((0.0, 0.93), (2.53, 3.0)),
+        on_floor=False,
+    ),
+    "cup_pass": Case(
+        "cup", "s10", 23, {"right_hand"}, (16, 37), ((0.0, 0.93), (2.59, 3.0)), on_floor=False
+    ),
+    "football_pass": Case(
+        "football", "s08", 24, {"right_hand", "left_hand"}, (16, 37), ((0.0, 0.93), (2.59, 3.0)),
+        on_floor=False,
+    ),
     "stool_sit": Case(
         "stool", "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),), pressed_m=0.018
     ),

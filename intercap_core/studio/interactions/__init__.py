@@ -5,7 +5,9 @@ from __future__ import annotations
 from intercap_core.errors import UserError
 from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.bottle_drink import BottleDrink
+from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
 from intercap_core.studio.interactions.cup_drink import CupDrink
+from intercap_core.studio.interactions.passing import BottlePass, CupPass, FootballPass
 from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
 from intercap_core.studio.interactions.toolbox_carry import ToolboxCarry
@@ -14,6 +16,12 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "suitcase_carry": SuitcaseCarry,
     "cup_drink": CupDrink,
     "bottle_drink": BottleDrink,
+    "bottle_check": BottleCheck,
+    "cup_check": CupCheck,
+    "football_check": FootballCheck,
+    "bottle_pass": BottlePass,
+    "cup_pass": CupPass,
+    "football_pass": FootballPass,
     "stool_sit": StoolSit,
     "toolbox_carry": ToolboxCarry,
 }

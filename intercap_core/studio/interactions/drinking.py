@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import product
-
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.studio.controls import Pose, Step, plateau, ramp
+from intercap_core.studio.controls import Pose, plateau, ramp
 from intercap_core.studio.hands import OPEN, RELAXED, HandShape, part_of
-from intercap_core.studio.interactions.base import transform, upright
-from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, backed_off, wrapped
-from intercap_core.studio.interactions.handling import FINGERS_REST_M, LEFT, RIGHT, Handling
+from intercap_core.studio.interactions.base import transform
+from intercap_core.studio.interactions.grasps import backed_off
+from intercap_core.studio.interactions.handling import LEFT, RIGHT, Handling
+from intercap_core.studio.interactions.taking import by_the_wall
 from intercap_core.studio.motion import Trunk
 from intercap_core.studio.skeleton import turn
 
 ATTACH_S, RELEASE_S = 1.06, 2.50
 PLINTH_OF_HEIGHT = 0.565  # its top, as a share of the person's height
-PLINTH_HALF_M = 0.17
+ASIDE_M = -0.12  # of the plinth, to the left
 LIP_GAP_M = 0.0008  # the vessel rests this close to the lips
 HOVER_M = (0.007, 0.018)  # how near the other hand comes without touching
 
@@ -34,42 +32,16 @@ class Drinking(Handling):
     lips_at_edge = True  # the lips touch the rim's near edge, else the middle of the mouth
 
     def plan(self) -> None:
-        rng, puppet = self.rng, self.puppet
-        self.top = PLINTH_OF_HEIGHT * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
-        self.table((0.38 + PLINTH_HALF_M, -0.12), (PLINTH_HALF_M, PLINTH_HALF_M), self.top)
-        self.taken = upright(
-            0.46 + rng.uniform(0, 0.03), -0.13 + rng.uniform(-0.03, 0.03),
-            self.top + self.thing.standing_height, np.radians(95) + rng.normal(0, 0.15),
-        )  # fmt: skip
-        self.put = upright(
-            self.taken[0, 3] + rng.uniform(-0.01, 0.04),
-            self.taken[1, 3] + rng.uniform(-0.03, 0.05),
-            self.taken[2, 3],
-            np.arctan2(self.taken[1, 0], self.taken[0, 0]) + rng.normal(0, 0.2),
-        )
-        w = puppet.hip_width * 1.05
-        steps = [
-            Step(RIGHT, 0.02, 0.40, (0.0, -w)),
-            Step(LEFT, 0.34, 0.72, (0.02, w)),
-        ]
-        self.walk(np.array([[-0.24, w], [-0.22, -w]]), steps)
+        rng = self.rng
+        self.set_out(PLINTH_OF_HEIGHT, ASIDE_M)
         self.tilt = np.radians(rng.uniform(*self.tilt_deg))
         self.hover = rng.uniform(*HOVER_M)
-        self.grips[RIGHT] = wrapped(puppet, RIGHT, WRAP_OPEN, self.thing.surface, self.taken,
-                                    self._approaches())  # fmt: skip
+        self.grips[RIGHT] = by_the_wall(self, self.grip_height_m)
         self.hold_s[RIGHT] = (ATTACH_S, RELEASE_S)
         self._drinking_place()
         self._hovering_place()
 
     # --- places found on the person's own surface ------------------------------------------
-
-    def _approaches(self) -> Iterator[Approach]:
-        """The palm against the wall, just above the plinth or higher, fingers left of ahead."""
-        at = self.taken[:3, 3] + (0, 0, self.grip_height_m)
-        for along, azimuth in product((0.030, 0.040, 0.022), np.radians((65.0, 80.0))):
-            sin, cos = np.sin(azimuth), np.cos(azimuth)
-            yield Approach(at, np.array([sin, cos, -0.10]), np.array([-cos, sin, 0.0]), along,
-                           self.top + FINGERS_REST_M)  # fmt: skip
 
     def _drinking_place(self) -> None:
         """head_from_thing (4, 4): the rim against the lips, tilted; rest axes at the head joint."""
@@ -132,19 +104,13 @@ class Drinking(Handling):
 
     def trunk(self, times: np.ndarray) -> Trunk:
         """Lean to the plinth, straighten up and put the head back to drink, lean again."""
-        track = self.pelvis_track(times)
-        sway, shift = self.sway(times), self.weight_shift(times)
         reach = plateau(times, 0.4, 1.0, 1.1, 1.6) + plateau(times, 2.0, 2.45, 2.55, 3.0)
         drink = plateau(times, 1.25, 1.7, 2.05, 2.4)
-        pelvis = track[:, :3] + shift
-        pelvis[:, 2] -= 0.01
-        bend = 0.6 * sway[:, :3]
-        bend[:, 0] += 0.03 + 0.16 * reach - 0.03 * drink
-        bend[:, 1] += 0.10 * reach
-        head = 1.3 * sway[:, 3:]
-        head[:, 0] += 0.10 + 0.28 * reach - self.head_back * drink
-        head[:, 1] -= 0.12 * reach
-        return Trunk(pelvis, track[:, 3], bend, head)
+        trunk = self.leaning(times, reach, 0.28 * reach - self.head_back * drink)
+        trunk.bend[:, 0] -= 0.03 * drink
+        trunk.bend[:, 1] += 0.10 * reach
+        trunk.head[:, 1] -= 0.12 * reach
+        return trunk
 
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
         """From the plinth to the lips, tilted there, and back."""

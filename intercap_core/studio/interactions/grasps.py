@@ -6,8 +6,9 @@ No contact term and no contact regions of the fit are used.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -25,6 +26,8 @@ FAR_M = 0.03  # a finger that ends farther off counts as this far
 ALONG_FINGERS_M = 0.030
 OPPOSITIONS_DEG = (60.0, 45.0, 30.0, 75.0, 90.0, 15.0, 0.0)  # of the thumb, in the order of tries
 WRAP_OPEN = shape((10, 12, 6), (0, 4, 6), 45)
+LAID = shape((2, 4, 3), (0, 2, 4), 8, 4)
+LAID_LIMITS = {"finger": (45.0, 45.0, 30.0), "thumb": (30.0, 30.0, 30.0)}
 WRAP_LIMITS = {"finger": (75.0, 95.0, 60.0), "thumb": (40.0, 50.0, 60.0)}
 
 
@@ -89,6 +92,23 @@ class Approach:
         ids = slice(None) if thumb else hand.but_thumb_ids
         return backed_off(hand, hand_shape, surface, stage_from_object,
                           transform(rotation, place), -palm, -PALM_PRESSED_M, ids)  # fmt: skip
+
+
+def around_wall(at: np.ndarray, floor: float) -> Iterator[Approach]:
+    """Approaches of a right hand to an upright wall before it, fingers left of ahead."""
+    for along, azimuth in product((0.030, 0.040, 0.022), np.radians((65.0, 80.0))):
+        sin, cos = np.sin(azimuth), np.cos(azimuth)
+        yield Approach(at, np.array([sin, cos, -0.10]), np.array([-cos, sin, 0.0]), along, floor)
+
+
+def laid_on(puppet: Puppet, side: int, surface: DistanceField, stage_from_object: np.ndarray,
+            approach: Approach) -> Grip:  # fmt: skip
+    """A flat hand laid on the thing, the thumb along it, fingers bent until they meet it."""
+    hand = puppet.hands[side]
+    wrist = approach.wrist(puppet, side, LAID, surface, stage_from_object, thumb=True)
+    pose = invert(stage_from_object) @ wrist
+    closed, gaps = hand.close(LAID, LAID_LIMITS, surface, pose)
+    return Grip(LAID, closed, pose, gaps)
 
 
 def wrapped(puppet: Puppet, side: int, open_shape: HandShape, surface: DistanceField,

@@ -10,16 +10,17 @@ import numpy as np
 from intercap_core.camera.transforms import invert
 from intercap_core.studio.controls import Footwork, Pose, Step, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
-from intercap_core.studio.interactions.base import SCRIPT_S, Box, Interaction, Performance
+from intercap_core.studio.interactions.base import SCRIPT_S, Box, Interaction, Performance, upright
 from intercap_core.studio.interactions.grasps import Grip
-from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.motion import LEG_REACH, Trunk, facing
+from intercap_core.studio.skeleton import turn
 
 RIGHT, LEFT = 1, 0
 SIDES = (RIGHT, LEFT)
 CLEAR_M = 0.075  # an open hand leaves the thing by this much, away from its palm
 BACK_M = 0.03  # and towards the wrist
 OVER_M = np.array([0.0, 0.0, 0.10])  # and comes from, and goes, this much above
-EYES_M = 0.07  # the eyes above and ahead of the head's joint
+PLINTH_HALF_M = 0.17
 FINGERS_REST_M = 0.004  # a hand stays this far above a table
 
 
@@ -38,6 +39,7 @@ class Handling(Interaction):
     def __post_init__(self) -> None:
         self.grips: dict[int, Grip] = {}
         self.hold_s: dict[int, tuple[float, float]] = {}
+        self.haste: dict[int, float] = {}  # a hand takes this part of the usual time to come
         super().__post_init__()
 
     # --- what a script decides -----------------------------------------------------------------
@@ -53,7 +55,7 @@ class Handling(Interaction):
     def needs(self, times: np.ndarray) -> dict[int, np.ndarray]:
         """How much the trunk helps each hand (N,): from shortly before to after it holds."""
         return {
-            side: ramp(times, on - 0.5, on - 0.1) - ramp(times, off + 0.1, off + 0.4)
+            side: ramp(times, on - 0.65, on - 0.20) - ramp(times, off + 0.20, off + 0.60)
             for side, (on, off) in self.hold_s.items()
         }
 
@@ -78,6 +80,47 @@ class Handling(Interaction):
         high = (middle[0] + half[0], middle[1] + half[1], top)
         self.furniture.append(Box(low, high, heading, "wood"))
 
+    def set_out(self, top_of_height: float, aside: float, further: Sequence[Step] = ()) -> None:
+        """A plinth ahead and ``aside`` (metres to the left), its top at a share of the person's
+        height; the thing on it, its x axis about to the left; two steps up to it and ``further``
+        ones."""
+        rng, puppet = self.rng, self.puppet
+        self.top = top_of_height * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
+        self.table((0.38 + PLINTH_HALF_M, aside), (PLINTH_HALF_M, PLINTH_HALF_M), self.top)
+        self.taken = upright(
+            0.46 + rng.uniform(0, 0.03), aside - 0.01 + rng.uniform(-0.03, 0.03),
+            self.top + self.thing.standing_height, np.radians(95) + rng.normal(0, 0.15),
+        )  # fmt: skip
+        self.put = upright(
+            self.taken[0, 3] + rng.uniform(-0.01, 0.04),
+            self.taken[1, 3] + rng.uniform(-0.03, 0.05),
+            self.taken[2, 3],
+            np.arctan2(self.taken[1, 0], self.taken[0, 0]) + rng.normal(0, 0.2),
+        )
+        w = puppet.hip_width * 1.05
+        steps = [Step(RIGHT, 0.02, 0.40, (0.0, -w)), Step(LEFT, 0.34, 0.72, (0.02, w))]
+        self.walk(np.array([[-0.24, w], [-0.22, -w]]), [*steps, *further])
+
+    def leaning(self, times: np.ndarray, reach: np.ndarray, look: np.ndarray) -> Trunk:
+        """The trunk over the feet, swaying, bent by ``reach`` (N,) from 0 to 1, the head pitched
+        down by ``look`` (N,) rad."""
+        track = self.pelvis_track(times)
+        sway = self.sway(times)
+        pelvis = track[:, :3] + self.weight_shift(times)
+        pelvis[:, 2] -= 0.01
+        bend, head = 0.6 * sway[:, :3], 1.3 * sway[:, 3:]
+        bend[:, 0] += 0.03 + 0.16 * reach
+        head[:, 0] += 0.10 + look
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def before_chest(self, world: np.ndarray, origin: np.ndarray, offset: np.ndarray,
+                     about: np.ndarray) -> Pose:  # fmt: skip
+        """The thing (N) held before the person: ``offset`` (3,) metres to the left, up and ahead
+        of ``origin`` (N, 3), turned by ``about`` (N, 3) from how it was taken."""
+        person = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
+        heading = person @ facing(np.zeros(1))[0].T
+        return Pose(origin + person @ offset, heading @ turn(about) @ self.taken[:3, :3])
+
     # --- playing ----------------------------------------------------------------------------
 
     def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
@@ -87,20 +130,21 @@ class Handling(Interaction):
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         if side not in self.grips:
             return idle
-        on, off = self.hold_s[side]
+        (on, off), q = self.hold_s[side], self.haste.get(side, 1.0)
         hand = self.puppet.hands[side]
         at = thing @ self.grips[side].object_from_wrist
         beside = at.copy()
         beside[:, :3, 3] += at[:, :3, :3] @ (-CLEAR_M * hand.palm - BACK_M * hand.out)
         over = beside.copy()
-        over[:, :3, 3] += OVER_M + 0.06 * (at[:, :3, :3] @ -hand.out)
+        raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)  # a palm below stays below
+        over[:, :3, 3] += raised * OVER_M - 0.06 * (at[:, :3, :3] @ hand.out)
         goal, near, far = (Pose(m[:, :3, 3], m[:, :3, :3]) for m in (at, beside, over))
-        wrist = idle.towards(far, ramp(times, on - 0.90, on - 0.38))
-        wrist = wrist.towards(near, ramp(times, on - 0.50, on - 0.20))
-        wrist = wrist.towards(goal, ramp(times, on - 0.26, on - 0.06))
-        wrist = wrist.towards(near, ramp(times, off + 0.08, off + 0.26))
-        wrist = wrist.towards(far, ramp(times, off + 0.18, off + 0.44))
-        return wrist.towards(idle, ramp(times, off + 0.30, off + 0.80))
+        wrist = idle.towards(far, ramp(times, on - 0.90 * q, on - 0.38 * q))
+        wrist = wrist.towards(near, ramp(times, on - 0.50 * q, on - 0.20 * q))
+        wrist = wrist.towards(goal, ramp(times, on - 0.26 * q, on - 0.06 * q))
+        wrist = wrist.towards(near, ramp(times, off + 0.08 * q, off + 0.26 * q))
+        wrist = wrist.towards(far, ramp(times, off + 0.18 * q, off + 0.44 * q))
+        return wrist.towards(idle, ramp(times, off + 0.30 * q, off + 0.80 * q))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
         """The shapes a hand goes through, as `Puppet.finger_track` takes them."""

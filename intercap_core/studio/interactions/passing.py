@@ -1,0 +1,122 @@
+"""Take a thing from a plinth, turn and walk two steps, hold it out, put it on another plinth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.studio.controls import Pose, Step, plateau, ramp
+from intercap_core.studio.interactions.base import upright
+from intercap_core.studio.interactions.handling import (
+    LEFT,
+    PLINTH_HALF_M,
+    RIGHT,
+    SIDES,
+    Handling,
+)
+from intercap_core.studio.interactions.taking import between_palms, by_the_wall
+from intercap_core.studio.motion import Trunk
+
+ATTACH_S, RELEASE_S = 0.96, 2.58
+AHEAD_M = 0.50  # the thing on the second plinth, from where the person then stands
+
+
+class Passing(Handling):
+    """What the ways of passing share; the second plinth is to the left of the first."""
+
+    highlight = 1.85
+    centre = (0.15, 0.40)
+    top_of_height = 0.52
+    aside = 0.0  # of the thing, to the left
+    carried = (0.0, 0.20, 0.36)  # from the pelvis: left, up, ahead, metres
+    offered_up_m = 0.33
+
+    def plan(self) -> None:
+        rng, w = self.rng, self.puppet.hip_width * 1.05
+        turned = np.radians(rng.uniform(62, 84))
+        way = np.array([np.cos(turned), np.sin(turned)])
+        left = np.array([-way[1], way[0]])
+        stand = rng.uniform(0.50, 0.60) * way
+
+        def foot(side: int, start: float, end: float, place: np.ndarray, share: float) -> Step:
+            place = place + (w, -w)[side] * left
+            return Step(side, start, end, (float(place[0]), float(place[1])), share * turned)
+
+        self.set_out(
+            self.top_of_height,
+            self.aside,
+            [
+                foot(LEFT, 1.04, 1.40, 0.45 * stand, 0.7),
+                foot(RIGHT, 1.30, 1.70, stand, 1.0),
+                foot(LEFT, 1.62, 1.96, stand, 1.0),
+            ],
+        )
+        top = self.top - rng.uniform(0.02, 0.10)
+        table = stand + (0.40 + PLINTH_HALF_M) * way + self.aside * left
+        self.table((table[0], table[1]), (PLINTH_HALF_M, PLINTH_HALF_M), top, turned)
+        place = stand + (AHEAD_M + rng.uniform(0, 0.04)) * way
+        place = place + (self.aside + rng.uniform(-0.03, 0.03)) * left
+        heading = np.arctan2(self.taken[1, 0], self.taken[0, 0]) + turned + rng.normal(0, 0.15)
+        self.put = upright(place[0], place[1], top + self.thing.standing_height, heading)
+        self.grasp()
+
+    def grasp(self) -> None:
+        """Plan the grips."""
+        raise NotImplementedError
+
+    def trunk(self, times: np.ndarray) -> Trunk:
+        """Lean to the plinth, walk upright, offer, lean to the other plinth."""
+        reach = plateau(times, 0.35, 0.9, 1.0, 1.45) + plateau(times, 2.1, 2.5, 2.6, 3.0)
+        trunk = self.leaning(times, reach, 0.30 * reach)
+        trunk.head[:, 1] += 0.30 * plateau(times, 1.0, 1.3, 1.5, 1.9)
+        return trunk
+
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        """From the plinth to before the belly, held out, to the other plinth."""
+        count = len(times)
+        level = np.zeros((count, 3))
+        lift = np.array([0.0, 0, 0.04])
+        carried = self.before_chest(world, pelvis, np.array(self.carried), level)
+        offer = np.array([self.carried[0], self.offered_up_m, 0.93 * self.puppet.arm])
+        level[:, 1] = 0.20  # tipped a little to whom it is offered
+        offered = self.before_chest(world, pelvis, offer, level)
+        thing = Pose.still(self.taken, count).towards(carried, ramp(times, ATTACH_S, 1.42), lift)
+        thing = thing.towards(offered, ramp(times, 1.62, 2.05))
+        return thing.towards(Pose.still(self.put, count), ramp(times, 2.12, RELEASE_S - 0.03), lift)
+
+
+class PassingByTheWall(Passing):
+    """The right hand around its wall."""
+
+    top_of_height = 0.555
+    aside = -0.10
+    carried = (-0.10, 0.20, 0.36)
+    grip_height_m = 0.0
+
+    def grasp(self) -> None:
+        """The wall as one drinks."""
+        self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
+        self.hold_s = {RIGHT: (ATTACH_S, RELEASE_S)}
+
+
+class CupPass(PassingByTheWall):
+    """The cup, in one hand."""
+
+    object_class = "cup"
+
+
+class BottlePass(PassingByTheWall):
+    """The bottle, in one hand."""
+
+    object_class = "bottle"
+    grip_height_m = 0.01
+
+
+class FootballPass(Passing):
+    """The ball, between both palms."""
+
+    object_class = "football"
+
+    def grasp(self) -> None:
+        """Both palms from the start."""
+        self.grips = between_palms(self)
+        self.hold_s = dict.fromkeys(SIDES, (ATTACH_S, RELEASE_S))
