@@ -6,6 +6,7 @@ two views' masks do, where they meet and both masks have the size that the objec
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -24,16 +25,20 @@ TOGETHER, APART_M = 0.6, 0.03  # of the diameter: measured centres of one object
 CROSSING = 0.35  # of the diameter: a ray through a mask's middle from the object's
 # Width of a mask over the diameter, in the object's place: seen end on, half hidden; smeared.
 SMALLEST, LARGEST = 0.12, 1.25
+UNLIKELY = 0.5  # what a sighting with another class's label counts; detectors err
+UNNAMED = 0.8  # one that no detector named
+OF_PERSON = 0.6  # share of a candidate's pixels on the person, from which it is the person
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """One candidate of one image: its ``outline`` (None where all of it is cut off) and, where the
-    view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,)."""
+    view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,).
+    ``value``: 1 where its label is one of the object's, less else."""
 
     view: int
     candidate: Candidate
-    likely: bool
+    value: float
     points: np.ndarray
     centre: np.ndarray | None
     outline: Outline | None
@@ -57,12 +62,17 @@ Group = list[Sighting]
 
 
 def find_groups(
-    mesh: ObjectMesh, views: list[View], labels: tuple[str, ...], near: np.ndarray | None
+    mesh: ObjectMesh,
+    views: list[View],
+    labels: tuple[str, ...],
+    worth: Callable[[np.ndarray], float] | None = None,
+    near: np.ndarray | None = None,
+    limit: int = MAX_GROUPS,
 ) -> list[Group]:
-    """Groups of candidates that may be the object, the most likely first.
+    """The first ``limit`` groups of candidates that may be the object, the most likely first.
 
-    ``labels`` are the classes that the object may be given; ``near`` (3,) prefers candidates near
-    a place.
+    ``labels`` are the classes that the object may be given; ``worth`` says of a place (3,) how
+    likely what is there is the object; ``near`` (3,) prefers candidates near a place.
     """
     measured = _measured(views, mesh.diameter, labels)
     outlined = _outlined(views, labels)
@@ -78,12 +88,14 @@ def find_groups(
             nearest = int(np.argmin(away))
             if away[nearest] < 1:
                 group.append(others[nearest])
-        value = sum(1.0 if s.likely else 0.5 for s in group)
+        value = sum(s.value for s in group)
+        if worth is not None:
+            value *= worth(centre_of(group))
         if near is not None:
             value -= 2.0 * float(np.linalg.norm(place - near))
         groups.append((value, group))
     groups.sort(key=lambda item: -item[0])
-    return _different([group for _, group in groups])
+    return _different([group for _, group in groups], limit)
 
 
 def centre_of(group: Group) -> np.ndarray:
@@ -98,11 +110,11 @@ def centre_of(group: Group) -> np.ndarray:
     return np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, eyes))
 
 
-def _different(groups: list[Group]) -> list[Group]:
+def _different(groups: list[Group], limit: int) -> list[Group]:
     """The first few groups that share at most half of their members with an earlier one."""
     kept: list[Group] = []
     for group in groups:
-        if len(kept) == MAX_GROUPS:
+        if len(kept) == limit:
             break
         members = {(s.view, s.candidate.index) for s in group}
         known = [{(s.view, s.candidate.index) for s in other} for other in kept]
@@ -125,7 +137,21 @@ def _crossings(outlined: list[Sighting], diameter: float) -> list[np.ndarray]:
 
 
 def _could_be(view: View) -> list[Candidate]:
-    return [c for c in view.candidates if c.label not in PERSON_LABELS and c.mask.area]
+    """All but those on the person: labels err, so none is left out for its label alone."""
+    found = []
+    for candidate in view.candidates:
+        mask = candidate.mask
+        if mask.area:
+            person = view.person.window(mask.x0, mask.y0, *mask.mask.shape)
+            if (person & mask.mask).sum() < OF_PERSON * mask.area:
+                found.append(candidate)
+    return found
+
+
+def _value(label: str, labels: tuple[str, ...]) -> float:
+    if label == "":
+        return UNNAMED
+    return 1.0 if label in labels or (not labels and label not in PERSON_LABELS) else UNLIKELY
 
 
 def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
@@ -135,9 +161,9 @@ def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
         for candidate in _could_be(view) if view.depth is None else ():
             outline = Outline.of(view, candidate) if candidate.mask.area >= MIN_POINTS else None
             if outline is not None:
-                likely = not labels or candidate.label in labels
+                value = _value(candidate.label, labels)
                 nothing = np.zeros((0, 3))
-                found.append(Sighting(number, candidate, likely, nothing, None, outline))
+                found.append(Sighting(number, candidate, value, nothing, None, outline))
     return found
 
 
@@ -171,7 +197,7 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
             spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
             if len(points) < MIN_POINTS or spread > 0.75 * diameter:
                 continue
-            likely = not labels or candidate.label in labels
+            value = _value(candidate.label, labels)
             outline = Outline.of(view, candidate)
-            found.append(Sighting(number, candidate, likely, points, centre, outline))
+            found.append(Sighting(number, candidate, value, points, centre, outline))
     return found

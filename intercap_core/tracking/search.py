@@ -7,6 +7,8 @@ rendered and compared with every view, and the best of those are fitted.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -39,20 +41,27 @@ def search(
     up: np.ndarray | None,
     min_overlap: float,
     background_term: bool,
+    worth: Callable[[np.ndarray], float] | None = None,
     near: np.ndarray | None = None,
 ) -> list[Fit]:
     """Fitted hypotheses of the pose, the most plausible first; none where nothing is detected.
 
     ``labels`` are the detector classes that the object may be given (empty: any but a person);
     ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
-    ``near`` (3,) prefers candidates near a place where the object was seen.
+    ``worth`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near`` (3,)
+    prefers candidates near a place where the object was seen.
     """
-    groups = find_groups(mesh, views, labels, near)
+
+    def value(fit: Fit) -> float:
+        there = fit.pose[:3, :3] @ mesh.centre_of_mass + fit.pose[:3, 3]
+        return plausibility(fit, up) * (1.0 if worth is None else worth(there))
+
+    groups = find_groups(mesh, views, labels, worth, near)
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
     rotations = rotation_grid(mesh.symmetry, up)
     found: list[Fit] = []
     for group in groups:
-        if found and max(fit.confidence for fit in found) > GOOD_ENOUGH:
+        if found and max(map(value, found)) > GOOD_ENOUGH:
             break
         poses, residual = align(mesh, field, group, views, rotations)
         compared = []
@@ -72,10 +81,10 @@ def search(
             )
             for start in compared[:FITTED]
         ]
-    found.sort(key=lambda fit: -plausibility(fit, up))
+    found.sort(key=lambda fit: -value(fit))
     if found and not mesh.symmetry.sphere:
         found += _turned(mesh, views, found[0], labels, min_overlap, background_term)
-        found.sort(key=lambda fit: -plausibility(fit, up))
+        found.sort(key=lambda fit: -value(fit))
     kept: list[Fit] = []
     for fit in found:
         if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):

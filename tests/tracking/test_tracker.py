@@ -13,8 +13,9 @@ from intercap_core.schemas import OBJECT_TRACK
 from intercap_core.stages import object_track
 from intercap_core.tracking.evidence import View, ViewGeometry
 from intercap_core.tracking.fit import MotionPrior, assess, fit_pose
-from intercap_core.tracking.passes import NotFound, Tracker
+from intercap_core.tracking.passes import Tracker
 from intercap_core.tracking.search import rank_frames, rotation_grid, search
+from intercap_core.tracking.seed import NotFound
 from tests.rigid.conftest import catalogue
 from tests.tracking.object_capture import ObjectCapture
 

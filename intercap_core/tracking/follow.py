@@ -1,0 +1,102 @@
+"""One pass over the frames: each pose starts the next, what is lost is searched for again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.tracking.lost import LOST_SCORE, FrameResult, judged
+from intercap_core.tracking.motion import expected, extrapolated, loose
+from intercap_core.tracking.observer import Observer
+from intercap_core.tracking.search import same_pose
+
+DOUBT = 0.55  # of the usual score: below, a search may find better
+RECOVERY_CONFIDENCE = 0.40  # with a ring of cameras
+RING = 6
+RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
+SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
+CLEARLY_BETTER = 1.15  # a searched pose's confidence over the tracked one's
+
+
+def follow(
+    observer: Observer,
+    frames: range,
+    start: FrameResult,
+    known: list[FrameResult] | None = None,
+    may_search: bool = True,
+) -> Iterator[tuple[int, FrameResult]]:
+    """Track ``frames`` in order from the result before the first; yields (t, result).
+
+    ``known`` are the results of an earlier pass: a frame in which this pass would start where
+    that one ended is not fitted again. ``may_search``: re-initialise where lost.
+    """
+    before, now = start.fit.pose, start.fit.pose
+    usual = max(start.fit.score, LOST_SCORE)
+    lost_for = 1 if start.lost else 0
+    searches = 0
+    for t in frames:
+        predicted = now if lost_for else extrapolated(before, now)
+        prior = expected(before, now, predicted, lost_for)
+        start_pose = _better_start(observer, t, predicted, now)
+        if known is not None and same_pose(observer.mesh, start_pose, known[t].fit.pose):
+            result = known[t]
+        else:
+            result = judged(observer.fit(t, start_pose, prior), observer.settings)
+        leapt = False
+        doubtful = result.lost or result.fit.score < DOUBT * usual
+        if may_search and doubtful and lost_for in RECOVERY_WAIT and searches < SEARCHES_MAX:
+            searches += 1
+            again = _recovered(observer, t, now, result)
+            leapt = again is not None
+            result = again or result
+        if result.lost:
+            lost_for += 1
+            frozen = replace(result.fit, pose=predicted, covariance=loose(prior))
+            result = replace(result, fit=frozen)
+            before = now = predicted
+        else:
+            broken = leapt or lost_for > 0
+            result = replace(result, leapt=leapt)
+            before, now = (result.fit.pose if broken else now), result.fit.pose
+            lost_for = 0
+            usual += 0.1 * (result.fit.score - usual)
+        yield t, result
+
+
+def _better_start(observer: Observer, t: int, predicted: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """The prediction or the last pose, whichever agrees better where they differ much."""
+    if same_pose(observer.mesh, predicted, now):
+        return predicted
+    options = [observer.assess(t, pose) for pose in (predicted, now)]
+    return max(options, key=lambda fit: fit.score).pose
+
+
+def _recovered(
+    observer: Observer, t: int, last: np.ndarray, result: FrameResult
+) -> FrameResult | None:
+    """A searched pose that is clearly better than what tracking found, if there is one."""
+    found = observer.search(t, near=last[:3, 3])
+    if not found:
+        return None
+    best = max(
+        found[:3],
+        key=lambda fit: observer.value(t, fit) - _leap(observer.mesh, last, fit.pose),
+    )
+    if same_pose(observer.mesh, best.pose, result.fit.pose):
+        return None
+    # few cameras can never be as sure as a ring
+    surest = min(1.0, (1 - 0.5 ** len(observer.views(t))) / (1 - 0.5**RING))
+    needed = max(RECOVERY_CONFIDENCE * surest, CLEARLY_BETTER * observer.value(t, result.fit))
+    if observer.value(t, best) < needed or judged(best, observer.settings).lost:
+        return None
+    return FrameResult(best, False)
+
+
+def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:
+    """How implausible a jump is, in units of confidence: a tie goes to the nearer pose."""
+    distance = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
+    angle = float(mesh.symmetry.rotation_error_deg(pose[:3, :3], last[:3, :3]))
+    return min(0.1 * distance, 0.1) + min(0.05 * angle / 180, 0.05)

@@ -1,0 +1,50 @@
+"""Which poses are not to be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.tracking.fit import Fit
+
+LOST_SCORE = 0.20
+# By how much the mean score of one pose has to be better than another's, over all frames of a run
+# and over one: errors of masks last several frames and agree over views.
+DECIDED, DECIDED_ONE = 0.01, 0.03
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One frame of the track.
+
+    ``leapt``: a search found its pose, away from where tracking had it; ``recovered``: the first
+    frame that is not lost after lost ones or a leap; ``disagree``: the passes ended in different
+    poses and the images do not decide between them; ``ambiguous``: a quite different pose explains
+    the images nearly as well; ``free_axis`` (3,), master frame: a turn about it through the
+    object's origin changes nothing that was seen, 0 = there is none.
+    """
+
+    fit: Fit
+    lost: bool
+    leapt: bool = False
+    recovered: bool = False
+    disagree: bool = False
+    ambiguous: bool = False
+    resting: bool = False
+    free_axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
+    """A fit, lost where the images do not bear it out."""
+    lost = fit.support == 0 or fit.score < LOST_SCORE
+    lost |= 0 < fit.mean_overlap < settings.lost_overlap
+    return FrameResult(fit, lost)
+
+
+def decided(gain: np.ndarray) -> bool:
+    """Whether the images decide between two poses by the differences (N,) of their scores."""
+    return bool(
+        len(gain) and abs(gain.mean()) > DECIDED + (DECIDED_ONE - DECIDED) / np.sqrt(len(gain))
+    )

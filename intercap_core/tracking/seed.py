@@ -1,0 +1,64 @@
+"""The pose that tracking starts from, found with nothing to start from."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from intercap_core.tracking.fit import Fit
+from intercap_core.tracking.follow import follow
+from intercap_core.tracking.lost import judged
+from intercap_core.tracking.observer import Observer
+
+log = logging.getLogger(__name__)
+
+SURE = 0.65  # confidence that is good enough to stop looking for a better seed frame
+SEARCHED = 3  # frames searched for the seed, more while nothing is found
+SEARCHED_MAX = 10
+RIVALS = 5  # hypotheses of the seed frame, compared over its neighbours
+RIVAL_MARGIN = 0.80  # of the best confidence
+RIVAL_FRAMES = 3  # on each side
+
+
+class NotFound(Exception):
+    """No frame shows anything that could be the object."""
+
+
+def find_seed(observer: Observer) -> tuple[int, Fit]:
+    """The frame to start from and the pose there. Raises NotFound where there is none."""
+    best: tuple[int, list[Fit]] | None = None
+    value = 0.0
+    for tried, t in enumerate(observer.frames_to_search()):
+        if tried >= SEARCHED_MAX or (tried >= SEARCHED and best is not None):
+            break
+        found = observer.search(t)
+        if found and (best is None or observer.value(t, found[0]) > value):
+            best, value = (t, found), observer.value(t, found[0])
+        if value > SURE:
+            break
+    if best is None:
+        raise NotFound
+    t, found = best
+    log.info("seed frame %d, confidence %.2f", t, found[0].confidence)
+    return t, _settled(observer, t, found)
+
+
+def _settled(observer: Observer, seed_frame: int, found: list[Fit]) -> Fit:
+    """The hypothesis that stays best over the neighbouring frames."""
+    least = RIVAL_MARGIN * observer.value(seed_frame, found[0])
+    rivals = [fit for fit in found if observer.value(seed_frame, fit) > least][:RIVALS]
+    if len(rivals) == 1:
+        return rivals[0]
+    totals = []
+    for rival in rivals:
+        total = [observer.value(seed_frame, rival)]
+        for frames in (
+            range(seed_frame + 1, min(seed_frame + 1 + RIVAL_FRAMES, observer.count)),
+            range(seed_frame - 1, max(seed_frame - 1 - RIVAL_FRAMES, -1), -1),
+        ):
+            start = judged(rival, observer.settings)
+            following = follow(observer, frames, start, may_search=False)
+            total += [observer.value(t, result.fit) for t, result in following]
+        totals.append(float(np.mean(total)))
+    return rivals[int(np.argmax(totals))]
