@@ -23,6 +23,7 @@ IMPACT = 3.0  # accelerations beyond so many standard deviations count as an imp
 OUTLIER = 5.0  # evidence this many standard deviations away counts half
 STEPS = 12
 CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
+SAMPLES_AT_REST = 1.0  # independent looks at an object at rest, however long: errors last
 UNKNOWN = np.repeat([np.pi / np.sqrt(3), 1.0], 3)  # standard deviations of what nothing shows
 BAND = 2  # nodes that an acceleration couples to the one before
 INVERTED, MARGIN = 64, 40  # nodes inverted at once, and how far a frame's neighbours matter
@@ -37,6 +38,26 @@ class Looks:
     information: np.ndarray
     gradient: np.ndarray
 
+    def about(self, centre: np.ndarray) -> Looks:
+        """The same with poses and steps about ``centre`` (3,) of the object instead of its origin:
+        the translations are where the centre is."""
+        # the origin's shift is the centre's and what the turn adds
+        to_origin = with_turn(self.poses[:, :3, :3] @ centre)
+        back = to_origin.transpose(0, 2, 1)
+        poses = self.poses.copy()
+        poses[:, :3, 3] += poses[:, :3, :3] @ centre
+        return Looks(
+            poses,
+            back @ self.information @ to_origin,
+            np.einsum("tij,tj->ti", back, self.gradient),
+        )
+
+    @property
+    def own(self) -> np.ndarray:
+        """Steps (T, 6) to where each frame's evidence alone would have the object."""
+        damped = self.information + np.diag(UNKNOWN**-2)
+        return -np.linalg.solve(damped, self.gradient[..., None])[..., 0]
+
 
 def smooth(
     looks: Looks, start: np.ndarray, node: np.ndarray, times: np.ndarray, centre: np.ndarray
@@ -47,29 +68,24 @@ def smooth(
     seconds; ``centre`` (3,) of the object, whose path is smooth.
     """
     count = int(node[-1]) + 1
-    first = np.searchsorted(node, np.arange(count))
-    # from the mesh's origin to its centre: the shift of the one is that of the other and the turn's
-    arms = _cross(looks.poses[:, :3, :3] @ centre)
-    to_origin = np.tile(np.eye(6), (len(node), 1, 1))
-    to_origin[:, 3:, :3] = arms
-    back = to_origin.transpose(0, 2, 1)
-    information = back @ looks.information @ to_origin
-    gradient = np.einsum("tij,tj->ti", back, looks.gradient)
-    seen_at = _about_centre(looks.poses, centre)
-    # where the frame's own evidence alone would put it, for what it disagrees with
-    damped = information + np.diag(UNKNOWN**-2)
-    own = -np.linalg.solve(damped, gradient[..., None])[..., 0]
-    state = _about_centre(start, centre)[first]
-    matrix = np.zeros((0, 0))
+    first, size = np.unique(node, return_index=True, return_counts=True)[1:]
+    looks = looks.about(centre)
+    information, own = looks.information, looks.own
+    share = np.minimum(1.0, SAMPLES_AT_REST / size)[node]
+    state = start[first].copy()
+    state[:, :3, 3] += state[:, :3, :3] @ centre
+    bands = np.zeros((0, 0, 0, 0))
     for _ in range(STEPS):
-        away = _between(seen_at, state[node])
+        away = between(looks.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", away - own, information, away - own)
-        weight = 1 / (1 + distance / OUTLIER**2) ** 2
+        weight = share / (1 + distance / OUTLIER**2) ** 2
         bands = np.zeros((BAND + 1, count, 6, 6))
         pull = np.zeros((count, 6))
-        np.add.at(bands[0], node, weight[:, None, None] * information + np.diag(UNKNOWN**-2))
-        force = gradient + np.einsum("tij,tj->ti", information, away)
-        np.add.at(pull, node, weight[:, None] * force + away * UNKNOWN**-2)
+        np.add.at(bands[0], node, weight[:, None, None] * information)
+        bands[0] += np.diag(UNKNOWN**-2)
+        force = looks.gradient + np.einsum("tij,tj->ti", information, away)
+        np.add.at(pull, node, weight[:, None] * force)
+        pull += away[first] * UNKNOWN**-2
         _add_motion(state, node, times, bands, pull)
         matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
         step = -cho_solve_banded((matrix, True), pull.ravel(), check_finite=False).reshape(-1, 6)
@@ -78,9 +94,10 @@ def smooth(
         if (np.abs(step) < CONVERGED).all():
             break
     covariance = _covariance(_banded(bands), count)[node]
-    poses = state[node].copy()
-    poses[:, :3, 3] -= poses[:, :3, :3] @ centre
-    to_origin[:, 3:, :3] = _cross(poses[:, :3, :3] @ centre)
+    poses = state[node]
+    arms = poses[:, :3, :3] @ centre
+    poses[:, :3, 3] -= arms
+    to_origin = with_turn(arms)
     return poses, to_origin @ covariance @ to_origin.transpose(0, 2, 1)
 
 
@@ -161,23 +178,25 @@ def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
     return found
 
 
-def _about_centre(poses: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Poses (T, 4, 4) whose translation is where the object's centre is."""
-    result = poses.copy()
-    result[:, :3, 3] += poses[:, :3, :3] @ centre
-    return result
+def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Steps (..., 6) that take poses a to b (..., 4, 4): turn on the left, shift."""
+    turn = b[..., :3, :3] @ np.swapaxes(a[..., :3, :3], -1, -2)
+    shape = turn.shape[:-2]
+    turn = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*shape, 3)
+    return np.concatenate([turn, b[..., :3, 3] - a[..., :3, 3]], axis=-1)
 
 
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Steps (T, 6) that take poses a to b (T, 4, 4)."""
-    turn = Rotation.from_matrix(b[:, :3, :3] @ a[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return np.concatenate([turn, b[:, :3, 3] - a[:, :3, 3]], axis=1)
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (T, 3, 3) of the cross product with vectors (T, 3) from the left."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack(
-        [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], 1
+def with_turn(arms: np.ndarray) -> np.ndarray:
+    """Matrices (T, 6, 6) from steps about one point to steps about another, which lies ``arms``
+    (T, 3) before it: the shift gains turn x -arm."""
+    x, y, z = arms.T
+    result = np.tile(np.eye(6), (len(arms), 1, 1))
+    result[:, 3:, :3] = np.stack(
+        [
+            np.stack([0 * x, -z, y], 1),
+            np.stack([z, 0 * x, -x], 1),
+            np.stack([-y, x, 0 * x], 1),
+        ],
+        1,
     )
+    return result

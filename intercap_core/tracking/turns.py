@@ -24,8 +24,8 @@ PLACE_STEPS = 10
 FAR_M, FAR_SHARE = 0.003, 0.01  # a point moved farther, also of the diameter, could be noticed
 CHANGED = 0.3  # share of such points, below which a turn is hard to see
 DISTINCT_DEG = 45.0  # flips nearer than this are one
-SCORE_SIGMA = 0.02  # of the mean score's difference between two turns; errors last several frames
-SLIDE_RAD_S = np.radians(50)  # by which a tracked turn drifts from the true one in a second
+SCORE_SIGMA = 0.01  # of the score's difference between two turns, a key frame
+SLIDE_RAD_S = np.radians(80)  # by which a tracked turn drifts from the true one in a second
 JUMP_COST, BROKEN_COST = 10.0, 1.0  # of any other change: in a sound track, and where it was lost
 
 
@@ -69,7 +69,10 @@ def choose_turns(
     to the next key frame; ``broken`` (K-1,) whether the track was lost between.
     """
     count = len(scores)
-    value = np.nan_to_num(scores / SCORE_SIGMA)
+    # what agrees badly with every turn says little about which
+    usual = np.nanmedian(scores.max(1))
+    trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
+    value = np.nan_to_num(scores * trust / SCORE_SIGMA)
     relative = turns[None, :, :3, :3].transpose(0, 1, 3, 2) @ turns[:, None, :3, :3]
     angle = Rotation.from_matrix(relative.reshape(-1, 3, 3)).magnitude().reshape(relative.shape[:2])
     best, came = value[0], np.zeros((count, len(turns)), int)

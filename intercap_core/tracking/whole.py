@@ -1,0 +1,240 @@
+"""The track decided over all frames: turns, weakly seen frames, rest, smoothness, uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from intercap_core.rigid.twist import twists
+from intercap_core.tracking.choices import best_sequence, other_fits, weak_frames
+from intercap_core.tracking.fit import Evidence, Fit, MotionPrior
+from intercap_core.tracking.lost import FrameResult, judged
+from intercap_core.tracking.observer import Observer
+from intercap_core.tracking.rest import resting
+from intercap_core.tracking.smooth import UNKNOWN, Looks, smooth
+from intercap_core.tracking.turns import choose_turns, near_turns
+
+TURNS_EVERY_S = 0.2
+TURN_LOSS = 0.01  # of the score, that all frames together may cost one frame
+SAME_ERRORS = 4.0  # variance of what views err together over what they err apart
+LEAST_NOISE = 0.05  # variance of the views' errors over the stated one: they cannot know better
+LOOKED_AT = 12  # frames of a rest that are looked at again
+WORSE = 0.97  # of the score, below which a smoothed pose is not where to look again
+FOUND = 0.7  # of the usual score, with which a lost frame is found between its neighbours
+FREE_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
+
+
+class WholeTrack:
+    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds."""
+
+    def __init__(self, observer: Observer, times: np.ndarray) -> None:
+        self._observer = observer
+        self._mesh = observer.mesh
+        self._times = times
+
+    def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
+        """The frames with the poses, covariances, rests and free axes that all together show.
+
+        A lost frame's pose is a guess: it is found again where its neighbours lead to a pose that
+        the images bear out.
+        """
+        lost = np.array([frame.lost for frame in frames])
+        if lost.all():
+            return frames
+        fits = [frame.fit for frame in frames]
+        fits = self._turned(fits, lost, np.array([frame.leapt for frame in frames]))
+        fits = self._decided(fits, lost)
+        fits, segment, free_axis = self._smoothed(fits, lost)
+        known = [fit.score for fit, unknown in zip(fits, lost, strict=True) if not unknown]
+        enough = FOUND * float(np.median(known))
+        return [
+            replace(
+                frame,
+                fit=fit,
+                lost=frame.lost
+                and (fit.score < enough or judged(fit, self._observer.settings).lost),
+                resting=bool(number >= 0),
+                free_axis=axis,
+            )
+            for frame, fit, number, axis in zip(frames, fits, segment, free_axis, strict=True)
+        ]
+
+    # --- which of several poses ----------------------------------------------------------------
+
+    def _turned(self, fits: list[Fit], lost: np.ndarray, broken: np.ndarray) -> list[Fit]:
+        """The fits, those on the wrong side turned and fitted anew."""
+        turns = near_turns(self._mesh)
+        if len(turns) == 1:
+            return fits
+        step = float(np.median(np.diff(self._times))) if len(fits) > 1 else TURNS_EVERY_S
+        keys = np.arange(0, len(fits), max(1, round(TURNS_EVERY_S / step)))
+        scores = np.full((len(keys), len(turns)), np.nan)
+        for k, t in enumerate(keys):
+            if not lost[t]:
+                found = [self._observer.assess(t, fits[t].pose @ turn) for turn in turns]
+                scores[k] = [self._observer.plausibility(fit) for fit in found]
+        jumped = lost | broken
+        between = [bool(jumped[a : b + 1].any()) for a, b in pairwise(keys)]
+        chosen = choose_turns(scores, turns, np.diff(self._times[keys]), np.array(between))
+        result = list(fits)
+        nearest = np.abs(np.arange(len(fits))[:, None] - keys).argmin(1)
+        for t in np.flatnonzero((chosen[nearest] > 0) & ~lost):
+            start = fits[t].pose @ turns[chosen[nearest[t]]]
+            fit = self._observer.fit(int(t), start, MotionPrior(start))
+            if fit.score >= fits[t].score - TURN_LOSS:
+                result[t] = fit
+        return result
+
+    def _decided(self, fits: list[Fit], lost: np.ndarray) -> list[Fit]:
+        """The fits, in weakly seen frames those that the neighbours prefer among several."""
+        if self._mesh.symmetry.sphere:
+            return fits
+        weak = weak_frames(np.array([fit.score for fit in fits]), lost)
+        if not weak.any():
+            return fits
+        options = [[fit] for fit in fits]
+        for t in map(int, np.flatnonzero(weak)):
+            options[t] += other_fits(
+                self._mesh,
+                fits[t].pose,
+                lambda pose, t=t: self._observer.assess(t, pose),
+                lambda pose, t=t: self._observer.fit(t, pose, MotionPrior(pose)),
+            )
+        path = best_sequence(self._mesh, options, self._times)
+        return [own[i] for own, i in zip(options, path, strict=True)]
+
+    # --- all frames together -------------------------------------------------------------------
+
+    def _smoothed(
+        self, fits: list[Fit], lost: np.ndarray
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray]:
+        """The fits, the number (T,) of the rest that each frame belongs to (-1: none) and the axes
+        (T, 3) about which nothing was seen."""
+        poses = np.array([fit.pose for fit in fits])
+        poses = self._unwrapped(poses)
+        motion = twists(poses, ~lost, self._times)
+        found = [
+            None if lost[t] else self._observer.evidence(t, poses[t], motion[t])
+            for t in range(len(fits))
+        ]
+        track, covariance, segment = self._solved(poses, found, poses)
+        motion = twists(track, np.ones(len(fits), bool), self._times)
+        motion[segment >= 0] = 0
+        looked = poses.copy()
+        for t in self._worth_a_look(segment):
+            again = self._observer.evidence(t, track[t], motion[t])
+            before = found[t]
+            if before is None or _score(again) >= WORSE * _score(before):
+                found[t], looked[t] = again, track[t]
+        track, covariance, segment = self._solved(looked, found, track)
+        free = self._free_axes(track, covariance)
+        result = [
+            replace(fit, pose=pose, covariance=spread, views=seen.reports if seen else fit.views)
+            for fit, pose, spread, seen in zip(fits, track, covariance, found, strict=True)
+        ]
+        return result, segment, free
+
+    def _solved(
+        self, looked: np.ndarray, found: list[Evidence | None], start: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
+        rests."""
+        count = len(looked)
+        noise = _noise([e for e in found if e is not None])
+        information, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        for t, evidence in enumerate(found):
+            if evidence is not None:
+                information[t] = evidence.information.sum(0) / noise
+                gradient[t] = evidence.gradient.sum(0) / noise
+        looks = self._without_symmetry(Looks(looked, information, gradient))
+        centre = self._mesh.centre_of_mass
+        segment = resting(looks, self._times, centre)
+        same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
+        node = np.concatenate([[0], np.cumsum(~same)])
+        poses, covariance = smooth(looks, start, node, self._times, centre)
+        return poses, covariance, segment
+
+    def _worth_a_look(self, segment: np.ndarray) -> list[int]:
+        """All moving frames and a few of each rest."""
+        frames = list(np.flatnonzero(segment < 0))
+        for number in range(segment.max(initial=-1) + 1):
+            rest = np.flatnonzero(segment == number)
+            some = np.linspace(0, len(rest) - 1, min(LOOKED_AT, len(rest))).round().astype(int)
+            frames += list(rest[some])
+        return sorted(map(int, frames))
+
+    def _unwrapped(self, poses: np.ndarray) -> np.ndarray:
+        """Equivalent poses (T, 4, 4) that follow each other as closely as the symmetry allows."""
+        symmetry = self._mesh.symmetry
+        if symmetry.trivial:
+            return poses
+        result = poses.copy()
+        for t in range(1, len(poses)):
+            result[t] = symmetry.nearest_equivalent_pose(poses[t], result[t - 1])
+        return result
+
+    def _axes(self, pose: np.ndarray) -> np.ndarray:
+        """Steps (N, 6) of a pose that leave all images as they are: turns about the symmetry's
+        axis, or any of a sphere's."""
+        symmetry = self._mesh.symmetry
+        if symmetry.sphere:
+            axes, offset = np.eye(3), np.zeros(3)
+        elif symmetry.axis is not None:
+            axes, offset = symmetry.axis[None], symmetry.offset
+        else:
+            return np.zeros((0, 6))
+        turn = axes @ pose[:3, :3].T
+        return np.concatenate([turn, -np.cross(turn, pose[:3, :3] @ offset)], axis=1)
+
+    def _without_symmetry(self, looks: Looks) -> Looks:
+        """The evidence without what the facets of a round mesh pretend to know of its spin."""
+        information, gradient = looks.information.copy(), looks.gradient.copy()
+        for t, pose in enumerate(looks.poses):
+            for step in self._axes(pose):
+                row = information[t] @ step
+                size = float(step @ row)
+                if size > 1e-9:
+                    gradient[t] -= row * (step @ gradient[t]) / size
+                    information[t] -= np.outer(row, row) / size
+        return Looks(looks.poses, information, gradient)
+
+    def _free_axes(self, poses: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """Axes (T, 3) about which a turn shows nothing; ``covariance`` becomes wide about them."""
+        axes = np.zeros((len(poses), 3))
+        for t, pose in enumerate(poses):
+            steps = self._axes(pose)
+            for step in steps:
+                along = step[:3] @ covariance[t][:3, :3] @ step[:3]
+                covariance[t] += np.outer(step, step) * max(UNKNOWN[0] ** 2 - along, 0)
+            if len(steps):
+                axes[t] = steps[0, :3]
+                continue
+            variance, vectors = np.linalg.eigh(covariance[t][:3, :3])
+            if variance[-1] > FREE_RAD**2:
+                axes[t] = vectors[:, -1]
+        return axes
+
+
+def _noise(found: list[Evidence]) -> float:
+    """Variance of the evidence over what it states, from how far the views' pulls disagree.
+
+    At the minimum each view v of a frame still pulls by g_v; if it errs independently with s^2
+    times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What all views
+    have in common (calibration, masks that are too large) does not show and comes on top.
+    """
+    squares = freedom = 0.0
+    for evidence in found:
+        total = evidence.information.sum(0) + np.diag(UNKNOWN**-2)
+        inverse = np.linalg.inv(total)
+        share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
+        pull = evidence.gradient
+        squares += float(np.einsum("vi,ij,vj->", pull, inverse, pull))
+        freedom += float((6 * share * (1 - share)).sum())
+    apart = squares / freedom if freedom > 1 else 1.0
+    return SAME_ERRORS * float(np.clip(apart, LEAST_NOISE / SAME_ERRORS, 1.0))
+
+
+def _score(evidence: Evidence) -> float:
+    return Fit(np.eye(4), np.eye(6), evidence.reports).score
