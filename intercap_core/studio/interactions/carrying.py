@@ -33,16 +33,19 @@ class HandleCarry(Interaction):
 
     highlight = 1.5
     centre = (0.22, -0.15)
-    # What a thing asks for. Metres: half the thickness of the handle's bar; the least room between
-    # the hip and the thing's middle; where the knuckles are tried beside and below the bar; the
-    # height above the grip from which the hand goes down to it, and to which it returns. The stoop:
-    # when it begins, s, how far down the pelvis goes, in lengths of a leg, how far back,
-    # metres, and how much more the trunk bends, rad.
+    # What a thing asks for: half the thickness of the handle's bar, the room between hip and the
+    # thing's middle, where the knuckles are tried beside and below the bar, the height above the
+    # grip from which the hand goes down to it, all in metres
     bar_half: float
     beside: float
     knuckles_aside: tuple[float, ...] = (0.020, 0.025, 0.030)
     knuckles_below: tuple[float, ...] = (0.020, 0.024, 0.028, 0.032)
     above: float
+    # until when it is lifted, from when it goes down, s
+    lifted_s: float
+    lower_s: float
+    # the stoop: from when, s; how far down the pelvis goes, in lengths of a leg, and how far back,
+    # metres; how much more the trunk bends, rad
     stoop_from: float
     stoop_down: float
     stoop_back: float
@@ -112,8 +115,8 @@ class HandleCarry(Interaction):
     def _trunk(self, times: np.ndarray) -> Trunk:
         track = self.pelvis_track(times)
         sway, shift = self.sway(times), self.weight_shift(times)
-        stoop = plateau(times, self.stoop_from, 1.02, 1.10, 1.52)
-        stoop = stoop + plateau(times, 1.80, 2.40, 2.54, 3.30)
+        stoop = plateau(times, self.stoop_from, 1.02, 1.10, self.lifted_s - 0.05)
+        stoop = stoop + plateau(times, self.lower_s, 2.40, 2.54, 3.30)
         carry = plateau(times, 1.15, 1.6, 1.85, 2.3)
         pelvis = track[:, :3] + shift
         pelvis[:, 2] -= self.stoop_down * self.puppet.leg * stoop
@@ -157,8 +160,8 @@ class HandleCarry(Interaction):
         wrist = idle.towards(Pose.still(over, count), ramp(times, 0.25, 0.90))
         wrist = wrist.towards(Pose.still(before, count), ramp(times, 0.62, 0.95))
         wrist = wrist.towards(Pose.still(first, count), ramp(times, 0.94, 1.04))
-        wrist = wrist.towards(carried, ramp(times, ATTACH_S, 1.70))
-        wrist = wrist.towards(Pose.still(last, count), ramp(times, 1.80, RELEASE_S - 0.02))
+        wrist = wrist.towards(carried, ramp(times, ATTACH_S, self.lifted_s))
+        wrist = wrist.towards(Pose.still(last, count), ramp(times, self.lower_s, RELEASE_S - 0.02))
         wrist = wrist.towards(Pose.still(after, count), ramp(times, 2.53, 2.65))
         wrist = wrist.towards(Pose.still(off, count), ramp(times, 2.62, 2.86))
         return wrist.towards(idle, ramp(times, 2.80, 3.40))

@@ -12,6 +12,7 @@ class SuitcaseCarry(HandleCarry):
 
     object_class = "suitcase"
     bar_half, beside, above = 0.008, 0.235, 0.14
+    lifted_s, lower_s = 1.55, 1.95
     stoop_from, stoop_down, stoop_back, stoop_bend = 0.55, 0.24, 0.05, 0.42
 
     def lifted(self) -> float:

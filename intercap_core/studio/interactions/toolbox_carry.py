@@ -15,6 +15,7 @@ class ToolboxCarry(HandleCarry):
     bar_half, beside, above = 0.014, 0.225, 0.22
     knuckles_aside = (0.020, 0.030, 0.040)
     knuckles_below = (0.022, 0.028, 0.034, 0.040)
+    lifted_s, lower_s = 1.70, 1.80
     stoop_from, stoop_down, stoop_back, stoop_bend = 0.28, 0.50, 0.08, 0.62
 
     def lifted(self) -> float:
