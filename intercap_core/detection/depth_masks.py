@@ -87,9 +87,9 @@ class Projected:
         row, column = np.divmod(cells, self.width)
         top, left = max(int(row.min()) - 2, 0), max(int(column.min()) - 2, 0)
         bottom, right = int(row.max()) + 3, int(column.max()) + 3
-        mask = np.zeros((bottom - top, right - left), np.uint8)
-        mask[row - top, column - left] = 1
-        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _CLOSING)
+        drawn = np.zeros((bottom - top, right - left), np.uint8)
+        drawn[row - top, column - left] = 1
+        mask = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, _CLOSING)
         taken_row, taken_column = np.divmod(self.cell[others & (self.cell >= 0)], self.width)
         near = (taken_row >= top) & (taken_row < bottom)
         near &= (taken_column >= left) & (taken_column < right)

@@ -53,9 +53,9 @@ class DepthBackground:
         for image in images:
             absent = ((image == 0) | (image > behind)).view(np.uint8)
             gone += cv2.medianBlur(absent, 5)  # single pixels fail now and then
-        gave_way = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
+        often = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
         # along the edges of furniture, pixels fail for most of a recording
-        gave_way = cv2.morphologyEx(gave_way, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+        gave_way = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
         depth = np.where(gave_way > 0, 0, background).astype(np.uint16)
         near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
         limit = np.where(depth > 0, near, reach_mm)
@@ -126,16 +126,17 @@ class DepthView:
         lens = self.camera.depth
         assert lens is not None
         along = self._rays @ self._rotation.T
-        eye = self.target_from_depth[:3, 3].astype(np.float32)
+        eye = self.target_from_depth[:3, 3]
+        enters = np.zeros(len(along), np.float32)
+        leaves = np.full(len(along), np.inf, np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ends = (np.stack([low, high]).astype(np.float32)[:, None] - eye) / along
-        enters, leaves = ends.min(0).max(1), ends.max(0).min(1)
-        found = np.where((leaves > np.maximum(enters, 0)), 1e3 * (leaves + self.bias_m), 0)
-        return (
-            np.clip(np.nan_to_num(found), 0, 65535)
-            .astype(np.uint16)
-            .reshape(lens.height, lens.width)
-        )
+            for axis in range(3):
+                one = np.float32(low[axis] - eye[axis]) / along[:, axis]
+                other = np.float32(high[axis] - eye[axis]) / along[:, axis]
+                np.maximum(enters, np.minimum(one, other), out=enters)
+                np.minimum(leaves, np.maximum(one, other), out=leaves)
+        reach = np.where(leaves > enters, 1e3 * (leaves + self.bias_m), 0)  # False for NaN
+        return np.minimum(reach, 65535).astype(np.uint16).reshape(lens.height, lens.width)
 
     @cached_property
     def _rotation(self) -> np.ndarray:

@@ -23,7 +23,7 @@ from intercap_core.detection.image_segments import ImageCandidate, ViewSegments
 from intercap_core.detection.person_volume import FAR, bones_of, outside
 from intercap_core.detection.see_through import see_through
 from intercap_core.detection.static_things import extent, find_static_things
-from intercap_core.detection.voxels import connected
+from intercap_core.detection.voxels import components
 from intercap_core.solve.velocity import limited_velocity
 
 CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
@@ -99,8 +99,8 @@ class DepthSegmenter:
             limited_velocity(self._joints, times, max_speed=HAND_SPEED_M_S)
         )
         everywhere = self._joints[np.isfinite(self._joints).all(-1)]
-        self._low = everywhere.min(0) - (AROUND_M, AROUND_M, AROUND_M)
-        self._high = everywhere.max(0) + (AROUND_M, AROUND_M, ABOVE_HEAD_M)
+        self._low = everywhere.min(0) - AROUND_M
+        self._high = everywhere.max(0) + np.array([AROUND_M, AROUND_M, ABOVE_HEAD_M])
         if grounded:
             self._low[2] = FLOOR_M
         views = [self._views[c] for c in self.cameras]
@@ -204,8 +204,8 @@ class DepthSegmenter:
             return []
         found = []
         for members, points in _grouped(seen, chosen):
-            moving = sum(int(v.moving[m].sum()) for v, m in zip(seen, members, strict=True))
-            if MIN_POINTS < moving < len(points) - MIN_POINTS:
+            moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
+            if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
                 found.append(_Piece(members, JOINT_SCORE, extent(points)))
         return found[:MAX_PIECES]
 
@@ -216,17 +216,10 @@ def _grouped(
     """Components of the points ``chosen`` in each view: their indices by view, and points."""
     ends = np.cumsum([0, *map(len, chosen)])
     points = np.concatenate([view.points[own] for view, own in zip(seen, chosen, strict=True)])
-    label, count = connected(points, CELL_M)
-    order = np.argsort(label, kind="stable")
-    splits = np.cumsum(np.bincount(label, minlength=count))[:-1]
-    for group in np.split(order, splits) if count else ():
-        if len(group) < MIN_POINTS:
-            continue
+    for group in components(points, CELL_M, MIN_POINTS):
         cuts = np.searchsorted(group, ends)
-        yield (
-            [own[group[a:b] - end] for own, a, b, end in zip(chosen, cuts, cuts[1:], ends)],
-            points[group],
-        )
+        members = [own[group[cuts[v] : cuts[v + 1]] - ends[v]] for v, own in enumerate(chosen)]
+        yield members, points[group]
 
 
 def _moving_pieces(seen: list[_Seen]) -> list[_Piece]:

@@ -16,11 +16,15 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 # of adults of middle build (half breadths and girths over 2 pi of NASA-STD-3000, section 3.3).
 # "middle_ear" is half way between the ears.
 _BODY: tuple[tuple[str, str, float, float, float], ...] = (
-    ("neck", "mid_hip", 0.130, 0.130, 0.035), ("left_shoulder", "left_hip", 0.100, 0.110, 0.035),
-    ("right_shoulder", "right_hip", 0.100, 0.110, 0.035), ("left_hip", "right_hip", 0.115, 0.115, 0.035),
-    ("left_shoulder", "right_shoulder", 0.075, 0.075, 0.035), ("neck", "middle_ear", 0.075, 0.080, 0.030),
-    ("middle_ear", "middle_ear", 0.125, 0.125, 0.025), ("nose", "middle_ear", 0.045, 0.105, 0.025),
-)  # fmt: skip
+    ("neck", "mid_hip", 0.130, 0.130, 0.035),
+    ("left_shoulder", "left_hip", 0.100, 0.110, 0.035),
+    ("right_shoulder", "right_hip", 0.100, 0.110, 0.035),
+    ("left_hip", "right_hip", 0.115, 0.115, 0.035),
+    ("left_shoulder", "right_shoulder", 0.075, 0.075, 0.035),
+    ("neck", "middle_ear", 0.075, 0.080, 0.030),
+    ("middle_ear", "middle_ear", 0.125, 0.125, 0.025),
+    ("nose", "middle_ear", 0.045, 0.105, 0.025),
+)
 _LIMBS: tuple[tuple[str, str, float, float, float], ...] = (
     ("shoulder", "elbow", 0.065, 0.048, 0.025), ("elbow", "wrist", 0.048, 0.034, 0.018),
     ("hip", "knee", 0.105, 0.070, 0.030), ("knee", "ankle", 0.068, 0.045, 0.022),

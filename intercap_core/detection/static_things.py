@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.detection.foreground import DepthBackground, DepthView
-from intercap_core.detection.voxels import Occupied, connected
+from intercap_core.detection.voxels import Occupied, components
 
 CELL_M = 0.025
 MIN_POINTS = 60  # of all views
@@ -85,21 +85,14 @@ def find_static_things(
             cells = Occupied(own, SURFACE_CELL_M, SURFACE_POINTS)
             things.append(Thing(size, away, on_top, carries, pixels, cells))
 
-    for members in _components(points, np.arange(len(points))):
-        above = _components(points, _above_level(points, members))
+    for members in components(points, CELL_M, MIN_POINTS):
+        top = _above_level(points, members)
+        above = [top[own] for own in components(points[top], CELL_M, MIN_POINTS)]
         add(members, False, bool(above))
         for standing in above:
             add(standing, True, False)
     things.sort(key=lambda thing: thing.away_m)
     return StaticScene(things[:MAX_THINGS], surface)
-
-
-def _components(points: np.ndarray, members: np.ndarray) -> list[np.ndarray]:
-    label, count = connected(points[members], CELL_M)
-    order = np.argsort(label, kind="stable")
-    ends = np.cumsum(np.bincount(label, minlength=count))
-    groups = np.split(members[order], ends[:-1]) if count else []
-    return [group for group in groups if len(group) >= MIN_POINTS]
 
 
 def _away(points: np.ndarray, places: np.ndarray) -> float:

@@ -25,6 +25,21 @@ def connected(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int]:
     return rank[label][inverse], len(order)
 
 
+def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.ndarray]:
+    """Indices of the points (N, 3) of each component of at least so many, ascending.
+
+    The component with most cells comes first.
+    """
+    label, count = connected(points, cell_m)
+    if not count:
+        return []
+    order = np.argsort(label, kind="stable")
+    sizes = np.bincount(label, minlength=count)
+    ends = np.cumsum(sizes)
+    large = np.flatnonzero(sizes >= min_points)
+    return [order[ends[k] - sizes[k] : ends[k]] for k in large]
+
+
 class Occupied:
     """The cells that points (N, 3) of a surface lie in, and those that share a face with them."""
 
