@@ -137,7 +137,7 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
     import open3d as o3d
     import scipy.sparse.csgraph
 
-    from intercap_core.rigid.render import vertex_normals
+    from intercap_core.rigid.normals import vertex_normals
 
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     graph = scipy.sparse.coo_matrix(

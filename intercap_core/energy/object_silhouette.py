@@ -3,14 +3,14 @@
 One-sided as in the paper: only mask pixels that the render misses count, so what a hand hides
 costs nothing. Each such pixel of the mask's contour pulls the nearest rim point of the render. The
 optional background term is the same from the other side: rim points of the render that lie on
-known background are pulled to the nearest contour pixel of the mask.
+known background are pulled to the nearest contour pixel of the mask. What a fit runs, compiled and
+summed, is :mod:`.object_silhouette_kernel`; this is the plain form that it is tested against.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from intercap_core.camera.intrinsics import Intrinsics
 
@@ -25,22 +25,6 @@ def rim(mask: np.ndarray) -> np.ndarray:
     """
     eroded = cv2.erode(mask.astype(np.uint8), _CROSS, borderType=cv2.BORDER_REPLICATE)
     return mask & (eroded == 0)
-
-
-class NearestRim:
-    """Rim pixels (R, 2) int64 as x, y, at least one, and which of them is nearest to a pixel."""
-
-    def __init__(self, pixels: np.ndarray) -> None:
-        self.pixels = pixels
-        self._tree = cKDTree(pixels, balanced_tree=False)
-
-    def query(self, pixels: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (N,) of pixels (N, 2) and index (N,) of the nearest rim pixel.
-
-        Beyond ``limit`` pixels the distance is infinite and the index is the number of pixels.
-        """
-        distance, index = self._tree.query(pixels, distance_upper_bound=limit)
-        return distance, index
 
 
 def residuals(

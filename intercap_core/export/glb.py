@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_NAMES, PARENTS
 from intercap_core.export.motion import Motion
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import vertex_normals
+from intercap_core.rigid.normals import vertex_normals
 
 _FLOAT, _USHORT, _UINT, _UBYTE = 5126, 5123, 5125, 5121
 _ARRAY, _ELEMENTS = 34962, 34963  # buffer targets

@@ -13,7 +13,7 @@ from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.render import vertex_normals
+from intercap_core.rigid.normals import vertex_normals
 from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.interactions.base import TrueObject

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply
 from intercap_core.tracking.reduced_mask import EMPTY, ReducedMask, decode, reduced_lens
 
 # The object is compared at about this many pixels: more cost time and carry no more information,
@@ -54,6 +54,33 @@ class ViewGeometry:
             depth_bias_m,
             time_offset_s,
         )
+
+    # Computed once: a fit asks for them thousands of times.
+
+    @cached_property
+    def colour_from_master(self) -> np.ndarray:
+        """(4, 4) of the camera."""
+        return np.ascontiguousarray(self.camera.colour_from_master)
+
+    @cached_property
+    def master_from_colour(self) -> np.ndarray:
+        """(4, 4) of the camera."""
+        return np.ascontiguousarray(self.camera.master_from_colour)
+
+    @cached_property
+    def master_from_depth(self) -> np.ndarray:
+        """(4, 4) of the camera, which has depth."""
+        return np.ascontiguousarray(self.camera.master_from_depth)
+
+    @cached_property
+    def depth_from_master(self) -> np.ndarray:
+        """(4, 4) of the camera, which has depth."""
+        return np.ascontiguousarray(self.camera.depth_from_master)
+
+    @cached_property
+    def depth_from_colour(self) -> np.ndarray:
+        """(4, 4) of the camera, which has depth."""
+        return self.depth_from_master @ self.master_from_colour
 
 
 def _step(focal_px: float, diameter_m: float, wanted_px: int) -> int:
@@ -111,48 +138,3 @@ class View:
         )
         person = decode(person_rle, colour, step) if person_rle else EMPTY
         return cls(geometry, depth, person, found, detected)
-
-
-@dataclass(frozen=True, eq=False)
-class DepthPatch:
-    """Measured points around the object in one view, on a window of the reduced depth grid.
-
-    ``depth`` (h, w) metres, 0 invalid; ``points`` (h, w, 3) float32, master frame; ``pixel``
-    (h, w, 2) int64, the reduced colour pixel (x, y) that shows the point, far outside where none.
-    """
-
-    x0: int
-    y0: int
-    depth: np.ndarray
-    points: np.ndarray
-    pixel: np.ndarray
-
-    @classmethod
-    def cut(cls, view: View, x0: int, y0: int, x1: int, y1: int) -> DepthPatch | None:
-        """Cut reduced depth pixels [x0, x1) x [y0, y1); None where none is in the image."""
-        geometry = view.geometry
-        lens = geometry.depth_lens
-        if view.depth is None or lens is None:
-            return None
-        height, width = view.depth.shape
-        x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
-        if x0 >= x1 or y0 >= y1:
-            return None
-        depth = view.depth[y0:y1, x0:x1]
-        rays = lens.rays[y0:y1, x0:x1]
-        depth = np.where(np.isfinite(rays[..., 0]), depth, 0)
-        local = np.empty((*depth.shape, 3), np.float32)
-        local[..., :2] = np.where(depth[..., None] > 0, rays, 0) * depth[..., None]
-        local[..., 2] = depth
-        camera = geometry.camera
-        assert camera.colour_from_depth is not None
-        in_colour = apply(camera.colour_from_depth, local.reshape(-1, 3))
-        pixel = np.rint(geometry.lens.project(in_colour)).astype(np.int64)
-        pixel[depth.ravel() <= 0] = -(1 << 20)
-        points = apply(camera.master_from_depth, local.reshape(-1, 3))
-        return cls(x0, y0, depth, points.reshape(*depth.shape, 3), pixel.reshape(*depth.shape, 2))
-
-    def sample(self, mask: ReducedMask) -> np.ndarray:
-        """A colour mask on this window: (h, w) bool."""
-        found = mask.sample(self.pixel[..., 0].ravel(), self.pixel[..., 1].ravel())
-        return found.reshape(self.depth.shape)

@@ -13,15 +13,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer, Rendering, Surface, default_renderer
 from intercap_core.rigid.twist import moved
+from intercap_core.tracking.candidates import MIN_PIXELS
 from intercap_core.tracking.evidence import View
-from intercap_core.tracking.view_fit import MIN_PIXELS, ViewFit, ViewReport, quick_report
+from intercap_core.tracking.view_fit import NormalEquations, ViewFit, shots_of
+from intercap_core.tracking.view_report import ViewReport, quick_report
 
 DEPTH_SCALES_M = (0.050, 0.012)  # Geman-McClure scale: first, last
 CONTOUR_SCALES_PX = (30.0, 6.0)  # at full resolution
 SHRINK = 0.5  # of the scales from step to step
 MAX_STEP_M, MAX_STEP_RAD = 0.06, np.radians(20)
 CONVERGED_M, CONVERGED_RAD = 5e-4, np.radians(0.1)
+# A pose this near to the one drawn last is a quarter of a pixel off: steps on from the same
+# renderings, whose residuals are linear in so small a motion.
+REDRAWN_M, REDRAWN_RAD = 1.5e-3, np.radians(0.3)
 DAMPING = 1e-3  # of the diagonal
 REPORT_SCALE = 4.0  # times the last contour scale: residuals that a report counts
 
@@ -97,6 +103,7 @@ def fit_pose(
     rounds: tuple[int, ...] = (4, 5),
     start_scale: float = 1.0,
     twist: np.ndarray | None = None,
+    renderer: Renderer | None = None,
 ) -> Fit:
     """Fit the pose (4, 4) to all views, starting from ``pose``.
 
@@ -106,47 +113,90 @@ def fit_pose(
     known better than from a search. The pivot of the rotation is the mesh's origin. ``twist`` (6,)
     is the object's turn and shift in a second (rad, m), by which each view sees it when it exposes;
     None = at rest. To first order in what it moves meanwhile, a step of the pose is the same step
-    of what every view sees.
+    of what every view sees. ``renderer`` draws; None = the CPU.
     """
+    renderer = renderer or default_renderer()
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
     depth_scale = max(depth_scale * start_scale, DEPTH_SCALES_M[1])
     contour_scale = max(contour_scale * start_scale, CONTOUR_SCALES_PX[1])
+    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
+    drawn_pose = pose  # what the fits look at
+    _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
     information = np.eye(6)
     done = False
-    seen = _seen(pose, views, twist)
-    fits = [
-        ViewFit(mesh, view, there, min_overlap, labels)
-        for view, there in zip(views, seen, strict=True)
-    ]
     for number, steps in enumerate(rounds):
-        if number:
-            changed = [fit.choose_again(there) for fit, there in zip(fits, seen, strict=True)]
-            if done and not any(changed):
-                break
+        if number == 0:
+            renderer.crew.map(ViewFit.choose, fits)
+        elif not any(renderer.crew.map(ViewFit.choose_again, fits)) and done:
+            break
         done = False
+        last = np.zeros(6)
         for _ in range(steps):
-            hessian, gradient = _prior_terms(prior, pose)
-            for fit, there in zip(fits, seen, strict=True):
-                h, g = fit.normal_equations(there, depth_scale, contour_scale, background_term)
-                hessian += h
-                gradient += g
-            information = hessian
-            damped = hessian + np.diag(DAMPING * np.diag(hessian) + 1e-9)
-            step = _limited(-np.linalg.solve(damped, gradient))
-            pose = moved(pose, step)
-            seen = _seen(pose, views, twist)
+            information, step = _step(
+                renderer, fits, prior, drawn_pose, depth_scale, contour_scale, background_term
+            )
+            pose = moved(drawn_pose, step)
             settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
             depth_scale = max(depth_scale * SHRINK, DEPTH_SCALES_M[1])
             contour_scale = max(contour_scale * SHRINK, CONTOUR_SCALES_PX[1])
-            small = np.abs(step[3:]).max() < CONVERGED_M and np.abs(step[:3]).max() < CONVERGED_RAD
-            if settled and small:
-                done = True
+            done = settled and _below(step - last, CONVERGED_M, CONVERGED_RAD)
+            if done:
                 break
-    reports = tuple(
-        fit.report(there, REPORT_SCALE * CONTOUR_SCALES_PX[1])
-        for fit, there in zip(fits, seen, strict=True)
-    )
-    return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), reports)
+            if _below(step, REDRAWN_M, REDRAWN_RAD):
+                last = step
+            else:
+                last, drawn_pose = np.zeros(6), pose
+                _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
+    report_scale = REPORT_SCALE * CONTOUR_SCALES_PX[1]
+    reports = renderer.crew.map(lambda fit: fit.report(report_scale), fits)
+    return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), tuple(reports))
+
+
+def _step(
+    renderer: Renderer,
+    fits: list[ViewFit],
+    prior: MotionPrior | None,
+    pose: np.ndarray,
+    depth_scale: float,
+    contour_scale: float,
+    background: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix (6, 6) over all views at the pose they look at, and the step (6,) from it."""
+
+    def terms(fit: ViewFit) -> NormalEquations:
+        return fit.normal_equations(depth_scale, contour_scale, background)
+
+    hessian, gradient = _prior_terms(prior, pose)
+    for h, g in renderer.crew.map(terms, fits):
+        hessian += h
+        gradient += g
+    damped = hessian + np.diag(DAMPING * np.diag(hessian) + 1e-9)
+    return hessian, _limited(-np.linalg.solve(damped, gradient))
+
+
+def _below(step: np.ndarray, metres: float, radians: float) -> bool:
+    return bool(np.abs(step[3:]).max() < metres and np.abs(step[:3]).max() < radians)
+
+
+def _look(
+    renderer: Renderer,
+    mesh: ObjectMesh,
+    views: list[View],
+    fits: list[ViewFit],
+    seen: list[np.ndarray],
+) -> None:
+    """Draw what each view sees, all at once, and show it to the views' fits."""
+    for fit, pose, drawn in zip(fits, seen, _draw(renderer, mesh, views, seen), strict=True):
+        fit.see(pose, drawn)
+
+
+def _draw(
+    renderer: Renderer, mesh: ObjectMesh, views: list[View], seen: list[np.ndarray]
+) -> list[list[Rendering]]:
+    """The renderings of each view's pose, in the order of :func:`.view_fit.shots_of`."""
+    shots = [shots_of(view, pose) for view, pose in zip(views, seen, strict=True)]
+    drawn = iter(renderer.draw(Surface.of(mesh), [shot for group in shots for shot in group]))
+    return [[next(drawn) for _ in group] for group in shots]
 
 
 @dataclass(frozen=True)
@@ -170,17 +220,24 @@ def evidence_at(
     background_term: bool,
     labels: tuple[str, ...] = (),
     twist: np.ndarray | None = None,
+    renderer: Renderer | None = None,
 ) -> Evidence:
     """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
-    information, gradient = np.zeros((len(views), 6, 6)), np.zeros((len(views), 6))
-    reports = []
-    for v, (view, there) in enumerate(zip(views, _seen(pose, views, twist), strict=True)):
-        fit = ViewFit(mesh, view, there, min_overlap, labels)
-        information[v], gradient[v] = fit.normal_equations(
-            there, DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term
-        )
-        reports.append(fit.report(there, REPORT_SCALE * CONTOUR_SCALES_PX[1]))
-    return Evidence(information, gradient, tuple(reports))
+    renderer = renderer or default_renderer()
+    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
+    _look(renderer, mesh, views, fits, _seen(pose, views, twist))
+
+    def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
+        fit.choose()
+        found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
+        return found, fit.report(REPORT_SCALE * CONTOUR_SCALES_PX[1])
+
+    found = renderer.crew.map(terms, fits)
+    return Evidence(
+        np.array([h for (h, _), _ in found]),
+        np.array([g for (_, g), _ in found]),
+        tuple(report for _, report in found),
+    )
 
 
 def assess(
@@ -190,10 +247,41 @@ def assess(
     *,
     min_overlap: float,
     labels: tuple[str, ...] = (),
+    renderer: Renderer | None = None,
 ) -> Fit:
     """How well a pose (4, 4) agrees with all views, without changing it."""
-    reports = tuple(quick_report(mesh, view, pose, min_overlap, labels) for view in views)
-    return Fit(pose, np.full((6, 6), np.nan), reports)
+    return assess_all(
+        mesh, views, pose[None], min_overlap=min_overlap, labels=labels, renderer=renderer
+    )[0]
+
+
+def assess_all(
+    mesh: ObjectMesh,
+    views: list[View],
+    poses: np.ndarray,
+    *,
+    min_overlap: float,
+    labels: tuple[str, ...] = (),
+    renderer: Renderer | None = None,
+) -> list[Fit]:
+    """:func:`assess` of many poses (N, 4, 4) at once."""
+    renderer = renderer or default_renderer()
+    cases = [(view, pose) for pose in poses for view in views]
+    drawn = _draw(renderer, mesh, [view for view, _ in cases], [pose for _, pose in cases])
+
+    def compare(number: int) -> ViewReport:
+        (view, pose), (silhouette, *depth) = cases[number], drawn[number]
+        return quick_report(
+            mesh, view, pose, silhouette, depth[0] if depth else None, min_overlap, labels
+        )
+
+    reports = renderer.crew.map(compare, range(len(cases)))
+    unknown = np.full((6, 6), np.nan)
+    count = len(views)
+    return [
+        Fit(pose, unknown, tuple(reports[i * count : (i + 1) * count]))
+        for i, pose in enumerate(poses)
+    ]
 
 
 def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ of each view would cost more than the fit.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -44,10 +45,10 @@ class ReducedMask:
         found[inside] = self.mask[row[inside], column[inside]]
         return found
 
-    @property
+    @cached_property
     def area(self) -> int:
         """Number of pixels set."""
-        return int(self.mask.sum())
+        return int(np.count_nonzero(self.mask))
 
 
 EMPTY = ReducedMask(0, 0, np.zeros((0, 0), bool))
@@ -87,7 +88,7 @@ def decode(rle: bytes, lens: Intrinsics, step: int) -> ReducedMask:
     return ReducedMask(left, top, mask)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _counts(text: np.ndarray) -> np.ndarray:
     """Run lengths of the compressed string, zeros first (format of pycocotools' maskApi.c)."""
     counts = np.empty(len(text), np.int64)
@@ -110,7 +111,7 @@ def _counts(text: np.ndarray) -> np.ndarray:
     return counts[:number]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _bounds(runs: np.ndarray, height: int, step: int) -> tuple[int, int, int, int]:
     """Reduced left, right, top, bottom, inclusive, of the reduced pixels set."""
     left, right, top, bottom = 1 << 30, -1, 1 << 30, -1
@@ -131,7 +132,7 @@ def _bounds(runs: np.ndarray, height: int, step: int) -> tuple[int, int, int, in
     return left, right, top, bottom
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _fill(runs: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
     start = 0
     for i in range(len(runs)):

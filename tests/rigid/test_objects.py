@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.render import vertex_normals
+from intercap_core.rigid.normals import vertex_normals
 from intercap_core.studio.objects import true_mesh
 from tests.rigid.conftest import CONFIG, catalogue
 

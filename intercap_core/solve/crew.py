@@ -1,0 +1,41 @@
+"""A few threads for work that runs without the interpreter's lock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Crew:
+    """``threads`` threads, the caller's own among them; one thread starts none."""
+
+    def __init__(self, threads: int = 1) -> None:
+        if threads < 1:
+            raise ValueError(f"{threads} threads; expected at least one")
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+
+    def map(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """``function`` of every item, in the items' order whatever the threads do.
+
+        Who is free takes the next item, so that unequal items need no planning.
+        """
+        if self._pool is None or len(items) < 2:
+            return [function(item) for item in items]
+        results: list[Result | None] = [None] * len(items)
+        ticket = count()
+
+        def work() -> None:
+            while (number := next(ticket)) < len(items):
+                results[number] = function(items[number])
+
+        helpers = [self._pool.submit(work) for _ in range(min(self.threads, len(items)) - 1)]
+        work()
+        for helper in helpers:
+            helper.result()
+        return results  # type: ignore[return-value]  # every place is filled

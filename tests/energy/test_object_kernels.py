@@ -1,0 +1,189 @@
+"""The compiled terms of the object's energy against their plain form, on one rendered view."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from intercap_core.camera import projection
+from intercap_core.camera.projection_kernels import project_point, project_point_with_jacobian
+from intercap_core.energy import (
+    object_depth,
+    object_depth_kernel,
+    object_silhouette,
+    object_silhouette_kernel,
+)
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import render
+from tests.rigid.conftest import catalogue
+from tests.rigid.test_render import LENS, PINHOLE
+
+RNG = np.random.default_rng(5)
+MASTER = np.eye(4)
+MASTER[:3, :3] = Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix()
+MASTER[:3, 3] = 0.3, 0.1, -0.2  # master_from_camera
+
+
+def _pose(shift=(0, 0, 0), turn=(0, 0, 0)):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(np.add((0.4, 0.8, -0.3), turn)).as_matrix()
+    pose[:3, 3] = np.add((0.25, -0.1, 1.8), shift)
+    return pose
+
+
+@pytest.fixture(scope="module")
+def views():
+    """A rendering of the chair, and another of it elsewhere that stands for what is measured."""
+    mesh = ObjectMesh.load(catalogue()["chair"])
+    there = _pose((0.01, 0.006, 0.012), (0.02, 0.03, -0.02))
+    return mesh, *(render(mesh.vertices, mesh.faces, LENS, pose) for pose in (_pose(), there))
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, LENS], ids=["pinhole", "lens"])
+def test_compiled_projection(lens):
+    points = RNG.normal(size=(200, 3)) * (0.8, 0.6, 0.5) + (0, 0, 2)
+    points = points[lens.inside_model(points)]
+    pixels, jacobian = projection.project_with_jacobian(points, lens.parameters)
+    found = np.array([project_point_with_jacobian(*p, lens.parameters) for p in points])
+    np.testing.assert_allclose(found[:, :2], pixels, atol=1e-9)
+    np.testing.assert_allclose(found[:, 2:].reshape(-1, 2, 3), jacobian, rtol=1e-9, atol=1e-9)
+    anywhere = RNG.normal(size=(200, 3)) * 3  # beyond the calibration and behind the camera too
+    found = np.array([project_point(*p, lens.parameters) for p in anywhere])
+    np.testing.assert_allclose(found, lens.project(anywhere), rtol=1e-9)
+
+
+def _evidence(image):
+    """Measured depth (H, W) in the whole image, and the points it measures, master frame."""
+    depth = np.zeros((LENS.height, LENS.width), np.float32)
+    depth[image.window] = image.depth
+    local = np.concatenate([LENS.rays * depth[..., None], depth[..., None]], -1)
+    return depth, (local @ MASTER[:3, :3].T + MASTER[:3, 3]).astype(np.float32)
+
+
+def test_depth_term(views):
+    mesh, image, other = views
+    measured, points = _evidence(other)
+    trust = RNG.uniform(size=measured.shape).astype(np.float32)
+    trust[::3] = 0
+    pose = MASTER @ _pose()
+    gate, scale = 0.04, 0.015
+    hessian, gradient, count = object_depth_kernel.normal_equations(
+        image.depth, image.face, (image.x0, image.y0), measured, points, trust,
+        mesh.face_normals, pose[:3, :3], pose[:3, 3], MASTER[:3, 3], gate, scale,
+    )  # fmt: skip
+    here = (slice(image.y0, None), slice(image.x0, None))
+    near = image.mask & (measured[image.window] > 0) & (trust[image.window] > 0)
+    near &= np.abs(measured[image.window] - image.depth.astype(float)) < gate
+    v, u = np.nonzero(near)
+    observed = points[here][v, u].astype(float)
+    rays = np.column_stack([LENS.rays[here][v, u], np.ones(len(u))]).astype(float)
+    hit = (rays * image.depth[v, u, None]) @ MASTER[:3, :3].T + MASTER[:3, 3]
+    normals = mesh.face_normals[image.face[v, u]] @ pose[:3, :3].T
+    residual, jacobian = object_depth.residuals(observed, hit, normals, pose[:3, 3])
+    weight = trust[here][v, u] * (scale**2 / (scale**2 + residual**2)) ** 2
+    assert count == len(u) > 300
+    expected = (jacobian * weight[:, None]).T @ jacobian
+    np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    expected = (jacobian * weight[:, None]).T @ residual
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    gap, across, where = object_depth_kernel.matches(
+        image.depth, image.face, (image.x0, image.y0), measured, points, mesh.face_normals,
+        pose[:3, :3], MASTER[:3, 3],
+    )  # fmt: skip
+    kept = (np.abs(gap) < gate) & (trust[where[:, 1], where[:, 0]] > 0)
+    np.testing.assert_allclose(across[kept], np.abs(residual), atol=1e-6)
+
+
+def test_rims_and_nearest_pixels():
+    mask = cv2.GaussianBlur(RNG.normal(size=(60, 80)), (0, 0), 4) > 0
+    pixels, starts = object_silhouette_kernel.rim(mask)
+    expected = np.argwhere(object_silhouette.rim(mask))[:, ::-1]
+    np.testing.assert_array_equal(pixels, expected)
+    np.testing.assert_array_equal(np.diff(starts), np.bincount(expected[:, 1], minlength=60))
+    for x, y in RNG.integers(-10, 90, size=(300, 2)):
+        distance = np.linalg.norm(pixels - (x, y), axis=1)
+        for limit in (4.0, 1e3):
+            index = object_silhouette_kernel.nearest(pixels, starts, x, y, limit)
+            if 0 <= y < 60 or index >= 0:
+                assert (index < 0) == (distance.min() >= limit)
+            if index >= 0:
+                assert distance[index] == distance.min()
+
+
+def test_silhouette_term(views):
+    _, image, other = views
+    left, top = min(image.x0, other.x0) - 5, min(image.y0, other.y0) - 5
+    shape = (max(image.y0, other.y0) + 400 - top, max(image.x0, other.x0) + 400 - left)
+    inside, drawn = np.zeros(shape, bool), np.zeros(shape, bool)
+    for target, source in ((inside, other), (drawn, image)):
+        y, x = np.nonzero(source.mask)
+        target[y + source.y0 - top, x + source.x0 - left] = True
+    person = np.zeros(shape, bool)
+    person[: shape[0] // 3] = True
+    person &= ~inside
+    border, starts = object_silhouette_kernel.rim(inside)
+    limit, scale, corner = 9.0, 5.0, (image.x0, image.y0)
+    at, target, missed, size = object_silhouette_kernel.correspondences(
+        image.face, corner, inside, person, (left, top), border, border, starts, True, limit, 12
+    )
+    own = np.argwhere(object_silhouette.rim(drawn))[:, ::-1]
+    assert size == len(own) and 0 < missed < len(at)
+
+    def reach(points, others):
+        distance = np.linalg.norm(points[:, None] - others[None], axis=2).min(1)
+        return np.sort(distance[distance < limit])
+
+    outside = own[~inside[own[:, 1], own[:, 0]] & ~person[own[:, 1], own[:, 0]]]
+    lengths = np.linalg.norm(at - target, axis=1)
+    misses = border[~drawn[border[:, 1], border[:, 0]]]
+    np.testing.assert_allclose(np.sort(lengths[:missed]), reach(misses, own))
+    np.testing.assert_allclose(np.sort(lengths[missed:]), reach(outside, border))
+
+    origin = (MASTER @ _pose())[:3, 3]
+    hessian, gradient, residuals = object_silhouette_kernel.normal_equations(
+        at, target, image.depth, corner, LENS.rays, LENS.parameters, MASTER, origin, scale
+    )
+    z = image.depth[at[:, 1] - image.y0, at[:, 0] - image.x0].astype(float)
+    local = np.column_stack([LENS.rays[at[:, 1], at[:, 0]] * z[:, None], z])
+    points = local @ MASTER[:3, :3].T + MASTER[:3, 3]
+    residual, jacobian = object_silhouette.residuals(
+        points, target.astype(float), LENS, np.linalg.inv(MASTER), origin
+    )
+    weight = (scale**2 / (scale**2 + residual**2)) ** 2
+    np.testing.assert_allclose(residuals, residual, atol=1e-3)
+    for found, expected in (
+        (hessian, (jacobian * weight[:, None]).T @ jacobian),
+        (gradient, (jacobian * weight[:, None]).T @ residual),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+def test_rim_points_in_front_of_a_measured_background(views):
+    _, image, _ = views
+    at = np.argwhere(object_silhouette.rim(image.mask))[:, ::-1] + (image.x0, image.y0)
+    at = at.astype(np.int32)
+    measured = np.zeros((LENS.height, LENS.width), np.float32)
+    measured[:, ::2] = image.depth.max() + 0.5
+    measured[:, 1::4] = image.depth[image.mask].min() - 0.1
+    clear = object_silhouette_kernel.sees_past(
+        at, image.depth, (image.x0, image.y0), LENS.rays, np.eye(4), LENS.parameters, measured,
+        (0, 0), 0.03,
+    )  # fmt: skip
+    np.testing.assert_array_equal(clear, at[:, 0] % 4 != 1)
+
+
+def test_agreement_is_that_of_the_matches(views):
+    mesh, image, other = views
+    measured, points = _evidence(other)
+    pose = _pose()
+    compared, free, total = object_depth_kernel.agreement(
+        image.depth, image.face, image.x0, image.y0, measured, LENS.rays, mesh.face_normals,
+        pose[:3, :3], 0.03, 0.01,
+    )  # fmt: skip
+    in_master = MASTER @ pose
+    gap, across, _ = object_depth_kernel.matches(
+        image.depth, image.face, (image.x0, image.y0), measured, points, mesh.face_normals,
+        in_master[:3, :3], MASTER[:3, 3],
+    )  # fmt: skip
+    assert (compared, free) == (len(gap), (gap > -0.03).sum())
+    assert total == pytest.approx((1e-4 / (1e-4 + across[gap > -0.03] ** 2)).sum(), rel=1e-4)
