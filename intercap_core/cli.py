@@ -79,10 +79,16 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     Example: intercap check config/demo/config.yaml
     """
     from intercap_core.project import load_project
-    from intercap_core.project_check import check_device, faults_of_sequences, notes_of_sequences
+    from intercap_core.project_check import (
+        check_detector,
+        check_device,
+        faults_of_sequences,
+        notes_of_sequences,
+    )
 
     project = load_project(settings)
     check_device(project)
+    check_detector(project)
     for note in notes_of_sequences(project):
         typer.echo(f"note: {note}")
     faults = faults_of_sequences(project)

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
+
+if TYPE_CHECKING:
+    from intercap_core.capture.source import Layout
+
+LABELS_TOLD = 8  # labels that a note names
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,14 @@ def check_device(project: Project) -> None:
             f"{project.path}: device is {project.config.device}, but PyTorch finds no such device "
             "here; set device: cpu, or run on a machine that has one"
         )
+
+
+def check_detector(project: Project) -> None:
+    """Raise UserError where the segmentation model that the settings name cannot be run here."""
+    if project.config.detections.segmentation_model is not None:
+        from intercap_core.detection.onnx_segmentation import Segmenter
+
+        Segmenter.load(project.config.detections)
 
 
 def faults_of_sequences(project: Project) -> list[Fault]:
@@ -70,13 +84,13 @@ def notes_of_sequences(project: Project) -> list[Fault]:
         if project.recordings_made(name) is None
         and row.recordings.is_dir()
         and row.calibration.exists()
-        for message in _notes_of_cameras(row)
+        for message in _notes_of_cameras(project, row)
     ]
 
 
-def _notes_of_cameras(row: SequenceEntry) -> list[str]:
+def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
     from intercap_core.capture.layouts import open_layout
-    from intercap_core.detection.mask_files import release_masks
+    from intercap_core.detection.candidate_files import has_candidates
 
     try:
         layout = open_layout(row)
@@ -92,7 +106,9 @@ def _notes_of_cameras(row: SequenceEntry) -> list[str]:
         )
     recorded = [name for name in known if name in layout.names]
     beside = row.layout == "behave"
-    if row.keypoints is None and row.candidates is None and recorded and not beside:
+    modelled = project.config.detections.segmentation_model is not None
+    nothing = row.keypoints is None and row.candidates is None and not beside and not modelled
+    if nothing and recorded:
         notes.append(
             "its row names neither keypoints nor candidates, without which only the frames can be "
             "computed; run the detectors and add the columns"
@@ -103,12 +119,47 @@ def _notes_of_cameras(row: SequenceEntry) -> list[str]:
         notes += [f"{folder} has no folder {name}; add this camera's keypoints" for name in without]
     if row.candidates is not None and row.candidates.is_dir():
         folder = row.candidates
-        without = [
-            name
-            for name in recorded
-            if not (folder / f"{name}.json").is_file() and release_masks(folder, name) is None
-        ]
+        having = [name for name in recorded if has_candidates(folder, name, row.layout)]
+        without = [name for name in recorded if name not in having and not modelled]
         notes += [f"{folder} has no {name}.json; add this camera's candidates" for name in without]
+        notes += _notes_of_candidates(project, row, layout, having)
+    return notes
+
+
+def _notes_of_candidates(
+    project: Project, row: SequenceEntry, layout: Layout, cameras: list[str]
+) -> list[str]:
+    """What a look at the first results of each camera shows: their form, size and labels."""
+    from intercap_core.detection.candidate_check import look_at_candidates
+    from intercap_core.detection.label_maps import class_names
+
+    assert row.candidates is not None
+    settings = project.config.detections
+    notes: list[str] = []
+    labels: set[str] = set()
+    for name in cameras:
+        try:
+            with layout.open(name) as recording:
+                lens = recording.camera.colour
+        except UserError:
+            continue  # told as a fault
+        seen = look_at_candidates(
+            row.candidates,
+            name,
+            size=(lens.width, lens.height),
+            names=class_names(settings.category_names),
+        )
+        notes += seen.notes
+        labels |= seen.labels
+    expected = project.objects[row.object].labels
+    if labels and expected and not labels & {*expected}:
+        found = sorted(label or "no label" for label in labels)
+        more = f" and {len(found) - LABELS_TOLD} more" if len(found) > LABELS_TOLD else ""
+        notes.append(
+            f"{row.candidates}: the first results are labelled {', '.join(found[:LABELS_TOLD])}"
+            f"{more}, none of which object {row.object!r} expects ({', '.join(expected)}); add its "
+            "labels to objects.yaml, or set detections.category_names"
+        )
     return notes
 
 

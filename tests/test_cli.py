@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import io
+import json
 import resource
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+import yaml
 from rich.console import Console
 from synthetic_capture import ring, write_frames
 
@@ -219,6 +221,53 @@ def test_check_notes_cameras_without_recording_or_detections(
     assert len(notes_of_sequences(load_project(Path("config.yaml"), exclude))) == 1
     done = intercap("check", "config.yaml", folder=small_project)
     assert "note: sequence 'good': rec records k1" in done.stdout
+
+
+LARGE = [
+    {"image_id": n, "category_id": 53, "segmentation": [[1, 2, 30, 2, 30, 40, 1, 40]]}
+    for n in range(5000)
+]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("{", "k1.json is not valid JSON"),
+        ("{}", "k1.json holds an empty object, expected a list of results"),
+        ([LARGE[0] | {"segmentation": {"size": [7, 7], "counts": "?"}}],
+         "1 of its first 1 results cannot be used (first: entry 0 (image 0): the mask has 7x7"),
+        ([LARGE[0] | {"segmentation": [[1, 2]]}, LARGE[1] | {"category_name": "mug"}, *LARGE], "(first: entry 0 (image 0): a polygon"),
+        (LARGE, "the first results are labelled apple, none of which object 'cup' expects (mug)"),
+        ([LARGE[0] | {"category_name": "mug"}, *LARGE[1:]], ""),
+        ([], ""),
+    ],
+)  # fmt: skip
+def test_check_looks_at_the_first_candidates(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch, content: str | list, says: str
+) -> None:
+    monkeypatch.chdir(small_project)
+    table, objects = Path("sequences.tsv"), Path("objects.yaml")
+    head, good, *_ = table.read_text().splitlines()
+    table.write_text(f"{head}\tcandidates\n{good}\tmasks\n")
+    objects.write_text(yaml.safe_dump({"cup": {"mesh": "cup.ply", "labels": ["mug"]}}))
+    Path("config.yaml").write_text("dataset: small\n")
+    Path("masks").mkdir()
+    Path("masks/k1.json").write_text(content if isinstance(content, str) else json.dumps(content))
+    notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
+    assert len(notes) == bool(says)
+    assert not says or says in notes[0]
+
+
+def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path) -> None:
+    (small_project / "model.onnx").write_text("not a model")
+    config = small_project / "config.yaml"
+    config.write_text(config.read_text() + "detections: {segmentation_model: model.onnx}\n")
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert done.returncode == 1 and "model.onnx: " in done.stderr
+    assert "Traceback" not in done.stderr
+    (small_project / "model.onnx").unlink()
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert "segmentation_model is model.onnx, and there is no such file" in done.stderr
 
 
 def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from intercap_core.detection.instance import Instance, to_rle
 from intercap_core.detection.label_maps import label_text, names_of
 
 MAX_BYTES = 1 << 29  # parsed JSON takes about six times its size in memory
+HEAD_BYTES = 1 << 18  # of a long file that is looked at before a run
 _LARGEST_ID = 2**31 - 1
 _NAME_KEYS = ("category_name", "category", "class_name", "class", "label", "name")
 _NUMBER_KEYS = ("category_id", "class", "class_id", "label")
@@ -82,7 +83,26 @@ def read_candidates(
     need not say their image. Results under ``min_score`` are left out; so are those that cannot be
     used, which the result tells. Raises :class:`UnreadableCandidates` where nothing can be used.
     """
-    content = read_json(path)
+    return candidates_of(
+        read_json(path),
+        width=width,
+        height=height,
+        min_score=min_score,
+        names=names,
+        one_image=one_image,
+    )
+
+
+def candidates_of(
+    content: Any,
+    *,
+    width: int,
+    height: int,
+    min_score: float,
+    names: Mapping[int, str],
+    one_image: bool = False,
+) -> CandidateFile:
+    """The results in parsed JSON; as :func:`read_candidates`."""
     entries = content
     images: list[ImageKey] | None = None
     stated = _Stated(names, {}, {}, None, False)
@@ -115,6 +135,34 @@ def read_candidates(
             found.scaled += scaled
         found.entries += 1
     return found
+
+
+def read_head(path: Path) -> Any:
+    """Parse a small file, or the first results of a long list of them.
+
+    A look before a run: None where a large file does not begin with results. Raises
+    :class:`UnreadableCandidates` as :func:`read_json` does.
+    """
+    try:
+        size = path.stat().st_size
+        with open(path, "rb") as file:
+            text = file.read(HEAD_BYTES).decode("utf-8", errors="ignore").lstrip()
+    except OSError as error:
+        raise UnreadableCandidates(f"cannot be read ({error.strerror})") from None
+    if size <= HEAD_BYTES or size > MAX_BYTES:
+        return read_json(path)
+    if not text.startswith("["):
+        return None
+    decoder, at = json.JSONDecoder(), 1
+    entries: list[Any] = []
+    while True:
+        while text[at : at + 1] in (",", " ", "\t", "\r", "\n"):
+            at += 1
+        try:
+            entry, at = decoder.raw_decode(text, at)
+        except (ValueError, RecursionError):
+            return entries or None
+        entries.append(entry)
 
 
 def read_json(path: Path) -> Any:

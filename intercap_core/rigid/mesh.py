@@ -19,10 +19,14 @@ from intercap_core.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
 
-MAX_EXTENT_M = 5.0  # larger: the file is in millimetres (the smallest object is 95 mm high)
-MIN_EXTENT_M = 0.01
+# Lengths of what people handle; beyond the second pair the file is in another unit.
+LONG_M, SHORT_M = 3.0, 0.02
+MAX_EXTENT_M, MIN_EXTENT_M = 5.0, 0.01
+UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 MIN_FILLED = 1e-8  # share of its bounding cube that a body fills; less is a flat sheet
-MAX_OPEN_EDGES = 0.05  # share of edges with one face, above which inside and outside mean nothing
+# Share of edges that do not join two faces: a quarter of a lidless box's of few faces; above the
+# limit the faces are loose, and inside and outside mean nothing.
+MAX_OPEN_EDGES = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +49,11 @@ class ObjectMesh:
     def load(cls, entry: ObjectEntry) -> ObjectMesh:
         """Load and check the mesh, contact vertices and symmetry of an objects.yaml entry.
 
-        Vertices that coincide are joined, inconsistent winding is turned and small holes are
-        closed, each with a warning. Raises UserError naming the file, what is wrong with it and
-        what to do: no such file, no faces, coordinates that are not numbers, millimetres, a
-        surface too open to have an inside, contact vertices that are not vertices.
+        Vertices that coincide are joined, inconsistent winding is turned, small holes are closed
+        and faces without area left out, each with a warning; a surface that stays open is told
+        (``watertight`` is false) and used. Raises UserError naming the file, what is wrong with it
+        and what to do: no such file, no faces, coordinates that are not numbers, another unit than
+        metres, loose faces without an inside, contact vertices that are not vertices.
         """
         path = Path(entry.mesh)
         mesh = _read(path)
@@ -181,13 +186,23 @@ def _colours(mesh: trimesh.Trimesh) -> np.ndarray:
 def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     if extent > MAX_EXTENT_M:
+        fitting = [f"{unit} ({scale:g})" for unit, scale in UNITS.items()
+                   if SHORT_M <= extent * scale <= LONG_M]  # fmt: skip
+        unit = f"; it looks like {' or '.join(fitting)}" if fitting else ""
         raise UserError(
-            f"{path}: is {extent:.4g} m long, which looks like millimetres; scale it by 0.001"
+            f"{path}: is {extent:.4g} m long, expected {SHORT_M} to {LONG_M:g} m{unit}: scale it "
+            "so that its unit is the metre"
         )
     if extent < MIN_EXTENT_M:
         raise UserError(
-            f"{path}: is only {extent:.3g} m long; scale it so that its unit is the metre"
+            f"{path}: is only {extent:.3g} m long, expected {SHORT_M} to {LONG_M:g} m; scale it so "
+            "that its unit is the metre"
         )
+    if not SHORT_M <= extent <= LONG_M:
+        log.warning(
+            "%s: is %.3g m long; hardly anybody handles what is not %g to %g m, so check its unit",
+            path, extent, SHORT_M, LONG_M,
+        )  # fmt: skip
 
 
 def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
@@ -217,6 +232,8 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
         vertices, faces[proper], vertex_colors=colours[first], process=False, validate=False
     )
     done = []
+    if not proper.all():
+        done.append(f"left out {(~proper).sum()} faces without area")
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
         done.append("turned faces of inconsistent winding")
@@ -239,7 +256,11 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
                 f"{path}: {open_share:.0%} of its edges do not join two faces, so it has no "
                 "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
             )
-        log.warning("%s: %.1f %% of the edges are still open", path, 100 * open_share)
+        log.warning(
+            "%s: not watertight, %.1f %% of its edges are open; what lies inside is decided by a "
+            "vote of five rays, so penetration near the holes is uncertain",
+            path, 100 * open_share,
+        )  # fmt: skip
     return mesh, new_id.reshape(-1)
 
 

@@ -14,6 +14,7 @@ import trimesh
 from intercap_core import safe_pickle
 from intercap_core.config import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
+from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 
 
@@ -47,6 +48,31 @@ def _millimetres(path):
     return _write(ball, path)
 
 
+def _centimetres(path):
+    ball = _ball()
+    ball.apply_scale(100)
+    return _write(ball, path)
+
+
+def _all_faces_without_area(path):
+    ball = _ball()
+    ball.faces[:, 2] = ball.faces[:, 1]
+    return _write(trimesh.Trimesh(ball.vertices, ball.faces, process=False), path)
+
+
+def _empty(path):
+    path.write_bytes(b"")
+    return path
+
+
+def _no_vertices(path):
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    return path
+
+
 def _tiny(path):
     ball = _ball()
     ball.apply_scale(0.001)
@@ -77,7 +103,11 @@ def _garbage(path):
         (lambda path: path, "no such mesh"),
         (_no_faces, "0 faces"),
         (_not_a_number, "vertex 7 is not a number"),
-        (_millimetres, "millimetres"),
+        (_millimetres, r"220 m long.*millimetres \(0\.001\)"),
+        (_centimetres, r"22 m long.*centimetres \(0\.01\)"),
+        (_all_faces_without_area, "encloses"),
+        (_empty, "not a readable mesh|0 faces"),
+        (_no_vertices, "0 faces|not a readable mesh"),
         (_tiny, "unit is the metre"),
         (_half_open, "no inside"),
         (_flat, "flat sheet"),
@@ -90,6 +120,44 @@ def test_bad_meshes_are_refused(tmp_path, make, words):
     with pytest.raises(UserError, match=words) as caught:
         ObjectMesh.load(_entry(path))
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(("scale", "doubted"), [(0.05, True), (1, False), (20, True)])
+def test_unusual_sizes_are_doubted_and_used(tmp_path, caplog, scale, doubted):
+    ball = _ball()
+    ball.apply_scale(scale)
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
+    assert mesh.diameter == pytest.approx(0.22 * scale, rel=1e-3)
+    assert ("check its unit" in caplog.text) == doubted
+
+
+def test_an_open_mesh_is_told_and_used(tmp_path, caplog):
+    """A box without its lid: what lies deep inside is inside, what lies outside is not."""
+    box = trimesh.creation.box((0.4, 0.4, 0.4)).subdivide().subdivide()
+    lid = box.triangles_center[:, 2] > 0.199
+    box = trimesh.Trimesh(box.vertices, box.faces[~lid], process=True)
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(_write(box, tmp_path / "thing.ply")))
+    assert not mesh.watertight and "not watertight" in caplog.text
+    assert "thing.ply" in caplog.text
+    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+    rng = np.random.default_rng(0)
+    inner = rng.uniform(-0.19, 0.19, (500, 3)) - (0, 0, 0.1) * rng.random((500, 1))
+    inner[:, 2] = inner[:, 2].clip(-0.19, -0.02)
+    outer = inner + np.array([0.5, 0.1, 0])
+    assert field.inside(inner).mean() > 0.95 and not field.inside(outer).any()
+    assert 0 < mesh.radius < 0.5 and np.isfinite(mesh.centre_of_mass).all()
+
+
+def test_faces_without_area_are_left_out(tmp_path, caplog):
+    ball = _ball()
+    faces = np.concatenate([ball.faces, [[0, 0, 1], [5, 7, 7]]])
+    ball = trimesh.Trimesh(ball.vertices, faces, process=False)
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
+    assert mesh.watertight and len(mesh.faces) == len(_ball().faces)
+    assert "left out 2 faces without area" in caplog.text
 
 
 def _inside_out(ball):
