@@ -11,7 +11,7 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.tracking.evidence import View
-from intercap_core.tracking.fit import Fit, MotionPrior, assess, fit_pose
+from intercap_core.tracking.fit import Evidence, Fit, MotionPrior, assess, evidence_at, fit_pose
 from intercap_core.tracking.places import Places
 from intercap_core.tracking.search import plausibility, rank_frames, search
 
@@ -96,6 +96,18 @@ class Observer:
             labels=self.labels,
             rounds=rounds,
             start_scale=scale,
+            twist=twist,
+        )
+
+    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> Evidence:
+        """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,)."""
+        return evidence_at(
+            self.mesh,
+            self.views(t),
+            pose,
+            min_overlap=self.settings.min_overlap,
+            background_term=self.settings.background_term,
+            labels=self.labels,
             twist=twist,
         )
 

@@ -14,26 +14,17 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import twists
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit, MotionPrior
 from intercap_core.tracking.follow import follow
 from intercap_core.tracking.lost import FrameResult, decided, judged
-from intercap_core.tracking.motion import expected
 from intercap_core.tracking.observer import Observer
-from intercap_core.tracking.search import own_turns, same_pose
 from intercap_core.tracking.seed import find_seed
+from intercap_core.tracking.whole import WholeTrack
 
 log = logging.getLogger(__name__)
 
-TURNS = 12  # about each axis, by which the whole track may be wrong
-TURN_FRAMES, TURN_RIVALS = 8, 5  # frames and turned tracks that are compared by fitting
-TURN_GAIN = 0.003  # of the mean score, for which the track is turned
 AGREE_M, AGREE_DEG = 0.02, 10.0
-# What a view sees has moved by less until it exposes: not worth another fit.
-MOVED_M, MOVED_RAD = 0.001, np.radians(0.2)
-TIMED_ROUNDS, TIMED_SCALE = (4,), 0.25
-WORSE_SCORE = 0.98  # of a fit that allows for the motion, for which the motion is not believed
 
 
 @dataclass(frozen=True)
@@ -84,10 +75,6 @@ class Tracker:
             seed_frame, seed = find_seed(self._observer)
         self._observer.places.claim(self._observer.centre(seed.pose))
         one = self._both_ways(seed_frame, seed)
-        # who annotates a pose knows on which side the handle is
-        turned = self._turned_seed(seed_frame, one) if initial is None else None
-        if turned is not None:
-            one = self._both_ways(seed_frame, turned)
         last = self._count - 1
         two = list(one)
         for frames, start_at in (
@@ -97,14 +84,8 @@ class Tracker:
             for t, result in follow(self._observer, frames, one[start_at], one, may_search=False):
                 two[t] = result
         merged = self._merged(one, two)
-        timed = self._unwrapped(self._timed(self._unwrapped(merged)))
-        frames_found = _recovered([self._with_axis(frame) for frame in timed], seed_frame)
-        return Track(frames_found, seed_frame, initial is not None)
-
-    def _with_axis(self, frame: FrameResult) -> FrameResult:
-        """The frame with the axis about which the object is a solid of revolution."""
-        axis = self._mesh.symmetry.axis
-        return frame if axis is None else replace(frame, free_axis=frame.fit.pose[:3, :3] @ axis)
+        whole = WholeTrack(self._observer, self._times).refine(merged)
+        return Track(_recovered(whole, seed_frame), seed_frame, initial is not None)
 
     def _both_ways(self, seed_frame: int, seed: Fit) -> list[FrameResult]:
         """Every frame (T), tracked from the seed to both ends."""
@@ -112,51 +93,6 @@ class Tracker:
         for frames in (range(seed_frame + 1, self._count), range(seed_frame - 1, -1, -1)):
             results.update(follow(self._observer, frames, results[seed_frame]))
         return [results[t] for t in range(self._count)]
-
-    def _turned_seed(self, seed_frame: int, track: list[FrameResult]) -> Fit | None:
-        """The seed turned about the object's own axes, where all frames together prefer that.
-
-        One frame may not show on which side a handle is; the frames of the whole track do. Every
-        turn is compared over a few well seen frames, the best are fitted there.
-        """
-        if self._mesh.symmetry.sphere:
-            return None
-        seen = [t for t, result in enumerate(track) if not result.lost]
-        if not seen:
-            return None
-        seen.sort(key=lambda t: -track[t].fit.confidence)
-        half = sorted(seen[: max(TURN_FRAMES, len(seen) // 2)])
-        frames = [
-            half[i]
-            for i in np.linspace(0, len(half) - 1, min(TURN_FRAMES, len(half))).round().astype(int)
-        ]
-        turns = own_turns(self._mesh, TURNS)
-        few = frames[:: max(1, len(frames) // 4)]
-        first = [
-            np.mean(
-                [
-                    self._observer.plausibility(self._observer.assess(t, track[t].fit.pose @ turn))
-                    for t in few
-                ]
-            )
-            for turn in turns
-        ]
-        rivals = [turns[i] for i in np.argsort(first, kind="stable")[::-1][:TURN_RIVALS]]
-        totals = []
-        for turn in [np.eye(4), *rivals]:
-            fits = []
-            for t in frames:
-                start = track[t].fit.pose @ turn
-                fits.append(
-                    self._observer.plausibility(self._observer.fit(t, start, MotionPrior(start)))
-                )
-            totals.append(float(np.mean(fits)))
-        best = int(np.argmax(totals[1:]))
-        if totals[1 + best] < totals[0] + TURN_GAIN:
-            return None
-        start = track[seed_frame].fit.pose @ rivals[best]
-        fit = self._observer.fit(seed_frame, start, MotionPrior(start))
-        return None if same_pose(self._mesh, fit.pose, track[seed_frame].fit.pose) else fit
 
     # --- two passes ---------------------------------------------------------------------------
 
@@ -187,42 +123,6 @@ class Tracker:
             self._observer.centre(one.fit.pose) - self._observer.centre(two.fit.pose)
         )
         return bool(apart > AGREE_M or angle > AGREE_DEG)
-
-    def _timed(self, frames: list[FrameResult]) -> list[FrameResult]:
-        """The frames in which the object moves, fitted again to what each view sees of it when it
-        exposes: the passes take all views to show one moment."""
-        poses = np.array([frame.fit.pose for frame in frames])
-        known = np.array([not frame.lost for frame in frames])
-        found = twists(poses, known, self._times)
-        late = max(abs(view.geometry.time_offset_s) for view in self._observer.views(0))
-        turn, shift = (late * np.linalg.norm(part, axis=1) for part in (found[:, :3], found[:, 3:]))
-        result = list(frames)
-        for t in map(int, np.flatnonzero(known & ((turn > MOVED_RAD) | (shift > MOVED_M)))):
-            before = poses[max(t - 1, 0)]
-            fit = self._observer.fit(
-                t,
-                poses[t],
-                expected(before, poses[t], poses[t], 0),
-                rounds=TIMED_ROUNDS,
-                scale=TIMED_SCALE,
-                twist=found[t],
-            )
-            if (
-                fit.score >= WORSE_SCORE * frames[t].fit.score
-                and not judged(fit, self._observer.settings).lost
-            ):
-                result[t] = replace(frames[t], fit=fit)
-        return result
-
-    def _unwrapped(self, frames: list[FrameResult]) -> list[FrameResult]:
-        """Equivalent poses that follow each other as closely as the symmetry allows."""
-        if self._mesh.symmetry.trivial:
-            return frames
-        result = frames[:1]
-        for frame in frames[1:]:
-            pose = self._mesh.symmetry.nearest_equivalent_pose(frame.fit.pose, result[-1].fit.pose)
-            result.append(replace(frame, fit=replace(frame.fit, pose=pose)))
-        return result
 
 
 def _better_run(one: list[FrameResult], two: list[FrameResult]) -> list[FrameResult]:
