@@ -17,8 +17,8 @@ NO_FACE = -1
 BOX_MARGIN_PX = 2  # straight edges between projected corners bend by less in any known lens
 # How far a triangle's edge of L px may bend: L^2 times this over the focal length (a curvature of
 # 0.24 in the normalised plane, some three times that of a Kinect's lens at its corners).
-_BEND = 0.03
-_SLACK_PX = 0.1  # rounding of the ray table and of small windows
+BEND = 0.03
+SLACK_PX = 0.1  # rounding of the ray table and of small windows
 
 
 @numba.njit(cache=True, nogil=True)
@@ -82,7 +82,7 @@ def draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, 
         top = min(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
         bottom = max(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
         extent = max(right - left, bottom - top)
-        slack = _SLACK_PX + _BEND * extent * extent / focal
+        slack = SLACK_PX + BEND * extent * extent / focal
         u0, u1 = max(left - slack, 0.0), min(right + slack, width - 1.0)
         v0, v1 = max(top - slack, 0.0), min(bottom + slack, height - 1.0)
         if u0 > u1 or v0 > v1:

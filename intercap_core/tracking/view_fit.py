@@ -8,7 +8,7 @@ from intercap_core.energy import object_depth_kernel, object_silhouette_kernel
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Rendering, Shot
 from intercap_core.tracking.candidates import MIN_PIXELS, choose, mask_overlap, visible_pixels
-from intercap_core.tracking.evidence import View
+from intercap_core.tracking.evidence import Candidate, View
 from intercap_core.tracking.patches import ContourPatch, DepthPatch
 from intercap_core.tracking.reduced_mask import EMPTY
 from intercap_core.tracking.view_report import FREE_SPACE_M, ViewReport, depth_agreement
@@ -49,7 +49,7 @@ class ViewFit:
         self._view = view
         self._min_overlap = min_overlap
         self._labels = labels
-        self._candidate = None
+        self._candidate: Candidate | None = None
         self._contour_patch: ContourPatch | None = None
         self._depth_patch: DepthPatch | None = None
 
