@@ -31,7 +31,7 @@ TRACKING_FACES = 600  # of the mesh that is rendered; kept within 0.5 mm of the 
 SMALLEST_EXTENT, LARGEST_EXTENT, SLACK_M = 0.25, 1.4, 0.05
 
 
-class _Recording:
+class ObjectRecording:
     """The views of every moment, read from the artefacts when asked for."""
 
     def __init__(
@@ -57,7 +57,7 @@ class _Recording:
         self._masks = [masks[t * len(rig) : (t + 1) * len(rig)] for t in range(frames.num_sets)]
         usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
         self.cameras = [int(c) for c in np.flatnonzero(usable)]
-        self._geometry = [
+        self.geometry = [
             ViewGeometry.for_object(
                 rig[c], diameter_m, float(np.nan_to_num(bias[c])), float(late[c])
             )
@@ -67,7 +67,7 @@ class _Recording:
     def views(self, t: int) -> list[View]:
         """What each usable camera shows of moment t."""
         found = []
-        for c, geometry in zip(self.cameras, self._geometry, strict=True):
+        for c, geometry in zip(self.cameras, self.geometry, strict=True):
             candidates = [
                 (candidate.index, candidate.label, candidate.score, candidate.rle)
                 for candidate in self._candidates(t, c)
@@ -111,7 +111,7 @@ def run(
     simple = mesh.simplified(TRACKING_FACES)
     with Frames.open(frames) as recording:
         detected = Detections.load(detections)
-        source = _Recording(recording, detected, scene, person, mesh.diameter)
+        source = ObjectRecording(recording, detected, scene, person, mesh.diameter)
         sequence = recording.sequence
         if not source.cameras:
             raise UserError(
