@@ -1,4 +1,4 @@
-"""Masks and candidates from the images alone, by depth where a camera measures it."""
+"""Masks and candidates from the images alone, by depth where a camera measures it, else colour."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.capture.frames import Frames
+from intercap_core.detection.colour_candidates import ColourSegmenter
 from intercap_core.detection.image_candidates import DepthSegmenter
 from intercap_core.detection.image_segments import ViewSegments
 
@@ -27,4 +28,11 @@ def segment_images(
         for t in np.flatnonzero(depth.any(1)).tolist():
             segments = segmenter.segment(t, np.flatnonzero(depth[t]).tolist())
             found.update({(t, c): view for c, view in segments.items()})
+    colour = wanted & ~depth & frames.colour_available
+    if colour.any() and np.isfinite(joints).any():
+        by_colour = ColourSegmenter(frames, scene, joints)
+        for t, c in np.argwhere(colour).tolist():
+            view = by_colour.segment(t, c)
+            if view is not None:
+                found[t, c] = view
     return found

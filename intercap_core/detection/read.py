@@ -129,11 +129,13 @@ class Detections:
             offsets = artefact["candidate_offsets"]
         both = copy(self)
         from_images = source == FROM_IMAGES
-        both.candidates_found = self.candidates_found | from_images
+        # that nothing stands before the background does not say that the object is not there
+        both.candidates_found = self.candidates_found & ~from_images
         both._from_images = {}
         for t, c in np.argwhere(from_images).tolist():
             image = t * source.shape[1] + c
             first, last = int(offsets[image]), int(offsets[image + 1])
+            both.candidates_found[t, c] = last > first
             width, height = (int(n) for n in self.image_sizes[c])
             both._from_images[t, c] = [
                 Candidate(

@@ -39,7 +39,7 @@ def see_through(
         points, _ = view.points(background.depth, index)
         inside = ((points > low) & (points < high)).all(1)
         index, points = index[inside], points[inside]
-        gone = np.zeros(background.depth.shape, np.uint8)
+        gone: np.ndarray = np.zeros(background.depth.shape, np.uint8)
         for other, far in enumerate(nearest):
             if other != number:
                 gone.ravel()[index[_before(views[other], far, points)]] = 1
