@@ -72,8 +72,9 @@ def smooth(
     looks = looks.about(centre)
     information, own = looks.information, looks.own
     share = np.minimum(1.0, SAMPLES_AT_REST / size)[node]
-    state = start[first].copy()
+    state = start.copy()
     state[:, :3, 3] += state[:, :3, :3] @ centre
+    state = _without_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
     for _ in range(STEPS):
         away = between(looks.poses, state[node])
@@ -99,6 +100,28 @@ def smooth(
     poses[:, :3, 3] -= arms
     to_origin = with_turn(arms)
     return poses, to_origin @ covariance @ to_origin.transpose(0, 2, 1)
+
+
+def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Poses (T, 4, 4) in which a frame that jumps away and back lies between its neighbours.
+
+    A robust fit that starts at a wrong pose would believe it. A kick or a drop changes the velocity
+    once, a wrong frame three times to and fro.
+    """
+    result = poses.copy()
+    if len(poses) < 5:
+        return result
+    step = np.diff(times)[:, None]
+    rate = between(poses[:-1], poses[1:]) / step
+    change = 2 * np.diff(rate, axis=0) / (step[1:] + step[:-1])  # of frame t + 1
+    for part, limit in ((np.s_[:, :3], ACCELERATION_RAD_S2), (np.s_[:, 3:], ACCELERATION_M_S2)):
+        kick = change[part]
+        size = np.linalg.norm(kick, axis=1)
+        back = -(kick[1:-1] * (kick[:-2] + kick[2:])).sum(1) > 0.5 * size[1:-1] ** 2
+        for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * IMPACT * limit)):
+            share = (times[t] - times[t - 1]) / (times[t + 1] - times[t - 1])
+            result[t] = moved(poses[t - 1], share * between(poses[t - 1], poses[t + 1]))
+    return result
 
 
 def _add_motion(
