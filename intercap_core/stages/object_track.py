@@ -25,6 +25,7 @@ from intercap_core.tracking.seed import NotFound
 
 log = logging.getLogger(__name__)
 
+MOSTLY = 0.5  # share of the frames from which a track's faults are told
 TRACKING_FACES = 600  # of the mesh that is rendered; kept within 0.5 mm of the full one
 # Extents, of the object's diameter, of a component of the images that may be it: partly hidden, or
 # with something that it touches.
@@ -141,6 +142,7 @@ def run(
                 f"annotate 'object_pose'{f'. Note: {doubt}' if doubt else ''}"
             ) from None
         names = list(recording.rig.names)
+    _tell(track, sequence)
     with artefacts.write(
         output,
         OBJECT_TRACK,
@@ -148,7 +150,7 @@ def run(
         sequence=sequence,
         object=object_.name,
         seed_frame=track.seed_frame,
-        seed_source="annotated" if track.annotated else "search",
+        seed_source=_source(track),
     ) as writer:
         for key, values in _datasets(track, source.cameras, len(names)).items():
             writer.put(key, values)
@@ -167,6 +169,42 @@ def _start(
         )
     rotation = Rotation.from_rotvec(initial.rotation_vector).as_matrix()
     return initial.frame, rigid(rotation, np.array(initial.translation))
+
+
+def _source(track: Track) -> str:
+    if not track.annotated:
+        return "search"
+    return "annotated" if track.borne_out else "annotated against the images"
+
+
+def _tell(track: Track, sequence: str) -> None:
+    """What whoever runs the stage should know of a track that is not sound."""
+    count = len(track.frames)
+    lost = sum(frame.lost for frame in track.frames)
+    doubtful = sum(frame.ambiguous or frame.disagree for frame in track.frames)
+    if not track.borne_out:
+        log.warning(
+            "sequence %s: the images do not agree with the annotated object_pose (frame %d looked "
+            "at); check its frame and pose",
+            sequence,
+            track.seed_frame,
+        )
+    if lost > MOSTLY * count:
+        log.warning(
+            "sequence %s: the object is lost in %d of %d frames; check the candidates, or "
+            "annotate 'object_pose'",
+            sequence,
+            lost,
+            count,
+        )
+    elif lost + doubtful > MOSTLY * count:
+        log.warning(
+            "sequence %s: quite different poses explain %d of %d frames alike; annotate "
+            "'object_pose' to decide",
+            sequence,
+            doubtful,
+            count,
+        )
 
 
 def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndarray]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
+from intercap_core.tracking.blobs import without_person
 from intercap_core.tracking.reduced_mask import EMPTY, ReducedMask, decode, reduced_lens
 
 # The object is compared at about this many pixels: more cost time and carry no more information,
@@ -122,7 +123,8 @@ class View:
     ) -> View:
         """Reduce one image's depth (H, W) uint16 mm, person mask and candidates.
 
-        A candidate is (index, label, score, RLE). Raises ValueError where a mask does not fit the
+        A candidate is (index, label, score, RLE); one that holds the person beside something else
+        is there a second time without the person. Raises ValueError where a mask does not fit the
         image.
         """
         depth = None
@@ -137,4 +139,9 @@ class View:
             for index, label, score, rle in candidates
         )
         person = decode(person_rle, colour, step) if person_rle else EMPTY
-        return cls(geometry, depth, person, found, detected)
+        parts = tuple(
+            replace(candidate, mask=part)
+            for candidate in found
+            if (part := without_person(candidate.mask, person, step)) is not None
+        )
+        return cls(geometry, depth, person, found + parts, detected)

@@ -15,11 +15,13 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.tracking.evidence import View
-from intercap_core.tracking.fit import Fit, MotionPrior
+from intercap_core.tracking.fit import Fit
 from intercap_core.tracking.follow import follow
 from intercap_core.tracking.lost import FrameResult, decided, judged
+from intercap_core.tracking.motion import extrapolated
 from intercap_core.tracking.observer import Observer
-from intercap_core.tracking.seed import find_seed
+from intercap_core.tracking.search import same_pose
+from intercap_core.tracking.seed import annotated_seed, find_seed
 from intercap_core.tracking.whole import WholeTrack
 
 log = logging.getLogger(__name__)
@@ -29,11 +31,13 @@ AGREE_M, AGREE_DEG = 0.02, 10.0
 
 @dataclass(frozen=True)
 class Track:
-    """All frames (T), the frame that the track started from and how its pose was found."""
+    """All frames (T), the frame that the track started from and how its pose was found:
+    ``borne_out``, whether the images agree with the annotation."""
 
     frames: list[FrameResult]
     seed_frame: int
     annotated: bool
+    borne_out: bool = True
 
 
 class Tracker:
@@ -66,11 +70,9 @@ class Tracker:
 
         Raises NotFound where no frame holds a candidate that could be the object.
         """
+        borne_out = True
         if initial is not None:
-            seed_frame, start = initial
-            seed = self._observer.fit(
-                seed_frame, start, MotionPrior(start), rounds=(4, 5), scale=1.0
-            )
+            seed_frame, seed, borne_out = annotated_seed(self._observer, *initial)
         else:
             seed_frame, seed = find_seed(self._observer)
         self._observer.places.claim(self._observer.centre(seed.pose))
@@ -85,7 +87,9 @@ class Tracker:
                 two[t] = result
         merged = self._merged(one, two)
         whole = WholeTrack(self._observer, self._times).refine(merged)
-        return Track(_recovered(whole, seed_frame), seed_frame, initial is not None)
+        return Track(
+            _recovered(self._mesh, whole, seed_frame), seed_frame, initial is not None, borne_out
+        )
 
     def _both_ways(self, seed_frame: int, seed: Fit) -> list[FrameResult]:
         """Every frame (T), tracked from the seed to both ends."""
@@ -139,12 +143,19 @@ def _score(frame: FrameResult) -> float:
     return 0.0 if frame.lost else frame.fit.score
 
 
-def _recovered(frames: list[FrameResult], seed_frame: int) -> list[FrameResult]:
+def _recovered(mesh: ObjectMesh, frames: list[FrameResult], seed_frame: int) -> list[FrameResult]:
     """The frames with ``recovered`` set: the first that is not lost after lost ones, or after the
     track leapt. Before the seed it ran backwards and leapt from the frame after."""
     result = list(frames)
     for t in range(1, len(frames)):
+        if frames[t].lost:
+            continue
         leapt = frames[t].leapt if t > seed_frame else frames[t - 1].leapt
-        if not frames[t].lost and (frames[t - 1].lost or leapt):
+        now = frames[t - 1].fit.pose
+        smooth = any(
+            same_pose(mesh, predicted, frames[t].fit.pose)
+            for predicted in (now, extrapolated(frames[max(t - 2, 0)].fit.pose, now))
+        )
+        if frames[t - 1].lost or (leapt and not smooth):
             result[t] = replace(frames[t], recovered=True)
     return result

@@ -6,10 +6,11 @@ import logging
 
 import numpy as np
 
-from intercap_core.tracking.fit import Fit
+from intercap_core.tracking.fit import Fit, MotionPrior
 from intercap_core.tracking.follow import follow
 from intercap_core.tracking.lost import judged
 from intercap_core.tracking.observer import Observer
+from intercap_core.tracking.search import same_pose
 
 log = logging.getLogger(__name__)
 
@@ -19,6 +20,9 @@ SEARCHED_MAX = 10
 RIVALS = 5  # hypotheses of the seed frame, compared over its neighbours
 RIVAL_MARGIN = 0.80  # of the best confidence
 RIVAL_FRAMES = 3  # on each side
+ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
+ANNOTATION_ROUNDS = (4, 5)
+CLEARLY_BETTER = 1.15  # of the value, for which another frame or pose is preferred
 
 
 class NotFound(Exception):
@@ -42,6 +46,41 @@ def find_seed(observer: Observer) -> tuple[int, Fit]:
     t, found = best
     log.info("seed frame %d, confidence %.2f", t, found[0].confidence)
     return t, _settled(observer, t, found)
+
+
+def annotated_seed(observer: Observer, frame: int, pose: np.ndarray) -> tuple[int, Fit, bool]:
+    """The frame and the pose to start from, near an annotated ``pose`` (4, 4) of ``frame``, and
+    whether the images bear the annotation out.
+
+    Where they do not, the frames beside it are tried, then what a search finds; a pose near the
+    annotation that is not lost goes before a better one elsewhere.
+    """
+    frames = range(
+        max(frame - ANNOTATION_FRAMES, 0), min(frame + ANNOTATION_FRAMES + 1, observer.count)
+    )
+    best: tuple[int, Fit] | None = None
+    for t in sorted(frames, key=lambda t: abs(t - frame)):
+        fit = observer.fit(t, pose, MotionPrior(pose), rounds=ANNOTATION_ROUNDS, scale=1.0)
+        if best is None or observer.value(t, fit) > CLEARLY_BETTER * observer.value(*best):
+            best = (t, fit)
+        if observer.value(*best) > SURE:
+            return *best, True
+    assert best is not None
+    t, fit = best
+    lost = judged(fit, observer.settings).lost
+    found = [
+        other
+        for other in observer.search(t, near=observer.centre(pose))
+        if observer.value(t, other) > CLEARLY_BETTER * observer.value(t, fit)
+        and not judged(other, observer.settings).lost
+        and not same_pose(observer.mesh, other.pose, fit.pose)
+    ]
+    if found and lost:
+        nearest = min(
+            found, key=lambda other: float(np.linalg.norm(other.pose[:3, 3] - pose[:3, 3]))
+        )
+        return t, nearest, False
+    return t, fit, not found and not lost
 
 
 def _settled(observer: Observer, seed_frame: int, found: list[Fit]) -> Fit:
