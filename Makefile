@@ -3,7 +3,8 @@
 # make lint      ruff, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track), tables and results/evaluation.json
-# make bench     seconds a frame and peak memory, extraction alone and its bytes, results/bench.json
+# make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker
+#                beside the paper's recipe, results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -11,7 +12,7 @@ CORES ?= 0
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
-EXTRAS := workflow,slurm,test,dev
+EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test lint ruff-check ruff-format snakefmt mypy snakemake-lint evaluate bench docs \
     environment clean
@@ -44,6 +45,7 @@ evaluate: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/intercap bench --cores $(CORES)
+	$(BIN)/python -m bench.object_speed
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

@@ -43,8 +43,8 @@ class Recipe:
     steps: int = 150
     learning_rate_m: float = 1e-3
     learning_rate_rad: float = 1e-3
-    depth_weight: float = 3000.0
-    depth_scale_m: float | None = 0.1
+    depth_weight: float = 1e4
+    depth_scale_m: float | None = 0.05
     rasteriser: Literal["overdraw", "soft"] = "overdraw"
 
 

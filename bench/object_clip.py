@@ -5,14 +5,11 @@ Reads the artefacts of the stages before ``object_track``; what is decoded here 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from intercap_core import artefacts
-from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
 from intercap_core.config import ObjectTrackSettings
@@ -23,9 +20,9 @@ from intercap_core.metrics.truth import Truth
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.twist import moved
-from intercap_core.schemas import PERSON, SCENE
-from intercap_core.stages.object_track import TRACKING_FACES
+from intercap_core.stages.object_track import TRACKING_FACES, ObjectRecording
 from intercap_core.tracking.evidence import View, ViewGeometry
+from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.passes import Tracker
 from intercap_core.tracking.reduced_mask import reduced_lens
 
@@ -47,6 +44,7 @@ class ObjectClip:
     views: list[list[View]]
     times: np.ndarray
     up: np.ndarray | None
+    joints: np.ndarray
     labels: tuple[str, ...]
     settings: ObjectTrackSettings
     true_rotation: np.ndarray
@@ -54,70 +52,45 @@ class ObjectClip:
     true_views: np.ndarray
 
     @classmethod
-    def load(cls, project: Project, sequence: str, count: int, *, coarser: int = 1) -> ObjectClip:
+    def load(
+        cls, project: Project, sequence: str, count: int, *, coarser: float = 1.0
+    ) -> ObjectClip:
         """The first ``count`` frame sets from the first that shows the object well.
 
-        ``coarser`` multiplies the steps by which the images are reduced. Raises UserError where
-        the sequence has no truth or an artefact is missing.
+        ``coarser`` multiplies the steps by which the images are reduced (never below one). Raises
+        UserError where the sequence has no truth or an artefact is missing.
         """
         row = project.sequences[sequence]
         if row.truth is None:
             raise UserError(f"sequence {sequence} has no truth; measure a virtual recording")
         entry = project.objects[row.object]
         whole = ObjectMesh.load(entry)
-        scene = project.artefact(sequence, "scene")
-        with artefacts.read(scene, SCENE) as artefact:
-            present, image_of = artefact["present"], artefact["image_of"]
-            bias, late = np.nan_to_num(artefact["depth_bias"]), artefact["time_offset"]
-            up = artefact["zup_from_master"][2, :3].copy()
-        with artefacts.read(project.artefact(sequence, "person"), PERSON) as artefact:
-            masks = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
-        rig = Rig.from_scene(scene)
-        usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
-        geometry = {
-            int(c): _coarser(
-                ViewGeometry.for_object(rig[c], whole.diameter, float(bias[c]), float(late[c])),
-                coarser,
+        with Frames.open(project.artefact(sequence, "frames")) as frames:
+            source = ObjectRecording(
+                frames,
+                Detections.load(project.artefact(sequence, "detections")),
+                project.artefact(sequence, "scene"),
+                project.artefact(sequence, "person"),
+                whole.diameter,
             )
-            for c in np.flatnonzero(usable)
-        }
-        detections = Detections.load(project.artefact(sequence, "detections")).showing(image_of)
-        views = []
-        with Frames.open(project.artefact(sequence, "frames")) as recording:
-            shown = recording.showing(image_of)
-            times = recording.time_s
-            truth = Truth.load(row.truth, times, recording.fps, 0)
+            source.geometry = [_coarser(geometry, coarser) for geometry in source.geometry]
+            truth = Truth.load(row.truth, frames.time_s, frames.fps, 0)
             first = int(np.argmax(truth.object_views >= SEEN_VIEWS))
-            frames = range(first, min(first + count, recording.num_sets))
-            for t in frames:
-                views.append(
-                    [
-                        View.build(
-                            seen,
-                            shown.depth(t, c),
-                            masks[t * len(rig) + c],
-                            [
-                                (k.index, k.label, k.score, k.rle)
-                                for k in detections.candidates(t, c)
-                            ],
-                            bool(detections.candidates_found[t, c]),
-                        )
-                        for c, seen in geometry.items()
-                    ]
-                )
-        kept = slice(frames.start, frames.stop)
-        return cls(
-            whole,
-            whole.simplified(TRACKING_FACES),
-            views,
-            times[kept],
-            up if np.isfinite(up).all() else None,
-            entry.labels,
-            project.config.object_track,
-            truth.rotation[kept],
-            truth.translation[kept],
-            truth.object_views[kept],
-        )
+            kept = slice(first, min(first + count, frames.num_sets))
+            views = [source.views(t) for t in range(kept.start, kept.stop)]
+            return cls(
+                whole,
+                whole.simplified(TRACKING_FACES),
+                views,
+                frames.time_s[kept],
+                source.up if np.isfinite(source.up).all() else None,
+                source.joints[kept],
+                entry.labels,
+                project.config.object_track,
+                truth.rotation[kept],
+                truth.translation[kept],
+                truth.object_views[kept],
+            )
 
     def __len__(self) -> int:
         return len(self.views)
@@ -130,20 +103,34 @@ class ObjectClip:
 
     def tracker(self) -> Tracker:
         """The project's tracker on these frames."""
-        labels = [[[k.label for k in view.candidates] for view in views] for views in self.views]
         return Tracker(
             self.mesh,
             self.views.__getitem__,
-            labels,
+            self._labels_by_view,
             self.settings,
             times=self.times,
             labels=self.labels,
             up=self.up,
+            joints=self.joints,
         )
 
-    def errors(
-        self, poses: np.ndarray, frames: Sequence[int] | int
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def observer(self) -> Observer:
+        """What the tracker asks of the images, for one pass of it."""
+        return Observer(
+            self.mesh,
+            self.views.__getitem__,
+            self._labels_by_view,
+            self.settings,
+            self.labels,
+            self.up,
+            self.joints,
+        )
+
+    @cached_property
+    def _labels_by_view(self) -> list[list[list[str]]]:
+        return [[[k.label for k in view.candidates] for view in views] for views in self.views]
+
+    def errors(self, poses: np.ndarray, frames: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
         """Errors of poses (..., 4, 4) in the given frame or frames: millimetres, degrees (...)."""
         centre = self.whole.centre_of_mass
         rotation = np.broadcast_to(self.true_rotation[frames], (*poses.shape[:-2], 3, 3))
@@ -160,10 +147,11 @@ class ObjectClip:
         return self.true_views >= SEEN_VIEWS
 
 
-def _coarser(geometry: ViewGeometry, factor: int) -> ViewGeometry:
+def _coarser(geometry: ViewGeometry, factor: float) -> ViewGeometry:
     if factor == 1:
         return geometry
-    step, depth_step = geometry.step * factor, geometry.depth_step * factor
+    step = max(round(geometry.step * factor), 1)
+    depth_step = max(round(geometry.depth_step * factor), 1)
     camera = geometry.camera
     return replace(
         geometry,

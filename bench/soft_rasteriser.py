@@ -221,7 +221,8 @@ class _Overdraw(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         ctx.rasteriser, ctx.corners = rasteriser, corners.detach().numpy()
         found = rasteriser.draw(ctx.corners, depth.detach().numpy())
-        return tuple(torch.from_numpy(values).to(corners.dtype) for values in found)
+        coverage, weighted = (torch.from_numpy(values).to(corners.dtype) for values in found)
+        return coverage, weighted
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[Any, ...]:

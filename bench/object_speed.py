@@ -1,0 +1,316 @@
+"""The object's tracker beside the paper's recipe: milliseconds a frame and errors, in one run.
+
+    python -m bench.object_speed [config/bench/config.yaml] [--output results/bench.json]
+
+Wants the artefacts that ``intercap bench`` computes. Both get the same frames of the first
+sequence, decoded and reduced beforehand, the same first pose (the true one, off by 10 mm and 5
+degrees) and as many threads. Adds its figures, keys ``object.<measure>``, to the output and draws
+``object_convergence.png`` beside the artefacts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when the libraries start
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from bench.object_baseline import Baseline, Recipe
+from bench.object_clip import ObjectClip
+from bench.object_convergence import draw_convergence
+from intercap_core.errors import UserError
+from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
+from intercap_core.project import Project, load_project
+from intercap_core.tracking.fit import MotionPrior
+from intercap_core.tracking.follow import follow
+from intercap_core.tracking.lost import judged
+
+THREADS = int(os.environ["OMP_NUM_THREADS"])
+FRAMES = 45
+REPEATS = 3  # of what takes seconds; medians
+# Adam steps a frame (the first frame gets 400 / 150 times as many) and learning rates in metres and
+# radians that did best with so few, on the evaluation's suitcase and cup, which are not measured.
+SCHEDULES = (
+    (5, 4e-3, 8e-3),
+    (10, 4e-3, 4e-3),
+    (20, 2e-3, 4e-3),
+    (40, 2e-3, 2e-3),
+    (75, 1e-3, 2e-3),
+)
+AS_GOOD = 1.02  # times our errors: reached
+NEAR_BEST = 1.05  # times the best median that any schedule comes to: its best
+SOFT_STEPS = 5  # of the plain torch rasteriser, which takes long
+GROWTH_FRAMES = 8
+GROWTH_FACES = (150, 600, 2400)
+GROWTH_STEPS = (0.5, 1.0, 2.0)  # times the reduction of the images: 4, 1 and 1/4 of the pixels
+
+
+@dataclass(frozen=True)
+class Run:
+    """One way to track the clip: milliseconds a frame, errors (median, p95) and frames lost."""
+
+    ms: float
+    translation_mm: tuple[float, float]
+    rotation_deg: tuple[float, float]
+    lost: float
+
+    @classmethod
+    def of(cls, clip: ObjectClip, poses: np.ndarray, seconds: float) -> Run:
+        """From poses (T, 4, 4) and the seconds they took in all."""
+        millimetres, degrees = clip.errors(poses, np.arange(len(clip)))
+        millimetres, degrees = millimetres[clip.seen], degrees[clip.seen]
+        lost = (millimetres > 1e3 * LOST_TRANSLATION_M) | (degrees > LOST_ROTATION_DEG)
+        return cls(
+            1e3 * seconds / len(clip),
+            (float(np.median(millimetres)), float(np.percentile(millimetres, 95))),
+            (float(np.median(degrees)), float(np.percentile(degrees, 95))),
+            float(lost.mean()),
+        )
+
+    def figures(self, prefix: str) -> dict[str, float]:
+        """Errors and lost frames by key."""
+        return {
+            f"{prefix}translation_median_mm": self.translation_mm[0],
+            f"{prefix}translation_p95_mm": self.translation_mm[1],
+            f"{prefix}rotation_median_deg": self.rotation_deg[0],
+            f"{prefix}rotation_p95_deg": self.rotation_deg[1],
+            f"{prefix}lost_share": self.lost,
+        }
+
+    def as_good_as(self, other: Run) -> bool:
+        """Whether no median or p95 is worse by more than a little and no more frames are lost."""
+        mine, its = ((*r.translation_mm, *r.rotation_deg) for r in (self, other))
+        near = all(a <= AS_GOOD * b for a, b in zip(mine, its, strict=True))
+        return near and self.lost <= other.lost
+
+
+def whole_track(clip: ObjectClip, start: np.ndarray | None) -> Run:
+    """All that the stage does: both ways, twice, exposure times, flags; no start: a search too."""
+    seconds, poses = [], np.zeros(0)
+    for _ in range(REPEATS if start is not None else 1):
+        tracker = clip.tracker()
+        begin = time.perf_counter()
+        track = tracker.run(None if start is None else (0, start))
+        seconds.append(time.perf_counter() - begin)
+        poses = np.array([frame.fit.pose for frame in track.frames])
+    return Run.of(clip, poses, statistics.median(seconds))
+
+
+def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
+    """The tracker's first pass alone: each frame fitted once and in order, as the paper goes."""
+    seconds, poses = [], np.zeros(0)
+    for _ in range(REPEATS):
+        observer = clip.observer()
+        begin = time.perf_counter()
+        seed = observer.fit(0, start, MotionPrior(start), rounds=(4, 5), scale=1.0)
+        first = judged(seed, clip.settings)
+        rest = follow(observer, range(1, len(clip)), first, may_search=False)
+        poses = np.array([first.fit.pose, *(frame.fit.pose for _, frame in rest)])
+        seconds.append(time.perf_counter() - begin)
+    return Run.of(clip, poses, statistics.median(seconds))
+
+
+def paper(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
+    """The baseline, one frame after another."""
+    baseline = Baseline(
+        clip.mesh, recipe, min_overlap=clip.settings.min_overlap, labels=clip.labels
+    )
+    begin, now = time.perf_counter(), start
+    poses: list[np.ndarray] = []
+    for views in clip.views:
+        now = baseline.fit(views, now, recipe.steps if poses else recipe.first_steps).poses[-1]
+        poses.append(now)
+    return Run.of(clip, np.array(poses), time.perf_counter() - begin)
+
+
+def schedules(clip: ObjectClip, start: np.ndarray) -> dict[int, Run]:
+    """The baseline with fewer steps, by their number a frame."""
+    found = {}
+    for steps, metres, radians in SCHEDULES:
+        recipe = Recipe(
+            first_steps=steps * Recipe.first_steps // Recipe.steps,
+            steps=steps,
+            learning_rate_m=metres,
+            learning_rate_rad=radians,
+        )
+        found[steps] = paper(clip, start, recipe)
+    return found
+
+
+def until(ours: Run, found: dict[int, Run]) -> tuple[int, Run, bool]:
+    """The fewest steps that are as good as ours, or else as good as this baseline gets; which."""
+    for steps, run in sorted(found.items()):
+        if run.as_good_as(ours):
+            return steps, run, True
+    kept = [run for run in found.values() if run.lost == min(r.lost for r in found.values())]
+    best = min(run.translation_mm for run in kept)  # median, then p95
+    for steps, run in sorted(found.items()):
+        if run in kept and run.translation_mm[0] <= NEAR_BEST * best[0]:
+            return steps, run, False
+    raise AssertionError("one of them is the best")
+
+
+def milliseconds_a_step(clip: ObjectClip, start: np.ndarray, recipe: Recipe, steps: int) -> float:
+    """Median over the steps of one frame."""
+    baseline = Baseline(
+        clip.mesh, recipe, min_overlap=clip.settings.min_overlap, labels=clip.labels
+    )
+    fit = baseline.fit(clip.views[0], start, steps)
+    return 1e3 * float(np.median(np.diff(fit.seconds)[1:]))
+
+
+def growth(project: Project, sequence: str) -> dict[str, float]:
+    """Milliseconds a frame of :func:`one_pass` by views, faces and pixels; keys after object."""
+    clip = ObjectClip.load(project, sequence, GROWTH_FRAMES)
+
+    def measure(changed: ObjectClip) -> float:
+        return round(one_pass(changed, changed.annotated).ms, 2)
+
+    found = {}
+    for count in range(1, len(clip.views[0]) + 1):
+        fewer = replace(clip, views=[views[:count] for views in clip.views])
+        found[f"ms_per_frame_views_{count}"] = measure(fewer)
+    for faces in GROWTH_FACES:
+        mesh = clip.whole.simplified(faces, tolerance_m=np.inf)
+        found[f"ms_per_frame_faces_{len(mesh.faces)}"] = measure(replace(clip, mesh=mesh))
+    whole = len(clip.whole.faces)
+    found[f"ms_per_frame_faces_{whole}"] = measure(replace(clip, mesh=clip.whole))
+    for factor in GROWTH_STEPS:
+        other = ObjectClip.load(project, sequence, GROWTH_FRAMES, coarser=factor)
+        found[f"ms_per_frame_pixels_{factor**-2:g}"] = measure(other)
+    return found
+
+
+def measure(settings: Path, output: Path, frames: int) -> None:
+    """Measure, print and add to the output; see the module's text."""
+    torch.set_num_threads(THREADS)
+    project = load_project(settings)
+    sequence = next(iter(project.sequences))
+    clip = ObjectClip.load(project, sequence, frames)
+    start = clip.annotated
+    warm = ObjectClip.load(project, sequence, 2)  # compiles and imports
+    warm.tracker().run((0, start))
+    milliseconds_a_step(warm, start, Recipe(), 3)
+
+    ours, single = whole_track(clip, start), one_pass(clip, start)
+    found = schedules(clip, start)
+    recipe = found[Recipe.steps] = paper(clip, start, Recipe())
+    again = whole_track(clip, start)  # before and after, should the machine have been disturbed
+    ours = replace(ours, ms=(ours.ms + again.ms) / 2)
+    search = len(clip) * (whole_track(clip, None).ms - ours.ms)
+    steps, reached, is_as_good = until(ours, found)
+    soft = milliseconds_a_step(clip, start, Recipe(rasteriser="soft"), SOFT_STEPS)
+    fast = milliseconds_a_step(clip, start, Recipe(), 50)
+    figures = {
+        "ms_per_frame": ours.ms,
+        "one_pass_ms_per_frame": single.ms,
+        "search_ms": max(search, 0.0),
+        "baseline_ms_per_frame": recipe.ms,
+        "baseline_until_ms_per_frame": reached.ms,
+        "baseline_until_steps": steps,
+        "baseline_reaches_our_accuracy": float(is_as_good),
+        "baseline_ms_per_step": fast,
+        "baseline_plain_torch_ms_per_step": soft,
+        "speedup_recipe": recipe.ms / ours.ms,
+        "speedup_accuracy": reached.ms / ours.ms,
+        "speedup": min(recipe.ms, reached.ms) / ours.ms,
+        "speedup_one_pass": min(recipe.ms, reached.ms) / single.ms,
+        **ours.figures(""),
+        **single.figures("one_pass_"),
+        **recipe.figures("baseline_"),
+        **reached.figures("baseline_until_"),
+        "frames": len(clip),
+        "threads": THREADS,
+        **growth(project, sequence),
+    }
+    _merge(output, {f"object.{key}": round(float(value), 4) for key, value in figures.items()})
+    picture = project.results / "object_convergence.png"
+    draw_convergence(clip, picture)
+    title = (
+        f"{sequence}: {len(clip)} frames, {len(clip.views[0])} views, {len(clip.mesh.faces)} "
+        f"faces, {THREADS} thread{'s' * (THREADS > 1)} each"
+    )
+    _print(title, ours, single, found, steps if is_as_good else None, figures)
+    print(output, picture, sep="\n")
+
+
+def _merge(output: Path, figures: dict[str, float]) -> None:
+    """Put the figures into the JSON that is there, in place of older ones of the object."""
+    known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
+    kept = {key: value for key, value in known.items() if not key.startswith("object.")}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
+
+
+def _print(
+    title: str,
+    ours: Run,
+    single: Run,
+    found: dict[int, Run],
+    reached: int | None,
+    figures: dict[str, float],
+) -> None:
+    console = Console()
+    table = Table(
+        "tracking", "ms a frame", "times ours", "mm (p95)", "degrees (p95)", "lost",
+        title=title, box=None,
+    )  # fmt: skip
+
+    def row(name: str, run: Run) -> None:
+        errors = ("{:.2f} ({:.2f})".format(*e) for e in (run.translation_mm, run.rotation_deg))
+        table.add_row(
+            name, f"{run.ms:.1f}", f"{run.ms / ours.ms:.1f}", *errors, f"{run.lost:.2f}"
+        )  # fmt: skip
+
+    row("ours, the whole track", ours)
+    row("ours, one pass of fits", single)
+    for steps, run in sorted(found.items()):
+        mark = " (reaches our accuracy)" if steps == reached else ""
+        name = (
+            "the paper's recipe, 400 and 150" if steps == Recipe.steps else f"its energy, {steps}"
+        )
+        row(f"{name} Adam steps{mark}", run)
+    console.print(table)
+    console.print(
+        f"search for the start: {figures['search_ms']:.0f} ms; an Adam step: "
+        f"{figures['baseline_ms_per_step']:.1f} ms with the compiled rasteriser that is compared, "
+        f"{figures['baseline_plain_torch_ms_per_step']:.0f} ms in plain torch; speed-up "
+        f"{figures['speedup_recipe']:.1f} over the recipe, {figures['speedup_accuracy']:.1f} to "
+        f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy",
+        highlight=False,
+    )
+    grown = Table("one pass of fits", "ms a frame", box=None)
+    for key, value in figures.items():
+        if key.startswith("ms_per_frame_"):
+            kind, size = key.removeprefix("ms_per_frame_").split("_")
+            grown.add_row(f"{size} {'times the ' * (kind == 'pixels')}{kind}", f"{value:.1f}")
+    console.print(grown)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
+    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
+    parser.add_argument("--frames", type=int, default=FRAMES)
+    arguments = parser.parse_args()
+    try:
+        measure(arguments.settings, arguments.output, arguments.frames)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    main()
