@@ -172,7 +172,7 @@ def open_renderer(device: Device = "auto", *, threads: int = 1) -> Renderer:
     if device == "cpu":
         return CpuRenderer(threads)
     try:
-        from intercap_core.rigid import render_warp
+        from intercap_core.rigid.render_warp import WarpRenderer, has_cuda
     except ImportError:
         if device == "auto":
             return CpuRenderer(threads)
@@ -180,8 +180,8 @@ def open_renderer(device: Device = "auto", *, threads: int = 1) -> Renderer:
             "rendering on device 'cuda' needs warp, which is not installed; run "
             "pip install 'intercap-core[gpu]', or set device: cpu"
         ) from None
-    if render_warp.has_cuda():
-        return render_warp.WarpRenderer("cuda:0", threads=threads)
+    if has_cuda():
+        return WarpRenderer("cuda:0", threads=threads)
     if device == "auto":
         return CpuRenderer(threads)
     raise UserError(
