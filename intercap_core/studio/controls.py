@@ -5,7 +5,7 @@ Everything is a function of time in seconds, smooth, and vectorised over moments
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -102,11 +102,25 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Guide:
+    """From ``start`` to ``end`` one foot, 0 left, 1 right, comes over to a path of its own.
+
+    ``path`` takes times (N,) to ankle x, y, z in metres, pitch and heading in rad (N, 5); without
+    one the foot comes back to its steps.
+    """
+
+    foot: int
+    start: float
+    end: float
+    path: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
 class Footwork:
     """Feet that stand without sliding, step, and carry a pelvis along.
 
     ``start`` (2, 2): where the ankles stand first, left and right; ``heading`` rad;
-    ``ankle_height`` (2,) above the floor, metres.
+    ``ankle_height`` (2,) above the floor, metres; ``guides`` lead feet that leave the floor.
     """
 
     start: np.ndarray
@@ -114,6 +128,7 @@ class Footwork:
     steps: Sequence[Step]
     ankle_height: np.ndarray
     end_s: float
+    guides: Sequence[Guide] = ()
 
     def feet(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Ankles (N, 2, 3), headings (N, 2), pitch (N, 2; positive toes down) at ``times``."""
@@ -138,7 +153,14 @@ class Footwork:
             ankle[:, step.foot, 2] += lift + SOLE_FRONT_M * roll**2 / np.hypot(roll, 0.12)
             placed[step.foot] = step.place
             turned[step.foot] = step.heading
-        return ankle, heading, pitch
+        stepped = np.concatenate([ankle, pitch[..., None], heading[..., None]], 2)
+        guided = stepped.copy()
+        for guide in self.guides:
+            foot = guide.foot
+            goal = guide.path(times) if guide.path else stepped[:, foot]
+            share = ramp(times, guide.start, guide.end)[:, None]
+            guided[:, foot] += share * (goal - guided[:, foot])
+        return guided[..., :3], guided[..., 4], guided[..., 3]
 
     def pelvis(self, leg: float, hip_width: float, hip_drop: float, stand: float) -> CubicSpline:
         """Pelvis position and heading (4 channels) over time, low enough for both legs to reach.

@@ -32,6 +32,7 @@ ASSIST_STEPS = 8
 FOREARM_TWIST = 0.6  # share of the wrist's roll that the forearm takes
 LEG_REACH = 0.984
 SETTLE_M = 0.004  # over which the pelvis gives way where a leg is at its reach
+SPLAY = 0.12  # rad, feet and knees outward
 STAND = 0.990  # of the leg's length when standing
 _J = JOINT_INDEX
 
@@ -43,6 +44,20 @@ def facing(heading: np.ndarray) -> np.ndarray:
     up = np.stack([zero, zero, zero + 1], -1)
     forward = np.stack([cos, sin, zero], -1)
     return np.stack([left, up, forward], -1)
+
+
+def foot_rotations(heading: np.ndarray, pitch: np.ndarray, splay: float = SPLAY) -> np.ndarray:
+    """stage_from_rest rotations (N, 2, 2, 3, 3), by side, of ankle and toes of feet with headings
+    and pitch (N, 2)."""
+    result = np.empty((*heading.shape, 2, 3, 3))
+    for side, sign in enumerate((1.0, -1.0)):
+        ahead = facing(heading[:, side] + sign * splay)
+        tilt = np.zeros((len(heading), 3))
+        tilt[:, 0] = pitch[:, side]
+        result[:, side, 0] = ahead @ turn(tilt)
+        tilt[:, 0] = np.minimum(pitch[:, side], 0) + 0.35 * np.maximum(pitch[:, side], 0)
+        result[:, side, 1] = ahead @ turn(tilt)
+    return result
 
 
 @dataclass(frozen=True)
@@ -121,24 +136,22 @@ class Puppet:
         return replace(trunk, pelvis=pelvis)
 
     def legs(self, world: np.ndarray, pelvis: np.ndarray, ankle: np.ndarray, heading: np.ndarray,
-             pitch: np.ndarray, splay: float = 0.12) -> None:  # fmt: skip
+             pitch: np.ndarray, splay: float = SPLAY) -> None:  # fmt: skip
         """Set the legs for ankles (N, 2, 3), foot headings and pitch (N, 2), in place.
 
         The knees point between the pelvis's and the foot's heading, ``splay`` rad outward.
         """
         hinge = np.array([1.0, 0, 0])
+        feet = foot_rotations(heading, pitch, splay)
         for side, (name, sign) in enumerate(zip(SIDES, (1.0, -1.0), strict=True)):
             hip = pelvis + world[:, 0] @ self.skeleton.bone("pelvis", f"{name}_hip")
-            foot = facing(heading[:, side] + sign * splay)
             names = (f"{name}_hip", f"{name}_knee", f"{name}_ankle")
-            pole = unit(world[:, 0, :, 2] * np.array([1, 1, 0.2])) + 1.5 * foot[:, :, 2]
+            foot, toes = feet[:, side].swapaxes(0, 1)
+            ahead = facing(heading[:, side] + sign * splay)[:, :, 2]
+            pole = unit(world[:, 0, :, 2] * np.array([1, 1, 0.2])) + 1.5 * ahead
             upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, hinge, LEG_REACH)
             world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
-            tilt = np.zeros((len(pelvis), 3))
-            tilt[:, 0] = pitch[:, side]
-            world[:, _J[names[2]]] = foot @ turn(tilt)
-            tilt[:, 0] = np.minimum(pitch[:, side], 0) + 0.35 * np.maximum(pitch[:, side], 0)
-            world[:, _J[f"{name}_foot"]] = foot @ turn(tilt)
+            world[:, _J[names[2]]], world[:, _J[f"{name}_foot"]] = foot, toes
 
     def arm_root(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> np.ndarray:
         """Shoulder joint (N, 3)."""

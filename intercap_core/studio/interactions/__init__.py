@@ -7,9 +7,11 @@ from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.bottle_drink import BottleDrink
 from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
 from intercap_core.studio.interactions.cup_drink import CupDrink
+from intercap_core.studio.interactions.football_kick import FootballKick
 from intercap_core.studio.interactions.passing import BottlePass, CupPass, FootballPass
 from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
+from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
 from intercap_core.studio.interactions.toolbox_carry import ToolboxCarry
 
 INTERACTIONS: dict[str, type[Interaction]] = {
@@ -22,6 +24,9 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "bottle_pass": BottlePass,
     "cup_pass": CupPass,
     "football_pass": FootballPass,
+    "football_kick": FootballKick,
+    "racquet_swing": RacquetSwing,
+    "umbrella_swing": UmbrellaSwing,
     "stool_sit": StoolSit,
     "toolbox_carry": ToolboxCarry,
 }

@@ -1,0 +1,211 @@
+"""Step up to a ball, put the sole on it, swing back, kick it with the instep; it rolls to a stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.studio.controls import Footwork, Guide, Pose, Step, bump, plateau, ramp
+from intercap_core.studio.hands import RELAXED, part_of
+from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
+from intercap_core.studio.motion import LEG_REACH, Trunk, foot_rotations
+from intercap_core.studio.skeleton import turn, unit
+
+RIGHT, LEFT = 1, 0
+SOLE_S, SOLE_OFF_S = 0.80, 1.02  # the sole is on the ball between these
+SWING_S, SWUNG_S = 1.28, 2.00
+PRESSED_M = 0.001
+HOVER_SHARE, HOVER_M = 0.35, (0.006, 0.016)  # how often, and by how much, the sole only comes near
+TOE_CLEAR_M = 0.012  # the toes above the floor as the foot swings through
+BACKSWING_M, THROUGH_M = 0.27, 0.37  # the ankle behind and beyond where it meets the ball
+STEP_S = 0.004
+NEAR_M = 0.01  # the ball is as good as round for a foot that is this far
+GRAVITY = 9.81
+SLIDING_FRICTION = (0.40, 0.55)  # of a ball on a hard floor
+ROLLING_FRICTION = (0.13, 0.18)  # on a thick carpet
+SPIN_UP = 1.5  # m r^2 over the moment of inertia: a thin shell
+
+
+class FootballKick(Interaction):
+    """The ball lies before the right foot and leaves about ahead."""
+
+    object_class = "football"
+    highlight = 1.7
+    centre = (0.50, -0.05)
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        self.radius = float(np.linalg.norm(self.thing.vertices, axis=1).mean())
+        self.first_turn = turn(unit(rng.normal(size=3)) * rng.uniform(0, np.pi))
+        lowest = float((self.thing.vertices @ self.first_turn[2]).min())
+        self.spot = np.array([0.24 + rng.uniform(0, 0.04), -puppet.hip_width, -lowest])
+        direction = rng.normal(0, 0.06)
+        self.ahead = np.array([np.cos(direction), np.sin(direction), 0.0])
+        sole_gap = rng.uniform(*HOVER_M) if rng.random() < HOVER_SHARE else -PRESSED_M
+        sliding, rolling = rng.uniform(*SLIDING_FRICTION), rng.uniform(*ROLLING_FRICTION)
+        bones = [JOINT_INDEX["right_ankle"], JOINT_INDEX["right_foot"]]
+        share = np.asarray(puppet.subject.weights[:, bones].sum(1)).ravel()
+        self.foot = part_of(puppet.subject, np.flatnonzero(share > 0.5))
+        self._footwork(sole_gap)
+        self._roll(GRAVITY * sliding, GRAVITY * rolling)
+
+    # --- the foot ----------------------------------------------------------------------------
+
+    def _skin(self, at: np.ndarray) -> np.ndarray:
+        """The right foot's skin (N, n, 3) for ankle x, y, z, pitch and heading (N, 5)."""
+        ankle, toes = JOINT_INDEX["right_ankle"], JOINT_INDEX["right_foot"]
+        foot = foot_rotations(at[:, [4, 4]], at[:, [3, 3]])[:, RIGHT]
+        local = np.broadcast_to(np.eye(3), (len(at), 55, 3, 3)).copy()
+        local[:, ankle] = foot[:, 0]
+        local[:, toes] = np.swapaxes(foot[:, 0], 1, 2) @ foot[:, 1]
+        posed = self.foot.skin(local, np.zeros((len(at), 3))).vertices
+        return posed - self.puppet.subject.rest_joints[ankle] + at[:, None, :3]
+
+    def _gap(self, skin: np.ndarray, rolled: float = 0.0) -> float:
+        """Least signed distance of skin (n, 3) to the ball that was moved by ``rolled`` metres."""
+        local = (skin - self.spot - rolled * self.ahead) @ self.first_turn
+        far = float(np.linalg.norm(local, axis=1).min()) - self.radius
+        return far if far > NEAR_M else float(self.thing.surface.signed_distance(local).min())
+
+    def _pushed(self, skin: np.ndarray, rolled: float) -> float:
+        """How far the ball is after the foot has pushed it away, metres."""
+        if self._gap(skin, rolled) >= -PRESSED_M:
+            return rolled
+        low, high = rolled, rolled + 0.02
+        for _ in range(10):
+            middle = (low + high) / 2
+            if self._gap(skin, middle) < -PRESSED_M:
+                low = middle
+            else:
+                high = middle
+        return high
+
+    def _touching(self, at: np.ndarray, way: np.ndarray, gap: float) -> np.ndarray:
+        """The foot (5,) moved back from the ball along ``way`` (5,) until it is ``gap`` off."""
+        low, high = 0.0, 1.0
+        for _ in range(18):
+            middle = (low + high) / 2
+            if self._gap(self._skin((at + middle * way)[None])[0]) < gap:
+                low = middle
+            else:
+                high = middle
+        return at + high * way
+
+    def _footwork(self, sole_gap: float) -> None:
+        puppet, w, (x, y, _) = self.puppet, self.puppet.hip_width, self.spot
+        sole = puppet.ankle_height[RIGHT]
+        on_ball = np.array([x - 0.11, y, self.radius, -0.10, 0.0])
+        on_ball = self._touching(on_ball, np.array([0, 0, 0.4, 0, 0]), sole_gap)
+        strike = np.array([x, y - 0.01, 0.5, 0.62, 0.0])
+        strike[2] += TOE_CLEAR_M - self._skin(strike[None])[0, :, 2].min()
+        self.strike = self._touching(strike, np.array([-0.5, 0, 0, 0, 0]), 0.0)
+        self.back = self.strike + (-BACKSWING_M, 0, sole + 0.20 - self.strike[2], 0.12, 0)
+        self.through = self.strike + (THROUGH_M, 0.03, sole + 0.17 - self.strike[2], -0.10, 0)
+        beside = self.strike[0] + 0.03
+        start = np.array([[beside - 0.36, w], [beside - 0.30, -w]])
+        steps = [
+            Step(LEFT, 0.02, 0.38, (beside, w)),
+            Step(RIGHT, 0.28, 2.50, (beside + 0.17, -w)),
+        ]
+        over = on_ball + (0, 0, 0.06, 0, 0)
+        guides = [
+            Guide(RIGHT, 0.26, 0.58, _held(over + (-0.16, 0, 0.02, 0.2, 0))),
+            Guide(RIGHT, 0.46, 0.74, _held(over)),
+            Guide(RIGHT, 0.66, SOLE_S, _held(on_ball)),
+            Guide(RIGHT, SOLE_OFF_S, 1.16, _held(over)),
+            Guide(RIGHT, 1.04, 1.38, self._swing),
+            Guide(RIGHT, SWUNG_S - 0.08, 2.50),
+        ]
+        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S, guides)
+        self.pelvis_track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
+        )
+
+    def _swing(self, times: np.ndarray) -> np.ndarray:
+        """The kicking foot (N, 5): from behind down to the ball and up again beyond it."""
+        share = ramp(times, SWING_S, SWUNG_S)
+        met = BACKSWING_M / (BACKSWING_M + THROUGH_M)
+        path = self.back + share[:, None] * (self.through - self.back)
+        straight = self.back + met * (self.through - self.back)
+        beyond = (share - met) / np.where(share < met, met, 1 - met)
+        low = (1 + np.cos(np.pi * beyond)) / 2
+        path[:, 1:4] += low[:, None] * (self.strike - straight)[1:4]
+        return path
+
+    # --- the ball ----------------------------------------------------------------------------
+
+    def _roll(self, sliding: float, rolling: float) -> None:
+        """How far the ball has moved, metres, and turned, rad, by time; ``sliding`` and
+        ``rolling`` are how fast friction slows it, m/s^2.
+
+        A foot that comes nearer pushes it away; friction with the floor slows the ball and spins it up
+        until it rolls.
+        """
+        self.clock = np.arange(SWING_S, SCRIPT_S + 1.0, STEP_S)
+        self.moved, self.turned = np.zeros((2, len(self.clock)))
+        swing = self.clock[self.clock < SWUNG_S]
+        skin = self._skin(self._swing(swing))
+        speed = spin = 0.0
+        for n in range(1, len(self.clock)):
+            slips = spin * self.radius < speed - 1e-9
+            speed = max(speed - (sliding if slips else rolling) * STEP_S, 0.0)
+            spin = min(spin + SPIN_UP * sliding / self.radius * STEP_S, speed / self.radius)
+            if n < len(swing):
+                pushed = self._pushed(skin[n], self.moved[n - 1]) - self.moved[n - 1]
+                speed = max(speed, pushed / STEP_S)
+            self.moved[n] = self.moved[n - 1] + speed * STEP_S
+            self.turned[n] = self.turned[n - 1] + spin * STEP_S
+
+    def _ball(self, times: np.ndarray) -> np.ndarray:
+        """stage_from_object (N, 4, 4): the lowest point of the ball is on the floor."""
+        pose = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
+        axis = np.cross([0, 0, 1.0], self.ahead)
+        turned = np.interp(times, self.clock, self.turned)
+        pose[:, :3, :3] = turn(turned[:, None] * axis) @ self.first_turn
+        moved = np.interp(times, self.clock, self.moved)
+        pose[:, :2, 3] = (self.spot + moved[:, None] * self.ahead)[:, :2]
+        pose[:, 2, 3] = -(pose[:, 2, :3] @ self.thing.vertices.T).min(1)
+        return pose
+
+    # --- the script --------------------------------------------------------------------------
+
+    def _trunk(self, times: np.ndarray) -> Trunk:
+        track = self.pelvis_track(times)
+        sway, shift = self.sway(times), self.weight_shift(times)
+        back = bump(times, 1.05, 1.62)
+        kick = plateau(times, 1.40, 1.75, 1.85, 2.40)
+        pelvis = track[:, :3] + shift
+        pelvis[:, 0] += 0.05 * back
+        pelvis[:, 1] += 0.03 * plateau(times, 0.30, 0.60, 2.10, 2.50)
+        pelvis[:, 2] -= 0.015 + 0.02 * (back + kick)
+        bend = 0.6 * sway[:, :3]
+        bend[:, 0] += 0.04 + 0.16 * back - 0.05 * kick
+        bend[:, 1] += -0.20 * back + 0.18 * kick
+        bend[:, 2] -= 0.05 * plateau(times, 0.30, 0.60, 2.10, 2.50)
+        head = 1.3 * sway[:, 3:]
+        head[:, 0] += 0.48 - 0.22 * ramp(times, 1.80, 2.60)
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def perform(self, times: np.ndarray) -> Performance:
+        puppet, feet = self.puppet, self.footwork.feet(times)
+        trunk = puppet.settled(self._trunk(times), feet[0])
+        world = puppet.trunk(trunk)
+        puppet.legs(world, trunk.pelvis, *feet)
+        back = bump(times, 1.00, 1.66)
+        kick = plateau(times, 1.42, 1.80, 1.85, 2.50)
+        balance = plateau(times, 0.30, 0.70, 2.00, 2.60)
+        for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
+            swing = sign * (0.16 * back - 0.20 * kick) + self.arm_swing(times)[:, side]
+            wrist = puppet.idle_wrist(world, trunk.pelvis, side, swing)
+            out = (0.10 * balance)[:, None] * np.array([0, sign, 0])
+            out[:, 2] += 0.05 * balance
+            puppet.arm_to(world, trunk.pelvis, side, Pose(wrist.position + out, wrist.rotation))
+            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+        return Performance(world, trunk.pelvis, self._ball(times))
+
+
+def _held(place: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """A foot (5,) that stays where it is."""
+    return lambda times: np.broadcast_to(place, (len(times), 5))
