@@ -63,6 +63,14 @@ CASES = {
         "football", "s08", 24, {"right_hand", "left_hand"}, (16, 37), ((0.0, 0.93), (2.59, 3.0)),
         on_floor=False,
     ),
+    "racquet_swing": Case(
+        "tennis_racquet", "s03", 5, {"right_hand"}, (16, 37), ((0.0, 0.93), (2.57, 3.0)),
+        on_floor=False, object_m_s=10.0, joint_m_s=6.5, joint_m_s2=150.0,
+    ),
+    "umbrella_swing": Case(
+        "umbrella", "s09", 25, {"right_hand"}, (16, 37), ((0.0, 0.93), (2.57, 3.0)),
+        on_floor=False, object_m_s=6.5,
+    ),
     "stool_sit": Case(
         "stool", "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),), pressed_m=0.018
     ),

@@ -6,6 +6,7 @@ from intercap_core.errors import UserError
 from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.bottle_drink import BottleDrink
 from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
+from intercap_core.studio.interactions.chair_sit import ChairSit
 from intercap_core.studio.interactions.cup_drink import CupDrink
 from intercap_core.studio.interactions.football_kick import FootballKick
 from intercap_core.studio.interactions.passing import BottlePass, CupPass, FootballPass
@@ -28,6 +29,7 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "racquet_swing": RacquetSwing,
     "umbrella_swing": UmbrellaSwing,
     "stool_sit": StoolSit,
+    "chair_sit": ChairSit,
     "toolbox_carry": ToolboxCarry,
 }
 

@@ -1,0 +1,171 @@
+"""Take a long thing that lies on a block by its handle, swing it, lay it down again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from intercap_core.camera.transforms import invert
+from intercap_core.studio.controls import Pose, Step, plateau, ramp
+from intercap_core.studio.interactions.base import transform
+from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, wrapped
+from intercap_core.studio.interactions.handling import PLINTH_HALF_M, RIGHT, Handling
+from intercap_core.studio.motion import Trunk
+from intercap_core.studio.skeleton import unit
+
+ATTACH_S, RELEASE_S = 0.96, 2.56
+BLOCK_OF_HEIGHT = 0.49  # its top, as a share of the person's height
+BLOCK_HALF_M = 0.23  # across the person's way
+OVERHANG_M = 0.085  # from the middle of the hand to the block's edge
+
+
+@dataclass(frozen=True)
+class Key:
+    """Where the swinging hand is at one moment: ``wrist`` (3,) from the shoulder's rest place, in
+    arm lengths ahead, to the left and up; where fingers and thumb point; from when to when it
+    goes there, script times."""
+
+    wrist: tuple[float, float, float]
+    fingers: tuple[float, float, float]
+    thumb: tuple[float, float, float]
+    start: float
+    end: float
+
+
+class Swinging(Handling):
+    """The handle overhangs the block's right edge; the far end points to the left."""
+
+    highlight = 1.65
+    centre = (0.25, 0.0)
+    handle_m = 0.0  # the middle of the hand along the thing's z axis, from its origin
+    far_end = 1.0  # where the far end is along z, +1 or -1
+    side_up = 1.0  # which side of the thing is up while it lies, along y
+    keys: tuple[Key, ...] = ()
+    turn_back_rad, turn_through_rad = 0.0, 0.0  # of the chest, to the right and to the left
+    back_s, through_s = (1.0, 1.35, 1.4, 1.7), (1.45, 1.75, 1.9, 2.3)
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        self.top = BLOCK_OF_HEIGHT * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
+        edge = -0.14 + OVERHANG_M
+        self.table((0.40 + PLINTH_HALF_M, edge + BLOCK_HALF_M), (PLINTH_HALF_M, BLOCK_HALF_M),
+                   self.top)  # fmt: skip
+        self.taken = self._lying(0.50 + rng.uniform(-0.015, 0.015), rng.normal(0, 0.06))
+        self.put = self._lying(0.52 + rng.uniform(-0.015, 0.02), rng.normal(0, 0.10))
+        w = puppet.hip_width * 1.1
+        steps = [
+            Step(RIGHT, 0.02, 0.40, (0.02, -w)),
+            Step(1 - RIGHT, 0.34, 0.72, (0.04, w)),
+            Step(RIGHT, 1.04, 1.38, (-0.20, -w - 0.05), -0.5),
+            Step(RIGHT, 1.98, 2.34, (0.03, -w)),
+        ]
+        self.walk(np.array([[-0.24, w], [-0.22, -w]]), steps)
+        self.size = rng.uniform(0.9, 1.1, 3)
+        self.grips[RIGHT] = wrapped(puppet, RIGHT, WRAP_OPEN, self.thing.surface, self.taken,
+                                    self._approaches())  # fmt: skip
+        self.hold_s[RIGHT] = (ATTACH_S, RELEASE_S)
+
+    def _lying(self, ahead: float, yaw: float) -> np.ndarray:
+        """The thing (4, 4) on the block: it rests on the two points on either side of its centre
+        of mass, its handle's middle ``ahead`` of the person."""
+        along = self.far_end * self.thing.vertices[:, 2]
+        height = self.side_up * self.thing.vertices[:, 1]
+        on_block = along > self.far_end * self.handle_m + OVERHANG_M
+        outline = np.stack([along, height], 1)[on_block]
+        hull = ConvexHull(outline)
+        ends = outline[hull.simplices]  # (E, 2, 2)
+        below = (ends[:, :, 0].min(1) < 0) & (ends[:, :, 0].max(1) > 0)
+        below &= hull.equations[:, 1] < 0
+        near, beyond = sorted(ends[below][0].tolist())
+        slope = np.arctan2(beyond[1] - near[1], beyond[0] - near[0])
+        far = np.array([-np.sin(yaw) * np.cos(slope), np.cos(yaw) * np.cos(slope), -np.sin(slope)])
+        z = self.far_end * far
+        y = self.side_up * unit(np.array([0, 0, 1.0]) - far[2] * far)
+        rotation = np.stack([np.cross(y, z), y, z], 1)
+        place = np.array([ahead, -0.14, 0.0]) - rotation @ np.array([0, 0, self.handle_m])
+        turned = self.thing.vertices[on_block] @ rotation.T
+        place[2] = self.top - turned[:, 2].min()
+        return transform(rotation, place)
+
+    def _approaches(self) -> Iterator[Approach]:
+        """The palm from above and behind, fingers across the handle."""
+        across = self.far_end * self.taken[:3, 2]
+        ahead = np.array([across[1], -across[0], 0.0])
+        for shift, along in product((0.0, 0.012, -0.012), (0.034, 0.026, 0.042)):
+            at = self.taken[:3, 3] + (self.far_end * self.handle_m + shift) * across
+            yield Approach(at, 0.92 * ahead + (0, 0, -0.40), -0.40 * ahead + (0, 0, -0.92), along)
+
+    def trunk(self, times: np.ndarray) -> Trunk:
+        """Lean to the block, turn back and through with the swing, lean again."""
+        reach = plateau(times, 0.35, 0.9, 1.0, 1.4) + plateau(times, 2.05, 2.5, 2.6, 3.0)
+        trunk = self.leaning(times, reach, 0.30 * reach)
+        back, through = plateau(times, *self.back_s), plateau(times, *self.through_s)
+        swing = self.turn_through_rad * through - self.turn_back_rad * back
+        trunk.bend[:, 0] += 0.5 * reach
+        trunk.bend[:, 1] += swing
+        trunk.head[:, 1] += 0.35 * swing - 0.15 * reach
+        return trunk
+
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        """The hand's way through the keys, as the thing sees it."""
+        count, puppet = len(times), self.puppet
+        grip = self.grips[RIGHT].object_from_wrist
+        rest = puppet.subject.rest_joints
+        shoulder = np.array([0.0, rest[17, 0], rest[17, 1] - rest[0, 1]])
+        shoulder = pelvis * (1, 1, 0) + (0, 0, puppet.stand) + shoulder
+        wrist = Pose.still(self.taken @ grip, count)
+        for key in self.keys:
+            fingers, thumb = unit(np.array(key.fingers)), unit(np.array(key.thumb))
+            thumb = unit(thumb - fingers * (fingers @ thumb))
+            rotation = puppet.wrist_rotation(RIGHT, fingers, np.cross(thumb, fingers))
+            place = shoulder + puppet.arm * self.size * key.wrist
+            goal = Pose(place, np.broadcast_to(rotation, (count, 3, 3)))
+            wrist = wrist.towards(goal, ramp(times, key.start, key.end))
+        last = Pose.still(self.put @ grip, count)
+        above = Pose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
+        wrist = wrist.towards(above, ramp(times, 2.0, 2.44))
+        wrist = wrist.towards(last, ramp(times, 2.32, RELEASE_S - 0.03))
+        wrist_from_object = invert(grip)
+        return Pose(
+            wrist.position + wrist.rotation @ wrist_from_object[:3, 3],
+            wrist.rotation @ wrist_from_object[:3, :3],
+        )
+
+    def raised(self, times: np.ndarray, side: int) -> np.ndarray:
+        """The elbow is a little away from the body in the swing."""
+        return (0.0, 0.3)[side] * plateau(times, 1.0, 1.3, 1.9, 2.3)
+
+
+class RacquetSwing(Swinging):
+    """A forehand: back, through the ball's place at the right, up over the left shoulder."""
+
+    object_class = "tennis_racquet"
+    handle_m = -0.27
+    turn_back_rad, turn_through_rad = 0.45, 0.50
+    keys = (
+        Key((0.62, -0.22, -0.40), (0.80, 0.00, -0.60), (0.60, -0.05, 0.80), ATTACH_S, 1.28),
+        Key((-0.30, -0.60, -0.55), (-0.05, -0.70, -0.70), (-0.70, -0.55, 0.45), 1.12, 1.46),
+        Key((0.60, -0.25, -0.62), (0.50, -0.15, -0.85), (0.25, -0.95, 0.05), 1.42, 1.64),
+        Key((0.62, 0.35, -0.10), (0.75, 0.60, 0.20), (0.10, -0.10, 1.00), 1.54, 1.74),
+        Key((0.45, 0.75, 0.10), (0.30, 0.90, -0.20), (-0.60, 0.30, 0.75), 1.64, 1.92),
+    )
+
+
+class UmbrellaSwing(Swinging):
+    """Like a cane: it points ahead, sweeps to the left and then low to the right."""
+
+    object_class = "umbrella"
+    handle_m = 0.305
+    far_end = -1.0
+    side_up = -1.0
+    turn_back_rad, turn_through_rad = 0.10, 0.20
+    back_s, through_s = (1.55, 1.85, 1.95, 2.25), (1.25, 1.5, 1.6, 1.9)
+    keys = (
+        Key((0.70, 0.00, -0.35), (0.60, 0.00, -0.80), (0.80, 0.05, 0.45), ATTACH_S, 1.34),
+        Key((0.66, 0.30, -0.30), (0.50, 0.35, -0.80), (0.35, 0.90, 0.25), 1.28, 1.62),
+        Key((0.50, -0.45, -0.62), (0.30, -0.35, -0.90), (0.55, -0.75, -0.30), 1.56, 1.94),
+    )
