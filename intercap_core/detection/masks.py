@@ -88,13 +88,16 @@ def encode_window(window: np.ndarray, x0: int, y0: int, height: int, width: int)
 
     The same string as of the whole image, in the time that the window takes.
     """
-    column, row = np.divmod(np.flatnonzero(window.T), window.shape[0])
+    length = window.shape[0] + 1  # of a column, and an empty pixel that ends its last run
+    columns = np.zeros(window.shape[1] * length + 1, bool)
+    columns[1:].reshape(-1, length)[:, :-1] = window.T
+    column, row = np.divmod(np.flatnonzero(columns[1:] != columns[:-1]), length)
     flat = (column + x0) * height + (row + y0)
     if not len(flat):
         return encode(np.zeros((height, width), np.uint8))
-    breaks = np.flatnonzero(np.diff(flat) != 1)
-    starts = flat[np.concatenate([[0], breaks + 1])]
-    ends = flat[np.concatenate([breaks, [len(flat) - 1]])] + 1
+    starts, ends = flat[::2], flat[1::2]
+    apart = starts[1:] != ends[:-1]  # from one column's last pixel to the next one's first
+    starts, ends = starts[np.append(True, apart)], ends[np.append(apart, True)]
     edges = np.concatenate([[0], np.stack([starts, ends], 1).ravel(), [height * width]])
     lengths = np.diff(edges)
     if lengths[-1] == 0:

@@ -105,3 +105,15 @@ def test_polygons_that_are_wrong(polygon):
 def test_polygons_far_outside_the_image(value):
     with pytest.raises(ValueError, match="pixels of the image"):
         masks.from_polygons([[1, 2, value, 4, 5, 6]], 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("x0", "y0", "size"), [(0, 0, (9, 12)), (0, 0, (40, 50)), (3, 31, (9, 12)), (38, 28, (12, 12))]
+)
+@pytest.mark.parametrize("filled", [0.0, 0.5, 0.97, 1.0])
+def test_a_window_is_encoded_as_the_whole_image(x0, y0, size, filled):
+    rng = np.random.default_rng(3)
+    whole = np.zeros((40, 50), bool)
+    window = rng.random(size)[: 40 - y0, : 50 - x0] < filled
+    whole[y0 : y0 + window.shape[0], x0 : x0 + window.shape[1]] = window
+    assert masks.encode_window(window, x0, y0, 40, 50) == masks.encode(whole)
