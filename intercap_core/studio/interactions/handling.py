@@ -17,8 +17,6 @@ from intercap_core.studio.skeleton import turn
 
 RIGHT, LEFT = 1, 0
 SIDES = (RIGHT, LEFT)
-CLEAR_M = 0.075  # an open hand leaves the thing by this much, away from its palm
-BACK_M = 0.03  # and towards the wrist
 OVER_M = np.array([0.0, 0.0, 0.10])  # and comes from, and goes, this much above
 PLINTH_HALF_M = 0.17
 FINGERS_REST_M = 0.004  # a hand stays this far above a table
@@ -33,6 +31,8 @@ class Handling(Interaction):
     """
 
     lead = RIGHT
+    clear_m = 0.075  # an open hand leaves the thing by this much, away from its palm,
+    back_m = 0.03  # and towards the wrist
     taken: np.ndarray
     put: np.ndarray
 
@@ -134,7 +134,7 @@ class Handling(Interaction):
         hand = self.puppet.hands[side]
         at = thing @ self.grips[side].object_from_wrist
         beside = at.copy()
-        beside[:, :3, 3] += at[:, :3, :3] @ (-CLEAR_M * hand.palm - BACK_M * hand.out)
+        beside[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
         over = beside.copy()
         raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)  # a palm below stays below
         over[:, :3, 3] += raised * OVER_M - 0.06 * (at[:, :3, :3] @ hand.out)

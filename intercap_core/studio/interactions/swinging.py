@@ -44,6 +44,7 @@ class Swinging(Handling):
     handle_m = 0.0  # the middle of the hand along the thing's z axis, from its origin
     far_end = 1.0  # where the far end is along z, +1 or -1
     side_up = 1.0  # which side of the thing is up while it lies, along y
+    clear_m, back_m = 0.045, 0.075  # the thumb is behind the handle
     keys: tuple[Key, ...] = ()
     turn_back_rad, turn_through_rad = 0.0, 0.0  # of the chest, to the right and to the left
     back_s, through_s = (1.0, 1.35, 1.4, 1.7), (1.45, 1.75, 1.9, 2.3)
