@@ -116,6 +116,8 @@ class ObjectTrackSettings(Model):
     """Also penalise render over known background, beside the paper's one-sided silhouette."""
     lost_overlap: Fraction = 0.25
     """The track counts as lost when the mean overlap over its views falls below this."""
+    render_on: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where the object is drawn: a GPU needs the extra gpu; auto takes one where it can be used."""
 
 
 class BodyFitSettings(Model):

@@ -164,11 +164,13 @@ class CpuRenderer:
         return np.array([scene.visible(shot.lens, shot.camera_from_mesh) for shot in shots])
 
 
-def open_renderer(device: Device = "auto", *, threads: int = 1) -> Renderer:
+def open_renderer(device: Device = "auto", *, threads: int | None = None) -> Renderer:
     """The renderer of a device; ``auto`` takes a GPU where there is one that can be used.
 
+    ``threads`` of the host: by default as many as the job may use (OMP_NUM_THREADS, else one).
     Raises UserError where ``cuda`` is asked for and there is no such device or no warp.
     """
+    threads = _threads_of_job() if threads is None else threads
     if device == "cpu":
         return CpuRenderer(threads)
     try:
@@ -178,7 +180,7 @@ def open_renderer(device: Device = "auto", *, threads: int = 1) -> Renderer:
             return CpuRenderer(threads)
         raise UserError(
             "rendering on device 'cuda' needs warp, which is not installed; run "
-            "pip install 'intercap-core[gpu]', or set device: cpu"
+            "pip install 'intercap-core[gpu]', or set object_track.render_on: cpu"
         ) from None
     if has_cuda():
         return WarpRenderer("cuda:0", threads=threads)
@@ -186,15 +188,19 @@ def open_renderer(device: Device = "auto", *, threads: int = 1) -> Renderer:
         return CpuRenderer(threads)
     raise UserError(
         "rendering was asked for on device 'cuda', but warp finds no such device here; set "
-        "device: cpu, or run on a machine that has one"
+        "object_track.render_on: cpu, or run on a machine that has one"
     )
 
 
 @lru_cache(maxsize=1)
 def default_renderer() -> Renderer:
-    """The CPU with as many threads as the job may use (OMP_NUM_THREADS; one if that is not set)."""
-    given = os.environ.get("OMP_NUM_THREADS", "1")
-    return CpuRenderer(int(given) if given.isdigit() else 1)
+    """The CPU, with as many threads as the job may use."""
+    return CpuRenderer(_threads_of_job())
+
+
+def _threads_of_job() -> int:
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    return int(given) if given.isdigit() and int(given) > 0 else 1
 
 
 def render(

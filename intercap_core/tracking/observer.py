@@ -10,8 +10,9 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer, open_renderer
 from intercap_core.tracking.evidence import View
-from intercap_core.tracking.fit import Evidence, Fit, MotionPrior, assess, evidence_at, fit_pose
+from intercap_core.tracking.fit import Evidence, Fit, MotionPrior, assess_all, evidence_at, fit_pose
 from intercap_core.tracking.places import Places
 from intercap_core.tracking.search import plausibility, rank_frames, search
 
@@ -39,9 +40,11 @@ class Observer:
     up: np.ndarray | None = None
     joints: np.ndarray | None = None
     views: Callable[[int], list[View]] = field(init=False)
+    renderer: Renderer = field(init=False)
 
     def __post_init__(self) -> None:
         self.views = lru_cache(maxsize=CACHED_FRAMES)(self.load)
+        self.renderer = open_renderer(self.settings.render_on)
 
     @property
     def count(self) -> int:
@@ -74,6 +77,7 @@ class Observer:
             background_term=self.settings.background_term,
             worth=partial(self.places.worth, t),
             near=near,
+            renderer=self.renderer,
         )
 
     def fit(
@@ -97,6 +101,7 @@ class Observer:
             rounds=rounds,
             start_scale=scale,
             twist=twist,
+            renderer=self.renderer,
         )
 
     def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> Evidence:
@@ -109,11 +114,23 @@ class Observer:
             background_term=self.settings.background_term,
             labels=self.labels,
             twist=twist,
+            renderer=self.renderer,
         )
 
     def assess(self, t: int, pose: np.ndarray) -> Fit:
         """How well a pose (4, 4) agrees with frame t as it is."""
-        return assess(self.mesh, self.views(t), pose, min_overlap=LOOK_OVERLAP, labels=self.labels)
+        return self.assess_all(t, pose[None])[0]
+
+    def assess_all(self, t: int, poses: np.ndarray) -> list[Fit]:
+        """:meth:`assess` of many poses (N, 4, 4) at once."""
+        return assess_all(
+            self.mesh,
+            self.views(t),
+            poses,
+            min_overlap=LOOK_OVERLAP,
+            labels=self.labels,
+            renderer=self.renderer,
+        )
 
     def plausibility(self, fit: Fit) -> float:
         """A fit's confidence, a little more where the object stands."""

@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.tracking.alignment import align
 from intercap_core.tracking.evidence import View
-from intercap_core.tracking.fit import Fit, assess, fit_pose
+from intercap_core.tracking.fit import Fit, assess_all, fit_pose
 from intercap_core.tracking.groups import PERSON_LABELS, find_groups
 
 GRID = 240  # rotations of a trivial group: about 40 degrees apart, inside the fit's basin
@@ -43,13 +44,14 @@ def search(
     background_term: bool,
     worth: Callable[[np.ndarray], float] | None = None,
     near: np.ndarray | None = None,
+    renderer: Renderer | None = None,
 ) -> list[Fit]:
     """Fitted hypotheses of the pose, the most plausible first; none where nothing is detected.
 
     ``labels`` are the detector classes that the object may be given (empty: any but a person);
     ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
     ``worth`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near`` (3,)
-    prefers candidates near a place where the object was seen.
+    prefers candidates near a place where the object was seen; ``renderer`` draws, None = the CPU.
     """
 
     def value(fit: Fit) -> float:
@@ -64,10 +66,10 @@ def search(
         if found and max(map(value, found)) > GOOD_ENOUGH:
             break
         poses, residual = align(mesh, field, group, views, rotations)
-        compared = []
-        for index in _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED):
-            start = assess(mesh, views, poses[index], min_overlap=0.1, labels=labels)
-            compared.append(start)
+        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED)
+        compared = assess_all(
+            mesh, views, poses[distinct], min_overlap=0.1, labels=labels, renderer=renderer
+        )
         compared.sort(key=lambda fit: -fit.confidence)
         found += [
             fit_pose(
@@ -78,12 +80,13 @@ def search(
                 min_overlap=min(min_overlap, 0.2),
                 background_term=background_term,
                 labels=labels,
+                renderer=renderer,
             )
             for start in compared[:FITTED]
         ]
     found.sort(key=lambda fit: -value(fit))
     if found and not mesh.symmetry.sphere:
-        found += _turned(mesh, views, found[0], labels, min_overlap, background_term)
+        found += _turned(mesh, views, found[0], labels, min_overlap, background_term, renderer)
         found.sort(key=lambda fit: -value(fit))
     kept: list[Fit] = []
     for fit in found:
@@ -99,15 +102,14 @@ def _turned(
     labels: tuple[str, ...],
     min_overlap: float,
     background_term: bool,
+    renderer: Renderer | None,
 ) -> list[Fit]:
     """Fits from the best pose turned about the object's axes: nearly symmetric objects.
 
     A mug looks much the same with its handle elsewhere, a box from its back.
     """
-    compared = [
-        assess(mesh, views, best.pose @ turn, min_overlap=0.1, labels=labels)
-        for turn in own_turns(mesh, NEAR_TURNS)
-    ]
+    turned = best.pose @ own_turns(mesh, NEAR_TURNS)
+    compared = assess_all(mesh, views, turned, min_overlap=0.1, labels=labels, renderer=renderer)
     compared.sort(key=lambda fit: -fit.score)
     return [
         fit_pose(
@@ -118,6 +120,7 @@ def _turned(
             min_overlap=min(min_overlap, 0.2),
             background_term=background_term,
             labels=labels,
+            renderer=renderer,
         )
         for start in compared[:TURNS_FITTED]
     ]
@@ -138,7 +141,7 @@ def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
             turn[:3, 3] = centre - turn[:3, :3] @ centre
             if not same_pose(mesh, turn, np.eye(4)):
                 found.append(turn)
-    return np.array(found)
+    return np.array(found).reshape(-1, 4, 4)
 
 
 def own_axes(mesh: ObjectMesh) -> np.ndarray:
