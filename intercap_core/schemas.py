@@ -65,6 +65,9 @@ DETECTIONS = Schema(
     stage="detections",
     frame="colour image of each camera, pixels",
     attributes={"sequence": "sequence name"},
+    optional_attributes={
+        "segmentation_model": "name and SHA-256 of the model that saw images without candidates",
+    },
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
         "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),

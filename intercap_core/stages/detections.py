@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -66,13 +67,19 @@ def run(
     if sequence.layout == "behave":
         beside = BehaveFiles(sequence.recordings, sequence.object)
     found = [_read_camera(sequence, camera, beside, settings) for camera in images]
+    attributes = {}
     if settings.segmentation_model is not None:
         _segment(frames, images, found, settings)
+        attributes["segmentation_model"] = _identity(settings.segmentation_model)
     if not any(d.keypoints_found.any() or d.candidates_found.any() for d in found):
         _raise_nothing(sequence, cameras, found)
     _check_labels(sequence, found, object_)
     with artefacts.write(
-        output, DETECTIONS, settings_digest=digest(settings), sequence=sequence.sequence
+        output,
+        DETECTIONS,
+        settings_digest=digest({k: v for k, v in settings if not isinstance(v, Path)}),
+        sequence=sequence.sequence,
+        **attributes,
     ) as writer:
         writer.put("camera_names", cameras)
         writer.put("colour_size", [camera.size for camera in images])
@@ -81,6 +88,11 @@ def run(
         writer.put("candidates_found", np.stack([d.candidates_found for d in found], 1))
         for name, detections in zip(cameras, found, strict=True):
             _put_camera(writer, name, detections)
+
+
+def _identity(path: Path) -> str:
+    with open(path, "rb") as file:
+        return f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 
 def _raise_nothing(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 
@@ -12,6 +13,7 @@ import pytest
 pytest.importorskip("onnxruntime")
 tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
 
+from intercap_core import artefacts  # noqa: E402
 from intercap_core.config import (  # noqa: E402
     DetectionsSettings,
     FramesSettings,
@@ -20,6 +22,7 @@ from intercap_core.config import (  # noqa: E402
 )
 from intercap_core.detection import masks  # noqa: E402
 from intercap_core.detection.read import Detections  # noqa: E402
+from intercap_core.schemas import DETECTIONS  # noqa: E402
 from intercap_core.stages import detections, frames  # noqa: E402
 
 WIDTH, HEIGHT, COUNT = 160, 96, 5
@@ -95,7 +98,13 @@ def test_images_without_candidates_are_segmented(capture, tmp_path, caplog, make
     assert read.candidates(1, 1) == [], "the file says that there is nothing"
     assert f"segmented {COUNT} of {COUNT} images" in caplog.text
     assert "umbrella" in caplog.text and "suitcase (5)" in caplog.text
-    run(capture, "again.h5", segmentation_model=path)
+    with artefacts.read(tmp_path / "detections.h5", DETECTIONS) as artefact:
+        name, digest = artefact.attributes["segmentation_model"].split()
+    assert name == "model.onnx" and digest == hashlib.sha256(path.read_bytes()).hexdigest()
+    moved = tmp_path / "elsewhere" / "model.onnx"
+    moved.parent.mkdir()
+    path.rename(moved)
+    run(capture, "again.h5", segmentation_model=moved)
     first, second = (tmp_path / name for name in ("detections.h5", "again.h5"))
     assert first.read_bytes() == second.read_bytes()
 
