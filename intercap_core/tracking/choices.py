@@ -33,19 +33,19 @@ def weak_frames(scores: np.ndarray, lost: np.ndarray) -> np.ndarray:
 def other_fits(
     mesh: ObjectMesh,
     pose: np.ndarray,
-    assess: Callable[[np.ndarray], Fit],
+    assess_all: Callable[[np.ndarray], list[Fit]],
     fit: Callable[[np.ndarray], Fit],
 ) -> list[Fit]:
     """Fits of one frame from its pose (4, 4) and from the best of those turned about each axis."""
     centre = mesh.centre_of_mass
-    starts = []
+    turns = []
     for axis in np.eye(3):
         for angle in (STARTS_RAD, -STARTS_RAD):
             turn = np.eye(4)
             turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
             turn[:3, 3] = centre - turn[:3, :3] @ centre
-            starts.append(assess(pose @ turn))
-    starts.sort(key=lambda found: -found.score)
+            turns.append(turn)
+    starts = sorted(assess_all(pose @ np.array(turns)), key=lambda found: -found.score)
     return [fit(pose), *(fit(start.pose) for start in starts[:FITTED])]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -73,7 +74,7 @@ class WholeTrack:
         scores = np.full((len(keys), len(turns)), np.nan)
         for k, t in enumerate(keys):
             if not lost[t]:
-                found = [self._observer.assess(t, fits[t].pose @ turn) for turn in turns]
+                found = self._observer.assess_all(int(t), fits[t].pose @ turns)
                 scores[k] = [self._observer.plausibility(fit) for fit in found]
         jumped = lost | broken
         between = [bool(jumped[a : b + 1].any()) for a, b in pairwise(keys)]
@@ -82,7 +83,7 @@ class WholeTrack:
         nearest = np.abs(np.arange(len(fits))[:, None] - keys).argmin(1)
         for t in np.flatnonzero((chosen[nearest] > 0) & ~lost):
             start = fits[t].pose @ turns[chosen[nearest[t]]]
-            fit = self._observer.fit(int(t), start, MotionPrior(start))
+            fit = self._fit_near(int(t), start)
             if fit.score >= fits[t].score - TURN_LOSS:
                 result[t] = fit
         return result
@@ -99,11 +100,14 @@ class WholeTrack:
             options[t] += other_fits(
                 self._mesh,
                 fits[t].pose,
-                lambda pose, t=t: self._observer.assess(t, pose),
-                lambda pose, t=t: self._observer.fit(t, pose, MotionPrior(pose)),
+                partial(self._observer.assess_all, t),
+                partial(self._fit_near, t),
             )
         path = best_sequence(self._mesh, options, self._times)
         return [own[i] for own, i in zip(options, path, strict=True)]
+
+    def _fit_near(self, t: int, pose: np.ndarray) -> Fit:
+        return self._observer.fit(t, pose, MotionPrior(pose))
 
     # --- all frames together -------------------------------------------------------------------
 
@@ -181,7 +185,7 @@ class WholeTrack:
         symmetry = self._mesh.symmetry
         if symmetry.sphere:
             axes, offset = np.eye(3), np.zeros(3)
-        elif symmetry.axis is not None:
+        elif symmetry.axis is not None and symmetry.offset is not None:
             axes, offset = symmetry.axis[None], symmetry.offset
         else:
             return np.zeros((0, 6))
