@@ -18,7 +18,7 @@ from intercap_core.errors import UserError
 from intercap_core.project import digest
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
-from intercap_core.tracking.evidence import View, ViewGeometry
+from intercap_core.tracking.evidence import View, ViewGeometry, distances
 from intercap_core.tracking.object_size import size_doubt
 from intercap_core.tracking.passes import Track, Tracker
 from intercap_core.tracking.seed import NotFound
@@ -58,11 +58,12 @@ class ObjectRecording:
         self._masks = [masks[t * len(rig) : (t + 1) * len(rig)] for t in range(frames.num_sets)]
         usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
         self.cameras = [int(c) for c in np.flatnonzero(usable)]
+        away = distances([rig[c] for c in self.cameras], self.joints)
         self.geometry = [
             ViewGeometry.for_object(
-                rig[c], diameter_m, float(np.nan_to_num(bias[c])), float(late[c])
+                rig[c], diameter_m, float(np.nan_to_num(bias[c])), float(late[c]), distance
             )
-            for c in self.cameras
+            for c, distance in zip(self.cameras, away, strict=True)
         ]
 
     def views(self, t: int) -> list[View]:

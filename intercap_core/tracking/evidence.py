@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +17,7 @@ from intercap_core.tracking.reduced_mask import EMPTY, ReducedMask, decode, redu
 # since neighbouring pixels of a mask or a depth image err together.
 SILHOUETTE_PX = 110
 DEPTH_PX = 80
-TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring
+TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, where nothing tells
 MAX_STEP = 4
 
 
@@ -42,10 +43,15 @@ class ViewGeometry:
         diameter_m: float,
         depth_bias_m: float = 0.0,
         time_offset_s: float = 0.0,
+        distance_m: float = TYPICAL_DISTANCE_M,
     ) -> ViewGeometry:
-        """Choose the reduction by how large the object appears at a typical distance."""
-        step = _step(camera.colour.fx, diameter_m, SILHOUETTE_PX)
-        depth_step = _step(camera.depth.fx, diameter_m, DEPTH_PX) if camera.depth else 1
+        """Choose the reduction by how large the object appears where it mostly is.
+
+        Metres: ``diameter_m`` of the object, ``distance_m`` of it from the camera.
+        """
+        angle = diameter_m / distance_m
+        step = _step(camera.colour.fx, angle, SILHOUETTE_PX)
+        depth_step = _step(camera.depth.fx, angle, DEPTH_PX) if camera.depth else 1
         return cls(
             camera,
             reduced_lens(camera.colour, step),
@@ -84,8 +90,18 @@ class ViewGeometry:
         return self.depth_from_master @ self.master_from_colour
 
 
-def _step(focal_px: float, diameter_m: float, wanted_px: int) -> int:
-    return int(np.clip(round(focal_px * diameter_m / TYPICAL_DISTANCE_M / wanted_px), 1, MAX_STEP))
+def distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
+    """How far (metres) each camera is from what happens: from the person's joints (T, K, 3),
+    master frame, NaN where unknown; :data:`TYPICAL_DISTANCE_M` where no joint is known."""
+    places = joints[np.isfinite(joints).all(-1)]
+    if not len(places):
+        return [TYPICAL_DISTANCE_M] * len(cameras)
+    eyes = [camera.master_from_colour[:3, 3] for camera in cameras]
+    return [float(np.median(np.linalg.norm(places - eye, axis=1))) for eye in eyes]
+
+
+def _step(focal_px: float, angle: float, wanted_px: int) -> int:
+    return int(np.clip(round(focal_px * angle / wanted_px), 1, MAX_STEP))
 
 
 @dataclass(frozen=True, eq=False)

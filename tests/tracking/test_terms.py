@@ -5,11 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import rigid
 from intercap_core.detection.masks import encode
 from intercap_core.energy import object_depth, object_silhouette
+from intercap_core.tracking.evidence import ViewGeometry, distances
 from intercap_core.tracking.reduced_mask import decode, reduced_lens
-from tests.synthetic_capture import COLOUR
+from tests.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH
 
 RNG = np.random.default_rng(0)
 LENS = COLOUR.scaled(0.5)
@@ -90,3 +92,29 @@ def test_reduced_pixels_are_the_same_rays():
 def test_a_mask_of_another_size_is_refused():
     with pytest.raises(ValueError, match="does not fit"):
         decode(encode(np.ones((5, 5), bool)), COLOUR, 2)
+
+
+def _geometry(diameter: float, distance: float, scale: float = 1.0) -> ViewGeometry:
+    camera = Camera("k1", COLOUR.scaled(scale), DEPTH, COLOUR_FROM_DEPTH, np.eye(4))
+    return ViewGeometry.for_object(camera, diameter, distance_m=distance)
+
+
+def test_images_are_reduced_by_how_large_the_object_appears():
+    """Every pixel of a cup counts; a suitcase near by would be 400 px high: each fourth does."""
+    assert (_geometry(0.1, 2.2).step, _geometry(0.1, 2.2).depth_step) == (1, 1)
+    assert _geometry(0.1, 2.2, scale=2 / 3).step == 1
+    assert [_geometry(0.62, distance).step for distance in (1.4, 2.2, 5.0)] == [4, 2, 1]
+    assert _geometry(1.1, 1.0).step == 4
+    for distance in (1.5, 2.0, 3.0, 4.0, 6.0):
+        for diameter in (0.25, 0.6, 1.0):
+            geometry = _geometry(diameter, distance)
+            shown = geometry.camera.colour.fx * diameter / distance
+            assert geometry.step in (1, 4) or 70 < shown / geometry.step < 170
+
+
+def test_distance_of_each_camera_from_the_person():
+    joints = np.full((2, 5, 3), np.nan)
+    cameras = [_geometry(1.0, 1.0).camera]
+    assert distances(cameras, joints) == [2.5]
+    joints[1, :3] = (0, 0, 3.5), (0, 0, 4.0), (0, 0, 9.0)
+    assert distances(cameras, joints) == [4.0]
