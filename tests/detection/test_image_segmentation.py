@@ -1,0 +1,115 @@
+"""Masks and candidates from the images alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreground_capture import BOX, BOX_M, PERSON, SCENERY, STOOL, Carrying
+from synthetic_people import seen_by, write_detections
+
+from intercap_core import artefacts
+from intercap_core.capture.frames import Frames
+from intercap_core.config import PersonSettings
+from intercap_core.detection import masks
+from intercap_core.detection.read import FROM_DETECTOR, FROM_IMAGES, Detections
+from intercap_core.schemas import PERSON as PERSON_SCHEMA
+from intercap_core.stages import person
+
+STEP = 4
+CAPTURE = Carrying()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> tuple[Path, Path, Path]:
+    """Frames, scene, and detections whose images all have candidates: none."""
+    folder = tmp_path_factory.mktemp("carrying")
+    keypoints = seen_by(CAPTURE.people, CAPTURE.rig, CAPTURE.zup_from_master)
+    noise = np.random.default_rng(1).normal(0, 3, keypoints[..., :2].shape)
+    keypoints[..., :2] += noise
+    people = [[[keypoints[t, c]] for c in range(CAPTURE.views)] for t in range(CAPTURE.sets)]
+    detections = write_detections(folder / "detections.h5", CAPTURE.rig, people)
+    return (*CAPTURE.write(folder), detections)
+
+
+def run(written: tuple[Path, Path, Path], output: Path, segmentation: str = "images") -> Path:
+    frames, scene, detections = written
+    person.run(
+        frames=frames,
+        detections=detections,
+        scene=scene,
+        output=output,
+        settings=PersonSettings(segmentation=segmentation),
+    )
+    return output
+
+
+@pytest.fixture(scope="module")
+def segmented(written, tmp_path_factory) -> Path:
+    return run(written, tmp_path_factory.mktemp("person") / "person.h5")
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / max(1, (a | b).sum()))
+
+
+def best_overlaps(written, segmented, t: int, what: int) -> list[float]:
+    """IoU of each view's best candidate with what is truly there, views that show it well."""
+    frames, _, detections = written
+    with Frames.open(frames) as images:
+        moments = np.tile(np.arange(images.num_sets)[:, None], (1, CAPTURE.views))
+    found = Detections.load(detections).showing(moments).with_candidates_of(segmented)
+    result = []
+    for c, camera in enumerate(CAPTURE.rig):
+        truth = CAPTURE.true_masks(t, camera, STEP) == what
+        if truth.sum() > 300:
+            drawn = [one.mask()[::STEP, ::STEP] for one in found.candidates(t, c)]
+            result.append(max([overlap(mask, truth) for mask in drawn], default=0.0))
+    return result
+
+
+def test_the_person_is_segmented(segmented):
+    with artefacts.read(segmented, PERSON_SCHEMA) as found:
+        rles = artefacts.unpack_ragged(found["mask_offsets"], found["mask_rle"])
+        assert (found["mask_source"] == FROM_IMAGES).all()
+    for t in (1, 7, 12):
+        for c, camera in enumerate(CAPTURE.rig):
+            truth = CAPTURE.true_masks(t, camera, STEP) == PERSON
+            mask = masks.decode(rles[t * CAPTURE.views + c], 1080, 1920)[::STEP, ::STEP]
+            assert overlap(mask, truth) > 0.75
+
+
+@pytest.mark.parametrize("t", [1, 6, 12])
+def test_what_is_carried_is_a_candidate_at_rest_and_in_the_hand(written, segmented, t):
+    found = best_overlaps(written, segmented, t, BOX)
+    assert len(found) >= 2 and np.median(found) > 0.6 and min(found) > 0.35
+
+
+def test_what_never_moves_is_a_candidate_where_the_person_passes(written, segmented):
+    found = best_overlaps(written, segmented, 12, SCENERY)
+    assert len(found) >= 3 and min(found) > 0.6
+
+
+def test_candidates_tell_their_size_and_are_few(segmented):
+    with artefacts.read(segmented, PERSON_SCHEMA) as found:
+        extents, scores = found["candidate_extents"], found["candidate_scores"]
+        count = np.diff(found["candidate_offsets"])
+        things = found["candidate_things"]
+    for size in (np.linalg.norm(BOX_M), np.linalg.norm(STOOL[1] - STOOL[0])):
+        assert (np.abs(extents - size) < 0.12).sum() >= CAPTURE.sets
+    assert ((scores > 0) & (scores <= 1)).all() and (things >= 0).all()
+    assert count.max() <= 8  # furniture that nobody comes near is none
+
+
+def test_images_that_a_detector_saw_are_left_to_it(written, tmp_path, monkeypatch):
+    monkeypatch.setattr(Frames, "depth", lambda *_: pytest.fail("opens depth"))
+    output = run(written, tmp_path / "person.h5", "auto")
+    with artefacts.read(output, PERSON_SCHEMA) as found:
+        assert (found["mask_source"] == FROM_DETECTOR).all()
+        assert "candidate_rle" not in found
+
+
+def test_same_images_same_bytes(written, segmented, tmp_path):
+    again = run(written, tmp_path / "person.h5")
+    assert again.read_bytes() == segmented.read_bytes()
