@@ -192,10 +192,12 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
                 continue
             z = depth[inside]
             inside = inside[np.abs(z - np.median(z)) < 0.75 * diameter]
+            if len(inside) < MIN_POINTS:
+                continue  # two surfaces, with the middle between them
             points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
             centre = np.median(points, axis=0)
             spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
-            if len(points) < MIN_POINTS or spread > 0.75 * diameter:
+            if spread > 0.75 * diameter:
                 continue
             value = _value(candidate.label, labels)
             outline = Outline.of(view, candidate)
