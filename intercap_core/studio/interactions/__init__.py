@@ -5,11 +5,12 @@ from __future__ import annotations
 from intercap_core.errors import UserError
 from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.bottle_drink import BottleDrink
-from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
 from intercap_core.studio.interactions.chair_sit import ChairSit
+from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
 from intercap_core.studio.interactions.cup_drink import CupDrink
 from intercap_core.studio.interactions.football_kick import FootballKick
 from intercap_core.studio.interactions.passing import BottlePass, CupPass, FootballPass
+from intercap_core.studio.interactions.skateboard_ride import SkateboardRide
 from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
 from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
@@ -26,6 +27,7 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "cup_pass": CupPass,
     "football_pass": FootballPass,
     "football_kick": FootballKick,
+    "skateboard_ride": SkateboardRide,
     "racquet_swing": RacquetSwing,
     "umbrella_swing": UmbrellaSwing,
     "stool_sit": StoolSit,

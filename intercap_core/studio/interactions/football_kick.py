@@ -1,16 +1,14 @@
-"""Step up to a ball, put the sole on it, swing back, kick it with the instep; it rolls to a stop."""
+"""Step up to a ball, put the sole on it, swing back, kick it; it rolls until it stops."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.studio.controls import Footwork, Guide, Pose, Step, bump, plateau, ramp
-from intercap_core.studio.hands import RELAXED, part_of
+from intercap_core.studio.hands import RELAXED
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
-from intercap_core.studio.motion import LEG_REACH, Trunk, foot_rotations
+from intercap_core.studio.interactions.feet import Foot, moved, still
+from intercap_core.studio.motion import LEG_REACH, Trunk
 from intercap_core.studio.skeleton import turn, unit
 
 RIGHT, LEFT = 1, 0
@@ -45,23 +43,11 @@ class FootballKick(Interaction):
         self.ahead = np.array([np.cos(direction), np.sin(direction), 0.0])
         sole_gap = rng.uniform(*HOVER_M) if rng.random() < HOVER_SHARE else -PRESSED_M
         sliding, rolling = rng.uniform(*SLIDING_FRICTION), rng.uniform(*ROLLING_FRICTION)
-        bones = [JOINT_INDEX["right_ankle"], JOINT_INDEX["right_foot"]]
-        share = np.asarray(puppet.subject.weights[:, bones].sum(1)).ravel()
-        self.foot = part_of(puppet.subject, np.flatnonzero(share > 0.5))
+        self.foot = Foot(puppet, RIGHT)
         self._footwork(sole_gap)
         self._roll(GRAVITY * sliding, GRAVITY * rolling)
 
     # --- the foot ----------------------------------------------------------------------------
-
-    def _skin(self, at: np.ndarray) -> np.ndarray:
-        """The right foot's skin (N, n, 3) for ankle x, y, z, pitch and heading (N, 5)."""
-        ankle, toes = JOINT_INDEX["right_ankle"], JOINT_INDEX["right_foot"]
-        foot = foot_rotations(at[:, [4, 4]], at[:, [3, 3]])[:, RIGHT]
-        local = np.broadcast_to(np.eye(3), (len(at), 55, 3, 3)).copy()
-        local[:, ankle] = foot[:, 0]
-        local[:, toes] = np.swapaxes(foot[:, 0], 1, 2) @ foot[:, 1]
-        posed = self.foot.skin(local, np.zeros((len(at), 3))).vertices
-        return posed - self.puppet.subject.rest_joints[ankle] + at[:, None, :3]
 
     def _gap(self, skin: np.ndarray, rolled: float = 0.0) -> float:
         """Least signed distance of skin (n, 3) to the ball that was moved by ``rolled`` metres."""
@@ -82,39 +68,30 @@ class FootballKick(Interaction):
                 high = middle
         return high
 
-    def _touching(self, at: np.ndarray, way: np.ndarray, gap: float) -> np.ndarray:
-        """The foot (5,) moved back from the ball along ``way`` (5,) until it is ``gap`` off."""
-        low, high = 0.0, 1.0
-        for _ in range(18):
-            middle = (low + high) / 2
-            if self._gap(self._skin((at + middle * way)[None])[0]) < gap:
-                low = middle
-            else:
-                high = middle
-        return at + high * way
-
     def _footwork(self, sole_gap: float) -> None:
         puppet, w, (x, y, _) = self.puppet, self.puppet.hip_width, self.spot
         sole = puppet.ankle_height[RIGHT]
         on_ball = np.array([x - 0.11, y, self.radius, -0.10, 0.0])
-        on_ball = self._touching(on_ball, np.array([0, 0, 0.4, 0, 0]), sole_gap)
+        on_ball = self.foot.backed_off(on_ball, np.array([0, 0, 0.4, 0, 0]), sole_gap, self._gap)
         strike = np.array([x, y - 0.01, 0.5, 0.62, 0.0])
-        strike[2] += TOE_CLEAR_M - self._skin(strike[None])[0, :, 2].min()
-        self.strike = self._touching(strike, np.array([-0.5, 0, 0, 0, 0]), 0.0)
-        self.back = self.strike + (-BACKSWING_M, 0, sole + 0.20 - self.strike[2], 0.12, 0)
-        self.through = self.strike + (THROUGH_M, 0.03, sole + 0.17 - self.strike[2], -0.10, 0)
+        strike[2] += TOE_CLEAR_M - self.foot.skin(strike[None])[0, :, 2].min()
+        self.strike = self.foot.backed_off(
+            strike, np.array([-0.5, 0, 0, 0, 0]), 0.0, self._gap
+        )
+        self.back = moved(self.strike, -BACKSWING_M, 0, sole + 0.20 - self.strike[2], 0.12)
+        self.through = moved(self.strike, THROUGH_M, 0.03, sole + 0.17 - self.strike[2], -0.1)
         beside = self.strike[0] + 0.03
         start = np.array([[beside - 0.36, w], [beside - 0.30, -w]])
         steps = [
             Step(LEFT, 0.02, 0.38, (beside, w)),
             Step(RIGHT, 0.28, 2.50, (beside + 0.17, -w)),
         ]
-        over = on_ball + (0, 0, 0.06, 0, 0)
+        over = moved(on_ball, 0, 0, 0.06)
         guides = [
-            Guide(RIGHT, 0.26, 0.58, _held(over + (-0.16, 0, 0.02, 0.2, 0))),
-            Guide(RIGHT, 0.46, 0.74, _held(over)),
-            Guide(RIGHT, 0.66, SOLE_S, _held(on_ball)),
-            Guide(RIGHT, SOLE_OFF_S, 1.16, _held(over)),
+            Guide(RIGHT, 0.26, 0.58, still(moved(over, -0.16, 0, 0.02, 0.2))),
+            Guide(RIGHT, 0.46, 0.74, still(over)),
+            Guide(RIGHT, 0.66, SOLE_S, still(on_ball)),
+            Guide(RIGHT, SOLE_OFF_S, 1.16, still(over)),
             Guide(RIGHT, 1.04, 1.38, self._swing),
             Guide(RIGHT, SWUNG_S - 0.08, 2.50),
         ]
@@ -140,13 +117,13 @@ class FootballKick(Interaction):
         """How far the ball has moved, metres, and turned, rad, by time; ``sliding`` and
         ``rolling`` are how fast friction slows it, m/s^2.
 
-        A foot that comes nearer pushes it away; friction with the floor slows the ball and spins it up
-        until it rolls.
+        A foot that comes nearer pushes it away; friction with the floor slows the ball and spins
+        it up until it rolls.
         """
         self.clock = np.arange(SWING_S, SCRIPT_S + 1.0, STEP_S)
         self.moved, self.turned = np.zeros((2, len(self.clock)))
         swing = self.clock[self.clock < SWUNG_S]
-        skin = self._skin(self._swing(swing))
+        skin = self.foot.skin(self._swing(swing))
         speed = spin = 0.0
         for n in range(1, len(self.clock)):
             slips = spin * self.radius < speed - 1e-9
@@ -204,8 +181,3 @@ class FootballKick(Interaction):
             puppet.arm_to(world, trunk.pelvis, side, Pose(wrist.position + out, wrist.rotation))
             puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
         return Performance(world, trunk.pelvis, self._ball(times))
-
-
-def _held(place: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A foot (5,) that stays where it is."""
-    return lambda times: np.broadcast_to(place, (len(times), 5))

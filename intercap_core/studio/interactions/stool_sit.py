@@ -4,198 +4,42 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.camera.transforms import invert
-from intercap_core.studio.controls import Footwork, Pose, Step, bump, plateau, ramp
-from intercap_core.studio.hands import FLAT, RELAXED, HandShape, part_of
-from intercap_core.studio.interactions.base import (
-    SCRIPT_S,
-    Interaction,
-    Performance,
-    transform,
-    upright,
-)
-from intercap_core.studio.motion import LEG_REACH, Trunk
-from intercap_core.studio.skeleton import local_rotations, unit
+from intercap_core.studio.controls import Pose, ramp
+from intercap_core.studio.hands import RELAXED
+from intercap_core.studio.interactions.sitting import LEFT, SEATED_S, Sitting
+from intercap_core.studio.skeleton import unit
 
-RIGHT, LEFT = 1, 0
-SIT_S, SEATED_S, RISE_S, RISEN_S = 0.68, 1.50, 2.10, 2.90
-PRESSED_M = 0.014  # flesh gives way by this much on the seat
 HOVER_M = (0.006, 0.016)
-TOUCH_M = 0.0006  # how deep the palm presses the seat
 
 
-class StoolSit(Interaction):
-    """The person stands before the stool with the back to it."""
+class StoolSit(Sitting):
+    """A round seat without a back; the left hand hangs beside its rim."""
 
     object_class = "stool"
-    highlight = 1.75
-    centre = (0.15, 0.0)
+    palm_at = (-0.02, -0.16)
+    hanging = 1.0
 
     def plan(self) -> None:
-        rng, puppet = self.rng, self.puppet
-        thigh = puppet.skeleton.length("left_hip", "left_knee")
-        self.seat = upright(0.0, 0.0, self.thing.standing_height, rng.uniform(0, np.pi / 2))
-        self.seat_top = self.seat[2, 3] + self.thing.vertices[:, 2].max()
-        self.ahead = thigh * rng.uniform(0.90, 0.98)  # feet before the seat's middle
-        w = puppet.hip_width * 1.15
-        before = 0.16
-        start = np.array([[self.ahead + before, w], [self.ahead + before - 0.03, -w]])
-        steps = [
-            Step(RIGHT, 0.02, 0.40, (self.ahead - 0.01, -w)),
-            Step(LEFT, 0.32, 0.70, (self.ahead + 0.01, w)),
-        ]
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
-        self.hover = rng.uniform(*HOVER_M)
-        self.seated_height = self.seat_top + 0.12
-        self._sit()
-        self.palm_place = self._palm_on_seat()
-        self.hover_place = self._beside_seat()
+        super().plan()
+        self.hover_place = self._beside_seat(self.rng.uniform(*HOVER_M))
 
-    def _sit(self) -> None:
-        """Lower the pelvis until the flesh is pressed in by ``PRESSED_M``."""
-        puppet, subject = self.puppet, self.puppet.subject
-        low_part = [JOINT_INDEX[n] for n in ("pelvis", "left_hip", "right_hip", "spine1")]
-        share = np.asarray(subject.weights[:, low_part].sum(1)).ravel()
-        seat = part_of(subject, np.flatnonzero(share > 0.5))
-        when = np.array([(SEATED_S + RISE_S) / 2])
-        low, high = self.seat_top + 0.02, self.seat_top + 0.22
-        for _ in range(14):
-            middle = (low + high) / 2
-            self.seated_height = middle
-            trunk = self._trunk(when, still=True)
-            world = puppet.trunk(trunk)
-            puppet.legs(world, trunk.pelvis, *self.footwork.feet(when))
-            posed = seat.skin(local_rotations(world), trunk.pelvis - subject.rest_joints[0])
-            local = (posed.vertices[0] - self.seat[:3, 3]) @ self.seat[:3, :3]
-            if self.thing.surface.signed_distance(local).min() < -PRESSED_M:
-                low = middle
-            else:
-                high = middle
-        self.seated_height = high
+    def turned(self) -> float:
+        return self.rng.uniform(0, np.pi / 2)
 
-    def _palm_on_seat(self) -> np.ndarray:
-        """The right hand flat on the edge of the seat, lightly pressed."""
-        hand = self.puppet.hands[RIGHT]
-        fingers = unit(np.array([0.12, -0.62, -0.55]))
-        palm = unit(np.array([0.08, -0.38, -0.90]))
-        rotation = self.puppet.wrist_rotation(RIGHT, fingers, palm)
-        place = np.array([-0.02, -0.16, self.seat_top + 0.10]) - rotation @ hand.knuckles.mean(0)
-        return self._approached(RIGHT, FLAT, rotation, place, np.array([0, 0, 1.0]), -TOUCH_M)
-
-    def _beside_seat(self) -> np.ndarray:
-        """The left hand hanging beside the seat's rim, ``hover`` away."""
+    def _beside_seat(self, hover: float) -> np.ndarray:
+        """The left hand hanging beside the seat's rim, ``hover`` metres away."""
         hand = self.puppet.hands[LEFT]
         fingers, palm = unit(np.array([0.15, 0.10, -1.0])), np.array([0.0, -1.0, -0.1])
         rotation = self.puppet.wrist_rotation(LEFT, fingers, palm)
         place = np.array([0.02, 0.20, self.seat_top - 0.02]) - rotation @ hand.knuckles.mean(0)
-        return self._approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), self.hover)
+        return self.approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), hover)
 
-    def _approached(
-        self,
-        side: int,
-        hand_shape: HandShape,
-        rotation: np.ndarray,
-        place: np.ndarray,
-        away: np.ndarray,
-        gap: float,
-    ) -> np.ndarray:
-        """A wrist (4, 4) moved along ``away`` from ``place`` until the hand is ``gap`` from the
-        stool (negative: pressed)."""
-        low, high = -0.15, 0.12
-        for _ in range(18):
-            middle = (low + high) / 2
-            pose = invert(self.seat) @ transform(rotation, place + middle * away)
-            if self.puppet.hands[side].gap(hand_shape, self.thing.surface, pose) < gap:
-                low = middle
-            else:
-                high = middle
-        return transform(rotation, place + high * away)
-
-    def _trunk(self, times: np.ndarray, *, still: bool = False) -> Trunk:
-        track = self.pelvis_track(times)
-        sway = self.sway(times) * (0.0 if still else 1.0)
-        shift = self.weight_shift(times) * (0.0 if still else 1.0)
-        # the hips go back before they go down, and up before they come forward
-        down = ramp(times, SIT_S, SEATED_S) - ramp(times, RISE_S, RISEN_S)
-        back = ramp(times, SIT_S - 0.12, SEATED_S - 0.30)
-        back -= ramp(times, RISE_S + 0.16, RISEN_S + 0.05)
-        lean = plateau(times, SIT_S - 0.12, SIT_S + 0.36, SEATED_S - 0.20, SEATED_S + 0.20)
-        lean = lean + plateau(times, RISE_S - 0.30, RISE_S + 0.05, RISE_S + 0.30, RISEN_S)
-        feel = plateau(times, 0.72, 1.16, 1.30, 1.75)
-        pelvis = track[:, :3] + shift * (1 - down)[:, None]
-        pelvis[:, 0] += back * (0.005 - pelvis[:, 0])
-        pelvis[:, 1] *= 1 - 0.7 * down
-        pelvis[:, 2] += down * (self.seated_height - pelvis[:, 2])
-        bend = 0.6 * sway[:, :3] * (1 - 0.7 * down)[:, None]
-        bend[:, 0] += 0.05 + 0.60 * lean + 0.10 * feel - 0.10 * down
-        bend[:, 2] += 0.30 * feel
-        bend[:, 1] -= 0.12 * feel
-        head = 1.3 * sway[:, 3:]
-        head[:, 0] += 0.10 + 0.25 * lean + 0.15 * feel
-        head[:, 1] -= 0.3 * feel
-        return Trunk(pelvis, track[:, 3], bend, head)
-
-    def _on_thigh(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> Pose:
-        """The wrist over the thigh of its side, the palm down."""
-        puppet, sign = self.puppet, (1.0, -1.0)[side]
-        name = ("left", "right")[side]
-        hip = pelvis + world[:, 0] @ puppet.skeleton.bone("pelvis", f"{name}_hip")
-        thigh = world[:, JOINT_INDEX[f"{name}_hip"]]
-        bone = puppet.skeleton.bone(f"{name}_hip", f"{name}_knee")
-        along = unit(thigh @ bone)
-        above = unit(thigh @ np.array([0, 0, 1.0]))
-        position = hip + 0.52 * (thigh @ bone) + 0.105 * above
-        position[:, 1] += 0.012 * sign
-        fingers = unit(along + np.array([0.0, -0.15 * sign, 0.0]) + 0.10 * above)
-        return Pose(position, puppet.wrist_rotation(side, fingers, -above))
-
-    def _wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, side: int) -> Pose:
+    def left_wrist(self, idle: Pose, world: np.ndarray, pelvis: np.ndarray,
+                   times: np.ndarray) -> Pose:  # fmt: skip
         count = len(times)
-        swing = 0.06 * bump(times, 0, 0.5) * (1, -1)[side] + self.arm_swing(times)[:, side]
-        idle = self.puppet.idle_wrist(world, pelvis, side, swing)
-        thigh = self._on_thigh(world, pelvis, side)
-        rising = ramp(times, RISE_S + 0.10, RISEN_S + 0.05)
-        place = (self.hover_place, self.palm_place)[side]
+        place = self.hover_place
         aside = place.copy()
-        if side == LEFT:  # hangs beside the seat while sitting
-            aside[:3, 3] += (0.0, 0.07, 0.06)
-            wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.9, SEATED_S))
-            wrist = wrist.towards(Pose.still(place, count), ramp(times, 1.38, 1.66))
-            wrist = wrist.towards(Pose.still(aside, count), ramp(times, 1.92, 2.15))
-            return wrist.towards(idle, rising)
-        aside[:3, 3] += (0.0, -0.05, 0.11)
-        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.72, 1.10))
-        wrist = wrist.towards(Pose.still(place, count), ramp(times, 0.94, 1.20))
-        wrist = wrist.towards(Pose.still(aside, count), ramp(times, 1.30, 1.48))
-        return wrist.towards(thigh, ramp(times, 1.36, 1.74)).towards(idle, rising)
-
-    def perform(self, times: np.ndarray) -> Performance:
-        puppet = self.puppet
-        feet = self.footwork.feet(times)
-        trunk = puppet.settled(self._trunk(times), feet[0])
-        world = puppet.trunk(trunk)
-        puppet.legs(world, trunk.pelvis, *feet)
-        feel = plateau(times, 0.90, 1.20, 1.30, 1.60)
-        hanging = plateau(times, 1.3, 1.6, 1.95, 2.25)
-        for _ in range(2):
-            right = self._wrist(world, trunk.pelvis, times, RIGHT)
-            left = self._wrist(world, trunk.pelvis, times, LEFT)
-            trunk = puppet.assist(trunk, {RIGHT: (right, feel), LEFT: (left, hanging)})
-            trunk = puppet.settled(trunk, feet[0])
-            world = puppet.trunk(trunk)
-            puppet.legs(world, trunk.pelvis, *feet)
-        pelvis = trunk.pelvis
-        for side in (LEFT, RIGHT):
-            puppet.arm_to(world, pelvis, side, self._wrist(world, pelvis, times, side), 0.15)
-        keys: list[tuple[np.ndarray, HandShape]] = [
-            (ramp(times, 0.7, 1.05), FLAT),
-            (ramp(times, 1.4, 1.8), RELAXED),
-        ]
-        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, keys))
-        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
-        pose = np.broadcast_to(self.seat, (len(times), 4, 4)).copy()
-        return Performance(world, pelvis, pose)
+        aside[:3, 3] += (0.0, 0.07, 0.06)
+        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.9, SEATED_S))
+        wrist = wrist.towards(Pose.still(place, count), ramp(times, 1.38, 1.66))
+        return wrist.towards(Pose.still(aside, count), ramp(times, 1.92, 2.15))

@@ -1,0 +1,136 @@
+"""Put one foot on a skateboard, push off with the other, ride until it stops, step off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from intercap_core.studio.controls import Footwork, Guide, Pose, Step, plateau, ramp
+from intercap_core.studio.hands import RELAXED
+from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance, upright
+from intercap_core.studio.interactions.feet import Foot, moved, still
+from intercap_core.studio.motion import LEG_REACH, Trunk
+
+RIGHT, LEFT = 1, 0
+PUSH_S, PUSHED_S, STOP_S = 0.80, 1.02, 2.15
+SPEED_M_S = (0.85, 1.15)  # once pushed off
+STANCE_M = 0.16  # each foot from the board's middle
+TURNED_RAD = 0.52  # the person looks this much towards where the board rolls
+PRESSED_M = 0.002
+HOVER_SHARE, HOVER_M = 0.35, (0.006, 0.016)  # how often the first foot stops short of the deck
+ASIDE_M = 0.34  # the feet on the floor from the board's middle line
+LIFT_M = 0.07  # above the deck before and after a foot stands on it
+
+
+class SkateboardRide(Interaction):
+    """The board rolls along x, to either side; the person stands behind its long side."""
+
+    object_class = "skateboard"
+    highlight = 1.5
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        self.way = float(rng.choice((-1, 1)))  # the right foot is in front on the way to +x
+        self.front = RIGHT if self.way > 0 else LEFT
+        self.flipped = float(rng.choice((0.0, np.pi)))
+        speed = rng.uniform(*SPEED_M_S)
+        self.speed = speed
+        self.rolled_m = speed * (STOP_S - PUSH_S) / 2
+        self.centre = (self.way * self.rolled_m / 2, -0.10)
+        heading = np.pi / 2 - self.way * TURNED_RAD + rng.normal(0, 0.05)
+        height = self.thing.standing_height
+        self.board = upright(0.0, 0.0, height, self.flipped + rng.normal(0, 0.01))
+        self.on_deck = [self._on_deck(side, heading) for side in (LEFT, RIGHT)]
+        hover = rng.uniform(*HOVER_M) if rng.random() < HOVER_SHARE else 0.0
+        steps, guides, start = [], [], np.empty((2, 2))
+        w = puppet.hip_width
+        for side, sign in ((LEFT, -1.0), (RIGHT, 1.0)):
+            behind = np.array([1.1 * w * sign, -ASIDE_M + 0.02 * rng.random()])
+            start[side] = behind
+            shift = np.array([self.way * self.rolled_m, 0.0]) + rng.normal(0, (0.02, 0.01))
+            last = behind + shift
+            steps.append(Step(side, 1.30, 1.70, (float(last[0]), float(last[1])), heading))
+            guides += self._guides(side, hover)
+        self.footwork = Footwork(start, heading, steps, puppet.ankle_height, SCRIPT_S, guides)
+        self.pelvis_track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
+        )
+
+    def _on_deck(self, side: int, heading: float) -> np.ndarray:
+        """The place (5,) of a foot that stands on the board, its sole lightly pressed."""
+        foot = Foot(self.puppet, side)
+        sign = (-1.0, 1.0)[side]
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        at = np.array([STANCE_M * sign, 0.0]) - 0.05 * ahead
+        place = np.array([*at, self.board[2, 3], 0.0, heading])
+
+        def distance(skin: np.ndarray) -> float:
+            local = (skin - self.board[:3, 3]) @ self.board[:3, :3]
+            return float(self.thing.surface.signed_distance(local).min())
+
+        return foot.backed_off(place, np.array([0, 0, 0.4, 0, 0]), -PRESSED_M, distance)
+
+    def _guides(self, side: int, hover: float) -> list[Guide]:
+        """From the floor over the deck's edge, onto the deck, and back."""
+        on = self.on_deck[side]
+        above = moved(on, 0.0, -0.13, LIFT_M, 0.10)
+        ride, over = self._along(on), self._along(above)
+        if side == self.front:
+            guides = [Guide(side, 0.06, 0.40, over)]
+            if hover:
+                guides.append(Guide(side, 0.30, 0.52, still(moved(on, 0, 0, PRESSED_M + hover))))
+            guides.append(Guide(side, 0.34 + 0.24 * (hover > 0), 0.60 + 0.16 * (hover > 0), ride))
+            return [*guides, Guide(side, 2.58, 2.82, over), Guide(side, 2.70, 3.02)]
+        return [
+            Guide(side, 0.88, 1.16, over),
+            Guide(side, 1.08, 1.32, ride),
+            Guide(side, 2.18, 2.42, over),
+            Guide(side, 2.32, 2.62),
+        ]
+
+    def _rolled(self, times: np.ndarray) -> np.ndarray:
+        """How far the board has rolled (N,): pushed evenly, then slowed evenly to a stop."""
+        pushed = np.clip(times - PUSH_S, 0, PUSHED_S - PUSH_S)
+        slowed = np.clip(times - PUSHED_S, 0, STOP_S - PUSHED_S)
+        first = self.speed * pushed**2 / (2 * (PUSHED_S - PUSH_S))
+        return first + self.speed * (slowed - slowed**2 / (2 * (STOP_S - PUSHED_S)))
+
+    def _along(self, place: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """A place (5,) that moves with the board."""
+        return lambda times: place + (self.way * self._rolled(times))[:, None] * np.eye(5)[0]
+
+    def _trunk(self, times: np.ndarray, ankle: np.ndarray) -> Trunk:
+        track = self.pelvis_track(times)
+        sway, shift = self.sway(times), self.weight_shift(times)
+        ride = plateau(times, 0.70, 1.20, 2.00, 2.60)
+        on_front = plateau(times, 0.72, 0.95, 1.08, 1.34) + plateau(times, 2.02, 2.25, 2.45, 2.68)
+        on_back = plateau(times, 0.0, 0.12, 0.36, 0.62) + plateau(times, 2.46, 2.66, 2.84, 3.06)
+        middle = ankle.mean(1)
+        front, back = ankle[:, self.front], ankle[:, 1 - self.front]
+        lean = on_front[:, None] * (front - middle) + on_back[:, None] * (back - middle)
+        pelvis = track[:, :3] + shift
+        pelvis[:, :2] += 0.6 * lean[:, :2]
+        pelvis[:, 2] -= 0.01 + 0.05 * ride
+        bend = 0.8 * sway[:, :3]
+        bend[:, 0] += 0.06 + 0.14 * ride
+        head = 1.3 * sway[:, 3:]
+        head[:, 0] += 0.40 - 0.22 * ride
+        head[:, 1] -= 0.45 * self.way * ride
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def perform(self, times: np.ndarray) -> Performance:
+        puppet, feet = self.puppet, self.footwork.feet(times)
+        trunk = puppet.settled(self._trunk(times, feet[0]), feet[0])
+        world = puppet.trunk(trunk)
+        puppet.legs(world, trunk.pelvis, *feet)
+        balance = 0.3 * ramp(times, 0.1, 0.5) + 0.7 * plateau(times, 0.7, 1.1, 2.2, 2.9)
+        for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
+            wrist = puppet.idle_wrist(world, trunk.pelvis, side, self.arm_swing(times)[:, side])
+            outward = sign * world[:, 9, :, 0] * (1, 1, 0)
+            out = balance[:, None] * (0.20 * outward + (0, 0, 0.12))
+            puppet.arm_to(world, trunk.pelvis, side, Pose(wrist.position + out, wrist.rotation))
+            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+        pose = np.broadcast_to(self.board, (len(times), 4, 4)).copy()
+        pose[:, 0, 3] += self.way * self._rolled(times)
+        return Performance(world, trunk.pelvis, pose)
