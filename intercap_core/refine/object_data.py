@@ -17,8 +17,8 @@ from intercap_core.refine.equations import NormalEquations
 from intercap_core.refine.state import OBJECT, State
 from intercap_core.rigid.twist import moved, twists
 
-# The tracker's views share calibration errors, so its minimum is never surer than this.
-_FLOOR = np.repeat([np.radians(0.3), 0.002], 3)
+# The meshes differ from the things themselves: no track is surer than this.
+_FLOOR = np.repeat([np.radians(0.1), 0.001], 3)
 _BRIDGED = np.repeat([0.5, 0.15], 3)  # rad, metres
 # Where poses apart explain a frame alike it is nearly always the turn (on which side a handle is).
 _DOUBTFUL = np.repeat([np.radians(10.0), 0.002], 3)
@@ -48,19 +48,21 @@ class TrackedPoses:
         covariance: np.ndarray,
         lost: np.ndarray,
         doubtful: np.ndarray,
+        resting: np.ndarray,
         *,
         seen: np.ndarray,
         times: np.ndarray,
         time_offset: np.ndarray,
     ) -> TrackedPoses:
         """Take over an object track whose lost frames are bridged; ``covariance`` (T, 6, 6),
-        ``lost`` and ``doubtful`` (T,), ``seen`` (T, C) the views that show the object, ``times``
-        (T,) s."""
+        ``lost``, ``doubtful`` and ``resting`` (T,), ``seen`` (T, C) the views that show the object,
+        ``times`` (T,) s."""
         known = ~lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(known[:, None, None], covariance, 0.0)
         floor = np.where(doubtful[:, None], np.hypot(_FLOOR, _DOUBTFUL), _FLOOR)
         total += np.eye(6) * np.where(known[:, None], floor, _BRIDGED)[:, None, :] ** 2
         twist = twists(rigid(rotation, translation), ~lost, times)
+        twist[resting] = 0
         share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
         return cls(rotation, translation, np.linalg.inv(total), twist, share, time_offset)
 

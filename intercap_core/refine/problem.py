@@ -37,6 +37,7 @@ OBJECT_ACCELERATION = 6.0
 # How fast a sequential fit's lasting errors change: a random walk, metres in one second.
 BODY_DRIFT = 0.010
 OBJECT_DRIFT = 0.004
+STILL = 2e-5  # metres that an object at rest moves between frames
 # Neighbouring points move as one: so many of them are one measurement of a correction.
 POINTS_PER_MOTION = {"body_drift": 2.0, "object_drift": 2.0}
 ROBUST_FACTOR = 2.0  # accelerations beyond so many sigmas count as a start, a stop or an impact
@@ -56,8 +57,9 @@ class Problem:
     """All that equation 6 needs beside the state.
 
     ``start`` is the sequential fits' state, ``body_known`` and ``object_known`` (T,) the frames in
-    which they are believed. ``data`` add E_B and E_O to the equations; ``probability`` (T, R) that
-    each region touches (Q); ``floor`` is None where none was seen.
+    which they are believed, ``object_still`` (T-1,) the steps over which the object rests. ``data``
+    add E_B and E_O to the equations; ``probability`` (T, R) that each region touches (Q); ``floor``
+    is None where none was seen.
     """
 
     model: BodyModel
@@ -72,6 +74,7 @@ class Problem:
     start: State
     body_known: np.ndarray
     object_known: np.ndarray
+    object_still: np.ndarray
 
     def __post_init__(self) -> None:
         self.skin = Skin.watch(self.model, self.patches)
@@ -198,7 +201,7 @@ class Problem:
         )
         self._add_drift(
             "body_drift", slice(0, BODY), joints, self._start_joints, jacobian, BODY_DRIFT,
-            self.body_known, out,
+            self.body_known, np.zeros(frames - 1, bool), out,
         )  # fmt: skip
 
     def _add_drift(
@@ -210,24 +213,29 @@ class Problem:
         jacobian: np.ndarray,
         drift: float,
         known: np.ndarray,
+        still: np.ndarray,
         out: NormalEquations,
     ) -> None:
-        """Corrections of points (T, N, 3) against the sequential fit's change slowly."""
+        """Corrections of points (T, N, 3) against the sequential fit's change slowly, and not at
+        all over ``still`` (T-1,) steps."""
         frames, count = points.shape[:2]
         noise = smoothness.jitter(start, known)
         sigma = np.sqrt(drift**2 / self.fps + 2 * noise**2)
-        change = np.diff(points - start, axis=0).reshape(frames - 1, -1) / sigma
-        pairs = known[1:] & known[:-1]
-        weight = np.repeat(pairs[:, None] / POINTS_PER_MOTION[term], 3 * count, axis=1)
-        out.add_differences(
-            term,
-            columns,
-            smoothness.RATE,
-            jacobian.reshape(frames, 3 * count, -1) / sigma,
-            weight,
-            change,
-            0.5 * float((weight * change**2).sum()),
-        )
+        change = np.diff(points - start, axis=0).reshape(frames - 1, -1)
+        slow = known[1:] & known[:-1] & ~still
+        for pairs, limit, tie in ((slow, sigma, False), (still, STILL, True)):
+            weight = np.repeat(pairs[:, None] / limit**2, 3 * count, axis=1)
+            weight /= POINTS_PER_MOTION[term]
+            out.add_differences(
+                term,
+                columns,
+                smoothness.RATE,
+                jacobian.reshape(frames, 3 * count, -1),
+                weight,
+                change,
+                0.5 * float((weight * change**2).sum()),
+                tie=tie,
+            )
 
     def _object_motion_and_ground(self, state: State, out: NormalEquations) -> None:
         """E_A and E_G'."""
@@ -250,7 +258,7 @@ class Problem:
             )
             self._add_drift(
                 "object_drift", OBJECT, points, self._start_object, jacobian, OBJECT_DRIFT,
-                self.object_known, out,
+                self.object_known, self.object_still, out,
             )  # fmt: skip
         if self.floor is not None:
             moved = self._object_at(state)

@@ -97,10 +97,12 @@ def run(
             track["covariance"],
             lost,
             disagree | ambiguous,
+            track["resting"],
             seen=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
             times=source["times"],
             time_offset=source["time_offset"],
         )
+        still = track["resting"][1:] & track["resting"][:-1]
         object_sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
         object_sigma = np.where(lost | ~np.isfinite(object_sigma), _UNTRACKED_SIGMA, object_sigma)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
@@ -135,6 +137,7 @@ def run(
         start=start,
         body_known=~failed,
         object_known=~lost,
+        object_still=still,
     )
 
     state, steps = start, 0

@@ -65,7 +65,7 @@ def _state(model: BodyModel, gap: float) -> State:
 
 
 def _problem(
-    model, box, state, *, data=(), floor=None, touching=(), known=None, start=None
+    model, box, state, *, data=(), floor=None, touching=(), known=None, start=None, still=False
 ) -> Problem:
     patches = contact_patches(model)
     probability = np.zeros((len(state), len(CONTACT_REGIONS)))
@@ -83,6 +83,7 @@ def _problem(
         start=start or state,
         body_known=np.ones(len(state), bool),
         object_known=np.ones(len(state), bool) if known is None else known,
+        object_still=np.full(len(state) - 1, still),
     )
 
 
@@ -90,7 +91,7 @@ def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
     covariance = np.repeat(np.eye(6)[None] * sigma**2, len(state), axis=0)
     agree = np.zeros_like(lost)
     return TrackedPoses.from_track(
-        state.rotation, state.translation, covariance, lost, agree,
+        state.rotation, state.translation, covariance, lost, agree, agree,
         seen=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
         time_offset=np.zeros(3),
     )  # fmt: skip
@@ -106,12 +107,26 @@ def test_tracked_poses_follow_the_views_that_they_rest_on():
     lost = np.arange(6) == 5
     tracked = TrackedPoses.from_track(
         np.repeat(np.eye(3)[None], 6, 0), way, np.repeat(np.eye(6)[None], 6, 0), lost, lost,
-        seen=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
+        np.zeros(6, bool), seen=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
     )  # fmt: skip
     found = tracked.at(np.array([0.0, 0.003, 0.004])).translation - way
     late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
     assert found == pytest.approx(-late[:, None] * [1.0, 0.0, 0.5])
     assert np.array_equal(tracked.at(tracked.time_offset).translation, way)
+
+
+def test_an_object_at_rest_moves_as_one(model, box):
+    """A hand that comes down onto it frame by frame moves it once, in all of them."""
+    state = _state(model, 0.012)
+    tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
+    data = (_hold(state, 0.02), tracked.add)
+    problem = _problem(model, box, state, data=data, still=True)
+    problem.probability[FRAMES // 2 :, LEFT_HAND] = 1
+    found = minimise(problem.equations, state, max_steps=8).state
+    assert np.linalg.norm(found.translation[0] - state.translation[0]) > 0.001
+    assert np.linalg.norm(np.diff(found.translation, axis=0), axis=1).max() < 2e-4
+    turn = found.rotation[1:] @ found.rotation[:-1].transpose(0, 2, 1)
+    assert np.abs(turn - np.eye(3)).max() < np.radians(0.1)
 
 
 def test_contact_closes_a_gap_between_hand_and_object(model, box):
