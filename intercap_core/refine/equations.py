@@ -14,20 +14,22 @@ class NormalEquations:
 
     ``bands`` (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or fewer for short recordings,
     ``gradient`` (T, n) and ``energy`` of each term, one half of the weighted sum of squares.
-    ``ties`` are the stiff part of the matrix: damping by its diagonal would hold in place what only
-    has to move together.
+    ``ties`` are stiff parts of the matrix, each over some columns: damping by their diagonal would
+    hold in place what only has to move together.
     """
 
     def __init__(self, frames: int) -> None:
         self.bands = np.zeros((min(3, frames), frames, SIZE, SIZE))
-        self.ties = np.zeros_like(self.bands)
+        self.ties: list[tuple[slice, np.ndarray]] = []
         self.gradient = np.zeros((frames, SIZE))
         self.energy: dict[str, float] = {}
 
     def step(self, damping: float) -> np.ndarray | None:
         """The damped Gauss-Newton step (T, n), or None where the matrix is not definite."""
         damped = BandedSystem(torch.from_numpy(self.bands)).damped(damping).bands
-        factor = BandedSystem(damped + torch.from_numpy(self.ties)).factorise()
+        for columns, tie in self.ties:
+            damped[:, :, columns, columns] += torch.from_numpy(tie)
+        factor = BandedSystem(damped).factorise()
         if factor is None:
             return None
         return factor.solve(-torch.from_numpy(self.gradient))[0].numpy()
@@ -77,7 +79,7 @@ class NormalEquations:
         *,
         tie: bool = False,
     ) -> None:
-        """Add differences of rows over neighbouring frames; ``tie``: to the stiff part.
+        """Add differences of rows over neighbouring frames; ``tie``: to the stiff parts.
 
         ``stencil`` (w+1,) factors of frames t .. t+w; ``jacobian`` (T, N, m) of the rows' values;
         ``weights`` and ``residuals`` (T-w, N) and ``energy`` of their differences.
@@ -88,9 +90,12 @@ class NormalEquations:
             return
         parts = [jacobian[k : k + count] * factor for k, factor in enumerate(stencil)]
         weighted = [(part * weights[..., None]).transpose(0, 2, 1) for part in parts]
-        bands = self.ties if tie else self.bands
+        bands = self.bands[:, :, columns, columns]
+        if tie:
+            bands = np.zeros_like(bands)
+            self.ties.append((columns, bands))
         for k, rows in enumerate(weighted):
             self.gradient[k : k + count, columns] += (rows @ residuals[..., None])[..., 0]
             for j in range(k + 1):
                 # frame t + k against frame t + j, stored with the earlier one
-                bands[k - j][j : j + count, columns, columns] += rows @ parts[j]
+                bands[k - j, j : j + count] += rows @ parts[j]
