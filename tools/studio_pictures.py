@@ -1,6 +1,7 @@
 """Render docs/pictures/studio_*.jpg: what the studio's cameras see, and grasps from close by.
 
 python tools/studio_pictures.py suitcase_carry s01 11 suitcase
+python tools/studio_pictures.py --sheet handling bottle_drink:s03:5 cup_pass:s10:23
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ sys.path.insert(0, str(ROOT))
 from intercap_core.camera.intrinsics import Intrinsics  # noqa: E402
 from intercap_core.camera.transforms import invert, rigid  # noqa: E402
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings  # noqa: E402
+from intercap_core.studio.interactions import interaction_named  # noqa: E402
 from intercap_core.studio.looks import body_colours  # noqa: E402
 from intercap_core.studio.recording import surfaces_at  # noqa: E402
-from intercap_core.studio.render import Photographer, View, scene_of  # noqa: E402
+from intercap_core.studio.render import Photographer, View  # noqa: E402
 from intercap_core.studio.skeleton import unit  # noqa: E402
 from intercap_core.studio.stage import Moment, Stage  # noqa: E402
 
@@ -40,25 +42,25 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def picture(stage: Stage, view: View, moment: Moment, t: int) -> np.ndarray:
     colours = body_colours(stage.subject, stage.noise.rng("looks"))
-    surfaces, normals = surfaces_at(stage, moment, t, colours)
-    scene = scene_of(*((s.vertices, s.faces) for s in surfaces))
     photographer = Photographer(view, np.ones(3), np.random.default_rng(0))
-    return photographer.photograph(view.cast(scene, surfaces, normals))
+    return photographer.photograph(view.cast(surfaces_at(stage, moment, t, colours)))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("interaction")
-    parser.add_argument("subject")
-    parser.add_argument("seed", type=int)
-    parser.add_argument("object")
+    parser.add_argument("what", nargs="+", help="interaction subject seed object, or rows")
+    parser.add_argument("--sheet", help="name of a sheet with one row for each interaction")
     parser.add_argument("--output", type=Path, default=ROOT / "docs/pictures")
     parser.add_argument("--times", type=float, nargs="+", default=[0.3, 0.9, 1.3, 1.7, 2.2, 2.7])
     parser.add_argument("--close", type=float, nargs="+", default=[1.02, 1.2, 1.75])
     options = parser.parse_args()
-    capture = StudioCapture(interaction=options.interaction, subject=options.subject,
-                            seed=options.seed, frames=45)  # fmt: skip
-    stage = Stage(capture, StudioSettings(captures={}), object_entry(options.object))
+    if options.sheet:
+        rows = [sheet_row(*what.split(":"), options.times) for what in options.what]
+        save(options.output / f"studio_{options.sheet}.jpg", np.vstack(rows))
+        return
+    interaction, subject, seed, thing = options.what
+    capture = StudioCapture(interaction=interaction, subject=subject, seed=int(seed), frames=45)
+    stage = Stage(capture, StudioSettings(captures={}), object_entry(thing))
     moment = stage.at(np.array(options.times))
     rows = []
     stage_from_master = invert(stage.rig.master_from_stage)
@@ -68,9 +70,25 @@ def main() -> None:
         view = View(camera.colour.scaled(0.5), pose, stage.room, coloured=True)
         images = [picture(stage, view, moment, t) for t in range(len(options.times))]
         rows.append(np.hstack([im[80:460, 240:720] for im in images]))
-    name = f"studio_{options.interaction}"
+    name = f"studio_{interaction}"
     save(options.output / f"{name}.jpg", np.vstack(rows))
     save(options.output / f"{name}_close.jpg", close_ups(stage, options.close))
+
+
+def sheet_row(interaction: str, subject: str, seed: str, times: list[float]) -> np.ndarray:
+    """One interaction at six moments, from ahead and the right of where the person starts."""
+    capture = StudioCapture(interaction=interaction, subject=subject, seed=int(seed), frames=45,
+                            room="bare")  # fmt: skip
+    thing = object_entry(interaction_named(interaction).object_class)
+    stage = Stage(capture, StudioSettings(captures={}, cameras=1), thing)
+    place = stage.stage_from_script
+    target = np.array([*stage.interaction.centre, 0.95])
+    eye = target + 2.6 * np.array([0.60, -0.72, 0.34])
+    eye, target = (place[:3, :3] @ at + place[:3, 3] for at in (eye, target))
+    view = View(Intrinsics(300, 330, 400.0, 400.0, 149.5, 164.5), look_at(eye, target),
+                stage.room, coloured=True)  # fmt: skip
+    moment = stage.at(np.array(times))
+    return np.hstack([picture(stage, view, moment, t) for t in range(len(times))])
 
 
 def close_ups(stage: Stage, times: list[float]) -> np.ndarray:

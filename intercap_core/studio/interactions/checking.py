@@ -44,6 +44,10 @@ class Checking(Handling):
         trunk.bend[:, 1] -= 0.06 * self.order[0] * bump(times, 1.2, 2.2)
         return trunk
 
+    def raised(self, times: np.ndarray, side: int) -> np.ndarray:
+        """The helping arm's elbow is away from the body while its hand is before the chest."""
+        return (0.4 * plateau(times, 0.9, 1.3, 2.0, 2.4), np.zeros(len(times)))[side]
+
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
         """From the plinth to before the eyes, turned there about three axes, and back."""
         count = len(times)
