@@ -58,6 +58,7 @@ class ObjectMesh:
         path = Path(entry.mesh)
         mesh = _read(path)
         _check_size(path, mesh)
+        mesh, place = _without_loose_vertices(path, mesh)
         mesh, new_id = _repair(path, mesh)
         _check_volume(path, mesh)
         try:
@@ -67,7 +68,7 @@ class ObjectMesh:
                 f"object {entry.name!r}: symmetry is impossible ({error}); correct it in "
                 "objects.yaml"
             ) from None
-        contact = _contact_vertices(entry.contact_vertices, len(new_id))
+        contact = _contact_vertices(entry.contact_vertices, place)
         ids = np.arange(len(mesh.vertices)) if contact is None else np.unique(new_id[contact])
         return cls(
             entry.name,
@@ -163,7 +164,9 @@ def _read(path: Path) -> trimesh.Trimesh:
             f"{path}: a face names vertex {faces.max()}, there are {len(vertices)}; export the "
             "mesh again"
         )
-    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    bad = np.flatnonzero(used & ~np.isfinite(vertices).all(1))
     if len(bad):
         raise UserError(
             f"{path}: vertex {bad[0]} is not a number (and {len(bad) - 1} more); export the mesh "
@@ -215,6 +218,30 @@ def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
         )
 
 
+def _without_loose_vertices(
+    path: Path, mesh: trimesh.Trimesh
+) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return the mesh of the vertices that faces use, and each file vertex's place (V_file,).
+
+    -1 = left out: such vertices are no surface, and would count in its size.
+    """
+    count = len(mesh.vertices)
+    used = np.unique(mesh.faces)
+    place = np.full(count, -1)
+    place[used] = np.arange(len(used))
+    if len(used) == count:
+        return mesh, place
+    log.warning("%s: left out %d vertices that no face uses", path, count - len(used))
+    kept = trimesh.Trimesh(
+        np.asarray(mesh.vertices)[used],
+        place[np.asarray(mesh.faces)],
+        vertex_colors=_colours(mesh)[used],
+        process=False,
+        validate=False,
+    )
+    return kept, place
+
+
 def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndarray]:
     """Return a consistent mesh and each file vertex's new id (V_file,)."""
     new_id = np.arange(len(mesh.vertices))
@@ -264,8 +291,11 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
     return mesh, new_id.reshape(-1)
 
 
-def _contact_vertices(path: Path | None, count: int) -> np.ndarray | None:
-    """Ids (K,) of likely-contact vertices, or None where there is no list."""
+def _contact_vertices(path: Path | None, place: np.ndarray) -> np.ndarray | None:
+    """Places (K,) of likely-contact vertices, or None where there is no list.
+
+    ``place`` (V,) of each vertex of the file, -1 = left out.
+    """
     if path is None:
         return None
     path = Path(path)
@@ -298,13 +328,19 @@ def _contact_vertices(path: Path | None, count: int) -> np.ndarray | None:
     )
     if ids.ndim != 1 or len(ids) == 0 or not whole:
         raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
-    if ids.min() < 0 or ids.max() >= count:
-        outside = int(ids.max() if ids.max() >= count else ids.min())
+    if ids.min() < 0 or ids.max() >= len(place):
+        outside = int(ids.max() if ids.max() >= len(place) else ids.min())
         raise UserError(
-            f"{path}: names vertex {outside}, the mesh has {count}; the list belongs to another "
-            "mesh"
+            f"{path}: names vertex {outside}, the mesh has {len(place)}; the list belongs to "
+            "another mesh"
         )
-    return ids.astype(np.int64)
+    places = place[ids.astype(np.int64)]
+    if (places < 0).all():
+        raise UserError(
+            f"{path}: no face of the mesh uses any of its {len(ids)} vertices; the list belongs to "
+            "another mesh"
+        )
+    return places[places >= 0]
 
 
 def _from_npz(path: Path) -> Any:

@@ -150,6 +150,24 @@ def test_an_open_mesh_is_told_and_used(tmp_path, caplog):
     assert 0 < mesh.radius < 0.5 and np.isfinite(mesh.centre_of_mass).all()
 
 
+@pytest.mark.parametrize("stray", [np.nan, 40.0])
+def test_vertices_without_a_face_do_not_count(tmp_path, caplog, stray):
+    ball = _ball()
+    vertices = np.concatenate([[[stray, 0, 0]], ball.vertices])
+    path = _write(trimesh.Trimesh(vertices, ball.faces + 1, process=False), tmp_path / "thing.ply")
+    contact = tmp_path / "thing.json"
+    contact.write_text("[0, 1, 6]")
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
+    assert "left out 1 vertices that no face uses" in caplog.text
+    assert mesh.watertight and mesh.diameter == pytest.approx(0.22, rel=1e-3)
+    assert len(mesh.vertices) == len(ball.vertices) == len(mesh.colours)
+    np.testing.assert_array_equal(mesh.contact_vertices, [0, 5])
+    contact.write_text("[0]")
+    with pytest.raises(UserError, match="no face of the mesh uses any"):
+        ObjectMesh.load(_entry(path, contact_vertices=contact))
+
+
 def test_faces_without_area_are_left_out(tmp_path, caplog):
     ball = _ball()
     faces = np.concatenate([ball.faces, [[0, 0, 1], [5, 7, 7]]])
