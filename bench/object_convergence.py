@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.object_baseline import Baseline, Recipe
+from bench.object_baseline import Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
 from intercap_core.camera.transforms import rigid
 from intercap_core.rigid.twist import moved
@@ -84,10 +84,15 @@ def _baseline(
     """Rows (steps, 3) as of :func:`_ours`."""
     found = []
     for t, start in zip(frames, starts, strict=True):
-        baseline = Baseline(
-            clip.mesh, recipe, min_overlap=clip.settings.min_overlap, labels=clip.labels
+        fit = fit_by_adam(
+            clip.mesh,
+            clip.views[t],
+            start,
+            recipe,
+            STEPS,
+            min_overlap=clip.settings.min_overlap,
+            labels=clip.labels,
         )
-        fit = baseline.fit(clip.views[t], start, STEPS)
         if len(fit.poses) == STEPS + 1:  # something was seen
             found.append(np.stack([fit.seconds, *clip.errors(fit.poses, int(t))], 1)[1:])
     return np.median(found, axis=0)

@@ -26,15 +26,17 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from bench.object_baseline import Baseline, Recipe
+from bench.object_baseline import FrameFit, Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
 from bench.object_convergence import draw_convergence
 from intercap_core.errors import UserError
 from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
 from intercap_core.project import Project, load_project
+from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import MotionPrior
 from intercap_core.tracking.follow import follow
 from intercap_core.tracking.lost import judged
+from intercap_core.tracking.motion import extrapolated
 
 THREADS = int(os.environ["OMP_NUM_THREADS"])
 FRAMES = 45
@@ -122,16 +124,30 @@ def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
 
 
 def paper(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
-    """The baseline, one frame after another."""
-    baseline = Baseline(
-        clip.mesh, recipe, min_overlap=clip.settings.min_overlap, labels=clip.labels
-    )
-    begin, now = time.perf_counter(), start
+    """The baseline, one frame after another, each from where the tracker's pass would start."""
+    begin, before, now = time.perf_counter(), start, start
     poses: list[np.ndarray] = []
     for views in clip.views:
-        now = baseline.fit(views, now, recipe.steps if poses else recipe.first_steps).poses[-1]
+        guess = extrapolated(before, now)
+        fit = adam(clip, views, guess, recipe, recipe.steps if poses else recipe.first_steps)
+        before, now = (now if poses else fit.poses[-1]), fit.poses[-1]
         poses.append(now)
     return Run.of(clip, np.array(poses), time.perf_counter() - begin)
+
+
+def adam(
+    clip: ObjectClip, views: list[View], pose: np.ndarray, recipe: Recipe, steps: int
+) -> FrameFit:
+    """The baseline's fit of one frame with the clip's mesh and settings."""
+    return fit_by_adam(
+        clip.mesh,
+        views,
+        pose,
+        recipe,
+        steps,
+        min_overlap=clip.settings.min_overlap,
+        labels=clip.labels,
+    )
 
 
 def schedules(clip: ObjectClip, start: np.ndarray) -> dict[int, Run]:
@@ -163,10 +179,7 @@ def until(ours: Run, found: dict[int, Run]) -> tuple[int, Run, bool]:
 
 def milliseconds_a_step(clip: ObjectClip, start: np.ndarray, recipe: Recipe, steps: int) -> float:
     """Median over the steps of one frame."""
-    baseline = Baseline(
-        clip.mesh, recipe, min_overlap=clip.settings.min_overlap, labels=clip.labels
-    )
-    fit = baseline.fit(clip.views[0], start, steps)
+    fit = adam(clip, clip.views[0], start, recipe, steps)
     return 1e3 * float(np.median(np.diff(fit.seconds)[1:]))
 
 
