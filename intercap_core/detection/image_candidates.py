@@ -21,7 +21,7 @@ from intercap_core.detection.depth_masks import Cells, Projected
 from intercap_core.detection.foreground import DepthBackground, DepthView, sampled_images
 from intercap_core.detection.image_segments import ImageCandidate, ViewSegments
 from intercap_core.detection.person_volume import FAR, bones_of, outside
-from intercap_core.detection.see_through import see_through
+from intercap_core.detection.see_through import see_through, without_person
 from intercap_core.detection.static_things import extent, find_static_things
 from intercap_core.detection.voxels import components
 from intercap_core.solve.velocity import limited_velocity
@@ -29,6 +29,7 @@ from intercap_core.solve.velocity import limited_velocity
 CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
 AROUND_M, ABOVE_HEAD_M = 1.5, 0.7  # of the person's path: where things are looked for
 FLOOR_M = 0.025  # what is lower may be the floor
+SPREAD_M = 0.07  # cells of pieces that may be one thing, with a hand's breadth between
 PERSON_MARGINS = 1.5  # outside the usual build by less is the person
 CLOSE, CLEAR = 1.0, 2.5  # margins at which things are taken off the person
 SHELL = 2.2  # a component that reaches no farther is clothing
@@ -38,8 +39,9 @@ MAX_PIECES = 6  # components of one kind
 SAME_SHARE = 0.9  # of a component's points: the farther cut shows nothing new
 # How likely a component is a thing that somebody handles, where that says nothing about the size:
 # what moves by how far off the person it reaches; of the static scene little speaks for any.
-STANDING_SCORE, STATIC_SCORE, JOINT_SCORE = 0.3, 0.2, 0.4
+STANDING_SCORE, STATIC_SCORE, JOINT_SCORE, SPREAD_SCORE = 0.3, 0.2, 0.4, 0.5
 HAND_SPEED_M_S = 8.0
+PERSON_SAMPLES = 12  # moments at which the person's own traces in the background are sought
 GAP_S = 0.5  # a keypoint lost for less is where it lies between
 
 
@@ -113,6 +115,12 @@ class DepthSegmenter:
             for c in self.cameras
         ]
         backgrounds = see_through(views, backgrounds, self._low, self._high)
+        some = self._joints[:: max(1, len(times) // PERSON_SAMPLES)]
+        bodies = [bones_of(joints) for joints in some]
+        backgrounds = [
+            without_person(view, background, bodies)
+            for view, background in zip(views, backgrounds, strict=True)
+        ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
         # without a floor to take away, all of the scene is one thing
         bottom = self._low if grounded else self._high
@@ -138,7 +146,13 @@ class DepthSegmenter:
         if not images:
             return {}
         seen = [self._look(t, c, image) for c, image in images.items()]
-        pieces = _moving_pieces(seen) + self._static_pieces(seen) + self._joint_pieces(seen)
+        moving = _moving_pieces(seen)
+        pieces = [
+            *moving,
+            *_spread_pieces(seen, moving),
+            *self._static_pieces(seen),
+            *self._joint_pieces(seen),
+        ]
         return {
             c: _masks(view, [(piece, piece.members[number]) for piece in pieces])
             for number, (c, view) in enumerate(zip(images, seen, strict=True))
@@ -211,12 +225,12 @@ class DepthSegmenter:
 
 
 def _grouped(
-    seen: list[_Seen], chosen: list[np.ndarray]
+    seen: list[_Seen], chosen: list[np.ndarray], cell_m: float = CELL_M
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
     """Components of the points ``chosen`` in each view: their indices by view, and points."""
     ends = np.cumsum([0, *map(len, chosen)])
     points = np.concatenate([view.points[own] for view, own in zip(seen, chosen, strict=True)])
-    for group in components(points, CELL_M, MIN_POINTS):
+    for group in components(points, cell_m, MIN_POINTS):
         cuts = np.searchsorted(group, ends)
         members = [own[group[cuts[v] : cuts[v + 1]] - ends[v]] for v, own in enumerate(chosen)]
         yield members, points[group]
@@ -238,6 +252,21 @@ def _moving_pieces(seen: list[_Seen]) -> list[_Piece]:
             if kept == MAX_PIECES:
                 break
     return pieces
+
+
+def _spread_pieces(seen: list[_Seen], pieces: list[_Piece]) -> list[_Piece]:
+    """``pieces`` that lie close together: both ends of what a hand holds in its middle."""
+    if len(pieces) < 2:
+        return []
+    chosen = [
+        np.unique(np.concatenate([piece.members[v] for piece in pieces])) for v in range(len(seen))
+    ]
+    found: list[_Piece] = []
+    for members, points in _grouped(seen, chosen, SPREAD_M):
+        parts = components(points, CELL_M, MIN_POINTS)
+        if len(parts) > 1 and len(found) < MAX_PIECES:
+            found.append(_Piece(members, SPREAD_SCORE, extent(points)))
+    return found
 
 
 def _same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
