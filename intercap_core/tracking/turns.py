@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
 
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
@@ -62,31 +63,44 @@ def near_turns(mesh: ObjectMesh) -> np.ndarray:
 
 def choose_turns(
     scores: np.ndarray, turns: np.ndarray, gaps: np.ndarray, broken: np.ndarray
-) -> np.ndarray:
-    """Index (K,) of the turn (N, 4, 4) that each of K key frames is best corrected by.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Index (K,) of the turn (N, 4, 4) that each of K key frames is best corrected by, and the
+    probability (K, N) of each turn given all frames.
 
     ``scores`` (K, N) of every turned pose, NaN rows where nothing is known; ``gaps`` (K-1,) seconds
     to the next key frame; ``broken`` (K-1,) whether the track was lost between.
     """
-    count = len(scores)
     # what agrees badly with every turn says little about which
     usual = np.nanmedian(scores.max(1))
     trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
     value = np.nan_to_num(scores * trust / SCORE_SIGMA)
-    relative = turns[None, :, :3, :3].transpose(0, 1, 3, 2) @ turns[:, None, :3, :3]
-    angle = Rotation.from_matrix(relative.reshape(-1, 3, 3)).magnitude().reshape(relative.shape[:2])
-    best, came = value[0], np.zeros((count, len(turns)), int)
-    for k in range(1, count):
-        slide = 0.5 * (angle / (SLIDE_RAD_S * gaps[k - 1])) ** 2
-        cost = np.minimum(slide, BROKEN_COST if broken[k - 1] else JUMP_COST)
-        total = best[:, None] - cost
-        came[k] = total.argmax(0)
-        best = total.max(0) + value[k]
-    path = np.zeros(count, int)
-    path[-1] = best.argmax()
-    for k in range(count - 1, 0, -1):
-        path[k - 1] = came[k, path[k]]
-    return path
+    between = angle_between(turns[:, None], turns[None])
+    costs = [
+        np.minimum(0.5 * (between / (SLIDE_RAD_S * gap)) ** 2, BROKEN_COST if gone else JUMP_COST)
+        for gap, gone in zip(gaps, broken, strict=True)
+    ]
+    best, ahead = [value[0]], [value[0]]
+    came = []
+    for cost, own in zip(costs, value[1:], strict=True):
+        through = best[-1][:, None] - cost
+        came.append(through.argmax(0))
+        best.append(through.max(0) + own)
+        ahead.append(logsumexp(ahead[-1][:, None] - cost, axis=0) + own)
+    path = [int(best[-1].argmax())]
+    for back in reversed(came):
+        path.append(int(back[path[-1]]))
+    behind = [np.zeros(len(turns))]
+    for cost, after in zip(reversed(costs), value[:0:-1], strict=True):
+        behind.append(logsumexp(behind[-1] + after - cost, axis=1))
+    log = np.array(ahead) + np.array(behind[::-1])
+    probability = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    return np.array(path[::-1]), probability
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle (...) in radians between the rotations of turns a and b (..., 4, 4)."""
+    chord = np.linalg.norm(a[..., :3, :3] - b[..., :3, :3], axis=(-1, -2))
+    return 2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1))
 
 
 def _about(axis: np.ndarray, angle: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from intercap_core.rigid.twist import twists
 from intercap_core.tracking.choices import best_sequence, other_fits, weak_frames
@@ -15,9 +16,11 @@ from intercap_core.tracking.lost import FrameResult, judged
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.rest import resting
 from intercap_core.tracking.smooth import UNKNOWN, Looks, smooth
-from intercap_core.tracking.turns import choose_turns, near_turns
+from intercap_core.tracking.turns import angle_between, choose_turns, near_turns
 
 TURNS_EVERY_S = 0.2
+QUITE_DIFFERENT_RAD = np.radians(20)
+DOUBT = 0.2  # probability of quite different turns, from which a frame is ambiguous
 TURN_LOSS = 0.01  # of the score, that all frames together may cost one frame
 SAME_ERRORS = 4.0  # variance of what views err together over what they err apart
 LEAST_NOISE = 0.05  # variance of the views' errors over the stated one: they cannot know better
@@ -45,9 +48,9 @@ class WholeTrack:
         if lost.all():
             return frames
         fits = [frame.fit for frame in frames]
-        fits = self._turned(fits, lost, np.array([frame.leapt for frame in frames]))
+        fits, doubt, spread = self._turned(fits, lost, np.array([f.leapt for f in frames]))
         fits = self._decided(fits, lost)
-        fits, segment, free_axis = self._smoothed(fits, lost)
+        fits, segment, free_axis = self._smoothed(fits, lost, spread)
         known = [fit.score for fit, unknown in zip(fits, lost, strict=True) if not unknown]
         enough = FOUND * float(np.median(known))
         return [
@@ -56,37 +59,56 @@ class WholeTrack:
                 fit=fit,
                 lost=frame.lost
                 and (fit.score < enough or judged(fit, self._observer.settings).lost),
+                ambiguous=frame.ambiguous or bool(unsure and not frame.lost),
                 resting=bool(number >= 0),
                 free_axis=axis,
             )
-            for frame, fit, number, axis in zip(frames, fits, segment, free_axis, strict=True)
+            for frame, fit, number, axis, unsure in zip(
+                frames, fits, segment, free_axis, doubt, strict=True
+            )
         ]
 
     # --- which of several poses ----------------------------------------------------------------
 
-    def _turned(self, fits: list[Fit], lost: np.ndarray, broken: np.ndarray) -> list[Fit]:
-        """The fits, those on the wrong side turned and fitted anew."""
+    def _turned(
+        self, fits: list[Fit], lost: np.ndarray, broken: np.ndarray
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray]:
+        """The fits, those on the wrong side turned and fitted anew; the frames (T,) in which a
+        quite different turn may be the true one, and what that adds to the variance of their turns
+        (T, 3, 3), object frame."""
+        count = len(fits)
+        doubt, spread = np.zeros(count, bool), np.zeros((count, 3, 3))
         turns = near_turns(self._mesh)
         if len(turns) == 1:
-            return fits
-        step = float(np.median(np.diff(self._times))) if len(fits) > 1 else TURNS_EVERY_S
-        keys = np.arange(0, len(fits), max(1, round(TURNS_EVERY_S / step)))
+            return fits, doubt, spread
+        step = float(np.median(np.diff(self._times))) if count > 1 else TURNS_EVERY_S
+        keys = np.arange(0, count, max(1, round(TURNS_EVERY_S / step)))
         scores = np.full((len(keys), len(turns)), np.nan)
         for k, t in enumerate(keys):
             if not lost[t]:
                 found = self._observer.assess_all(int(t), fits[t].pose @ turns)
                 scores[k] = [self._observer.plausibility(fit) for fit in found]
+        if np.isnan(scores).all():
+            return fits, doubt, spread
         jumped = lost | broken
         between = [bool(jumped[a : b + 1].any()) for a, b in pairwise(keys)]
-        chosen = choose_turns(scores, turns, np.diff(self._times[keys]), np.array(between))
+        gaps = np.diff(self._times[keys])
+        chosen, probability = choose_turns(scores, turns, gaps, np.array(between, bool))
+        nearest = np.abs(np.arange(count)[:, None] - keys).argmin(1)
         result = list(fits)
-        nearest = np.abs(np.arange(len(fits))[:, None] - keys).argmin(1)
         for t in np.flatnonzero((chosen[nearest] > 0) & ~lost):
             start = fits[t].pose @ turns[chosen[nearest[t]]]
             fit = self._fit_near(int(t), start)
             if fit.score >= fits[t].score - TURN_LOSS:
                 result[t] = fit
-        return result
+        # turns that are not the chosen one's neighbours
+        far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
+        other = np.where(far[chosen], probability, 0.0)
+        doubt = other.sum(1)[nearest] > DOUBT
+        relative = turns[chosen][:, None, :3, :3].transpose(0, 1, 3, 2) @ turns[None, :, :3, :3]
+        away = Rotation.from_matrix(relative.reshape(-1, 3, 3)).as_rotvec().reshape(*other.shape, 3)
+        spread = np.einsum("kn,kni,knj->kij", other, away, away)[nearest]
+        return result, doubt, spread
 
     def _decided(self, fits: list[Fit], lost: np.ndarray) -> list[Fit]:
         """The fits, in weakly seen frames those that the neighbours prefer among several."""
@@ -112,10 +134,11 @@ class WholeTrack:
     # --- all frames together -------------------------------------------------------------------
 
     def _smoothed(
-        self, fits: list[Fit], lost: np.ndarray
+        self, fits: list[Fit], lost: np.ndarray, spread: np.ndarray
     ) -> tuple[list[Fit], np.ndarray, np.ndarray]:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none) and the axes
-        (T, 3) about which nothing was seen."""
+        (T, 3) about which nothing was seen; ``spread`` (T, 3, 3) is the variance of the turns by
+        which the object may be other than it was fitted, object frame."""
         poses = np.array([fit.pose for fit in fits])
         poses = self._unwrapped(poses)
         motion = twists(poses, ~lost, self._times)
@@ -133,6 +156,7 @@ class WholeTrack:
             if before is None or _score(again) >= WORSE * _score(before):
                 found[t], looked[t] = again, track[t]
         track, covariance, segment = self._solved(looked, found, track)
+        covariance[:, :3, :3] += track[:, :3, :3] @ spread @ track[:, :3, :3].transpose(0, 2, 1)
         free = self._free_axes(track, covariance)
         result = [
             replace(fit, pose=pose, covariance=spread, views=seen.reports if seen else fit.views)

@@ -142,8 +142,12 @@ def test_a_turn_is_decided_by_all_frames() -> None:
     rng = np.random.default_rng(3)
     scores = 0.7 + 0.02 * rng.normal(size=(20, 4))
     scores[:, 2] += 0.02  # hardly visible in one frame
-    chosen = choose_turns(scores, turns, np.full(19, 0.2), np.zeros(19, bool))
+    chosen, probability = choose_turns(scores, turns, np.full(19, 0.2), np.zeros(19, bool))
     assert (chosen == 2).all()
+    assert np.allclose(probability.sum(1), 1)
+    assert probability[:, 2].min() > 0.9
+    alone, unsure = choose_turns(scores[:1] * 0 + 0.7, turns, np.zeros(0), np.zeros(0, bool))
+    assert alone.shape == (1,) and np.allclose(unsure, 0.25)
 
 
 def test_a_turn_changes_where_the_track_was_lost() -> None:
@@ -153,9 +157,8 @@ def test_a_turn_changes_where_the_track_was_lost() -> None:
     scores[5:, 1] += 0.03
     scores[4:6] = np.nan
     broken = np.zeros(9, bool)
-    whole = choose_turns(scores, turns, np.full(9, 0.2), broken)
+    whole, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
     assert len(set(whole)) == 1 or np.diff(whole).nonzero()[0].size == 1
     broken[4] = True
-    assert (
-        choose_turns(scores, turns, np.full(9, 0.2), broken)[[0, 3, 6, 9]] == [0, 0, 1, 1]
-    ).all()
+    chosen, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
+    assert (chosen[[0, 3, 6, 9]] == [0, 0, 1, 1]).all()
