@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from intercap_core.capture_evaluation import CaptureEvaluation, evaluate_captures, print_captures
+from intercap_core.cli import OBJECT_SETTINGS
 from intercap_core.errors import UserError
 from intercap_core.metrics import capture
 from intercap_core.metrics.capture import CaptureErrors, SlipCounts
@@ -26,11 +27,26 @@ def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
         rooms = [entry.room for entry in studio.captures.values()]
         assert {"furnished", "bare"} == set(rooms)
         seeds += [entry.seed for entry in studio.captures.values()]
-    for other in ("demo", "test", "bench", "evaluation"):
-        studio = load_project(Path(f"config/{other}/config.yaml")).config.studio
+    objects = [path for path in OBJECT_SETTINGS if path.stem != "no_detector"]
+    others = [
+        Path(f"config/{other}/config.yaml") for other in ("demo", "test", "bench", "evaluation")
+    ]
+    for path in [*others, *objects]:
+        studio = load_project(path).config.studio
         assert studio is not None
         seeds += {entry.seed for entry in studio.captures.values()}
     assert len(CONFIGS) == 3 and len(seeds) == len(set(seeds))
+
+
+def test_all_objects_are_evaluated_with_and_without_a_detector() -> None:
+    project, without = (
+        load_project(Path(f"config/object/{n}.yaml")) for n in ("config", "no_detector")
+    )
+    assert {row.object for row in project.sequences.values()} == set(project.objects)
+    assert all(row.candidates is None for row in without.sequences.values())
+    assert [row.recordings for row in without.sequences.values()] == [
+        row.recordings for row in project.sequences.values()
+    ]
 
 
 def test_captures_without_truth_cannot_be_evaluated() -> None:
