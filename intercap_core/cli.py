@@ -88,8 +88,7 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 
     project = load_project(settings)
     check_device(project)
-    check_detector(project)
-    for note in notes_of_sequences(project):
+    for note in [*check_detector(project), *notes_of_sequences(project)]:
         typer.echo(f"note: {note}")
     faults = faults_of_sequences(project)
     for fault in faults:
@@ -194,9 +193,7 @@ def evaluate(
     ] = CAPTURE_SETTINGS,
     objects: Annotated[
         list[Path],
-        typer.Option(
-            metavar="SETTINGS", help="Recordings taken to the object track; may repeat."
-        ),
+        typer.Option(metavar="SETTINGS", help="Recordings taken to the object track; may repeat."),
     ] = OBJECT_SETTINGS,
     only: Annotated[
         Part | None,

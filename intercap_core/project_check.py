@@ -39,12 +39,33 @@ def check_device(project: Project) -> None:
         )
 
 
-def check_detector(project: Project) -> None:
-    """Raise UserError where the segmentation model that the settings name cannot be run here."""
-    if project.config.detections.segmentation_model is not None:
-        from intercap_core.detection.onnx_segmentation import Segmenter
+def check_detector(project: Project) -> list[Fault]:
+    """Open the segmentation model that the settings name; notes of objects that it does not know.
 
-        Segmenter.load(project.config.detections)
+    Raises UserError where it cannot be run here.
+    """
+    settings = project.config.detections
+    if settings.segmentation_model is None:
+        return []
+    from intercap_core.detection.onnx_segmentation import Segmenter
+
+    classes = Segmenter.load(settings).classes
+    return [
+        Fault(
+            "",
+            f"{settings.segmentation_model}: none of its {len(classes)} classes "
+            f"({_told(classes)}) is a label of object {name!r} "
+            f"({', '.join(project.objects[name].labels)}); add the label to objects.yaml, or name "
+            "the model's classes in detections.segmentation_labels",
+        )
+        for name in sorted({row.object for row in project.sequences.values()})
+        if project.objects[name].labels and not {*project.objects[name].labels} & {*classes}
+    ]
+
+
+def _told(labels: list[str]) -> str:
+    more = f" and {len(labels) - LABELS_TOLD} more" if len(labels) > LABELS_TOLD else ""
+    return ", ".join(labels[:LABELS_TOLD]) + more
 
 
 def faults_of_sequences(project: Project) -> list[Fault]:
@@ -154,11 +175,10 @@ def _notes_of_candidates(
     expected = project.objects[row.object].labels
     if labels and expected and not labels & {*expected}:
         found = sorted(label or "no label" for label in labels)
-        more = f" and {len(found) - LABELS_TOLD} more" if len(found) > LABELS_TOLD else ""
         notes.append(
-            f"{row.candidates}: the first results are labelled {', '.join(found[:LABELS_TOLD])}"
-            f"{more}, none of which object {row.object!r} expects ({', '.join(expected)}); add its "
-            "labels to objects.yaml, or set detections.category_names"
+            f"{row.candidates}: the first results are labelled {_told(found)}, none of which "
+            f"object {row.object!r} expects ({', '.join(expected)}); add its labels to "
+            "objects.yaml, or set detections.category_names"
         )
     return notes
 

@@ -27,7 +27,12 @@ from intercap_core.camera.rig import Camera
 from intercap_core.cli import STAGES
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
-from intercap_core.project_check import check_device, faults_of_sequences, notes_of_sequences
+from intercap_core.project_check import (
+    check_detector,
+    check_device,
+    faults_of_sequences,
+    notes_of_sequences,
+)
 from intercap_core.run import Watcher
 from intercap_core.schemas import DETECTIONS
 from intercap_core.step import READS, SEQUENCE_STAGES
@@ -257,6 +262,24 @@ def test_check_looks_at_the_first_candidates(
     notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
     assert len(notes) == bool(says)
     assert not says or says in notes[0]
+
+
+def test_objects_that_the_model_does_not_know_are_noted(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnxruntime")
+    tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+    monkeypatch.chdir(small_project)
+    names = {"names": "{0: 'suitcase', 1: 'cup'}"}
+    path = tiny_onnx.yolo(small_project / "model.onnx", (64, 64), names)
+    settings = {"detections": {"segmentation_model": path.name}}
+    for labels, count in ((["mug"], 1), (["mug", "cup"], 0), ([], 0)):
+        Path("objects.yaml").write_text(
+            yaml.safe_dump({"cup": {"mesh": "cup.ply", "labels": labels}})
+        )
+        notes = check_detector(load_project(Path("config.yaml"), settings))
+        assert len(notes) == count
+        assert not notes or "(suitcase, cup) is a label of object 'cup' (mug)" in str(notes[0])
 
 
 def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path) -> None:

@@ -83,6 +83,11 @@ class Segmenter:
             names = _own_names(model) or _coco_names(yolo, values)
         return cls(model, _Kind(values, names, found, yolo), settings.min_score)
 
+    @property
+    def classes(self) -> list[str]:
+        """What the model can find, in the order of its numbers."""
+        return [self._kind.names[number] for number in sorted(self._kind.names)]
+
     def segment(
         self, pictures: Iterable[tuple[Key, np.ndarray]]
     ) -> Iterator[tuple[Key, list[Instance]]]:
