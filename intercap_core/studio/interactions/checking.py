@@ -21,7 +21,7 @@ class Checking(Handling):
     centre = (0.20, 0.0)
     top_of_height = 0.52
     aside = 0.0
-    before_eyes = (0.0, -0.17, 0.36)  # from the head's joint: left, up, ahead, metres
+    before_eyes = (0.0, -0.35, 0.72)  # from the head's joint: left, up, ahead, arm lengths
     tip_deg = 35.0  # towards the eyes, and half of it away
     spin_deg = 25.0  # about the vertical
     roll_deg = 18.0  # to the sides
@@ -58,7 +58,8 @@ class Checking(Handling):
         about[:, 1] = tip * (0.5 * bump(times, 1.75, 2.3) - bump(times, 1.2, 1.85))
         about[:, 2] = spin * first * (bump(times, 1.3, 1.8) - bump(times, 1.6, 2.2))
         about[:, 0] = roll * second * bump(times, 1.45, 2.1)
-        shown = self.before_chest(world, head, np.array(self.before_eyes), about)
+        offset = self.puppet.arm * np.array(self.before_eyes)
+        shown = self.before_chest(world, head, offset, about)
         lift = np.array([0.0, 0, 0.04])
         thing = Pose.still(self.taken, count)
         thing = thing.towards(shown, ramp(times, ATTACH_S, RAISED_S[0]), lift)
@@ -98,7 +99,7 @@ class BottleCheck(CheckingByTheWall):
 
     object_class = "bottle"
     grip_height_m = 0.01
-    before_eyes = (0.03, -0.20, 0.31)
+    before_eyes = (0.06, -0.42, 0.64)
     tip_deg = 20.0
 
 
