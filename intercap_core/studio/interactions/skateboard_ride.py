@@ -20,7 +20,7 @@ TURNED_RAD = 0.52  # the person looks this much towards where the board rolls
 PRESSED_M = 0.002
 HOVER_SHARE, HOVER_M = 0.35, (0.006, 0.016)  # how often the first foot stops short of the deck
 ASIDE_M = 0.34  # the feet on the floor from the board's middle line
-LIFT_M = 0.07  # above the deck before and after a foot stands on it
+LIFT_M = 0.08  # above the deck before and after a foot stands on it
 
 
 class SkateboardRide(Interaction):
@@ -74,19 +74,26 @@ class SkateboardRide(Interaction):
     def _guides(self, side: int, hover: float) -> list[Guide]:
         """From the floor over the deck's edge, onto the deck, and back."""
         on = self.on_deck[side]
-        above = moved(on, 0.0, -0.13, LIFT_M, 0.10)
-        ride, over = self._along(on), self._along(above)
+        ride, over, up = (
+            self._along(place)
+            for place in (on, moved(on, 0, -0.13, LIFT_M, 0.1), moved(on, 0, -0.26, LIFT_M, 0.2))
+        )
         if side == self.front:
-            guides = [Guide(side, 0.06, 0.40, over)]
+            late = 0.20 if hover else 0.0
+            guides = [Guide(side, 0.04, 0.30, up), Guide(side, 0.20, 0.44, over)]
             if hover:
-                guides.append(Guide(side, 0.30, 0.52, still(moved(on, 0, 0, PRESSED_M + hover))))
-            guides.append(Guide(side, 0.34 + 0.24 * (hover > 0), 0.60 + 0.16 * (hover > 0), ride))
-            return [*guides, Guide(side, 2.58, 2.82, over), Guide(side, 2.70, 3.02)]
+                guides.append(Guide(side, 0.34, 0.54, still(moved(on, 0, 0, PRESSED_M + hover))))
+            guides.append(Guide(side, 0.38 + late, 0.62 + late, ride))
+            leave = 2.54
+        else:
+            guides = [Guide(side, 0.82, 1.02, up), Guide(side, 0.93, 1.16, over)]
+            guides.append(Guide(side, 1.10, 1.32, ride))
+            leave = 2.16
         return [
-            Guide(side, 0.88, 1.16, over),
-            Guide(side, 1.08, 1.32, ride),
-            Guide(side, 2.18, 2.42, over),
-            Guide(side, 2.32, 2.62),
+            *guides,
+            Guide(side, leave, leave + 0.22, over),
+            Guide(side, leave + 0.12, leave + 0.34, up),
+            Guide(side, leave + 0.24, leave + 0.48),
         ]
 
     def _rolled(self, times: np.ndarray) -> np.ndarray:
