@@ -21,7 +21,7 @@ from intercap_core.tracking.search import own_axes
 STEPS = 12  # angles of a full turn
 FINE = np.pi / STEPS  # beside no turn, where a slow slide is caught first
 SURFACE_POINTS = 500
-PLACE_STEPS = 10
+PLACE_STEPS = 6
 FAR_M, FAR_SHARE = 0.003, 0.01  # a point moved farther, also of the diameter, could be noticed
 CHANGED = 0.3  # share of such points, below which a turn is hard to see
 DISTINCT_DEG = 45.0  # flips nearer than this are one
@@ -45,10 +45,13 @@ def near_turns(mesh: ObjectMesh) -> np.ndarray:
     angles = 2 * np.pi * np.arange(STEPS) / STEPS
     flips = []
     for axis in own_axes(mesh):
-        placed = [_placed(field, points, _about(axis, angle), far) for angle in angles]
+        half = [_placed(field, points, _about(axis, a), far) for a in angles[: STEPS // 2 + 1]]
+        # turned back as much it has moved as much
+        placed = half + [(np.linalg.inv(turn), share) for turn, share in half[-2:0:-1]]
         moved = np.array([share for _, share in placed])
         if moved.max() < CHANGED and mesh.symmetry.axis is None:
-            found += [_placed(field, points, _about(axis, a), far)[0] for a in (FINE, -FINE)]
+            fine, _ = _placed(field, points, _about(axis, FINE), far)
+            found += [fine, np.linalg.inv(fine)]
             found += [turn for turn, _ in placed[1:]]
             continue
         least = (moved <= np.roll(moved, 1)) & (moved <= np.roll(moved, -1)) & (moved < CHANGED)

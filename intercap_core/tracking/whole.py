@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.refine.bridge import bridge_poses
 from intercap_core.rigid.twist import twists
 from intercap_core.tracking.choices import best_sequence, other_fits, weak_frames
 from intercap_core.tracking.fit import Evidence, Fit, MotionPrior
@@ -118,7 +119,7 @@ class WholeTrack:
         if not weak.any():
             return fits
         options = [[fit] for fit in fits]
-        for t in map(int, np.flatnonzero(weak)):
+        for t in map(int, np.flatnonzero(weak)[::-1]):
             options[t] += other_fits(
                 self._mesh,
                 fits[t].pose,
@@ -139,8 +140,8 @@ class WholeTrack:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none) and the axes
         (T, 3) about which nothing was seen; ``spread`` (T, 3, 3) is the variance of the turns by
         which the object may be other than it was fitted, object frame."""
-        poses = np.array([fit.pose for fit in fits])
-        poses = self._unwrapped(poses)
+        poses = self._unwrapped(np.array([fit.pose for fit in fits]))
+        poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
         motion = twists(poses, ~lost, self._times)
         found = [
             None if lost[t] else self._observer.evidence(t, poses[t], motion[t])
@@ -150,7 +151,7 @@ class WholeTrack:
         motion = twists(track, np.ones(len(fits), bool), self._times)
         motion[segment >= 0] = 0
         looked = poses.copy()
-        for t in self._worth_a_look(segment):
+        for t in reversed(self._worth_a_look(segment)):  # what was read last is still there
             again = self._observer.evidence(t, track[t], motion[t])
             before = found[t]
             if before is None or _score(again) >= WORSE * _score(before):
