@@ -71,18 +71,18 @@ def _run(translation: float, p95: float = 5.0, lost: float = 0.0) -> Run:
 
 
 def test_the_shortest_schedule_that_reaches_our_accuracy() -> None:
-    ours = _run(2.0)
-    found = {5: _run(9.0), 20: _run(2.03), 40: _run(1.5), 150: _run(1.4)}
-    assert until(ours, found) == (20, found[20], True)
-    found[20] = _run(1.9, p95=7.0)  # the median alone does not count
-    assert until(ours, found)[0] == 40
-    found[40] = _run(1.5, lost=0.1)
-    assert until(ours, found)[0] == 150
+    ours, bad = _run(2.0), _run(9.0)
+    near, good, best = _run(2.03), _run(1.5), _run(1.4)
+    assert until(ours, [(5, bad), (20, bad), (20, near), (150, best)]) == (20, near, True)
+    wide = _run(1.9, p95=7.0)  # the median alone does not count
+    assert until(ours, [(20, wide), (40, good), (150, best)]) == (40, good, True)
+    lost = _run(1.5, lost=0.1)
+    assert until(ours, [(20, wide), (40, lost), (150, best)]) == (150, best, True)
 
 
 def test_the_shortest_schedule_near_its_best_where_none_reaches_ours() -> None:
-    found = {5: _run(9.0), 40: _run(3.1), 75: _run(2.9, lost=0.2), 150: _run(3.0)}
-    assert until(_run(1.0), found) == (40, found[40], False)
+    found = [(5, _run(9.0)), (40, _run(3.1)), (75, _run(2.9, lost=0.2)), (150, _run(3.0))]
+    assert until(_run(1.0), found) == (40, found[1][1], False)
 
 
 def test_figures_replace_older_ones_and_leave_the_others(tmp_path: Path) -> None:
