@@ -7,6 +7,8 @@ import re
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from intercap_core.detection import coco, masks
 from intercap_core.detection.coco import ImageKey, UnreadableCandidates, read_candidates
@@ -235,3 +237,36 @@ def test_what_detectors_write(tmp_path, content, key, label, score, options):
     assert (instance.label, instance.score) == (label, score)
     assert instance.box == (10, 4, 12, 5)
     np.testing.assert_array_equal(masks.decode(instance.rle, HEIGHT, WIDTH), MASK)
+
+
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+KEYS = ("image_id", "category_id", "category_name", "score", "bbox", "box", "segmentation",
+        "segments", "file_name", "label", "class")  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.dictionaries(st.sampled_from(KEYS), JSON_VALUES, max_size=4),
+    st.dictionaries(
+        st.sampled_from(("images", "categories", "img_width", "img_height")), JSON_VALUES
+    ),
+    st.dictionaries(st.sampled_from(("size", "counts", "x", "y")), JSON_VALUES),
+)
+def test_any_json_is_read_or_told(changes, whole, segmentation):
+    entries = [ENTRY | changes, ENTRY | {"segmentation": segmentation}, changes]
+    options = {"width": WIDTH, "height": HEIGHT, "min_score": 0.0, "names": COCO_NAMES}
+    try:
+        found = coco.candidates_of({"annotations": [*entries, ENTRY]} | whole, **options)
+    except UnreadableCandidates:
+        return
+    assert len(found.results) + len(found.faults) == found.entries
+    for _, instance in found.results:
+        masks.Runs(instance.rle, HEIGHT, WIDTH)
+        assert np.isfinite(instance.box).all() and np.isfinite(instance.score)
+        instance.label.encode()
