@@ -10,7 +10,10 @@ from intercap_core.studio.interactions.sitting import SEATED_S, Sitting
 from intercap_core.studio.skeleton import local_rotations
 
 BACK_PRESSED_M = 0.006  # the back gives way by this much on the slats
-BACKRESTS = (0.0, 0.60)  # rad, between which the trunk finds the back
+OVER_SEAT_M = 0.04  # what is lower meets the seat
+SITS_ABOVE_M = 0.13  # the pelvis above the seat, about
+UPRIGHT_RAD, RECLINED_RAD = 0.08, 0.45
+FARTHEST_AHEAD_M = 0.04  # of the pelvis from the seat's middle
 
 
 class ChairSit(Sitting):
@@ -19,30 +22,45 @@ class ChairSit(Sitting):
     object_class = "chair"
     palm_at = (-0.02, -0.19)
     rise_s, risen_s = 2.40, 3.20
-    sat_back = -0.05
-    feet_ahead, on_thigh_s = 0.32, 1.95
+    sat_back = -0.12
+    front_edge, on_thigh_s = 0.215, 1.95
 
     def turned(self) -> float:
         return np.pi / 2 + self.rng.normal(0, 0.03)
 
     def sit(self) -> None:
-        """Sit, lean back until the back is pressed, and sit as one then sits."""
-        super().sit()
+        """Sit as far back as an upright back has room, then lean until it is pressed."""
         subject = self.puppet.subject
-        bones = [JOINT_INDEX[name] for name in ("spine1", "spine2", "spine3")]
+        bones = [JOINT_INDEX[name] for name in ("pelvis", "spine1", "spine2", "spine3")]
         share = np.asarray(subject.weights[:, bones].sum(1)).ravel()
         back = part_of(subject, np.flatnonzero(share > 0.5))
         when = np.array([(SEATED_S + self.rise_s) / 2])
-        low, high = BACKRESTS
-        for _ in range(14):
-            self.recline = (low + high) / 2
+
+        def pressed() -> bool:
             trunk = self.trunk(when, still=True)
             local = local_rotations(self.puppet.trunk(trunk))
             posed = back.skin(local, trunk.pelvis - subject.rest_joints[0]).vertices[0]
             at = (posed - self.seat[:3, 3]) @ self.seat[:3, :3]
-            if self.thing.surface.signed_distance(at).min() < -BACK_PRESSED_M:
-                high = self.recline
+            at = at[at[:, 2] + self.seat[2, 3] > self.seat_top + OVER_SEAT_M]
+            return float(self.thing.surface.signed_distance(at).min()) < -BACK_PRESSED_M
+
+        self.seated_height, self.recline = self.seat_top + SITS_ABOVE_M, UPRIGHT_RAD
+        low, high = self.sat_back, FARTHEST_AHEAD_M
+        for _ in range(12):
+            self.sat_back = (low + high) / 2
+            if pressed():
+                low = self.sat_back
             else:
-                low = self.recline
-        self.recline = low
+                high = self.sat_back
+        self.sat_back = high
+        for _ in range(2):
+            super().sit()
+            low, high = 0.0, RECLINED_RAD
+            for _ in range(12):
+                self.recline = (low + high) / 2
+                if pressed():
+                    high = self.recline
+                else:
+                    low = self.recline
+            self.recline = low
         super().sit()

@@ -75,9 +75,7 @@ class FootballKick(Interaction):
         on_ball = self.foot.backed_off(on_ball, np.array([0, 0, 0.4, 0, 0]), sole_gap, self._gap)
         strike = np.array([x, y - 0.01, 0.5, 0.62, 0.0])
         strike[2] += TOE_CLEAR_M - self.foot.skin(strike[None])[0, :, 2].min()
-        self.strike = self.foot.backed_off(
-            strike, np.array([-0.5, 0, 0, 0, 0]), 0.0, self._gap
-        )
+        self.strike = self.foot.backed_off(strike, np.array([-0.5, 0, 0, 0, 0]), 0.0, self._gap)
         self.back = moved(self.strike, -BACKSWING_M, 0, sole + 0.20 - self.strike[2], 0.12)
         self.through = moved(self.strike, THROUGH_M, 0.03, sole + 0.17 - self.strike[2], -0.1)
         beside = self.strike[0] + 0.03

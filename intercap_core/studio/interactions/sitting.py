@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.camera.transforms import invert
-from intercap_core.studio.controls import Footwork, Pose, Step, bump, plateau, ramp
+from intercap_core.studio.controls import (
+    SOLE_FRONT_M,
+    Footwork,
+    Guide,
+    Pose,
+    Step,
+    bump,
+    plateau,
+    ramp,
+)
 from intercap_core.studio.hands import FLAT, RELAXED, HandShape, part_of
 from intercap_core.studio.interactions.base import (
     SCRIPT_S,
@@ -17,11 +27,14 @@ from intercap_core.studio.interactions.base import (
     transform,
     upright,
 )
+from intercap_core.studio.interactions.feet import Foot, still
 from intercap_core.studio.motion import LEG_REACH, Trunk
 from intercap_core.studio.skeleton import local_rotations, unit
 
 RIGHT, LEFT = 1, 0
 SIT_S, SEATED_S = 0.68, 1.50
+CALF_M, THIGH_M = 0.055, 0.065  # half their thickness, at the knee
+STEEPEST_RAD = 0.75  # of a foot that stands on its ball
 PRESSED_M = 0.014  # flesh gives way by this much on the seat
 TOUCH_M = 0.0006  # how deep the palm presses the seat
 
@@ -36,7 +49,7 @@ class Sitting(Interaction):
     hanging = 0.0  # how much the trunk helps the left hand while the person sits
     sat_back = 0.005  # where the pelvis sits, metres ahead of the seat's middle
     recline = 0.10  # rad
-    feet_ahead = 0.0  # the least distance of the ankles from the seat's middle, metres
+    front_edge = 0.0  # the seat's front from its middle, metres; 0 where the legs may spread
     on_thigh_s = 1.74  # when the hands lie on the thighs
 
     def plan(self) -> None:
@@ -46,8 +59,9 @@ class Sitting(Interaction):
         middle = (np.abs(self.thing.vertices[:, :2]) < 0.10).all(1)
         self.seat_top = self.seat[2, 3] + self.thing.vertices[middle, 2].max()
         # feet before the seat's middle, the calves clear of its front
+        self.sat_back = max(self.sat_back, self.front_edge + CALF_M - thigh)
         self.ahead = thigh * rng.uniform(0.90, 0.98) + self.sat_back
-        self.ahead = max(self.ahead, self.feet_ahead + rng.uniform(0.0, 0.02))
+        self.ahead = max(self.ahead, self.front_edge + 2 * CALF_M + rng.uniform(0.0, 0.02))
         w = puppet.hip_width * 1.15
         before = 0.16
         start = np.array([[self.ahead + before, w], [self.ahead + before - 0.03, -w]])
@@ -55,13 +69,29 @@ class Sitting(Interaction):
             Step(RIGHT, 0.02, 0.40, (self.ahead - 0.01, -w)),
             Step(LEFT, 0.32, 0.70, (self.ahead + 0.01, w)),
         ]
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
+        self.footwork = Footwork(
+            start, 0.0, steps, puppet.ankle_height, SCRIPT_S, self._heels(steps)
+        )
         self.pelvis_track = self.footwork.pelvis(
             LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
         )
         self.seated_height = self.seat_top + 0.12
         self.sit()
         self.palm_place = self._palm_on_seat()
+
+    def _heels(self, steps: Sequence[Step]) -> list[Guide]:
+        """Feet of people whose knees are lower than the seat stand on their balls meanwhile."""
+        puppet, guides = self.puppet, []
+        knee = puppet.skeleton.length("left_knee", "left_ankle") + float(puppet.ankle_height[0])
+        missing = self.seat_top + THIGH_M - knee if self.front_edge else 0.0
+        pitch = float(np.clip(missing / SOLE_FRONT_M, 0.0, STEEPEST_RAD))
+        for step in steps:
+            place = np.array([*step.place, 0.0, pitch, step.heading])
+            place[2] = -Foot(puppet, step.foot).skin(place[None])[0, :, 2].min()
+            on_ball = still(place)
+            guides.append(Guide(step.foot, SIT_S + 0.1, SEATED_S - 0.2, on_ball))
+            guides.append(Guide(step.foot, self.rise_s + 0.1, self.risen_s - 0.1))
+        return guides if pitch else []
 
     @abstractmethod
     def turned(self) -> float:
