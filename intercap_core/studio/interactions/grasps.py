@@ -20,7 +20,7 @@ from intercap_core.studio.motion import Puppet
 from intercap_core.studio.skeleton import unit
 
 PALM_PRESSED_M = 0.001
-FINGER_MEETS_M = 0.002
+FINGER_MEETS_M, THUMB_NEAR_M = 0.002, 0.008  # such a grasp is good enough
 FAR_M = 0.03  # a finger that ends farther off counts as this far
 # The grasped surface meets the hand this far beyond the palm's middle, towards the fingers
 ALONG_FINGERS_M = 0.030
@@ -115,7 +115,8 @@ def wrapped(puppet: Puppet, side: int, open_shape: HandShape, surface: DistanceF
             stage_from_object: np.ndarray, approaches: Iterable[Approach]) -> Grip:  # fmt: skip
     """Palm against the thing, fingers around it, then the thumb from where it has room.
 
-    Of ``approaches`` the first is kept in which all fingers meet the thing, else the best.
+    Of ``approaches`` the first is kept in which all fingers meet the thing or nearly do, else the
+    best.
     """
     hand = puppet.hands[side]
     four = (1, 3, 0, 2)
@@ -135,6 +136,8 @@ def wrapped(puppet: Puppet, side: int, open_shape: HandShape, surface: DistanceF
                 best = score, Grip(opened, closed, pose, gaps)
             if gaps.max() < FINGER_MEETS_M:
                 return best[1]
+        if best is not None and best[0] > -THUMB_NEAR_M:
+            break
     if best is None:
         raise ValueError("no approach leaves the thumb room")
     return best[1]
