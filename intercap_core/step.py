@@ -142,6 +142,7 @@ def run_dataset(project: Project) -> Path:
                         "frames",
                         "scene",
                         "detections",
+                        "person",
                         "object_track",
                         "joint",
                         "metrics",

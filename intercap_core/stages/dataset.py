@@ -44,6 +44,7 @@ class SequenceArtefacts:
     frames: Path
     scene: Path
     detections: Path
+    person: Path
     object_track: Path
     joint: Path
     metrics: Path
@@ -152,7 +153,8 @@ def _track(
     paths: SequenceArtefacts, object_name: str, objects: Mapping[str, ObjectEntry]
 ) -> TrackFacts:
     with artefacts.read(paths.scene, SCENE) as scene:
-        found = Detections.load(paths.detections).showing(scene["image_of"])
+        moments = Detections.load(paths.detections).showing(scene["image_of"])
+    found = moments.with_candidates_of(paths.person)
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         candidate = track["candidate"]
 

@@ -50,7 +50,13 @@ def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Pat
         sequences={
             name: dataset.SequenceArtefacts(
                 **capture.inputs(
-                    "frames", "scene", "detections", "object_track", "joint", "metrics"
+                    "frames",
+                    "scene",
+                    "detections",
+                    "person",
+                    "object_track",
+                    "joint",
+                    "metrics",
                 )
             )
             for name, capture in captures.items()

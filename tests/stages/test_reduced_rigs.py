@@ -264,7 +264,10 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
         sequences={
             "cap": dataset.SequenceArtefacts(
                 metrics=measured,
-                **{s: paths[s] for s in ("frames", "scene", "detections", "object_track", "joint")},
+                **{
+                    s: paths[s]
+                    for s in ("frames", "scene", "detections", "person", "object_track", "joint")
+                },
             )
         },
         objects={capture.object_.name: capture.object_},

@@ -4,6 +4,7 @@ rule dataset:
         frames=expand(rules.frames.output.frames, sequence=SEQUENCES),
         scene=expand(rules.scene.output.scene, sequence=SEQUENCES),
         detections=expand(rules.detections.output.detections, sequence=SEQUENCES),
+        person=expand(rules.person.output.person, sequence=SEQUENCES),
         object_track=expand(rules.object_track.output.object_track, sequence=SEQUENCES),
         joint=expand(rules.joint.output.joint, sequence=SEQUENCES),
         metrics=expand(rules.metrics.output.metrics, sequence=SEQUENCES),
