@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.tracking.lost import LOST_SCORE, FrameResult, judged
+from intercap_core.tracking.fit import Fit
+from intercap_core.tracking.lost import LOST_SCORE, FrameResult, Named, judged
 from intercap_core.tracking.motion import expected, extrapolated, loose
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.search import same_pose
@@ -18,6 +19,7 @@ RECOVERY_CONFIDENCE = 0.40  # with a ring of cameras
 RING = 6
 RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
 SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
+NAMED_VIEWS, VIEWS_EACH = 2, 3  # views with a candidate, of so many each, for a searched pose
 CLEARLY_BETTER = 1.15  # a searched pose's confidence over the tracked one's
 
 
@@ -36,6 +38,7 @@ def follow(
     before, now = start.fit.pose, start.fit.pose
     usual = max(start.fit.score, LOST_SCORE)
     lost_for = 1 if start.lost else 0
+    named = Named(observer.centre(now))
     searches = 0
     for t in frames:
         predicted = now if lost_for else extrapolated(before, now)
@@ -45,6 +48,8 @@ def follow(
             result = known[t]
         else:
             result = judged(observer.fit(t, start_pose, prior), observer.settings)
+        if not named.believes(observer.centre(result.fit.pose), result.fit):
+            result = replace(result, lost=True)
         leapt = False
         doubtful = result.lost or result.fit.score < DOUBT * usual
         if may_search and doubtful and lost_for in RECOVERY_WAIT and searches < SEARCHES_MAX:
@@ -78,11 +83,11 @@ def _recovered(
     observer: Observer, t: int, last: np.ndarray, result: FrameResult
 ) -> FrameResult | None:
     """A searched pose that is clearly better than what tracking found, if there is one."""
-    found = observer.search(t, near=last[:3, 3])
+    found = [fit for fit in observer.search(t, near=last[:3, 3]) if _named(fit)][:3]
     if not found:
         return None
     best = max(
-        found[:3],
+        found,
         key=lambda fit: observer.value(t, fit) - _leap(observer.mesh, last, fit.pose),
     )
     if same_pose(observer.mesh, best.pose, result.fit.pose):
@@ -93,6 +98,13 @@ def _recovered(
     if observer.value(t, best) < needed or judged(best, observer.settings).lost:
         return None
     return FrameResult(best, False)
+
+
+def _named(fit: Fit) -> bool:
+    """Whether candidates of enough views show the object there: one alone may be anything."""
+    looked = sum(view.detected for view in fit.views)
+    named = sum(view.candidate >= 0 for view in fit.views)
+    return named >= min(NAMED_VIEWS, -(-looked // VIEWS_EACH))
 
 
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:

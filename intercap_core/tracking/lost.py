@@ -13,6 +13,7 @@ LOST_SCORE = 0.20
 # By how much the mean score of one pose has to be better than another's, over all frames of a run
 # and over one: errors of masks last several frames and agree over views.
 DECIDED, DECIDED_ONE = 0.01, 0.03
+UNNAMED_FRAMES, UNNAMED_M = 4, 0.05  # that the object is followed without any candidate
 
 
 @dataclass(frozen=True)
@@ -48,3 +49,25 @@ def decided(gain: np.ndarray) -> bool:
     return bool(
         len(gain) and abs(gain.mean()) > DECIDED + (DECIDED_ONE - DECIDED) / np.sqrt(len(gain))
     )
+
+
+class Named:
+    """Where a candidate last bore the track out: depth alone fits the floor as well as a box.
+
+    ``place`` (3,), metres, is where the track starts.
+    """
+
+    def __init__(self, place: np.ndarray) -> None:
+        self._place = place
+        self._frames = 0
+
+    def believes(self, place: np.ndarray, fit: Fit) -> bool:
+        """Whether the object may be at ``place`` (3,): some view's candidate shows it, or one did
+        a few frames ago, or there; where no detector looked, always."""
+        looked = any(view.detected for view in fit.views)
+        if not looked or any(view.candidate >= 0 for view in fit.views):
+            self._place, self._frames = place, 0
+            return True
+        self._frames += 1
+        stayed = float(np.linalg.norm(place - self._place)) < UNNAMED_M
+        return self._frames <= UNNAMED_FRAMES or stayed

@@ -16,7 +16,7 @@ from intercap_core.tracking.fit import Evidence, Fit, MotionPrior, assess_all, e
 from intercap_core.tracking.places import Places
 from intercap_core.tracking.search import plausibility, rank_frames, search
 
-CACHED_FRAMES = 12
+CACHED_FRAMES = 32  # of a small object's whole depth images: 300 MB
 PASS_ROUNDS = (3, 3)
 PASS_SCALE = 0.5
 LOOK_OVERLAP = 0.1  # of a candidate that a pose is compared with, before it is fitted
@@ -65,6 +65,13 @@ class Observer:
         first = self._survey[1]
         known = set(first)
         return first + [t for t in rank_frames(self.labels_by_view, self.labels) if t not in known]
+
+    def promise(self, t: int) -> int:
+        """Views of frame t with a candidate that has one of the object's labels."""
+        return sum(
+            any(label in self.labels or (not self.labels) for label in view)
+            for view in self.labels_by_view[t]
+        )
 
     def search(self, t: int, near: np.ndarray | None = None) -> list[Fit]:
         """Fitted hypotheses of frame t, the best first; ``near`` (3,) prefers a place."""

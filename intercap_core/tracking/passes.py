@@ -14,19 +14,19 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.tracking.audit import audited
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit
 from intercap_core.tracking.follow import follow
 from intercap_core.tracking.lost import FrameResult, decided, judged
-from intercap_core.tracking.motion import extrapolated
 from intercap_core.tracking.observer import Observer
-from intercap_core.tracking.search import same_pose
 from intercap_core.tracking.seed import annotated_seed, find_seed
 from intercap_core.tracking.whole import WholeTrack
 
 log = logging.getLogger(__name__)
 
 AGREE_M, AGREE_DEG = 0.02, 10.0
+JUMP_M, JUMP_DEG = 0.15, 45.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Tracker:
         else:
             seed_frame, seed = find_seed(self._observer)
         self._observer.places.claim(self._observer.centre(seed.pose))
-        one = self._both_ways(seed_frame, seed)
+        one = audited(self._observer, self._both_ways(seed_frame, seed))
         last = self._count - 1
         two = list(one)
         for frames, start_at in (
@@ -151,11 +151,13 @@ def _recovered(mesh: ObjectMesh, frames: list[FrameResult], seed_frame: int) -> 
         if frames[t].lost:
             continue
         leapt = frames[t].leapt if t > seed_frame else frames[t - 1].leapt
-        now = frames[t - 1].fit.pose
-        smooth = any(
-            same_pose(mesh, predicted, frames[t].fit.pose)
-            for predicted in (now, extrapolated(frames[max(t - 2, 0)].fit.pose, now))
-        )
-        if frames[t - 1].lost or (leapt and not smooth):
+        if frames[t - 1].lost or (leapt and _jumped(mesh, frames[t - 1], frames[t])):
             result[t] = replace(frames[t], recovered=True)
     return result
+
+
+def _jumped(mesh: ObjectMesh, before: FrameResult, now: FrameResult) -> bool:
+    """Whether the object moved as no hand moves it in one frame."""
+    shift = float(np.linalg.norm(now.fit.pose[:3, 3] - before.fit.pose[:3, 3]))
+    turn = mesh.symmetry.rotation_error_deg(now.fit.pose[:3, :3], before.fit.pose[:3, :3])
+    return bool(shift > JUMP_M or turn > JUMP_DEG)

@@ -95,8 +95,8 @@ class Places:
 
     def _standing_worth(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
-        left = MOVED * (PRESENT - standing.share) / (PRESENT - ABSENT)
-        return float(np.clip(max(handled, left), LEAST, 1.0))
+        left = MOVED * min((PRESENT - standing.share) / (PRESENT - ABSENT), 1.0)
+        return max(handled, left, LEAST)
 
     def _gaps(self, place: np.ndarray, frames: slice) -> np.ndarray:
         """About how far (N,) the person is from an object there, metres, where that is known."""

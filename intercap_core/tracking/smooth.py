@@ -68,9 +68,12 @@ def smooth(
     seconds; ``centre`` (3,) of the object, whose path is smooth.
     """
     count = int(node[-1]) + 1
-    first, size = np.unique(node, return_index=True, return_counts=True)[1:]
+    size = np.bincount(node)
     looks = looks.about(centre)
     information, own = looks.information, looks.own
+    # of the frames of a rest the start is the one that knows most, not a guess
+    order = np.lexsort((-np.trace(information, axis1=1, axis2=2), node))
+    first = order[np.unique(node[order], return_index=True)[1]]
     share = np.minimum(1.0, SAMPLES_AT_REST / size)[node]
     state = start.copy()
     state[:, :3, 3] += state[:, :3, :3] @ centre
