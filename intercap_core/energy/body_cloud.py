@@ -134,10 +134,10 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
 
     On the head a vertex is inside where a ray along its normal meets the mesh again.
     """
-    import open3d as o3d
     import scipy.sparse.csgraph
 
     from intercap_core.rigid.normals import vertex_normals
+    from intercap_core.rigid.open3d_core import o3d
 
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     graph = scipy.sparse.coo_matrix(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import open3d as o3d
 
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
 from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.open3d_core import o3d
 
 REACH_M = 0.25  # distances are capped here: nothing that is reported looks further
 _LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own triangle

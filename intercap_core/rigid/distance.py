@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
+
+from intercap_core.rigid.open3d_core import o3d
 
 # Directions along which crossings are counted: one for a watertight mesh (measured without a sign
 # error on 10 k points), a vote of all where faces are missing (Open3D's own samples run nearly

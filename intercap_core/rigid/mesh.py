@@ -106,9 +106,8 @@ class ObjectMesh:
         is small enough, and as many faces as it takes to keep every vertex within
         ``tolerance_m`` of the simplified surface.
         """
-        import open3d as o3d
-
         from intercap_core.rigid.distance import DistanceField
+        from intercap_core.rigid.open3d_core import o3d
 
         full = o3d.geometry.TriangleMesh(
             o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.faces)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import open3d as o3d
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.rigid.normals import vertex_normals
+from intercap_core.rigid.open3d_core import o3d
 
 
 class OcclusionScene:
