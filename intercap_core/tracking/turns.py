@@ -21,7 +21,8 @@ from intercap_core.tracking.search import own_axes
 STEPS = 12  # angles of a full turn
 FINE = np.pi / STEPS  # beside no turn, where a slow slide is caught first
 SURFACE_POINTS = 500
-PLACE_STEPS = 6
+PLACE_STEPS = 8
+PLACE_START = 6.0  # robust scale that placing starts from, over the last
 FAR_M, FAR_SHARE = 0.003, 0.01  # a point moved farther, also of the diameter, could be noticed
 CHANGED = 0.3  # share of such points, below which a turn is hard to see
 DISTINCT_DEG = 45.0  # flips nearer than this are one
@@ -117,10 +118,16 @@ def _placed(
     the share of ``points`` (N, 3) that stay farther than ``far``."""
     turned = points @ rotation.T
     shift = points.mean(0) - turned.mean(0)
-    for _ in range(PLACE_STEPS):
-        gap = field.closest(turned + shift).points - (turned + shift)
-        weight = 1 / (1 + (gap**2).sum(1, keepdims=True) / far**2) ** 2
-        shift = shift + (weight * gap).sum(0) / weight.sum()
+    for scale in far * np.geomspace(PLACE_START, 1, PLACE_STEPS):
+        at = turned + shift
+        closest = field.closest(at)
+        gap = closest.points - at
+        weight = 1 / (1 + (gap**2).sum(1) / scale**2) ** 2
+        weighted = closest.normals * weight[:, None]
+        # point to plane, a little to the point where no plane holds it
+        matrix = weighted.T @ closest.normals + 0.05 * weight.sum() * np.eye(3)
+        pull = weighted.T @ (closest.normals * gap).sum(1) + 0.05 * weight @ gap
+        shift = shift + np.linalg.solve(matrix, pull)
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = rotation, shift
     return turn, float((field.distance(turned + shift) > far).mean())
