@@ -8,11 +8,12 @@ from intercap_core import artefacts
 from intercap_core.config import InitialObjectPose, ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import CpuRenderer
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import OBJECT_TRACK
 from intercap_core.stages import object_track
 from intercap_core.tracking.evidence import View, ViewGeometry
-from intercap_core.tracking.fit import MotionPrior, assess, fit_pose
+from intercap_core.tracking.fit import MotionPrior, assess, assess_all, fit_pose
 from intercap_core.tracking.passes import Tracker
 from intercap_core.tracking.search import rank_frames, rotation_grid, search
 from intercap_core.tracking.seed import NotFound
@@ -81,6 +82,24 @@ def test_fit_recovers_from_six_centimetres_and_twenty_degrees(
     millimetres, degrees = _error(mesh, fit.pose, capture.poses[0])
     assert millimetres < 1.5 and degrees < 0.4
     assert fit.score > 0.9 and fit.support == len(views)
+
+
+def test_fit_is_the_same_whatever_the_threads_do(mesh, capture, views):
+    start = _disturbed(capture.poses[0], 0.03, 10, 5)
+    one, *others = (
+        _fit(mesh, views, start, renderer=CpuRenderer(threads)) for threads in (1, 3, 3, 2)
+    )
+    for other in others:
+        assert other.pose.tobytes() == one.pose.tobytes()
+        assert other.covariance.tobytes() == one.covariance.tobytes() and other.views == one.views
+
+
+def test_poses_assessed_together_are_those_assessed_alone(mesh, capture, views):
+    poses = np.array([_disturbed(capture.poses[0], 0.05, 15, seed) for seed in range(3)])
+    together = assess_all(mesh, views, poses, min_overlap=0.1, labels=LABELS)
+    for pose, fit in zip(poses, together, strict=True):
+        alone = assess(mesh, views, pose, min_overlap=0.1, labels=LABELS)
+        assert fit.score == alone.score and len(fit.views) == len(views)
 
 
 def test_fit_keeps_the_true_candidate_whatever_its_label_and_score(mesh, capture, views):
