@@ -12,7 +12,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.config import DetectionsSettings, ObjectEntry, SequenceEntry
+from intercap_core.config import DetectionsSettings, SequenceEntry
 from intercap_core.detection import candidate_files, openpose
 from intercap_core.detection.candidate_files import Candidates
 from intercap_core.detection.image_numbers import CameraImages, camera_images
@@ -26,7 +26,6 @@ from intercap_core.schemas import DETECTIONS, FRAMES
 log = logging.getLogger(__name__)
 
 NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
-LABELS_TOLD = 8  # labels that a warning names
 IMAGES_PER_LINE = 100  # segmented between two lines of the log
 
 
@@ -47,7 +46,6 @@ def run(
     output: Path,
     sequence: SequenceEntry,
     settings: DetectionsSettings,
-    object_: ObjectEntry | None = None,
 ) -> None:
     """Read the sequence's OpenPose and candidate files and write the detections artefact.
 
@@ -56,9 +54,8 @@ def run(
     damaged ones count too, and files may be named after the images. BEHAVE's keypoints and masks
     lie beside its images and are read from there unless the row names others. A segmentation model
     sees the images of which no file says anything. Missing or broken files, entries that cannot
-    be used and missing cameras are noted, not fatal. ``object_`` says which labels are expected:
-    where none is found, that is told. Raises UserError where neither keypoints nor candidates are
-    found for any image, or a keypoint file has another layout than it must.
+    be used and missing cameras are noted, not fatal. Raises UserError where neither keypoints nor
+    candidates are found for any image, or a keypoint file has another layout than it must.
     """
     with artefacts.read(frames, FRAMES) as source:
         images = camera_images(source, sequence)
@@ -73,7 +70,6 @@ def run(
         attributes["segmentation_model"] = _identity(settings.segmentation_model)
     if not any(d.keypoints_found.any() or d.candidates_found.any() for d in found):
         _raise_nothing(sequence, cameras, found)
-    _check_labels(sequence, found, object_)
     with artefacts.write(
         output,
         DETECTIONS,
@@ -107,33 +103,6 @@ def _raise_nothing(
         f"{sequence.candidates or 'not named'}{f'; {reasons}' if reasons else ''}); expected "
         f"<keypoints>/{cameras[0]}/<image>_keypoints.json and <candidates>/{cameras[0]}.json; "
         "run the detectors or correct the paths in the table of sequences"
-    )
-
-
-def _check_labels(
-    sequence: SequenceEntry, found: list[CameraDetections], object_: ObjectEntry | None
-) -> None:
-    """Tell where no candidate has a label of the object: a label map may be of another numbering.
-
-    The object may still be found, since labels may be wrong.
-    """
-    counts: dict[str, int] = {}
-    for detections in found:
-        for instance in (i for in_set in detections.instances for i in in_set):
-            counts[instance.label] = counts.get(instance.label, 0) + 1
-    if object_ is None or not object_.labels or not counts or counts.keys() & {*object_.labels}:
-        return
-    often = sorted(counts, key=lambda label: (-counts[label], label))
-    told = ", ".join(f"{label or 'no label'} ({counts[label]})" for label in often[:LABELS_TOLD])
-    log.warning(
-        "sequence %s: no candidate has a label of object %r (%s); found %s%s. Labels may be wrong, "
-        "so it is searched all the same; add the label to objects.yaml, or set "
-        "detections.category_names",
-        sequence.sequence,
-        object_.name,
-        ", ".join(object_.labels),
-        told,
-        f" and {len(often) - LABELS_TOLD} more" if len(often) > LABELS_TOLD else "",
     )
 
 

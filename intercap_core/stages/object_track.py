@@ -19,7 +19,7 @@ from intercap_core.project import digest
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
 from intercap_core.tracking.evidence import View, ViewGeometry, distances
-from intercap_core.tracking.object_size import size_doubt
+from intercap_core.tracking.object_size import label_doubt, size_doubt
 from intercap_core.tracking.passes import Track, Tracker
 from intercap_core.tracking.seed import NotFound
 
@@ -120,8 +120,11 @@ def run(
                 f"sequence {sequence}: no camera has images and a pose; check the recordings and "
                 "the calibration"
             )
-        doubt = size_doubt(recording, detected, recording.rig, mesh.diameter, object_.labels)
-        if doubt:
+        doubts = [
+            label_doubt(detected, object_.labels),
+            size_doubt(recording, detected, recording.rig, mesh.diameter, object_.labels),
+        ]
+        for doubt in filter(None, doubts):
             log.warning("sequence %s: object %r: %s", sequence, object_.name, doubt)
         tracker = Tracker(
             simple,
@@ -140,7 +143,7 @@ def run(
                 f"sequence {sequence}: object {object_.name!r} was found in no frame (no "
                 "segmentation candidate, with depth or in two views, fits its size; labels "
                 f"expected: {', '.join(object_.labels) or 'any'}); check the candidates, or "
-                f"annotate 'object_pose'{f'. Note: {doubt}' if doubt else ''}"
+                f"annotate 'object_pose'{'. Note: '.join(['', *filter(None, doubts)])}"
             ) from None
         names = list(recording.rig.names)
     _tell(track, sequence)

@@ -1,10 +1,12 @@
-"""Whether a mesh has the size of what the detector calls the object.
+"""Whether the detector knows the object at all, and whether the mesh has that thing's size.
 
 A mesh in decimetres, or one scaled by mistake, passes every check of the file alone. Where depth
 lies under a candidate's mask, the mask's extent in pixels is one in metres.
 """
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from intercap_core.capture.frames import Frames
 from intercap_core.detection.masks import Runs
 from intercap_core.detection.read import Detections
 
+LABELS_TOLD = 8
 SETS = 6  # that are looked at, spread over the recording
 STRIDE = 3  # of the depth pixels
 MIN_POINTS = 8  # of them under a mask
@@ -22,6 +25,30 @@ MIN_SIGHTINGS = 5
 # it also covers the person; most are neither, and a wrong unit is a factor of ten.
 DOUBTFUL = 4.0
 MOST, LEAST = 90, 25  # percentiles of the extents that say how large and how small it may be
+
+
+def label_doubt(detections: Detections, labels: tuple[str, ...]) -> str | None:
+    """Say in words that candidates have labels and none has one of ``labels``; else None.
+
+    The detector's classes may be numbered in another way. Labels may be wrong, so the object is
+    searched for all the same.
+    """
+    counts = Counter(
+        candidate.label
+        for t in range(detections.num_sets)
+        for c in range(len(detections.camera_names))
+        for candidate in detections.candidates(t, c)
+        if candidate.label
+    )
+    if not labels or not counts or counts.keys() & {*labels}:
+        return None
+    often = sorted(counts, key=lambda label: (-counts[label], label))
+    more = f" and {len(often) - LABELS_TOLD} more" if len(often) > LABELS_TOLD else ""
+    told = ", ".join(f"{label} ({counts[label]})" for label in often[:LABELS_TOLD])
+    return (
+        f"no candidate has one of its labels ({', '.join(labels)}), found {told}{more}; add the "
+        "label to objects.yaml, or set detections.category_names"
+    )
 
 
 def size_doubt(

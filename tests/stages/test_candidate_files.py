@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic_capture import ring, write_frames
 
-from intercap_core.config import DetectionsSettings, ObjectEntry, SequenceEntry
+from intercap_core.config import DetectionsSettings, SequenceEntry
 from intercap_core.detection import coco, masks
 from intercap_core.detection.read import Detections
 from intercap_core.errors import UserError
@@ -57,7 +56,6 @@ def run(folder: Path, *, layout: str = "k4a", **settings) -> Detections:
             calibration=root / "rig.json", candidates=folder,
         ),
         settings=DetectionsSettings(**settings),
-        object_=ObjectEntry(name="cup", mesh=root / "cup.ply", labels=("cup", "bowl")),
     )  # fmt: skip
     return Detections.load(root / "detections.h5")
 
@@ -121,21 +119,6 @@ def test_reasons_are_told_where_nothing_is_left(candidates):
         (candidates / f"{name}.json").write_text("{")
     with pytest.raises(UserError, match=r"k2: candidates/k2\.json is not valid JSON"):
         run(candidates)
-
-
-def test_labels_that_are_not_the_objects_are_told_and_kept(candidates, caplog):
-    with caplog.at_level(logging.WARNING):
-        run(candidates)
-    assert not caplog.text
-    entries = [result(i, label=label) for i in range(SETS) for label in ("apple", "vase")]
-    for name in ("k1", "k2"):
-        (candidates / f"{name}.json").write_text(json.dumps([*entries, result(0, label="apple")]))
-    with caplog.at_level(logging.WARNING):
-        read = run(candidates)
-    assert "no candidate has a label of object 'cup' (cup, bowl); found apple (10), vase (8)" in (
-        caplog.text
-    )
-    assert [c.label for c in read.candidates(1, 0)] == ["apple", "vase"]
 
 
 def numbered(entries: list[dict], number: int) -> list[dict]:

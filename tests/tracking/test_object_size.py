@@ -12,7 +12,7 @@ from intercap_core.capture.frames import Frames
 from intercap_core.config import DetectionsSettings, SequenceEntry
 from intercap_core.detection.read import Detections
 from intercap_core.stages import detections
-from intercap_core.tracking.object_size import size_doubt
+from intercap_core.tracking.object_size import label_doubt, size_doubt
 
 RIG, _ = ring(2)
 AWAY_M, SIDE_PX = 2.0, 120
@@ -66,3 +66,10 @@ def test_another_unit_is_told_with_both_sizes(evidence, factor, word):
 
 def test_without_a_label_nothing_is_said(evidence):
     assert doubt(evidence, 10 * EXTENT_M, ("suitcase",)) is None
+
+
+def test_labels_of_other_things_are_told_with_their_counts(evidence):
+    _, found = evidence
+    assert label_doubt(found, ("bowl", "cup")) is None and label_doubt(found, ()) is None
+    told = label_doubt(found, ("bowl", "mug"))
+    assert "none" not in told and "(bowl, mug), found cup (8);" in told
