@@ -86,11 +86,12 @@ class Puppet:
         self.skeleton = Skeleton(subject.rest_joints)
         self.hands = (Hand(subject, 0), Hand(subject, 1))
         rest = subject.rest_joints
-        # the shorter of both sides: people are not symmetric
+        # people are not symmetric: both arms' lengths, and the shorter of both sides
         self.leg = min(self.skeleton.length(f"{s}_hip", f"{s}_knee", f"{s}_ankle") for s in SIDES)
-        self.arm = min(
+        self.arms = [
             self.skeleton.length(f"{s}_shoulder", f"{s}_elbow", f"{s}_wrist") for s in SIDES
-        )
+        ]
+        self.arm = min(self.arms)
         self.hip_width = float(rest[_J["left_hip"], 0] - rest[_J["right_hip"], 0]) / 2
         self.hip_drop = float(rest[0, 1] - rest[[1, 2], 1].mean())
         self.ankle_height = np.array([_sole_depth(subject, side) for side in (0, 1)])
@@ -178,7 +179,7 @@ class Puppet:
         base = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
         left, up, forward = base[..., 0], base[..., 1], base[..., 2]
         shoulder = self.arm_root(world, pelvis, side)
-        reach = 0.955 * self.arm
+        reach = 0.955 * self.arms[side]
         offset = (sign * 0.085 * left + (0.05 + swing)[:, None] * forward) - reach * 0.965 * up
         position = shoulder + offset
         fingers = unit(-up + (0.10 + swing)[:, None] * forward - 0.02 * sign * left)
@@ -203,7 +204,7 @@ class Puppet:
             for side, (target, weight) in targets.items():
                 shoulder = self.arm_root(world, trunk.pelvis, side)
                 way = target.position - shoulder
-                excess = np.linalg.norm(way, axis=1) - ARM_REACH * self.arm
+                excess = np.linalg.norm(way, axis=1) - ARM_REACH * self.arms[side]
                 excess = weight * 0.5 * (excess + np.sqrt(excess**2 + 0.01**2))
                 lever = shoulder - trunk.pelvis
                 axis = np.cross(lever, unit(way)) / (lever**2).sum(1, keepdims=True)
