@@ -130,14 +130,14 @@ class Carrying:
         rays = lens.unproject(pixels.reshape(-1, 2)) @ pose[:3, :3].T
         return self._cast(t, pose[:3, 3], rays)[1].reshape(pixels.shape[:2])
 
-    def write(self, folder: Path) -> tuple[Path, Path]:
-        """Frames and scene artefacts."""
+    def write(self, folder: Path, floor: bool = True) -> tuple[Path, Path]:
+        """Frames and scene artefacts; without a ``floor`` neither it nor the vertical is known."""
         frames = write_frames(
             folder / "frames.h5", self.rig, num_sets=self.sets, depths=self.depths
         )
-        return frames, self._write_scene(frames, folder / "scene.h5")
+        return frames, self._write_scene(frames, folder / "scene.h5", floor)
 
-    def _write_scene(self, frames: Path, path: Path) -> Path:
+    def _write_scene(self, frames: Path, path: Path, floor: bool) -> Path:
         from intercap_core.capture.frames import Frames
 
         with Frames.open(frames) as images:
@@ -147,7 +147,8 @@ class Carrying:
         attributes = {
             "sequence": "test", "master": "k1", "fps": 15.0, "extrinsics_refined": False,
             "extrinsics_converged": False, "verdict": "",
-            "ground_found": True, "ground_source": "fitted", "ground_rms": 0.0, "ground_inliers": 9,
+            "ground_found": floor, "ground_source": "fitted" if floor else "none",
+            "ground_rms": 0.0, "ground_inliers": 9,
         }  # fmt: skip
         with artefacts.write(path, SCENE, **attributes) as writer:
             for key, values in self.rig.datasets().items():
@@ -166,10 +167,11 @@ class Carrying:
             for key in SCENE.fields:
                 if key.startswith("pair_"):
                     writer.put(key, np.zeros(0, int))
+            known = 1.0 if floor else np.nan
             to_master = invert(self.zup_from_master)
-            writer.put("ground_point", to_master[:3, 3])
-            writer.put("ground_normal", to_master[:3, 2])
-            writer.put("zup_from_master", self.zup_from_master)
+            writer.put("ground_point", known * to_master[:3, 3])
+            writer.put("ground_normal", known * to_master[:3, 2])
+            writer.put("zup_from_master", known * self.zup_from_master)
             for name, background in zip(self.rig.names, found, strict=True):
                 assert background is not None
                 writer.put(f"cameras/{name}/background", background.depth)

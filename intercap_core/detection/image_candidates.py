@@ -82,8 +82,9 @@ class DepthSegmenter:
         self._frames = frames
         rig = Rig.from_artefact(scene)
         zup = scene["zup_from_master"]
-        grounded = bool(scene.attributes["ground_found"]) and bool(np.isfinite(zup).all())
-        zup = zup if np.isfinite(zup).all() else np.eye(4)
+        upright = bool(np.isfinite(zup).all())
+        grounded = bool(scene.attributes["ground_found"]) and upright
+        zup = zup if upright else np.eye(4)
         times = scene["times"]
         bias, self._late = np.nan_to_num(scene["depth_bias"]), scene["time_offset"]
         self.cameras = [
@@ -102,7 +103,8 @@ class DepthSegmenter:
         )
         everywhere = self._joints[np.isfinite(self._joints).all(-1)]
         self._low = everywhere.min(0) - AROUND_M
-        self._high = everywhere.max(0) + np.array([AROUND_M, AROUND_M, ABOVE_HEAD_M])
+        above = ABOVE_HEAD_M if upright else AROUND_M
+        self._high = everywhere.max(0) + np.array([AROUND_M, AROUND_M, above])
         if grounded:
             self._low[2] = FLOOR_M
         views = [self._views[c] for c in self.cameras]

@@ -13,8 +13,10 @@ from intercap_core import artefacts
 from intercap_core.capture.frames import Frames
 from intercap_core.config import PersonSettings
 from intercap_core.detection import masks
+from intercap_core.detection.image_segmentation import segment_images
 from intercap_core.detection.read import FROM_DETECTOR, FROM_IMAGES, Detections
 from intercap_core.schemas import PERSON as PERSON_SCHEMA
+from intercap_core.schemas import SCENE
 from intercap_core.stages import person
 
 STEP = 4
@@ -100,6 +102,38 @@ def test_candidates_tell_their_size_and_are_few(segmented):
         assert (np.abs(extents - size) < 0.12).sum() >= CAPTURE.sets
     assert ((scores > 0) & (scores <= 1)).all() and (things >= 0).all()
     assert count.max() <= 8  # furniture that nobody comes near is none
+
+
+def test_without_a_floor_what_moves_is_found(written, tmp_path):
+    frames, scene = CAPTURE.write(tmp_path, floor=False)
+    wanted = np.zeros((CAPTURE.sets, CAPTURE.views), bool)
+    wanted[12] = True
+    with Frames.open(frames) as images, artefacts.read(scene, SCENE) as artefact:
+        found = segment_images(images, artefact, CAPTURE.joints, wanted)
+    overlaps = []
+    for c, camera in enumerate(CAPTURE.rig):
+        truth = CAPTURE.true_masks(12, camera, STEP)
+        size = camera.colour.height, camera.colour.width
+        drawn = masks.decode(found[12, c].person, *size)[::STEP, ::STEP]
+        assert overlap(drawn, truth == PERSON) > 0.7
+        things = [masks.decode(one.rle, *size) for one in found[12, c].candidates]
+        if (truth == BOX).sum() > 300:
+            overlaps.append(max(overlap(m[::STEP, ::STEP], truth == BOX) for m in things))
+    assert np.median(overlaps) > 0.6
+
+
+def test_only_the_images_asked_for_are_segmented_and_lost_keypoints_are_bridged(written):
+    frames, scene, _ = written
+    wanted = np.zeros((CAPTURE.sets, CAPTURE.views), bool)
+    wanted[7, 1] = wanted[7, 3] = wanted[9, 0] = True
+    joints = CAPTURE.joints.copy()
+    joints[6:8] = np.nan
+    with Frames.open(frames) as images, artefacts.read(scene, SCENE) as artefact:
+        found = segment_images(images, artefact, joints, wanted)
+        nobody = segment_images(images, artefact, np.full_like(joints, np.nan), wanted)
+    assert sorted(found) == [(7, 1), (7, 3), (9, 0)] and not nobody
+    truth = CAPTURE.true_masks(7, CAPTURE.rig[1], STEP) == PERSON
+    assert overlap(masks.decode(found[7, 1].person, 1080, 1920)[::STEP, ::STEP], truth) > 0.7
 
 
 def test_images_that_a_detector_saw_are_left_to_it(written, tmp_path, monkeypatch):
