@@ -73,10 +73,9 @@ def fit_by_adam(
     stays far from the vector's singular half turn.
     """
     begin = time.perf_counter()
-    poses, seconds = [pose], [0.0]
     crops = Crops.cut(mesh, views, pose, min_overlap, labels)
     if crops is None:
-        return FrameFit(np.array(poses), np.array(seconds))
+        return FrameFit(pose[None], np.zeros(1))
     energy = Energy(mesh, crops, pose, recipe)
     turn = torch.zeros(3, requires_grad=True)
     place = torch.tensor(pose[:3, 3], dtype=torch.float32, requires_grad=True)
@@ -84,18 +83,20 @@ def fit_by_adam(
         [
             {"params": [turn], "lr": recipe.learning_rate_rad},
             {"params": [place], "lr": recipe.learning_rate_m},
-        ]
+        ],
+        fused=True,
     )
+    path, seconds = [np.append(np.zeros(3), pose[:3, 3])], [0.0]
     for _ in range(steps):
         adam.zero_grad()
         energy(turn, place).backward()
         adam.step()
-        found = np.eye(4)
-        found[:3, :3] = Rotation.from_rotvec(turn.detach().numpy()).as_matrix() @ pose[:3, :3]
-        found[:3, 3] = place.detach().numpy()
-        poses.append(found)
+        path.append(np.append(turn.detach().numpy(), place.detach().numpy()))
         seconds.append(time.perf_counter() - begin)
-    return FrameFit(np.array(poses), np.array(seconds))
+    poses = np.tile(np.eye(4), (len(path), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.array(path)[:, :3]).as_matrix() @ pose[:3, :3]
+    poses[:, :3, 3] = np.array(path)[:, 3:]
+    return FrameFit(poses, np.array(seconds))
 
 
 @dataclass(frozen=True, eq=False)
