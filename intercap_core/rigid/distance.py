@@ -60,7 +60,7 @@ class DistanceField:
         self._scene.add_triangles(
             o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces)
         )
-        self._directions = _DIRECTIONS[:1] if watertight else _DIRECTIONS
+        self._watertight = watertight
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) to the surface, metres, negative inside."""
@@ -73,14 +73,25 @@ class DistanceField:
         return self._scene.compute_distance(query).numpy().astype(np.float64)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (N, 3) are inside the solid: (N,) bool."""
+        """Whether points (N, 3) are inside the solid: (N,) bool.
+
+        Of a watertight mesh one ray a point; as a ray through an edge may count it twice or never,
+        the few points that are found inside are asked again with more rays.
+        """
         query = np.asarray(points, np.float32).reshape(-1, 3)
+        asked = np.arange(len(query))
+        if self._watertight:
+            asked = np.flatnonzero(self._odd(query, _DIRECTIONS[0]))
         votes = np.zeros(len(query), int)
-        for direction in self._directions.astype(np.float32):
-            rays = np.concatenate([query, np.broadcast_to(direction, query.shape)], 1)
-            crossings = self._scene.count_intersections(o3d.core.Tensor.from_numpy(rays)).numpy()
-            votes += crossings % 2
-        return 2 * votes > len(self._directions)
+        for direction in _DIRECTIONS:
+            votes[asked] += self._odd(query[asked], direction)
+        return 2 * votes > len(_DIRECTIONS)
+
+    def _odd(self, query: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Whether rays from points (N, 3) float32 cross the surface an odd number of times."""
+        towards = np.broadcast_to(direction.astype(np.float32), query.shape)
+        rays = o3d.core.Tensor.from_numpy(np.concatenate([query, towards], 1))
+        return self._scene.count_intersections(rays).numpy() % 2 == 1
 
     def closest(self, points: np.ndarray) -> Closest:
         """The closest surface points of points (N, 3)."""
