@@ -15,7 +15,7 @@ from intercap_core.tracking.smooth import Looks, between
 
 LASTING_S = 0.3  # errors of masks last about so long: frames closer than that are one observation
 MOVING = 9.0  # cost of one observation's own pose: six numbers, each to be told from noise
-SEGMENT = 7.0  # cost of one more rest: its pose and where it begins and ends
+SEGMENT = 8.0  # cost of one more rest: its pose and where it begins and ends
 MIN_REST_S = 0.25
 MAX_REST = 900  # frames tested against one pose
 LIMIT = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away nothing is tested
