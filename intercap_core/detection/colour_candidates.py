@@ -8,6 +8,7 @@ person in the image is taken for the person, and what rests for most of a record
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
 
 from intercap_core.artefacts import Artefact
@@ -109,31 +110,67 @@ def median_without(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, 
 
     Exposures are brought to that of the first image before.
     """
-    gains = [_gain(image, images[0]) for image in images]
-    levelled = [
-        np.minimum(image * gain, 255).astype(np.uint16)
-        for image, gain in zip(images, gains, strict=True)
-    ]
-    ordered = np.sort(np.stack(levelled) + 256 * people[..., None].astype(np.uint16), axis=0)
+    gains = np.stack([_gain(image, images[0]) for image in images])
     seen = len(images) - people.sum(0)
-    middle = np.maximum(seen - 1, 0) // 2
-    median = np.take_along_axis(ordered, middle[None, ..., None], 0)[0].astype(np.float32)
-    return median, seen >= MIN_SAMPLES
+    return _median(images, people, gains), seen >= MIN_SAMPLES
+
+
+@numba.njit(cache=True)
+def _median(images: np.ndarray, people: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    samples, height, width, channels = images.shape
+    median = np.zeros((height, width, channels), np.float32)
+    values = np.empty(samples, np.float32)
+    for y in range(height):
+        for x in range(width):
+            for channel in range(channels):
+                count = 0
+                for s in range(samples):
+                    if people[s, y, x]:
+                        continue
+                    value = min(images[s, y, x, channel] * gains[s, channel], np.float32(255))
+                    at = count  # sorted as they come: there are few
+                    while at > 0 and values[at - 1] > value:
+                        values[at] = values[at - 1]
+                        at -= 1
+                    values[at] = value
+                    count += 1
+                if count:
+                    median[y, x, channel] = values[(count - 1) // 2]
+    return median
 
 
 def before(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Pixels (H, W) bool of an image (H, W, 3) uint8 that differ from the ``background`` (H, W, 3)
     float32 by more than a shadow does, holes closed; False where that is not ``known`` (H, W)."""
-    seen = image * _gain(image, background)
-    power = (background**2).sum(-1)
-    brightness = (seen * background).sum(-1) / np.maximum(power, 1.0)
-    off = np.sqrt(((seen - brightness[..., None] * background) ** 2).sum(-1))
-    changed = (off > OFF_COLOUR) | (brightness < SHADOW) | (brightness > HIGHLIGHT)
-    dark = power < DARK**2
-    changed = np.where(dark, np.abs(seen - background).max(-1) > DARK_CHANGE, changed)
+    changed = _changed(image, background, _gain(image, background)) & known
     block = np.ones((3, 3), np.uint8)
-    opened = cv2.morphologyEx((changed & known).view(np.uint8), cv2.MORPH_OPEN, block)
+    opened = cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, block)
     return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+@numba.njit(cache=True)
+def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    height, width, channels = image.shape
+    found = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            power = along = length = largest = np.float32(0)
+            for channel in range(channels):
+                seen = image[y, x, channel] * gain[channel]
+                known = background[y, x, channel]
+                power += known * known
+                along += seen * known
+                length += seen * seen
+                largest = max(largest, abs(seen - known))
+            if power < DARK * DARK:
+                found[y, x] = largest > DARK_CHANGE
+                continue
+            brightness = along / power
+            off = length - brightness * along  # squared distance from the background's colour
+            found[y, x] = (
+                off > OFF_COLOUR * OFF_COLOUR or brightness < SHADOW or brightness > HIGHLIGHT
+            )
+    return found
 
 
 def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
