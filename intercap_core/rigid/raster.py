@@ -15,9 +15,10 @@ from intercap_core.camera.projection_kernels import project_point
 NEAR_M = 0.05  # triangles that reach nearer than this are left out: no Kinect images them
 NO_FACE = -1
 BOX_MARGIN_PX = 2  # straight edges between projected corners bend by less in any known lens
-# How far a triangle's edge of L px may bend: L^2 times this over the focal length (a curvature of
-# 0.24 in the normalised plane, some three times that of a Kinect's lens at its corners).
-BEND = 0.03
+# How far a triangle's edge of L px may bend: L^2 times this over the focal length. Chords between
+# any two pixels of Azure Kinects' colour and depth images need at most 0.135.
+BEND = 0.15
+LARGE_PX = 6.0  # of a triangle from which its edges bound each row
 SLACK_PX = 0.1  # rounding of the ray table and of small windows
 
 
@@ -65,6 +66,7 @@ def draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, 
     mesh, called ``number``, is nearer.
     """
     height, width = depth.shape
+    bounds = np.empty((3, 3))
     for f in range(faces.shape[0]):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, az = corners[i, 0], corners[i, 1], corners[i, 2]
@@ -92,7 +94,21 @@ def draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, 
         n2x, n2y, n2z = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
         sx, sy, sz = n0x + n1x + n2x, n0y + n1y + n2y, n0z + n1z + n2z  # the plane's normal
         sign = 1.0 if volume > 0.0 else -1.0
+        narrow = extent > LARGE_PX
+        if narrow:
+            _bound(0, pixels[i], pixels[j], pixels[k], x0, y0, slack, bounds)
+            _bound(1, pixels[j], pixels[k], pixels[i], x0, y0, slack, bounds)
+            _bound(2, pixels[k], pixels[i], pixels[j], x0, y0, slack, bounds)
         for v in range(int(np.ceil(v0)), int(v1) + 1):
+            if narrow:
+                low, high = u0, u1
+                for edge in range(3):
+                    bound = bounds[edge, 0] * v + bounds[edge, 1]
+                    if bounds[edge, 2] > 0.0:
+                        low = max(low, bound)
+                    elif bounds[edge, 2] < 0.0:
+                        high = min(high, bound)
+                first, last = int(np.ceil(low)), int(high) + 1
             for u in range(first, last):
                 x, y = np.float64(rays[y0 + v, x0 + u, 0]), np.float64(rays[y0 + v, x0 + u, 1])
                 if (
@@ -105,6 +121,24 @@ def draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, 
                         depth[v, u] = z
                         face[v, u] = f
                         body[v, u] = number
+
+
+@numba.njit(cache=True, nogil=True)
+def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
+    """Which columns of a row may lie on the inner side of the projected edge p q, or within
+    ``slack`` px outside: from (1) or up to (-1) ``bounds[edge, 0]`` * row + ``bounds[edge, 1]``,
+    the sign in ``bounds[edge, 2]``; 0 for all columns. Pixels (2,) of the image."""
+    du, dv = q[0] - p[0], q[1] - p[1]
+    inner = du * (opposite[1] - p[1]) - dv * (opposite[0] - p[0])
+    side = 1.0 if inner > 0.0 else -1.0
+    across, along = -side * dv, side * du  # of the distance from the edge, times its length
+    if inner == 0.0 or abs(across) < 1e-9:
+        bounds[edge, 2] = 0.0
+        return
+    offset = across * (p[0] - x0) + along * (p[1] - y0) - slack * np.sqrt(du * du + dv * dv)
+    bounds[edge, 0] = -along / across
+    bounds[edge, 1] = offset / across
+    bounds[edge, 2] = 1.0 if across > 0.0 else -1.0
 
 
 @numba.njit(cache=True, nogil=True)

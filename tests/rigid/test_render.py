@@ -71,6 +71,19 @@ def test_equals_an_independent_ray_caster(objects, name):
     assert close.mean() > 0.998
 
 
+@pytest.mark.parametrize("corner", [(-0.7, -0.4), (0.75, 0.35), (0.1, 0.4)])
+def test_large_triangles_bend_as_the_lens_bends_them(corner):
+    """Twelve triangles of hundreds of pixels cover what thousands of small ones do."""
+    box = trimesh.creation.box((0.5, 0.35, 0.2))
+    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
+    for turn in (0.0, 0.5, 1.1):
+        pose = _pose((*corner, 1.1), (turn, 0.4 - turn, 0.7 * turn))
+        few = render(vertices, faces, LENS, pose, margin_px=8)
+        fine = render(*trimesh.remesh.subdivide_to_size(vertices, faces, 0.03), LENS, pose)
+        assert fine.mask.sum() > 10_000
+        assert (few.full_mask(LENS) != fine.full_mask(LENS)).sum() <= 4
+
+
 def test_projected_vertices_fall_into_the_mask(objects):
     mesh = objects["suitcase"]
     pose = _pose((-0.5, 0.2, 1.5), (0.3, 1.0, -0.2))
