@@ -20,6 +20,7 @@ RING = 6
 RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
 SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
 NAMED_VIEWS, VIEWS_EACH = 2, 3  # views with a candidate, of so many each, for a searched pose
+NEAR_M = 0.4
 CLEARLY_BETTER = 1.15  # a searched pose's confidence over the tracked one's
 
 
@@ -83,7 +84,7 @@ def _recovered(
     observer: Observer, t: int, last: np.ndarray, result: FrameResult
 ) -> FrameResult | None:
     """A searched pose that is clearly better than what tracking found, if there is one."""
-    found = [fit for fit in observer.search(t, near=last[:3, 3]) if _named(fit)][:3]
+    found = [fit for fit in observer.search(t, near=last[:3, 3]) if _named(observer, last, fit)][:3]
     if not found:
         return None
     best = max(
@@ -100,11 +101,14 @@ def _recovered(
     return FrameResult(best, False)
 
 
-def _named(fit: Fit) -> bool:
-    """Whether candidates of enough views show the object there: one alone may be anything."""
+def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
+    """Whether candidates of enough views show the object there: far from where it was one alone
+    may be anything."""
     looked = sum(view.detected for view in fit.views)
     named = sum(view.candidate >= 0 for view in fit.views)
-    return named >= min(NAMED_VIEWS, -(-looked // VIEWS_EACH))
+    away = float(np.linalg.norm(observer.centre(fit.pose) - observer.centre(last)))
+    far = away > NEAR_M
+    return named >= min(NAMED_VIEWS if far else 1, -(-looked // VIEWS_EACH))
 
 
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.tracking.fit import Fit
 
 LOST_SCORE = 0.20
 # By how much the mean score of one pose has to be better than another's, over all frames of a run
 # and over one: errors of masks last several frames and agree over views.
 DECIDED, DECIDED_ONE = 0.01, 0.03
+UNSURE_M, UNSURE_RAD = 0.03, np.radians(15)  # standard deviations that are as good as lost
 UNNAMED_FRAMES, UNNAMED_M = 4, 0.05  # that the object is followed without any candidate
 
 
@@ -71,3 +73,51 @@ class Named:
         self._frames += 1
         stayed = float(np.linalg.norm(place - self._place)) < UNNAMED_M
         return self._frames <= UNNAMED_FRAMES or stayed
+
+
+def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
+    """The frames (T) of a final track, those flagged that nothing bears out for long or that may be
+    elsewhere by their covariance: lost where the place is not known, ambiguous where the turn is
+    not."""
+    later = _unnamed(mesh, frames)
+    sooner = _unnamed(mesh, frames[::-1])[::-1]
+    result = []
+    for frame, unnamed in zip(frames, later & sooner, strict=True):
+        shift, turn = _deviations(mesh, frame.fit)
+        lost = frame.lost or bool(unnamed) or shift > UNSURE_M
+        unsure = frame.ambiguous or turn > UNSURE_RAD
+        result.append(replace(frame, lost=lost, ambiguous=unsure and not lost))
+    return result
+
+
+def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
+    """Which frames (T) no candidate bears out, seen from those before."""
+    places = [_place(mesh, frame.fit) for frame in frames]
+    named = Named(places[0])
+    believed = [named.believes(at, frame.fit) for at, frame in zip(places, frames, strict=True)]
+    return ~np.array(believed)
+
+
+def _place(mesh: ObjectMesh, fit: Fit) -> np.ndarray:
+    return fit.pose[:3, :3] @ mesh.centre_of_mass + fit.pose[:3, 3]
+
+
+def _deviations(mesh: ObjectMesh, fit: Fit) -> tuple[float, float]:
+    """Largest standard deviations of the centre, metres, and of the turn, radians, without turns
+    that change nothing."""
+    arm = fit.pose[:3, :3] @ mesh.centre_of_mass
+    about = np.cross(np.eye(3), arm)  # row i: shift of the centre by a turn about axis i
+    to_centre = np.concatenate([about.T, np.eye(3)], axis=1)
+    shift = to_centre @ fit.covariance @ to_centre.T
+    turn = fit.covariance[:3, :3]
+    if mesh.symmetry.sphere:
+        turn = np.zeros((3, 3))
+    elif mesh.symmetry.axis is not None:
+        axis = fit.pose[:3, :3] @ mesh.symmetry.axis
+        across = np.eye(3) - np.outer(axis, axis)
+        turn = across @ turn @ across
+    return _largest(shift), _largest(turn)
+
+
+def _largest(covariance: np.ndarray) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))

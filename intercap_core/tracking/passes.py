@@ -18,7 +18,7 @@ from intercap_core.tracking.audit import audited
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Fit
 from intercap_core.tracking.follow import follow
-from intercap_core.tracking.lost import FrameResult, decided, judged
+from intercap_core.tracking.lost import FrameResult, decided, doubted, judged
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.seed import annotated_seed, find_seed
 from intercap_core.tracking.whole import WholeTrack
@@ -86,7 +86,7 @@ class Tracker:
             for t, result in follow(self._observer, frames, one[start_at], one, may_search=False):
                 two[t] = result
         merged = self._merged(one, two)
-        whole = WholeTrack(self._observer, self._times).refine(merged)
+        whole = doubted(self._mesh, WholeTrack(self._observer, self._times).refine(merged))
         return Track(
             _recovered(self._mesh, whole, seed_frame), seed_frame, initial is not None, borne_out
         )
