@@ -192,15 +192,19 @@ def drawn(bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: fl
     ``bones`` (B, 9), master frame, of :func:`.person_volume.bones_of`.
     """
     mask = np.zeros(shape[:2], np.uint8)
-    for bone in bones.astype(np.float64):
-        ends = apply(camera.colour_from_master, bone[:6].reshape(2, 3))
-        if not camera.colour.inside_model(ends).all():
-            continue
-        pixels = camera.colour.project(ends) / SCALE
-        if np.abs(pixels).max() > 1e4:
-            continue
-        radius = float(bone[6:8].mean() + margins * bone[8])
-        width = 2 * radius * camera.colour.fx / float(ends[:, 2].mean()) / SCALE
-        (x0, y0), (x1, y1) = np.rint(pixels).astype(int).tolist()
-        cv2.line(mask, (x0, y0), (x1, y1), 1, thickness=max(1, round(width)))
+    if not len(bones):
+        return mask > 0
+    ends = apply(camera.colour_from_master, bones[:, :6].astype(np.float64).reshape(-1, 3))
+    pixels = (camera.colour.project(ends) / SCALE).reshape(-1, 4)
+    radius = bones[:, 6:8].mean(1) + margins * bones[:, 8]
+    distance = ends[:, 2].reshape(-1, 2).mean(1)
+    shown = camera.colour.inside_model(ends).reshape(-1, 2).all(1)
+    shown &= np.abs(pixels).max(1) < 1e4  # False for what is not a number
+    width = 2 * radius[shown] * camera.colour.fx / distance[shown] / SCALE
+    for (x0, y0, x1, y1), thick in zip(
+        np.rint(pixels[shown]).astype(int).tolist(),
+        np.rint(width).astype(int).tolist(),
+        strict=True,
+    ):
+        cv2.line(mask, (x0, y0), (x1, y1), 1, thickness=max(1, thick))
     return mask > 0

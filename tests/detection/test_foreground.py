@@ -8,8 +8,9 @@ from scipy import ndimage
 from synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
 from synthetic_people import stick_person
 
+from intercap_core.camera.transforms import apply, invert
 from intercap_core.detection import masks
-from intercap_core.detection.colour_candidates import before, median_without
+from intercap_core.detection.colour_candidates import before, drawn, median_without
 from intercap_core.detection.depth_masks import Cells, Projected, encode_window
 from intercap_core.detection.foreground import DepthBackground, DepthView
 from intercap_core.detection.person_volume import FAR, bones_of, outside
@@ -260,3 +261,21 @@ def test_a_shadow_or_another_exposure_is_not_before_the_scene_but_a_thing_is():
     assert found[22:48, 92:118].mean() > 0.9
     found[20:50, 90:120] = False
     assert found.mean() < 0.01
+
+
+def test_the_person_is_drawn_where_the_points_within_the_body_are_seen():
+    camera = RIG[2]
+    joints = apply(invert(UP), stick_person())
+    bones = bones_of(joints)
+    mask = drawn(bones, camera, (540, 960), 0.0)
+    points = np.random.default_rng(4).uniform([-0.4, -0.5, 0], [0.4, 0.5, 1.8], (4000, 3))
+    in_master = apply(invert(UP), points)
+    away = outside(in_master.astype(np.float32), bones)
+    pixel = np.rint(camera.colour.project(apply(camera.colour_from_master, in_master)) / 2)
+    column, row = np.clip(pixel.astype(int), 0, (959, 539)).T
+    assert mask[row[away < -0.5], column[away < -0.5]].mean() > 0.97
+    assert mask.mean() < 0.1
+    assert not drawn(bones[:0], camera, (540, 960), 0.0).any()
+    behind = bones.copy()
+    behind[:, [2, 5]] -= 20
+    assert not drawn(behind, camera, (540, 960), 0.0).all()
