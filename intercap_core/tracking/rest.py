@@ -48,7 +48,8 @@ def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
         if spread is None:
             break
         wander = float(np.clip(wander * spread, *WANDER))
-    return _trimmed(segments, poses, information / wander)
+    information = information / wander
+    return _joined(_trimmed(segments, poses, information), poses, information * share, seen)
 
 
 def _partition(
@@ -132,6 +133,28 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
             result[rest[: inside[0]]] = -1
         if rest[-1] < len(segments) - 1:
             result[rest[inside[-1] + 1 :]] = -1
+    return result
+
+
+def _joined(
+    segments: np.ndarray, poses: np.ndarray, information: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
+    """The segments (T,) with two that a blip or the longest rest parted made one again, where one
+    pose explains both."""
+    result = np.full_like(segments, -1)
+    number, last = -1, np.zeros(0, int)
+    for old in range(segments.max(initial=-1) + 1):
+        rest = np.flatnonzero(segments == old)
+        if len(last) and rest[0] - last[-1] <= BLIP + 1:
+            both = np.concatenate([last, rest])
+            spreads = [_spread(poses[i], information[i], seen[i]) for i in (both, last, rest)]
+            apart = 0.5 * (spreads[0][-1] - spreads[1][-1] - spreads[2][-1])
+            if len(spreads[0]) == len(both) and apart < SEGMENT:
+                result[last[0] : rest[-1] + 1] = number
+                last = both
+                continue
+        number, last = number + 1, rest
+        result[rest] = number
     return result
 
 

@@ -162,3 +162,18 @@ def test_a_turn_changes_where_the_track_was_lost() -> None:
     broken[4] = True
     chosen, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
     assert (chosen[[0, 3, 6, 9]] == [0, 0, 1, 1]).all()
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_a_wrong_frame_does_not_end_a_rest(width: int) -> None:
+    true = lifted(40, 38, 39)[:30]
+    looks = looks_at(true)
+    looks.poses[12 : 12 + width, :3, 3] += [0.1, 0.0, 0.02]
+    segment = resting(looks, np.arange(30) / FPS, CENTRE)
+    assert (segment == 0).all()
+
+
+def test_a_long_rest_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("intercap_core.tracking.rest.MAX_REST", 20)
+    true = lifted(60, 58, 59)[:55]
+    assert (resting(looks_at(true), np.arange(55) / FPS, CENTRE) == 0).all()
