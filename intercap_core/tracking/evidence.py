@@ -128,6 +128,13 @@ class View:
     candidates: tuple[Candidate, ...]
     detected: bool = True
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the images."""
+        masks = [self.person, *(candidate.mask for candidate in self.candidates)]
+        depth = 0 if self.depth is None else self.depth.nbytes
+        return depth + sum(mask.mask.nbytes for mask in masks)
+
     @classmethod
     def build(
         cls,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import Evidence, Fit, MotionPrior, assess_all, evidence_at, fit_pose
 from intercap_core.tracking.places import Places
 from intercap_core.tracking.search import plausibility, rank_frames, search
+from intercap_core.tracking.view_cache import ViewCache
 
-CACHED_FRAMES = 32  # of a small object's whole depth images: 300 MB
 PASS_ROUNDS = (3, 3)
 PASS_SCALE = 0.5
 LOOK_OVERLAP = 0.1  # of a candidate that a pose is compared with, before it is fitted
@@ -43,7 +43,7 @@ class Observer:
     renderer: Renderer = field(init=False)
 
     def __post_init__(self) -> None:
-        self.views = lru_cache(maxsize=CACHED_FRAMES)(self.load)
+        self.views = ViewCache(self.load)
         self.renderer = open_renderer(self.settings.render_on)
 
     @property
