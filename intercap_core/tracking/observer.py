@@ -67,9 +67,9 @@ class Observer:
         return first + [t for t in rank_frames(self.labels_by_view, self.labels) if t not in known]
 
     def promise(self, t: int) -> int:
-        """Views of frame t with a candidate that has one of the object's labels."""
+        """Views of frame t with a candidate that has one of the object's labels, or none."""
         return sum(
-            any(label in self.labels or (not self.labels) for label in view)
+            any(label in self.labels or not label or not self.labels for label in view)
             for view in self.labels_by_view[t]
         )
 

@@ -214,6 +214,25 @@ def test_track_from_an_annotation_that_is_a_little_wrong(mesh):
         assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 3
 
 
+def test_an_annotation_of_another_frame_is_found_in_its_own(mesh):
+    """Five frames off while the object moves by 7 cm a frame."""
+    capture = ObjectCapture.make(mesh, 6, speed=0.07, turn_deg=4)
+    track = _track(capture, mesh, (5, capture.poses[0]))
+    assert track.annotated and track.borne_out
+    for t, frame in enumerate(track.frames):
+        assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 4
+
+
+def test_an_annotation_that_the_images_contradict_does_not_poison_the_track(mesh):
+    capture = ObjectCapture.make(mesh, 3)
+    wrong = capture.poses[1].copy()
+    wrong[:3, 3] += capture.master_from_room[:3, :3] @ (0.1, -0.9, 0.3)
+    track = _track(capture, mesh, (1, wrong))
+    assert track.annotated and not track.borne_out
+    for t, frame in enumerate(track.frames):
+        assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 4
+
+
 def test_known_offsets_of_the_exposures_make_a_moving_object_better(mesh):
     """At 1.5 m/s and 3 rad/s, eight milliseconds are 12 mm and 1.4 degrees."""
     capture = ObjectCapture.make(mesh, 5, speed=0.1, turn_deg=11.5)
