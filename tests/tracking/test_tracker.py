@@ -94,6 +94,18 @@ def test_fit_is_the_same_whatever_the_threads_do(mesh, capture, views):
         assert other.covariance.tobytes() == one.covariance.tobytes() and other.views == one.views
 
 
+def test_fit_drawn_by_warp_is_the_same(mesh, capture, views):
+    pytest.importorskip("warp", reason="warp is not installed (pip install 'intercap-core[gpu]')")
+    from intercap_core.rigid.render_warp import WarpRenderer
+
+    start = _disturbed(capture.poses[0], 0.03, 10, 6)
+    one, two = (
+        _fit(mesh, views, start, renderer=renderer)
+        for renderer in (CpuRenderer(), WarpRenderer("cpu"))
+    )
+    np.testing.assert_allclose(one.pose, two.pose, atol=1e-7)
+
+
 def test_poses_assessed_together_are_those_assessed_alone(mesh, capture, views):
     poses = np.array([_disturbed(capture.poses[0], 0.05, 15, seed) for seed in range(3)])
     together = assess_all(mesh, views, poses, min_overlap=0.1, labels=LABELS)
