@@ -5,7 +5,7 @@ Reads the artefacts of the stages before ``object_track``; what is decoded here 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,10 +21,9 @@ from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.twist import moved
 from intercap_core.stages.object_track import TRACKING_FACES, ObjectRecording
-from intercap_core.tracking.evidence import View, ViewGeometry
+from intercap_core.tracking.evidence import View
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.passes import Tracker
-from intercap_core.tracking.reduced_mask import reduced_lens
 
 # Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
 ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)
@@ -52,13 +51,10 @@ class ObjectClip:
     true_views: np.ndarray
 
     @classmethod
-    def load(
-        cls, project: Project, sequence: str, count: int, *, coarser: float = 1.0
-    ) -> ObjectClip:
+    def load(cls, project: Project, sequence: str, count: int) -> ObjectClip:
         """The first ``count`` frame sets from the first that shows the object well.
 
-        ``coarser`` multiplies the steps by which the images are reduced (never below one). Raises
-        UserError where the sequence has no truth or an artefact is missing.
+        Raises UserError where the sequence has no truth or an artefact is missing.
         """
         row = project.sequences[sequence]
         if row.truth is None:
@@ -73,7 +69,6 @@ class ObjectClip:
                 project.artefact(sequence, "person"),
                 whole.diameter,
             )
-            source.geometry = [_coarser(geometry, coarser) for geometry in source.geometry]
             truth = Truth.load(row.truth, frames.time_s, frames.fps, 0)
             first = int(np.argmax(truth.object_views >= SEEN_VIEWS))
             kept = slice(first, min(first + count, frames.num_sets))
@@ -145,18 +140,3 @@ class ObjectClip:
     def seen(self) -> np.ndarray:
         """Frames (T,) bool that count: enough views truly see the object."""
         return self.true_views >= SEEN_VIEWS
-
-
-def _coarser(geometry: ViewGeometry, factor: float) -> ViewGeometry:
-    if factor == 1:
-        return geometry
-    step = max(round(geometry.step * factor), 1)
-    depth_step = max(round(geometry.depth_step * factor), 1)
-    camera = geometry.camera
-    return replace(
-        geometry,
-        step=step,
-        lens=reduced_lens(camera.colour, step),
-        depth_step=depth_step,
-        depth_lens=reduced_lens(camera.depth, depth_step) if camera.depth else None,
-    )

@@ -29,9 +29,10 @@ from rich.table import Table
 from bench.object_baseline import FrameFit, Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
 from bench.object_convergence import draw_convergence
+from bench.object_scaling import tracking_scaling
 from intercap_core.errors import UserError
 from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
-from intercap_core.project import Project, load_project
+from intercap_core.project import load_project
 from intercap_core.tracking.evidence import View
 from intercap_core.tracking.fit import MotionPrior
 from intercap_core.tracking.follow import follow
@@ -57,9 +58,6 @@ SCHEDULES = (
 AS_GOOD = 1.02  # times our errors: reached
 NEAR_BEST = 1.05  # times the best median that any schedule comes to: its best
 SOFT_STEPS = 5  # of the plain torch rasteriser, which takes long
-GROWTH_FRAMES = 8
-GROWTH_FACES = (150, 600, 2400)
-GROWTH_STEPS = (0.5, 1.0, 2.0)  # times the reduction of the images: 4, 1 and 1/4 of the pixels
 
 
 @dataclass(frozen=True)
@@ -181,28 +179,6 @@ def milliseconds_a_step(clip: ObjectClip, start: np.ndarray, recipe: Recipe, ste
     return 1e3 * float(np.median(np.diff(fit.seconds)[1:]))
 
 
-def growth(project: Project, sequence: str) -> dict[str, float]:
-    """Milliseconds a frame of :func:`one_pass` by views, faces and pixels; keys after object."""
-    clip = ObjectClip.load(project, sequence, GROWTH_FRAMES)
-
-    def measure(changed: ObjectClip) -> float:
-        return round(one_pass(changed, changed.annotated).ms, 2)
-
-    found = {}
-    for count in range(1, len(clip.views[0]) + 1):
-        fewer = replace(clip, views=[views[:count] for views in clip.views])
-        found[f"ms_per_frame_views_{count}"] = measure(fewer)
-    for faces in GROWTH_FACES:
-        mesh = clip.whole.simplified(faces, tolerance_m=np.inf)
-        found[f"ms_per_frame_faces_{len(mesh.faces)}"] = measure(replace(clip, mesh=mesh))
-    whole = len(clip.whole.faces)
-    found[f"ms_per_frame_faces_{whole}"] = measure(replace(clip, mesh=clip.whole))
-    for factor in GROWTH_STEPS:
-        other = ObjectClip.load(project, sequence, GROWTH_FRAMES, coarser=factor)
-        found[f"ms_per_frame_pixels_{factor**-2:g}"] = measure(other)
-    return found
-
-
 def measure(settings: Path, output: Path, frames: int) -> None:
     """Measure, print and add to the output; see the module's text."""
     torch.set_num_threads(THREADS)
@@ -244,7 +220,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         **reached.figures("baseline_until_"),
         "frames": len(clip),
         "threads": THREADS,
-        **growth(project, sequence),
+        **tracking_scaling(clip.whole),
     }
     _merge(output, {f"object.{key}": round(float(value), 4) for key, value in figures.items()})
     picture = project.results / "object_convergence.png"
@@ -300,11 +276,10 @@ def _print(
         f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy (*)",
         highlight=False,
     )
-    grown = Table("one pass of fits", "ms a frame", box=None)
+    grown = Table("a fit of one frame, or a drawn image", "ms", box=None)
     for key, value in figures.items():
-        if key.startswith("ms_per_frame_"):
-            kind, size = key.removeprefix("ms_per_frame_").split("_")
-            grown.add_row(f"{size} {'times the ' * (kind == 'pixels')}{kind}", f"{value:.1f}")
+        if key.startswith(("fit_ms_", "draw_ms_")):
+            grown.add_row(key.replace("_ms", "").replace("_", " "), f"{value:.2f}")
     console.print(grown)
 
 
