@@ -23,12 +23,14 @@ TURNS_EVERY_S = 0.2
 QUITE_DIFFERENT_RAD = np.radians(20)
 DOUBT = 0.2  # probability of quite different turns, from which a frame is ambiguous
 TURN_LOSS = 0.01  # of the score, that all frames together may cost one frame
-SAME_ERRORS = 4.0  # variance of what views err together over what they err apart
+SAME_ERRORS = 4.0  # variance of what views err together and apart over what they err apart ...
+SAME_TURNS = 1.5  # ... of turns: what all have in common (calibration, large masks) rather shifts
 LEAST_NOISE = 0.05  # variance of the views' errors over the stated one: they cannot know better
 LOOKED_AT = 12  # frames of a rest that are looked at again
 WORSE = 0.97  # of the score, below which a smoothed pose is not where to look again
 FOUND = 0.7  # of the usual score, with which a lost frame is found between its neighbours
 FREE_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
+_TURNS_LESS = np.repeat([np.sqrt(SAME_TURNS / SAME_ERRORS), 1.0], 3)
 
 
 class WholeTrack:
@@ -157,6 +159,7 @@ class WholeTrack:
             if before is None or _score(again) >= WORSE * _score(before):
                 found[t], looked[t] = again, track[t]
         track, covariance, segment = self._solved(looked, found, track)
+        covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
         covariance[:, :3, :3] += track[:, :3, :3] @ spread @ track[:, :3, :3].transpose(0, 2, 1)
         free = self._free_axes(track, covariance)
         result = [
