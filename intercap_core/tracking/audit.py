@@ -11,21 +11,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from intercap_core.tracking.choices import best_sequence
 from intercap_core.tracking.fit import MIN_PIXELS, Fit
 from intercap_core.tracking.follow import follow
 from intercap_core.tracking.lost import FrameResult, decided
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.search import same_pose
+from intercap_core.tracking.turns import near_turns
 
 EVERY = 12  # frames
 SOUND_VIEWS, SOUND = 3, 0.8  # views that agree this well, in mask and depth: no need to look
 NEARLY = 0.03  # of the confidence: a found pose this much worse is a rival
+TURN_DEG = 20.0  # from a turn that hardly changes the object
+DIFFERENT_M, DIFFERENT_DEG = 0.05, 30.0
+AROUND = 3  # frames on each side, whose images decide together
 AUDITS_MAX = 8  # of a recording, the least sound windows first
 
 
-def audited(observer: Observer, track: list[FrameResult]) -> list[FrameResult]:
-    """The track (T) with the runs replaced that another pose explains better, and those flagged
-    that it explains as well."""
+def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> list[FrameResult]:
+    """The track (T) with the frames replaced that another pose explains better, and those flagged
+    that it explains as well; ``times`` (T,) seconds."""
     result = list(track)
     windows = [
         range(start, min(start + EVERY, observer.count))
@@ -35,11 +40,11 @@ def audited(observer: Observer, track: list[FrameResult]) -> list[FrameResult]:
     doubtful.sort(key=lambda frames: max(_evidence(track[t].fit) for t in frames))
     for frames in doubtful[:AUDITS_MAX]:
         t = max(frames, key=observer.promise)
-        _look(observer, result, t)
+        _look(observer, result, t, times)
     return result
 
 
-def _look(observer: Observer, track: list[FrameResult], t: int) -> None:
+def _look(observer: Observer, track: list[FrameResult], t: int, times: np.ndarray) -> None:
     """Search frame t; where that finds another pose, decide about the frames around it."""
     own = track[t]
     value = 0.0 if own.lost else observer.value(t, own.fit)
@@ -48,15 +53,56 @@ def _look(observer: Observer, track: list[FrameResult], t: int) -> None:
     if not others:
         return
     rival = _followed(observer, track, t, others[0])
-    seen = [(track[u], other) for u, other in rival.items() if not (track[u].lost and other.lost)]
-    gain = np.array([_score(other) - _score(mine) for mine, other in seen])
-    if decided(gain):
-        if gain.mean() > 0:
-            for u, other in rival.items():
-                track[u] = other
-        return
-    for u in rival:
+    unsure = [] if _is_turn(observer, own.fit, others[0]) else _undecided(observer, track, rival)
+    for u in unsure:
         track[u] = replace(track[u], ambiguous=not track[u].lost)
+    for u in _preferred(observer, track, rival, times):
+        track[u] = replace(rival[u], ambiguous=track[u].ambiguous and not rival[u].lost)
+
+
+def _undecided(
+    observer: Observer, track: list[FrameResult], rival: dict[int, FrameResult]
+) -> list[int]:
+    """The frames in which the two are quite different and the images around do not decide."""
+    run = sorted(rival)
+    gain = np.array([_score(rival[u]) - _score(track[u]) for u in run])
+    symmetry = observer.mesh.symmetry
+    found = []
+    for i, u in enumerate(run):
+        own, other = track[u].fit.pose, rival[u].fit.pose
+        apart = float(np.linalg.norm(observer.centre(own) - observer.centre(other)))
+        turn = float(symmetry.rotation_error_deg(own[:3, :3], other[:3, :3]))
+        around = gain[max(i - AROUND, 0) : i + AROUND + 1]
+        if (apart > DIFFERENT_M or turn > DIFFERENT_DEG) and not decided(around):
+            found.append(u)
+    return found
+
+
+def _preferred(
+    observer: Observer,
+    track: list[FrameResult],
+    rival: dict[int, FrameResult],
+    times: np.ndarray,
+) -> list[int]:
+    """The frames in which the rival explains the images better, for the object's inertia."""
+    run = range(max(min(rival) - 1, 0), min(max(rival) + 2, len(track)))
+    options: list[list[tuple[Fit, bool]]] = []
+    for u in run:
+        own, other = track[u], rival.get(u)
+        both = [(own.fit, False)] if other is None or not own.lost or other.lost else []
+        if other is not None and not other.lost:
+            both.append((other.fit, True))
+        options.append(both)
+    path = best_sequence(observer.mesh, [[fit for fit, _ in both] for both in options], times[run])
+    return [u for u, both, index in zip(run, options, path, strict=True) if both[index][1]]
+
+
+def _is_turn(observer: Observer, own: Fit, other: Fit) -> bool:
+    """Whether the two poses differ by a turn that hardly changes the object: which of those it is
+    all frames of the track decide together."""
+    turned = own.pose[:3, :3] @ near_turns(observer.mesh)[:, :3, :3]
+    error = observer.mesh.symmetry.rotation_error_deg(turned, other.pose[:3, :3])
+    return bool(np.min(error) < TURN_DEG)
 
 
 def _followed(

@@ -76,7 +76,7 @@ class Tracker:
         else:
             seed_frame, seed = find_seed(self._observer)
         self._observer.places.claim(self._observer.centre(seed.pose))
-        one = audited(self._observer, self._both_ways(seed_frame, seed))
+        one = audited(self._observer, self._both_ways(seed_frame, seed), self._times)
         last = self._count - 1
         two = list(one)
         for frames, start_at in (
