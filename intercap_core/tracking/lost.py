@@ -103,8 +103,8 @@ def _place(mesh: ObjectMesh, fit: Fit) -> np.ndarray:
 
 
 def _deviations(mesh: ObjectMesh, fit: Fit) -> tuple[float, float]:
-    """Largest standard deviations of the centre, metres, and of the turn, radians, without turns
-    that change nothing."""
+    """Standard deviations of the centre, metres, in its worst direction, and of the turn, radians,
+    about its second worst axis: on which side a handle is, about one axis, is decided elsewhere."""
     arm = fit.pose[:3, :3] @ mesh.centre_of_mass
     about = np.cross(np.eye(3), arm)  # row i: shift of the centre by a turn about axis i
     to_centre = np.concatenate([about.T, np.eye(3)], axis=1)
@@ -116,8 +116,8 @@ def _deviations(mesh: ObjectMesh, fit: Fit) -> tuple[float, float]:
         axis = fit.pose[:3, :3] @ mesh.symmetry.axis
         across = np.eye(3) - np.outer(axis, axis)
         turn = across @ turn @ across
-    return _largest(shift), _largest(turn)
+    return _deviation(shift, -1), _deviation(turn, -2)
 
 
-def _largest(covariance: np.ndarray) -> float:
-    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+def _deviation(covariance: np.ndarray, number: int) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[number], 0.0)))
