@@ -26,7 +26,10 @@ PLACE_START = 6.0  # robust scale that placing starts from, over the last
 FAR_M, FAR_SHARE = 0.003, 0.01  # a point moved farther, also of the diameter, could be noticed
 CHANGED = 0.3  # share of such points, below which a turn is hard to see
 DISTINCT_DEG = 45.0  # flips nearer than this are one
-SCORE_SIGMA = 0.01  # of the score's difference between two turns, a key frame
+SCORE_SIGMA = 0.01  # of the score's difference from no turn, a key frame
+# To turn the track by a right angle or more takes so much more than to doubt it: images of poses
+# far apart err apart, and for longer than a key frame.
+APART = 2.5
 SLIDE_RAD_S = np.radians(80)  # by which a tracked turn drifts from the true one in a second
 JUMP_COST, BROKEN_COST = 10.0, 1.0  # of any other change: in a sound track, and where it was lost
 
@@ -77,24 +80,25 @@ def choose_turns(
     # what agrees badly with every turn says little about which
     usual = np.nanmedian(scores.max(1))
     trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
-    value = np.nan_to_num(scores * trust / SCORE_SIGMA)
     between = angle_between(turns[:, None], turns[None])
+    sigma = SCORE_SIGMA * (1 + (APART - 1) * np.minimum(between[0] / (np.pi / 2), 1.0))
+    likely = np.nan_to_num((scores - scores[:, :1]) * trust / SCORE_SIGMA)
+    value = likely * SCORE_SIGMA / sigma
     costs = [
         np.minimum(0.5 * (between / (SLIDE_RAD_S * gap)) ** 2, BROKEN_COST if gone else JUMP_COST)
         for gap, gone in zip(gaps, broken, strict=True)
     ]
-    best, ahead = [value[0]], [value[0]]
-    came = []
-    for cost, own in zip(costs, value[1:], strict=True):
+    best, ahead, came = [value[0]], [likely[0]], []
+    for k, cost in enumerate(costs, 1):
         through = best[-1][:, None] - cost
         came.append(through.argmax(0))
-        best.append(through.max(0) + own)
-        ahead.append(logsumexp(ahead[-1][:, None] - cost, axis=0) + own)
+        best.append(through.max(0) + value[k])
+        ahead.append(logsumexp(ahead[-1][:, None] - cost, axis=0) + likely[k])
     path = [int(best[-1].argmax())]
     for back in reversed(came):
         path.append(int(back[path[-1]]))
     behind = [np.zeros(len(turns))]
-    for cost, after in zip(reversed(costs), value[:0:-1], strict=True):
+    for cost, after in zip(reversed(costs), likely[:0:-1], strict=True):
         behind.append(logsumexp(behind[-1] + after - cost, axis=1))
     log = np.array(ahead) + np.array(behind[::-1])
     probability = np.exp(log - logsumexp(log, axis=1, keepdims=True))

@@ -21,8 +21,8 @@ from intercap_core.tracking.turns import angle_between, choose_turns, near_turns
 
 TURNS_EVERY_S = 0.2
 QUITE_DIFFERENT_RAD = np.radians(20)
-DOUBT = 0.2  # probability of quite different turns, from which a frame is ambiguous
-TURN_LOSS = 0.01  # of the score, that all frames together may cost one frame
+DOUBT = 0.35  # probability of quite different turns, from which a frame is ambiguous
+TURN_LOSS = 0.01  # of the score, that a turn may cost a run of frames which others decide
 SAME_ERRORS = 4.0  # variance of what views err together and apart over what they err apart ...
 SAME_TURNS = 1.5  # ... of turns: what all have in common (calibration, large masks) rather shifts
 LEAST_NOISE = 0.05  # variance of the views' errors over the stated one: they cannot know better
@@ -99,18 +99,24 @@ class WholeTrack:
         chosen, probability = choose_turns(scores, turns, gaps, np.array(between, bool))
         nearest = np.abs(np.arange(count)[:, None] - keys).argmin(1)
         result = list(fits)
-        for t in np.flatnonzero((chosen[nearest] > 0) & ~lost):
-            start = fits[t].pose @ turns[chosen[nearest[t]]]
-            fit = self._fit_near(int(t), start)
-            if fit.score >= fits[t].score - TURN_LOSS:
-                result[t] = fit
+        of_frame = np.where(lost, 0, chosen[nearest])
+        for run in np.split(np.arange(count), 1 + np.flatnonzero(np.diff(of_frame))):
+            if of_frame[run[0]]:
+                turn = turns[of_frame[run[0]]]
+                found = [self._fit_near(int(t), fits[t].pose @ turn) for t in run]
+                gain = [fit.score - fits[t].score for fit, t in zip(found, run, strict=True)]
+                if np.mean(gain) > -TURN_LOSS:
+                    result[run[0] : run[-1] + 1] = found
+                else:
+                    of_frame[run] = 0
         # turns that are not the chosen one's neighbours
         far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
-        other = np.where(far[chosen], probability, 0.0)
-        doubt = other.sum(1)[nearest] > DOUBT
-        relative = turns[chosen][:, None, :3, :3].transpose(0, 1, 3, 2) @ turns[None, :, :3, :3]
-        away = Rotation.from_matrix(relative.reshape(-1, 3, 3)).as_rotvec().reshape(*other.shape, 3)
-        spread = np.einsum("kn,kni,knj->kij", other, away, away)[nearest]
+        other = np.where(far[of_frame], probability[nearest], 0.0)
+        kept, rivals = turns[of_frame][:, None, :3, :3], turns[None, :, :3, :3]
+        relative = (kept.transpose(0, 1, 3, 2) @ rivals).reshape(-1, 3, 3)
+        away = Rotation.from_matrix(relative).as_rotvec().reshape(*other.shape, 3)
+        doubt = other.sum(1) > DOUBT
+        spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], away, away)
         return result, doubt, spread
 
     def _decided(self, fits: list[Fit], lost: np.ndarray) -> list[Fit]:
