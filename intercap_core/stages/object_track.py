@@ -203,11 +203,12 @@ def _tell(track: Track, sequence: str) -> None:
         )
     elif lost + doubtful > MOSTLY * count:
         log.warning(
-            "sequence %s: quite different poses explain %d of %d frames alike; annotate "
-            "'object_pose' to decide",
+            "sequence %s: of %d frames the object is lost in %d, and quite different poses explain "
+            "%d alike; annotate 'object_pose' to decide",
             sequence,
-            doubtful,
             count,
+            lost,
+            doubtful,
         )
 
 
