@@ -27,6 +27,7 @@ CROSSING = 0.35  # of the diameter: a ray through a mask's middle from the objec
 SMALLEST, LARGEST = 0.12, 1.25
 UNLIKELY = 0.5  # what a sighting with another class's label counts; detectors err
 UNNAMED = 0.8  # one that no detector named
+MOST = 0.3  # share of the person's pixels
 OF_PERSON = 0.6  # share of a candidate's pixels on the person, from which it is the person
 
 
@@ -143,7 +144,9 @@ def _could_be(view: View) -> list[Candidate]:
         mask = candidate.mask
         if mask.area:
             person = view.person.window(mask.x0, mask.y0, *mask.mask.shape)
-            if (person & mask.mask).sum() < OF_PERSON * mask.area:
+            on_person = (person & mask.mask).sum() > OF_PERSON * mask.area
+            large = candidate.label in PERSON_LABELS or mask.area > MOST * view.person.area
+            if not (on_person and large):  # what is held before the body may lie in its mask
                 found.append(candidate)
     return found
 
