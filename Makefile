@@ -46,7 +46,6 @@ evaluate: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/intercap bench --cores $(CORES)
 	$(BIN)/python -m bench.object_speed
-	$(BIN)/python -m bench.object_scaling --output results/bench.json
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

@@ -130,9 +130,12 @@ SCENE = Schema(
 
 PERSON = Schema(
     name="person",
-    version=3,
+    version=4,
     stage="person",
-    attributes={"sequence": "sequence name"},
+    attributes={
+        "sequence": "sequence name",
+        "images_alone": "whether the candidates of the images alone replace a detector's",
+    },
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
         "person": Field(("T", "C"), "int32", "index among the people of the image that shows this moment (image_of of the scene), -1 = not seen"),
@@ -144,7 +147,7 @@ PERSON = Schema(
         "missing": Field(("T",), "bool", "fewer than two views see the subject, and no depth places it"),
         "mask_offsets": Field(("M+1",), "int64", "start of each mask's RLE, in the order of (T, C)"),
         "mask_rle": Field(("B",), "uint8", "COCO compressed RLE of the person in the image that shows this moment, empty = no mask"),
-        "mask_source": Field(("T", "C"), "int8", "who segmented the image: 0 nobody, 1 a detector, 2 the images alone"),
+        "mask_source": Field(("T", "C"), "int8", "who segmented the person: 0 nobody, 1 a detector, 2 the images alone"),
         "candidate_offsets": Field(("M+1",), "int64", "first candidate of each image, and the end, in the order of (T, C): what was segmented from the images alone; no candidate_ datasets where nothing was", optional=True),
         "candidate_scores": Field(("N",), "float32", "how likely the candidate is a thing, 0 to 1", optional=True),
         "candidate_extents": Field(("N",), "float32", "diagonal of what all views show of it; NaN = not known", "m", optional=True),

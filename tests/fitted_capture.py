@@ -286,7 +286,9 @@ def _write_person(capture: Capture, views: Any, name: str) -> None:
     offsets, values = artefacts.pack_ragged(rles)
     missing = np.zeros(total, bool)
     missing[-1] = True
-    with artefacts.write(capture.paths["person"], PERSON, sequence=name) as writer:
+    with artefacts.write(
+        capture.paths["person"], PERSON, sequence=name, images_alone=False
+    ) as writer:
         writer.put("camera_names", rig.names)
         writer.put("person", np.zeros((total, count), int))
         writer.put("keypoints", np.zeros((total, count, 135, 3)))

@@ -107,9 +107,9 @@ class Detections:
     def with_candidates_of(self, person: Path) -> Detections:
         """The same with the candidates that stage ``person`` found in the images alone.
 
-        They replace a detector's where that stage took them (``mask_source`` 2); only of
-        detections read by the moment (:meth:`showing`). Raises UserError where the artefact cannot
-        be read or is of another recording.
+        They follow a detector's, or replace them where the stage was to use the images alone; only
+        of detections read by the moment (:meth:`showing`). Raises UserError where the artefact
+        cannot be read or is of another recording.
         """
         with artefacts.read(person, PERSON) as artefact:
             source = artefact["mask_source"]
@@ -120,7 +120,8 @@ class Detections:
                     f"expected {sets} of {cameras} as in {self.path}; re-run stage 'person' for "
                     f"sequence {self.sequence!r}"
                 )
-            if not (source == FROM_IMAGES).any():
+            alone = bool(artefact.attributes["images_alone"])
+            if not alone and "candidate_offsets" not in artefact:
                 return self
             scores, extents = artefact["candidate_scores"], artefact["candidate_extents"]
             rle = artefacts.unpack_ragged(
@@ -128,18 +129,18 @@ class Detections:
             )
             offsets = artefact["candidate_offsets"]
         both = copy(self)
-        from_images = source == FROM_IMAGES
-        # that nothing stands before the background does not say that the object is not there
-        both.candidates_found = self.candidates_found & ~from_images
+        both.candidates_found = self.candidates_found & (not alone)
         both._from_images = {}
-        for t, c in np.argwhere(from_images).tolist():
+        for t, c in np.ndindex(source.shape):
             image = t * source.shape[1] + c
             first, last = int(offsets[image]), int(offsets[image + 1])
-            both.candidates_found[t, c] = last > first
+            named = [] if alone else self.candidates(t, c)
+            # that nothing stands before the background does not say that the object is not there
+            both.candidates_found[t, c] |= last > first
             width, height = (int(n) for n in self.image_sizes[c])
-            both._from_images[t, c] = [
+            both._from_images[t, c] = named + [
                 Candidate(
-                    index=i - first,
+                    index=len(named) + i - first,
                     label=UNKNOWN_LABEL,
                     score=float(scores[i]),
                     box=np.array(Runs(rle[i], height, width).box),

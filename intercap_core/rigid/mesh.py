@@ -159,9 +159,9 @@ def _read(path: Path) -> trimesh.Trimesh:
             "mesh; export the surface, not a point cloud"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
+        stray = faces.min() if faces.min() < 0 else faces.max()
         raise UserError(
-            f"{path}: a face names vertex {faces.max()}, there are {len(vertices)}; export the "
-            "mesh again"
+            f"{path}: a face names vertex {stray}, there are {len(vertices)}; export the mesh again"
         )
     used = np.zeros(len(vertices), bool)
     used[faces] = True

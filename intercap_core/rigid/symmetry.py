@@ -15,7 +15,7 @@ import numpy as np
 from intercap_core.config import Symmetry
 
 MAX_DISCRETE = 128  # elements of the closure; the icosahedron's rotation group has 60
-_SAME = 1e-4  # two transforms nearer than this (per entry) are one: tables carry 4 digits
+_SAME = 1e-3  # two transforms nearer than this (per entry) are one: tables carry 4 digits
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,9 @@ class SymmetryGroup:
                 or not np.allclose(transform[3], (0, 0, 0, 1))
             ):
                 raise ValueError(f"discrete[{row}] is not a rotation and translation")
+        for transform in given:  # tables round: products must stay rotations
+            left, _, right = np.linalg.svd(transform[:3, :3])
+            transform[:3, :3] = left @ right
         if len(symmetry.continuous) > 1:
             raise ValueError("more than one continuous axis: set 'sphere: true' instead")
         axis = offset = None

@@ -167,13 +167,19 @@ def _write(
         masks = [b""] * len(masks)
     candidates: list[list[ImageCandidate]] = [[] for _ in masks]
     for (t, c), segments in segmented.items():
-        mask_source[t, c] = FROM_IMAGES
-        masks[t * views + c] = segments.person
-        candidates[t * views + c] = segments.candidates
+        image = t * views + c
+        candidates[image] = segments.candidates
+        if not masks[image]:
+            masks[image] = segments.person
+            mask_source[t, c] = FROM_IMAGES
     offsets, rle = artefacts.pack_ragged(masks)
     inlier = np.swapaxes(points.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
     with artefacts.write(
-        output, PERSON, settings_digest=digest(settings), sequence=detections.sequence
+        output,
+        PERSON,
+        settings_digest=digest(settings),
+        sequence=detections.sequence,
+        images_alone=settings.segmentation == "images",
     ) as writer:
         writer.put("camera_names", list(detections.camera_names))
         writer.put("person", person)
@@ -186,7 +192,7 @@ def _write(
         writer.put("mask_offsets", offsets)
         writer.put("mask_rle", rle)
         writer.put("mask_source", mask_source)
-        if segmented:
+        if segmented or settings.segmentation == "images":
             _put_candidates(writer, candidates)
 
 

@@ -25,7 +25,8 @@ NEARLY = 0.03  # of the confidence: a found pose this much worse is a rival
 TURN_DEG = 20.0  # from a turn that hardly changes the object
 DIFFERENT_M, DIFFERENT_DEG = 0.05, 30.0
 AROUND = 3  # frames on each side, whose images decide together
-AUDITS_MAX = 8  # of a recording, the least sound windows first
+# Audits of a recording, the least sound windows first; of a long one, one in so many frames.
+AUDITS_MAX, AUDIT_EVERY = 8, 45
 
 
 def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> list[FrameResult]:
@@ -38,7 +39,8 @@ def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> 
     ]
     doubtful = [frames for frames in windows if not any(_sound(track[t]) for t in frames)]
     doubtful.sort(key=lambda frames: max(_evidence(track[t].fit) for t in frames))
-    for frames in doubtful[:AUDITS_MAX]:
+    most = max(AUDITS_MAX, observer.count // AUDIT_EVERY)
+    for frames in doubtful[:most]:
         t = max(frames, key=observer.promise)
         _look(observer, result, t, times)
     return result

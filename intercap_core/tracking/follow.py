@@ -17,8 +17,10 @@ from intercap_core.tracking.search import same_pose
 DOUBT = 0.55  # of the usual score: below, a search may find better
 RECOVERY_CONFIDENCE = 0.40  # with a ring of cameras
 RING = 6
-RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)  # lost frames after which to search
-SEARCHES_MAX = 12  # re-initialisations of a pass, so that a hopeless recording ends
+# After so many frames in doubt a search is due, later now and then.
+RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)
+SEARCH_EVERY = 30
+SEARCHES_MAX = 12  # that find nothing, and one more in SEARCH_EVERY frames: a pass must end
 NAMED_VIEWS, VIEWS_EACH = 2, 3  # views with a candidate, of so many each, for a searched pose
 NEAR_M = 0.4
 CLEARLY_BETTER = 1.15  # a searched pose's confidence over the tracked one's
@@ -40,7 +42,8 @@ def follow(
     usual = max(start.fit.score, LOST_SCORE)
     lost_for = 1 if start.lost else 0
     named = Named(observer.centre(now))
-    searches = 0
+    searches = doubted_for = 0
+    most = SEARCHES_MAX + len(frames) // SEARCH_EVERY
     for t in frames:
         predicted = now if lost_for else extrapolated(before, now)
         prior = expected(before, now, predicted, lost_for)
@@ -53,11 +56,12 @@ def follow(
             result = replace(result, lost=True)
         leapt = False
         doubtful = result.lost or result.fit.score < DOUBT * usual
-        if may_search and doubtful and lost_for in RECOVERY_WAIT and searches < SEARCHES_MAX:
-            searches += 1
+        if may_search and doubtful and _is_due(doubted_for) and searches < most:
             again = _recovered(observer, t, now, result)
             leapt = again is not None
+            searches += not leapt
             result = again or result
+        doubted_for = doubted_for + 1 if doubtful and not leapt else 0
         if result.lost:
             lost_for += 1
             frozen = replace(result.fit, pose=predicted, covariance=loose(prior))
@@ -70,6 +74,11 @@ def follow(
             lost_for = 0
             usual += 0.1 * (result.fit.score - usual)
         yield t, result
+
+
+def _is_due(doubted_for: int) -> bool:
+    late = doubted_for > RECOVERY_WAIT[-1] and doubted_for % SEARCH_EVERY == 0
+    return late or doubted_for in RECOVERY_WAIT
 
 
 def _better_start(observer: Observer, t: int, predicted: np.ndarray, now: np.ndarray) -> np.ndarray:

@@ -86,7 +86,9 @@ class Tracker:
             for t, result in follow(self._observer, frames, one[start_at], one, may_search=False):
                 two[t] = result
         merged = self._merged(one, two)
-        whole = doubted(self._mesh, WholeTrack(self._observer, self._times).refine(merged))
+        sure = seed_frame if initial is not None and borne_out else None
+        refined = WholeTrack(self._observer, self._times, sure).refine(merged)
+        whole = doubted(self._mesh, refined)
         return Track(
             _recovered(self._mesh, whole, seed_frame), seed_frame, initial is not None, borne_out
         )

@@ -78,7 +78,7 @@ def choose_turns(
     to the next key frame; ``broken`` (K-1,) whether the track was lost between.
     """
     # what agrees badly with every turn says little about which
-    usual = np.nanmedian(scores.max(1))
+    usual = max(float(np.nanmedian(scores.max(1))), 1e-6)
     trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
     between = angle_between(turns[:, None], turns[None])
     sigma = SCORE_SIGMA * (1 + (APART - 1) * np.minimum(between[0] / (np.pi / 2), 1.0))

@@ -11,7 +11,7 @@ from intercap_core.tracking.candidates import MIN_PIXELS, choose, mask_overlap, 
 from intercap_core.tracking.evidence import Candidate, View
 from intercap_core.tracking.patches import ContourPatch, DepthPatch
 from intercap_core.tracking.reduced_mask import EMPTY
-from intercap_core.tracking.view_report import FREE_SPACE_M, ViewReport, depth_agreement
+from intercap_core.tracking.view_report import FREE_SPACE_M, ViewReport, depth_agreement, unhidden
 
 DEPTH_SIGMA_M = 0.005  # of one view: ranging bias and calibration rather than pixel noise
 CONTOUR_SIGMA_PX = 2.0  # of a detector's contour at full resolution
@@ -205,9 +205,8 @@ class ViewFit:
             mine = (patch.trust[row, column] == 1.0) & (np.abs(gap) < REPORT_DEPTH_M)
             if mine.sum() >= MIN_PIXELS:
                 depth_residual = float(np.median(across[mine]))
-            agreement, hidden = depth_agreement(gap, across, patch.on_person[row, column])
-            if hidden:
-                visible = 0
+            agreement, free = depth_agreement(gap, across, patch.on_person[row, column])
+            visible = unhidden(image, visible, free, len(gap))
         number = self._candidate.index if self._candidate is not None else -1
         return ViewReport(
             number, overlap, depth_residual, contour, visible, agreement, view.detected

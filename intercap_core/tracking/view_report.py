@@ -65,8 +65,7 @@ def quick_report(
         )
         if free >= MIN_PIXELS:
             agreement = total / free
-        elif compared > MIN_PIXELS:
-            visible = 0  # something nearer hides it all
+        visible = unhidden(silhouette, visible, free, compared)
     number = candidate.index if candidate else -1
     nothing = float("nan")
     return ViewReport(number, overlap, nothing, nothing, visible, agreement, view.detected)
@@ -74,14 +73,25 @@ def quick_report(
 
 def depth_agreement(
     gap: np.ndarray, across: np.ndarray, on_person: np.ndarray
-) -> tuple[float, bool]:
-    """How well measured depth fits where nothing is in front, and whether something hides it all.
+) -> tuple[float, int]:
+    """How well measured depth fits where nothing is in front, and of how many pixels that holds.
 
     ``gap`` (N,) measured minus rendered depth, ``across`` (N,) the same across the surface, both
     metres; pixels on a person (N,) and those measured nearer do not count. NaN for too few.
     """
     free = ~on_person & (gap > -FREE_SPACE_M)
-    if free.sum() >= MIN_PIXELS:
-        scale = AGREEMENT_SCALE_M**2
-        return float((scale / (scale + across[free] ** 2)).mean()), False
-    return float("nan"), len(gap) > MIN_PIXELS
+    count = int(free.sum())
+    if count < MIN_PIXELS:
+        return float("nan"), count
+    scale = AGREEMENT_SCALE_M**2
+    return float((scale / (scale + across[free] ** 2)).mean()), count
+
+
+def unhidden(silhouette: Rendering, visible: int, free: int, compared: int) -> int:
+    """Pixels of a rendered silhouette that nothing hides: of those that no person's mask covers
+    (``visible``) at most the share ``free`` of ``compared`` before which depth finds nothing."""
+    if compared <= MIN_PIXELS:
+        return visible
+    if free < MIN_PIXELS:
+        return 0
+    return min(visible, round(int(silhouette.mask.sum()) * free / compared))

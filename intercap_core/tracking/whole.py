@@ -34,9 +34,13 @@ _TURNS_LESS = np.repeat([np.sqrt(SAME_TURNS / SAME_ERRORS), 1.0], 3)
 
 
 class WholeTrack:
-    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds."""
+    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds.
 
-    def __init__(self, observer: Observer, times: np.ndarray) -> None:
+    In the frame ``sure``, annotated by a person, the object is not turned.
+    """
+
+    def __init__(self, observer: Observer, times: np.ndarray, sure: int | None = None) -> None:
+        self._sure = sure
         self._observer = observer
         self._mesh = observer.mesh
         self._times = times
@@ -86,11 +90,15 @@ class WholeTrack:
             return fits, doubt, spread
         step = float(np.median(np.diff(self._times))) if count > 1 else TURNS_EVERY_S
         keys = np.arange(0, count, max(1, round(TURNS_EVERY_S / step)))
+        if self._sure is not None:
+            keys = np.union1d(keys, self._sure)
         scores = np.full((len(keys), len(turns)), np.nan)
         for k, t in enumerate(keys):
             if not lost[t]:
                 found = self._observer.assess_all(int(t), fits[t].pose @ turns)
                 scores[k] = [self._observer.plausibility(fit) for fit in found]
+        if self._sure is not None:
+            scores[keys == self._sure, 1:] = 0.0
         if np.isnan(scores).all():
             return fits, doubt, spread
         jumped = lost | broken

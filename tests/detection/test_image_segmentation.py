@@ -27,12 +27,15 @@ CAPTURE = Carrying()
 def written(tmp_path_factory) -> tuple[Path, Path, Path]:
     """Frames, scene, and detections whose images all have candidates: none."""
     folder = tmp_path_factory.mktemp("carrying")
-    keypoints = seen_by(CAPTURE.people, CAPTURE.rig, CAPTURE.zup_from_master)
-    noise = np.random.default_rng(1).normal(0, 3, keypoints[..., :2].shape)
-    keypoints[..., :2] += noise
-    people = [[[keypoints[t, c]] for c in range(CAPTURE.views)] for t in range(CAPTURE.sets)]
-    detections = write_detections(folder / "detections.h5", CAPTURE.rig, people)
+    detections = write_detections(folder / "detections.h5", CAPTURE.rig, seen())
     return (*CAPTURE.write(folder), detections)
+
+
+def seen() -> list[list[list[np.ndarray]]]:
+    """The person's keypoints [T][C][1], off by a few pixels."""
+    keypoints = seen_by(CAPTURE.people, CAPTURE.rig, CAPTURE.zup_from_master)
+    keypoints[..., :2] += np.random.default_rng(1).normal(0, 3, keypoints[..., :2].shape)
+    return [[[keypoints[t, c]] for c in range(CAPTURE.views)] for t in range(CAPTURE.sets)]
 
 
 def run(written: tuple[Path, Path, Path], output: Path, segmentation: str = "images") -> Path:
@@ -142,6 +145,27 @@ def test_images_that_a_detector_saw_are_left_to_it(written, tmp_path, monkeypatc
     with artefacts.read(output, PERSON_SCHEMA) as found:
         assert (found["mask_source"] == FROM_DETECTOR).all()
         assert "candidate_rle" not in found
+
+
+def test_what_the_images_show_follows_a_detectors_candidates(written, segmented, tmp_path):
+    frames, scene, _ = written
+    rle = masks.encode(np.eye(1080, 1920, dtype=bool))
+    named = {(7, 1): [("cup", rle)]}
+    detections = write_detections(tmp_path / "detections.h5", CAPTURE.rig, seen(), named)
+    inputs = (frames, scene, detections)
+    moments = np.tile(np.arange(CAPTURE.sets)[:, None], (1, CAPTURE.views))
+    found = Detections.load(detections).showing(moments)
+    alone = found.with_candidates_of(segmented).candidates(7, 1)
+    both = found.with_candidates_of(run(inputs, tmp_path / "both.h5", "both")).candidates(7, 1)
+    assert [one.label for one in both] == ["cup"] + [""] * len(alone) and len(alone) > 0
+    assert [one.index for one in both] == list(range(len(both)))
+    assert [one.rle for one in both] == [rle, *(one.rle for one in alone)]
+    with artefacts.read(tmp_path / "both.h5", PERSON_SCHEMA) as artefact:
+        person = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
+        # no candidate is the person, so the images give the mask
+        assert artefact["mask_source"][7, 1] == FROM_IMAGES and person[7 * CAPTURE.views + 1]
+    none = run(inputs, tmp_path / "detector.h5", "detector")
+    assert [one.label for one in found.with_candidates_of(none).candidates(7, 1)] == ["cup"]
 
 
 def test_same_images_same_bytes(written, segmented, tmp_path):

@@ -117,3 +117,18 @@ def test_equivalent_poses_move_points_by_group_elements():
 def test_impossible_groups_are_refused(symmetry, words):
     with pytest.raises(ValueError, match=words):
         SymmetryGroup.from_settings(symmetry)
+
+
+@pytest.mark.parametrize("fold", [3, 6, 8, 12])
+def test_tables_that_carry_four_digits_give_the_exact_group(fold):
+    angle = 2 * np.pi / fold
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    group = SymmetryGroup.from_settings(Symmetry(discrete=(tuple(turn.round(4).ravel()),)))
+    assert len(group.discrete) == fold
+    for a, b in Rotation.random(40, random_state=fold).as_matrix().reshape(20, 2, 3, 3):
+        pose, reference = np.eye(4), np.eye(4)
+        pose[:3, :3], reference[:3, :3] = a, b
+        found = group.nearest_equivalent_pose(pose, reference)[:3, :3]
+        np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
+        assert group.rotation_error_deg(found, a) < 0.02

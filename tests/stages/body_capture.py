@@ -114,7 +114,7 @@ def write_capture(
         for c, camera in enumerate(rig)
     ]
     offsets, runs = pack_ragged(masks)
-    with artefacts.write(paths.person, PERSON, sequence="test") as writer:
+    with artefacts.write(paths.person, PERSON, sequence="test", images_alone=False) as writer:
         writer.put("camera_names", rig.names)
         writer.put("person", np.where(present[:, None], 0, -1).repeat(cameras, 1).astype(int))
         writer.put("keypoints", observed)

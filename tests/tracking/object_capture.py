@@ -226,7 +226,7 @@ class ObjectCapture:
                 w.put(f"{group}/rle", rle)
         offsets, rle = pack_ragged([images[t][c][1] for t in range(count) for c in range(cameras)])
         shape = (count, cameras, 135)
-        with artefacts.write(paths["person"], PERSON, sequence="glide") as w:
+        with artefacts.write(paths["person"], PERSON, sequence="glide", images_alone=False) as w:
             w.put("camera_names", names)
             w.put("person", np.zeros((count, cameras), np.int32))
             w.put("keypoints", np.zeros((*shape, 3)))

@@ -7,6 +7,7 @@ import pytest
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Rendering
 from intercap_core.tracking.fit import Fit
 from intercap_core.tracking.lost import (
     UNNAMED_FRAMES,
@@ -15,7 +16,7 @@ from intercap_core.tracking.lost import (
     doubted,
     judged,
 )
-from intercap_core.tracking.view_report import ViewReport
+from intercap_core.tracking.view_report import ViewReport, unhidden
 from tests.rigid.conftest import catalogue
 
 SEEN = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
@@ -68,3 +69,12 @@ def test_an_uncertain_place_is_lost_and_an_uncertain_turn_ambiguous(mesh):
     spin = _fit()
     spin.covariance[2, 2] = 4.0  # about the bottle's own axis
     assert flags(spin) == (False, False)
+
+
+def test_what_depth_finds_something_before_is_not_visible() -> None:
+    face = np.zeros((20, 20), np.int32)
+    drawn = Rendering(0, 0, np.ones((20, 20), np.float32), face, face.astype(np.int16))
+    assert unhidden(drawn, 400, 90, 100) == 360
+    assert unhidden(drawn, 200, 90, 100) == 200  # a person's mask covers the rest
+    assert unhidden(drawn, 400, 5, 100) == 0
+    assert unhidden(drawn, 400, 0, 3) == 400  # too little measured to tell
