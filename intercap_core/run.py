@@ -111,12 +111,14 @@ class Watcher:
         """State of every job that this run has started, by "sequence: stage"."""
         found = {}
         for path in sorted(self._logs.glob("**/*.log")):
-            if path == self.transcript or path.stat().st_mtime < self._start:
+            try:
+                if path == self.transcript or path.stat().st_mtime < self._start:
+                    continue
+                state = JobState(*read_state(path))
+            except FileNotFoundError:  # the workflow removes an old log before it runs a job anew
                 continue
             sequence = path.parent.name if path.parent != self._logs else ""
-            found[f"{sequence}: {path.stem}" if sequence else path.stem] = JobState(
-                *read_state(path)
-            )
+            found[f"{sequence}: {path.stem}" if sequence else path.stem] = state
         return found
 
     def failures(self) -> dict[str, str]:
