@@ -79,7 +79,7 @@ def run(tmp_path, people, candidates=None, slip=None) -> Path:
         detections=write_detections(tmp_path / "detections.h5", RIG, people, candidates),
         scene=write_scene(tmp_path / "scene.h5", RIG, T, slip),
         output=tmp_path / "person.h5",
-        settings=PersonSettings(),
+        settings=PersonSettings(segmentation="detector"),
     )
     return tmp_path / "person.h5"
 
