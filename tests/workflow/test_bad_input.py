@@ -198,7 +198,9 @@ def scribble(path: Path) -> None:
 def test_a_damaged_artefact_is_named_with_the_stage_to_re_run(lab: Flow, damage: Break) -> None:
     damage(lab.artefact(ONE, "person"))
     kept = {stage: lab.artefact(ONE, stage).read_bytes() for stage in ("frames", "scene", "joint")}
-    done = lab.run(str(lab.artefact(ONE, "metrics").relative_to(lab.folder)))
+    # object_track reads it as well: either may be the first to fail, and must not stop the other
+    metrics = lab.artefact(ONE, "metrics").relative_to(lab.folder)
+    done = lab.run("--keep-going", str(metrics))
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     told = [line for line in done.stderr.splitlines() if line.startswith(f"{ONE}: body_fit")]
