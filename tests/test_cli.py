@@ -375,6 +375,17 @@ def test_reasons_that_look_like_markup_are_shown_as_they_are(
     assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
 
 
+def test_a_log_that_is_removed_while_it_is_looked_at_is_no_job(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    watcher = Watcher(load_project(Path("config.yaml")), Console(file=io.StringIO()))
+    gone = Path("logs/trial/good/scene.log")
+    gone.parent.mkdir(parents=True)
+    gone.symlink_to("removed.log")  # listed, but there is nothing behind it
+    assert watcher.jobs() == {}
+
+
 def test_real_recordings_below_the_results_are_never_made(small_project: Path) -> None:
     place = small_project / "results" / "trial" / "recordings" / "good"
     place.parent.mkdir(parents=True)

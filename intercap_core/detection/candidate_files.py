@@ -15,7 +15,8 @@ from intercap_core.detection.coco import (
     CandidateFile,
     ImageKey,
     UnreadableCandidates,
-    read_candidates,
+    candidates_of,
+    read_json,
 )
 from intercap_core.detection.image_numbers import CameraImages
 from intercap_core.detection.instance import Instance
@@ -80,8 +81,8 @@ def read_camera(
     path = camera_file(folder, images.name)
     if path is not None:
         try:
-            content = read_candidates(
-                path, width=width, height=height, min_score=min_score, names=names
+            content = candidates_of(
+                read_json(path), width=width, height=height, min_score=min_score, names=names
             )
         except UnreadableCandidates as error:
             found.notes.append(f"{short(path)} {error}")
@@ -167,8 +168,8 @@ def _add_image_files(
             absent.append(name)
             continue
         try:
-            content = read_candidates(
-                path,
+            content = candidates_of(
+                read_json(path),
                 width=images.size[0],
                 height=images.size[1],
                 min_score=min_score,

@@ -68,31 +68,6 @@ class _Stated:
     corners: bool  # boxes are x, y of two corners
 
 
-def read_candidates(
-    path: Path,
-    *,
-    width: int,
-    height: int,
-    min_score: float,
-    names: Mapping[int, str],
-    one_image: bool = False,
-) -> CandidateFile:
-    """Read results for images of ``width`` x ``height``, in the file's order.
-
-    ``names`` are the classes by number, where the file does not list them. ``one_image``: entries
-    need not say their image. Results under ``min_score`` are left out; so are those that cannot be
-    used, which the result tells. Raises :class:`UnreadableCandidates` where nothing can be used.
-    """
-    return candidates_of(
-        read_json(path),
-        width=width,
-        height=height,
-        min_score=min_score,
-        names=names,
-        one_image=one_image,
-    )
-
-
 def candidates_of(
     content: Any,
     *,
@@ -102,7 +77,12 @@ def candidates_of(
     names: Mapping[int, str],
     one_image: bool = False,
 ) -> CandidateFile:
-    """The results in parsed JSON; as :func:`read_candidates`."""
+    """The results in parsed JSON (:func:`read_json`), in order: images of ``width`` x ``height``.
+
+    ``names`` are the classes by number, where the file does not list them. ``one_image``: entries
+    need not say their image. Results under ``min_score`` are left out; so are those that cannot be
+    used, which the result tells. Raises :class:`UnreadableCandidates` where nothing can be used.
+    """
     entries = content
     images: list[ImageKey] | None = None
     stated = _Stated(names, {}, {}, None, False)

@@ -133,6 +133,10 @@ class ObjectMesh:
         """Largest distance of a vertex from the centre of mass, metres."""
         return float(np.linalg.norm(self.vertices - self.centre_of_mass, axis=1).max())
 
+    def centre_at(self, pose: np.ndarray) -> np.ndarray:
+        """Centre of mass (3,) under a pose (4, 4), in the frame that the pose leads to, metres."""
+        return pose[:3, :3] @ self.centre_of_mass + pose[:3, 3]
+
     @cached_property
     def diameter(self) -> float:
         """Largest distance between two vertices, metres (BOP's scale of pose errors)."""

@@ -67,12 +67,12 @@ def _undecided(
 ) -> list[int]:
     """The frames in which the two are quite different and the images around do not decide."""
     run = sorted(rival)
-    gain = np.array([_score(rival[u]) - _score(track[u]) for u in run])
+    gain = np.array([rival[u].score - track[u].score for u in run])
     symmetry = observer.mesh.symmetry
     found = []
     for i, u in enumerate(run):
         own, other = track[u].fit.pose, rival[u].fit.pose
-        apart = float(np.linalg.norm(observer.centre(own) - observer.centre(other)))
+        apart = float(np.linalg.norm(observer.mesh.centre_at(own) - observer.mesh.centre_at(other)))
         turn = float(symmetry.rotation_error_deg(own[:3, :3], other[:3, :3]))
         around = gain[max(i - AROUND, 0) : i + AROUND + 1]
         if (apart > DIFFERENT_M or turn > DIFFERENT_DEG) and not decided(around):
@@ -121,10 +121,6 @@ def _followed(
                 break
             rival[u] = other
     return rival
-
-
-def _score(frame: FrameResult) -> float:
-    return 0.0 if frame.lost else frame.fit.score
 
 
 def _sound(frame: FrameResult) -> bool:

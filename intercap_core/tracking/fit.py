@@ -286,8 +286,7 @@ def assess_all(
 
 def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if prior is None:
-        weight = np.concatenate([np.full(3, 1.0), np.full(3, 1.0)])
-        return np.diag(weight), np.zeros(6)
+        return np.eye(6), np.zeros(6)
     turn = Rotation.from_matrix(pose[:3, :3] @ prior.pose[:3, :3].T).as_rotvec()
     away = np.concatenate([turn, pose[:3, 3] - prior.pose[:3, 3]])
     weight = np.repeat([prior.sigma_rad**-2, prior.sigma_m**-2], 3)

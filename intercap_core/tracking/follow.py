@@ -41,7 +41,7 @@ def follow(
     before, now = start.fit.pose, start.fit.pose
     usual = max(start.fit.score, LOST_SCORE)
     lost_for = 1 if start.lost else 0
-    named = Named(observer.centre(now))
+    named = Named(observer.mesh.centre_at(now))
     searches = doubted_for = 0
     most = SEARCHES_MAX + len(frames) // SEARCH_EVERY
     for t in frames:
@@ -52,7 +52,7 @@ def follow(
             result = known[t]
         else:
             result = judged(observer.fit(t, start_pose, prior), observer.settings)
-        if not named.believes(observer.centre(result.fit.pose), result.fit):
+        if not named.believes(observer.mesh.centre_at(result.fit.pose), result.fit):
             result = replace(result, lost=True)
         leapt = False
         doubtful = result.lost or result.fit.score < DOUBT * usual
@@ -115,7 +115,7 @@ def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
     may be anything."""
     looked = sum(view.detected for view in fit.views)
     named = sum(view.candidate >= 0 for view in fit.views)
-    away = float(np.linalg.norm(observer.centre(fit.pose) - observer.centre(last)))
+    away = float(np.linalg.norm(observer.mesh.centre_at(fit.pose) - observer.mesh.centre_at(last)))
     far = away > NEAR_M
     return named >= min(NAMED_VIEWS if far else 1, -(-looked // VIEWS_EACH))
 

@@ -38,6 +38,11 @@ class FrameResult:
     resting: bool = False
     free_axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
+    @property
+    def score(self) -> float:
+        """The fit's agreement with the images, 0 where it is not believed."""
+        return 0.0 if self.lost else self.fit.score
+
 
 def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
     """A fit, lost where the images do not bear it out."""
@@ -92,14 +97,10 @@ def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
 
 def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
     """Which frames (T) no candidate bears out, seen from those before."""
-    places = [_place(mesh, frame.fit) for frame in frames]
+    places = [mesh.centre_at(frame.fit.pose) for frame in frames]
     named = Named(places[0])
     believed = [named.believes(at, frame.fit) for at, frame in zip(places, frames, strict=True)]
     return ~np.array(believed)
-
-
-def _place(mesh: ObjectMesh, fit: Fit) -> np.ndarray:
-    return fit.pose[:3, :3] @ mesh.centre_of_mass + fit.pose[:3, 3]
 
 
 def _deviations(mesh: ObjectMesh, fit: Fit) -> tuple[float, float]:

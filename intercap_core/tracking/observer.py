@@ -145,8 +145,4 @@ class Observer:
 
     def value(self, t: int, fit: Fit) -> float:
         """:meth:`plausibility`, less where what is there in frame t is hardly the object."""
-        return self.plausibility(fit) * self.places.worth(t, self.centre(fit.pose))
-
-    def centre(self, pose: np.ndarray) -> np.ndarray:
-        """The object's centre of mass (3,) at a pose (4, 4), master frame."""
-        return pose[:3, :3] @ self.mesh.centre_of_mass + pose[:3, 3]
+        return self.plausibility(fit) * self.places.worth(t, self.mesh.centre_at(fit.pose))

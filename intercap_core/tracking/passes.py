@@ -75,7 +75,7 @@ class Tracker:
             seed_frame, seed, borne_out = annotated_seed(self._observer, *initial)
         else:
             seed_frame, seed = find_seed(self._observer)
-        self._observer.places.claim(self._observer.centre(seed.pose))
+        self._observer.places.claim(self._mesh.centre_at(seed.pose))
         one = audited(self._observer, self._both_ways(seed_frame, seed), self._times)
         last = self._count - 1
         two = list(one)
@@ -126,7 +126,7 @@ class Tracker:
             return False
         angle = self._mesh.symmetry.rotation_error_deg(one.fit.pose[:3, :3], two.fit.pose[:3, :3])
         apart = np.linalg.norm(
-            self._observer.centre(one.fit.pose) - self._observer.centre(two.fit.pose)
+            self._mesh.centre_at(one.fit.pose) - self._mesh.centre_at(two.fit.pose)
         )
         return bool(apart > AGREE_M or angle > AGREE_DEG)
 
@@ -135,14 +135,10 @@ def _better_run(one: list[FrameResult], two: list[FrameResult]) -> list[FrameRes
     """Of two passes over the same frames the one that explains them better, flagged where the
     images do not decide."""
     kept = [(a, b) for a, b in zip(one, two, strict=True) if not (a.lost and b.lost)]
-    gain = np.array([_score(b) - _score(a) for a, b in kept])
+    gain = np.array([b.score - a.score for a, b in kept])
     better = two if len(gain) and gain.mean() > 0 else one
     unsure = not decided(gain)
     return [replace(frame, disagree=unsure and not frame.lost) for frame in better]
-
-
-def _score(frame: FrameResult) -> float:
-    return 0.0 if frame.lost else frame.fit.score
 
 
 def _recovered(mesh: ObjectMesh, frames: list[FrameResult], seed_frame: int) -> list[FrameResult]:

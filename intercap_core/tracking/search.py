@@ -55,23 +55,10 @@ def search(
     """
 
     def value(fit: Fit) -> float:
-        there = fit.pose[:3, :3] @ mesh.centre_of_mass + fit.pose[:3, 3]
-        return plausibility(fit, up) * (1.0 if worth is None else worth(there))
+        return plausibility(fit, up) * (1.0 if worth is None else worth(mesh.centre_at(fit.pose)))
 
-    groups = find_groups(mesh, views, labels, worth, near)
-    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
-    rotations = rotation_grid(mesh.symmetry, up)
-    found: list[Fit] = []
-    for group in groups:
-        if found and max(map(value, found)) > GOOD_ENOUGH:
-            break
-        poses, residual = align(mesh, field, group, views, rotations)
-        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED)
-        compared = assess_all(
-            mesh, views, poses[distinct], min_overlap=0.1, labels=labels, renderer=renderer
-        )
-        compared.sort(key=lambda fit: -fit.confidence)
-        found += [
+    def fitted(starts: list[Fit]) -> list[Fit]:
+        return [
             fit_pose(
                 mesh,
                 views,
@@ -82,48 +69,34 @@ def search(
                 labels=labels,
                 renderer=renderer,
             )
-            for start in compared[:FITTED]
+            for start in starts
         ]
+
+    def compared(poses: np.ndarray) -> list[Fit]:
+        return assess_all(mesh, views, poses, min_overlap=0.1, labels=labels, renderer=renderer)
+
+    groups = find_groups(mesh, views, labels, worth, near)
+    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
+    rotations = rotation_grid(mesh.symmetry, up)
+    found: list[Fit] = []
+    for group in groups:
+        if found and max(map(value, found)) > GOOD_ENOUGH:
+            break
+        poses, residual = align(mesh, field, group, views, rotations)
+        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED)
+        likely = sorted(compared(poses[distinct]), key=lambda fit: -fit.confidence)
+        found += fitted(likely[:FITTED])
     found.sort(key=lambda fit: -value(fit))
     if found and not mesh.symmetry.sphere:
-        found += _turned(mesh, views, found[0], labels, min_overlap, background_term, renderer)
+        # a mug looks much the same with its handle elsewhere, a box from its back
+        turned = compared(found[0].pose @ own_turns(mesh, NEAR_TURNS))
+        found += fitted(sorted(turned, key=lambda fit: -fit.score)[:TURNS_FITTED])
         found.sort(key=lambda fit: -value(fit))
     kept: list[Fit] = []
     for fit in found:
         if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):
             kept.append(fit)
     return kept
-
-
-def _turned(
-    mesh: ObjectMesh,
-    views: list[View],
-    best: Fit,
-    labels: tuple[str, ...],
-    min_overlap: float,
-    background_term: bool,
-    renderer: Renderer | None,
-) -> list[Fit]:
-    """Fits from the best pose turned about the object's axes: nearly symmetric objects.
-
-    A mug looks much the same with its handle elsewhere, a box from its back.
-    """
-    turned = best.pose @ own_turns(mesh, NEAR_TURNS)
-    compared = assess_all(mesh, views, turned, min_overlap=0.1, labels=labels, renderer=renderer)
-    compared.sort(key=lambda fit: -fit.score)
-    return [
-        fit_pose(
-            mesh,
-            views,
-            start.pose,
-            prior=None,
-            min_overlap=min(min_overlap, 0.2),
-            background_term=background_term,
-            labels=labels,
-            renderer=renderer,
-        )
-        for start in compared[:TURNS_FITTED]
-    ]
 
 
 def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
@@ -218,9 +191,8 @@ def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
 def same_pose(mesh: ObjectMesh, a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two poses (4, 4) are one, up to symmetry and a small difference."""
     angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
-    centre = mesh.centre_of_mass
-    shift = (a[:3, :3] @ centre + a[:3, 3]) - (b[:3, :3] @ centre + b[:3, 3])
-    return angle < SAME_POSE_DEG and float(np.linalg.norm(shift)) < SAME_POSE_M
+    shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
+    return angle < SAME_POSE_DEG and shift < SAME_POSE_M
 
 
 def _super_fibonacci(count: int) -> np.ndarray:

@@ -70,7 +70,7 @@ def annotated_seed(observer: Observer, frame: int, pose: np.ndarray) -> tuple[in
     lost = judged(fit, observer.settings).lost
     found = [
         other
-        for other in observer.search(t, near=observer.centre(pose))
+        for other in observer.search(t, near=observer.mesh.centre_at(pose))
         if observer.value(t, other) > CLEARLY_BETTER * observer.value(t, fit)
         and not judged(other, observer.settings).lost
         and not same_pose(observer.mesh, other.pose, fit.pose)

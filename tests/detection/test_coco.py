@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from intercap_core.detection import coco, masks
-from intercap_core.detection.coco import ImageKey, UnreadableCandidates, read_candidates
+from intercap_core.detection.coco import ImageKey, UnreadableCandidates, candidates_of, read_json
 from intercap_core.detection.label_maps import COCO_NAMES, COCO_NAMES_FROM_0
 
 HEIGHT, WIDTH = 20, 30
@@ -32,7 +32,7 @@ def read(tmp_path, content, **options):
     path = tmp_path / "k1.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     options = {"names": COCO_NAMES, "min_score": 0.05} | options
-    return read_candidates(path, width=WIDTH, height=HEIGHT, **options)
+    return candidates_of(read_json(path), width=WIDTH, height=HEIGHT, **options)
 
 
 def instances(found, number):
