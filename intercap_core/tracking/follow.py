@@ -72,6 +72,8 @@ def follow(
             result = replace(result, leapt=leapt)
             before, now = (result.fit.pose if broken else now), result.fit.pose
             lost_for = 0
+            if result.fit.score > DOUBT * usual:
+                observer.places.tracked(t, observer.mesh.centre_at(result.fit.pose))
             usual += 0.1 * (result.fit.score - usual)
         yield t, result
 

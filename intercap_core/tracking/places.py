@@ -2,13 +2,14 @@
 
 Another chair, a second cup: what has the object's class and size is not always the object. The
 object is what the person handles: it moves, or the person is at it. What stands in one place from
-the first frame to the last while nobody comes near is another.
+the first frame to the last while nobody comes near is another, and so is what stands there while
+the object is soundly tracked elsewhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,15 +25,19 @@ AT_HAND_M, FAR_M = 0.10, 0.45  # from the nearest joint to the object, about
 NEAREST = 0.1  # quantile of the frames: a person is not at the object all the time
 MOVED = 0.8  # worth of what was not in this place all the time, wherever the person is
 LEAST = 0.1  # worth of what stands apart all the time
+BESIDE = 2  # frames in which something stands there while the object is elsewhere: another thing
 _BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what the mouth does
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Standing:
-    """A place (3,) where something was in ``share`` of the surveyed frames."""
+    """A place (3,) where something was in ``share`` of the surveyed frames: in ``frames``, and in
+    those of ``beside`` while the object was elsewhere."""
 
     place: np.ndarray
     share: float
+    frames: frozenset[int] = frozenset()
+    beside: set[int] = field(default_factory=set)
 
 
 class Places:
@@ -66,7 +71,7 @@ class Places:
             groups = find_groups(mesh, load(t), labels, limit=GROUPS)
             seen.append([(centre_of(g), sum(s.value for s in g)) for g in groups])
         same = SAME_PLACE * mesh.diameter + SAME_PLACE_M
-        places = cls(mesh, _clusters(seen, same), joints)
+        places = cls(mesh, _clusters(frames, seen, same), joints)
         best = [
             max((value * places.worth(t, place) for place, value in here), default=0.0)
             for t, here in zip(frames, seen, strict=True)
@@ -77,7 +82,7 @@ class Places:
     def worth(self, t: int, place: np.ndarray) -> float:
         """How likely what is at ``place`` (3,) in frame t is the object: 0.1 to 1."""
         near = [
-            (float(np.linalg.norm(s.place - place)), worth)
+            (float(np.linalg.norm(s.place - place)), LEAST if len(s.beside) >= BESIDE else worth)
             for s, worth in self._standing
             if np.linalg.norm(s.place - place) < self._same
         ]
@@ -92,6 +97,12 @@ class Places:
             for s, worth in self._standing
             if np.linalg.norm(s.place - place) >= self._same
         ]
+
+    def tracked(self, t: int, place: np.ndarray) -> None:
+        """The object is at ``place`` (3,) in frame t beyond doubt."""
+        for s, _ in self._standing:
+            if t in s.frames and np.linalg.norm(s.place - place) >= self._same:
+                s.beside.add(t)
 
     def _standing_worth(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
@@ -113,9 +124,11 @@ def _closeness(gaps: np.ndarray) -> float:
     return float(np.clip((FAR_M - gap) / (FAR_M - AT_HAND_M), LEAST, 1.0))
 
 
-def _clusters(seen: list[list[tuple[np.ndarray, float]]], same: float) -> list[Standing]:
-    """Places in which something was seen in more than one frame."""
-    every = [(t, place) for t, here in enumerate(seen) for place, _ in here]
+def _clusters(
+    frames: list[int], seen: list[list[tuple[np.ndarray, float]]], same: float
+) -> list[Standing]:
+    """Places in which something was ``seen`` in more than one of the ``frames``."""
+    every = [(t, place) for t, here in zip(frames, seen, strict=True) for place, _ in here]
     places = np.array([place for _, place in every]).reshape(-1, 3)
     frame = np.array([t for t, _ in every], int)
     free = np.ones(len(every), bool)
@@ -128,6 +141,7 @@ def _clusters(seen: list[list[tuple[np.ndarray, float]]], same: float) -> list[S
         if counts[best] < 2:
             break
         members = together[best]
-        found.append(Standing(places[members].mean(0), counts[best] / max(looked, 1)))
+        there = frozenset(frame[members].tolist())
+        found.append(Standing(places[members].mean(0), counts[best] / max(looked, 1), there))
         free &= ~members
     return found

@@ -44,6 +44,18 @@ def test_a_brief_visit_is_not_being_handled(bottle):
     assert places.worth(3, APART) == 0.1
 
 
+def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
+    twin = Standing(APART, 0.8, frozenset({8, 12, 16}))
+    places = Places(bottle, [twin], _joints(APART, 20))  # the person walks past it
+    assert places.worth(3, APART) == 1.0
+    places.tracked(8, HANDLED)
+    places.tracked(9, HANDLED)  # nobody looked at what stands where in this frame
+    places.tracked(12, APART + 0.01)  # the object itself
+    assert places.worth(3, APART) == 1.0
+    places.tracked(16, HANDLED)
+    assert places.worth(3, APART) == 0.1
+
+
 @pytest.mark.parametrize("name", ["tennis_racquet"])
 def test_starts_by_itself_beside_a_twin_with_all_that_detectors_do_wrong(name):
     entry = catalogue()[name]
