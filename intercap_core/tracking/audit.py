@@ -13,9 +13,10 @@ import numpy as np
 
 from intercap_core.tracking.choices import best_sequence
 from intercap_core.tracking.fit import MIN_PIXELS, Fit
-from intercap_core.tracking.follow import follow
+from intercap_core.tracking.follow import NEAR_M, follow, value_to_believe
 from intercap_core.tracking.lost import FrameResult, decided
 from intercap_core.tracking.observer import Observer
+from intercap_core.tracking.places import LEAST
 from intercap_core.tracking.search import same_pose
 from intercap_core.tracking.turns import near_turns
 
@@ -50,8 +51,13 @@ def _look(observer: Observer, track: list[FrameResult], t: int, times: np.ndarra
     """Search frame t; where that finds another pose, decide about the frames around it."""
     own = track[t]
     value = 0.0 if own.lost else observer.value(t, own.fit)
-    found = [fit for fit in observer.search(t) if observer.value(t, fit) > value - NEARLY]
-    others = [fit for fit in found if not same_pose(observer.mesh, fit.pose, own.fit.pose)]
+    others = [
+        fit
+        for fit in observer.search(t)
+        if observer.value(t, fit) > value - NEARLY
+        and not same_pose(observer.mesh, fit.pose, own.fit.pose)
+        and _may_be_there(observer, t, own, fit)
+    ]
     if not others:
         return
     rival = _followed(observer, track, t, others[0])
@@ -60,6 +66,17 @@ def _look(observer: Observer, track: list[FrameResult], t: int, times: np.ndarra
         track[u] = replace(track[u], ambiguous=not track[u].lost)
     for u in _preferred(observer, track, rival, times):
         track[u] = replace(rival[u], ambiguous=track[u].ambiguous and not rival[u].lost)
+
+
+def _may_be_there(observer: Observer, t: int, own: FrameResult, fit: Fit) -> bool:
+    """Whether what a search found may be the object: images alone would prefer a twin in plain
+    sight to the object in a hand."""
+    there = observer.mesh.centre_at(fit.pose)
+    away = float(np.linalg.norm(there - observer.mesh.centre_at(own.fit.pose)))
+    if not own.lost and away < NEAR_M:
+        return True
+    sure = observer.value(t, fit) >= value_to_believe(observer, t)
+    return sure and observer.places.worth(t, there) > LEAST
 
 
 def _undecided(

@@ -104,12 +104,17 @@ def _recovered(
     )
     if same_pose(observer.mesh, best.pose, result.fit.pose):
         return None
-    # few cameras can never be as sure as a ring
-    surest = min(1.0, (1 - 0.5 ** len(observer.views(t))) / (1 - 0.5**RING))
-    needed = max(RECOVERY_CONFIDENCE * surest, CLEARLY_BETTER * observer.value(t, result.fit))
+    needed = max(value_to_believe(observer, t), CLEARLY_BETTER * observer.value(t, result.fit))
     if observer.value(t, best) < needed or judged(best, observer.settings).lost:
         return None
     return FrameResult(best, False)
+
+
+def value_to_believe(observer: Observer, t: int) -> float:
+    """The value from which a pose that was searched for in frame t may be the object."""
+    # few cameras can never be as sure as a ring
+    surest = min(1.0, (1 - 0.5 ** len(observer.views(t))) / (1 - 0.5**RING))
+    return RECOVERY_CONFIDENCE * surest
 
 
 def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:

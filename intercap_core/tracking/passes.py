@@ -76,6 +76,18 @@ class Tracker:
         else:
             seed_frame, seed = find_seed(self._observer)
         self._observer.places.claim(self._mesh.centre_at(seed.pose))
+        merged = self._passes(seed_frame, seed)
+        if self._at_another(merged):  # which only later frames have shown
+            merged = self._passes(seed_frame, seed)
+        sure = seed_frame if initial is not None and borne_out else None
+        refined = WholeTrack(self._observer, self._times, sure).refine(merged)
+        whole = doubted(self._mesh, refined)
+        return Track(
+            _recovered(self._mesh, whole, seed_frame), seed_frame, initial is not None, borne_out
+        )
+
+    def _passes(self, seed_frame: int, seed: Fit) -> list[FrameResult]:
+        """Every frame (T) by both passes."""
         one = audited(self._observer, self._both_ways(seed_frame, seed), self._times)
         last = self._count - 1
         two = list(one)
@@ -85,13 +97,7 @@ class Tracker:
         ):
             for t, result in follow(self._observer, frames, one[start_at], one, may_search=False):
                 two[t] = result
-        merged = self._merged(one, two)
-        sure = seed_frame if initial is not None and borne_out else None
-        refined = WholeTrack(self._observer, self._times, sure).refine(merged)
-        whole = doubted(self._mesh, refined)
-        return Track(
-            _recovered(self._mesh, whole, seed_frame), seed_frame, initial is not None, borne_out
-        )
+        return self._merged(one, two)
 
     def _both_ways(self, seed_frame: int, seed: Fit) -> list[FrameResult]:
         """Every frame (T), tracked from the seed to both ends."""
@@ -99,6 +105,14 @@ class Tracker:
         for frames in (range(seed_frame + 1, self._count), range(seed_frame - 1, -1, -1)):
             results.update(follow(self._observer, frames, results[seed_frame]))
         return [results[t] for t in range(self._count)]
+
+    def _at_another(self, frames: list[FrameResult]) -> bool:
+        """Whether the track (T) was at a place where another thing stands."""
+        return any(
+            self._observer.places.taken(self._mesh.centre_at(frame.fit.pose))
+            for frame in frames
+            if not frame.lost
+        )
 
     # --- two passes ---------------------------------------------------------------------------
 

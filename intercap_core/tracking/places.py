@@ -81,14 +81,22 @@ class Places:
 
     def worth(self, t: int, place: np.ndarray) -> float:
         """How likely what is at ``place`` (3,) in frame t is the object: 0.1 to 1."""
-        near = [
-            (float(np.linalg.norm(s.place - place)), LEAST if len(s.beside) >= BESIDE else worth)
-            for s, worth in self._standing
-            if np.linalg.norm(s.place - place) < self._same
-        ]
-        if near:
-            return min(near)[1]
-        return max(MOVED, _closeness(self._gaps(place, slice(t, t + 1))))
+        found = self._nearest(place)
+        if found is None:
+            return max(MOVED, _closeness(self._gaps(place, slice(t, t + 1))))
+        standing, worth = found
+        return LEAST if len(standing.beside) >= BESIDE else worth
+
+    def taken(self, place: np.ndarray) -> bool:
+        """Whether another thing stands at ``place`` (3,): the object was elsewhere meanwhile."""
+        found = self._nearest(place)
+        return found is not None and len(found[0].beside) >= BESIDE
+
+    def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
+        """What stands at ``place`` (3,) and what it is worth."""
+        away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
+        nearest = int(np.argmin(away)) if away else 0
+        return self._standing[nearest] if away and away[nearest] < self._same else None
 
     def claim(self, place: np.ndarray) -> None:
         """What is at ``place`` (3,) is the object, whoever comes near."""

@@ -122,8 +122,13 @@ def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
         size = np.linalg.norm(kick, axis=1)
         back = -(kick[1:-1] * (kick[:-2] + kick[2:])).sum(1) > 0.5 * size[1:-1] ** 2
         for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * IMPACT * limit)):
-            share = (times[t] - times[t - 1]) / (times[t + 1] - times[t - 1])
-            result[t] = moved(poses[t - 1], share * between(poses[t - 1], poses[t + 1]))
+            past = between(poses[t - 1], poses[t + 1])
+            ends = np.diff([rate[t - 2], past / (times[t + 1] - times[t - 1]), rate[t + 1]], axis=0)
+            ends = 2 * ends / (times[[t, t + 2]] - times[[t - 2, t]])[:, None]
+            # without a wrong frame the motion is smooth; between two places it never is
+            if (np.linalg.norm(ends[part], axis=1) < IMPACT * limit).all():
+                share = (times[t] - times[t - 1]) / (times[t + 1] - times[t - 1])
+                result[t] = moved(poses[t - 1], share * past)
     return result
 
 

@@ -13,7 +13,7 @@ from intercap_core.refine.bridge import bridge_poses
 from intercap_core.rigid.twist import twists
 from intercap_core.tracking.choices import best_sequence, other_fits, weak_frames
 from intercap_core.tracking.fit import Evidence, Fit, MotionPrior
-from intercap_core.tracking.lost import FrameResult, judged
+from intercap_core.tracking.lost import UNSURE_M, FrameResult, judged
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.rest import resting
 from intercap_core.tracking.smooth import UNKNOWN, Looks, smooth
@@ -49,7 +49,8 @@ class WholeTrack:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
         A lost frame's pose is a guess: it is found again where its neighbours lead to a pose that
-        the images bear out.
+        the images bear out. Where they pull a frame far from what it shows, it is lost unless the
+        images bear that out.
         """
         lost = np.array([frame.lost for frame in frames])
         if lost.all():
@@ -57,21 +58,22 @@ class WholeTrack:
         fits = [frame.fit for frame in frames]
         fits, doubt, spread = self._turned(fits, lost, np.array([f.leapt for f in frames]))
         fits = self._decided(fits, lost)
-        fits, segment, free_axis = self._smoothed(fits, lost, spread)
+        fits, segment, free_axis, pulled = self._smoothed(fits, lost, spread)
+        guessed = lost | pulled
         known = [fit.score for fit, unknown in zip(fits, lost, strict=True) if not unknown]
         enough = FOUND * float(np.median(known))
         return [
             replace(
                 frame,
                 fit=fit,
-                lost=frame.lost
+                lost=bool(guess)
                 and (fit.score < enough or judged(fit, self._observer.settings).lost),
                 ambiguous=frame.ambiguous or bool(unsure and not frame.lost),
                 resting=bool(number >= 0),
                 free_axis=axis,
             )
-            for frame, fit, number, axis, unsure in zip(
-                frames, fits, segment, free_axis, doubt, strict=True
+            for frame, fit, number, axis, unsure, guess in zip(
+                frames, fits, segment, free_axis, doubt, guessed, strict=True
             )
         ]
 
@@ -152,10 +154,11 @@ class WholeTrack:
 
     def _smoothed(
         self, fits: list[Fit], lost: np.ndarray, spread: np.ndarray
-    ) -> tuple[list[Fit], np.ndarray, np.ndarray]:
-        """The fits, the number (T,) of the rest that each frame belongs to (-1: none) and the axes
-        (T, 3) about which nothing was seen; ``spread`` (T, 3, 3) is the variance of the turns by
-        which the object may be other than it was fitted, object frame."""
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray]:
+        """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
+        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show;
+        ``spread`` (T, 3, 3) is the variance of the turns by which the object may be other than it
+        was fitted, object frame."""
         poses = self._unwrapped(np.array([fit.pose for fit in fits]))
         poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
         motion = twists(poses, ~lost, self._times)
@@ -180,7 +183,16 @@ class WholeTrack:
             replace(fit, pose=pose, covariance=spread, views=seen.reports if seen else fit.views)
             for fit, pose, spread, seen in zip(fits, track, covariance, found, strict=True)
         ]
-        return result, segment, free
+        pulled = self._apart(looked, track) & np.array([seen is not None for seen in found])
+        for t in map(int, np.flatnonzero(pulled)):
+            result[t] = replace(result[t], views=self._observer.assess(t, track[t]).views)
+        return result, segment, free, pulled
+
+    def _apart(self, one: np.ndarray, two: np.ndarray) -> np.ndarray:
+        """In which frames (T,) the object is elsewhere by poses (T, 4, 4) than by others."""
+        centre = self._mesh.centre_at
+        away = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
+        return np.linalg.norm(away, axis=-1) > UNSURE_M
 
     def _solved(
         self, looked: np.ndarray, found: list[Evidence | None], start: np.ndarray

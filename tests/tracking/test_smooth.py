@@ -76,6 +76,19 @@ def test_one_wrong_frame_does_not_drag_its_neighbours() -> None:
     assert shift(found, true).max() < 0.03
 
 
+@pytest.mark.parametrize("leap", [0.25, 0.6])
+def test_a_leap_between_two_places_does_not_drag_what_is_sure(leap: float) -> None:
+    true = np.tile(np.eye(4), (20, 1, 1))
+    true[:, 2, 3] = 2.0
+    true[8:12, 0, 3] = leap  # wrong, then a frame that saw nothing, then right
+    looks = looks_at(true)
+    looks.information[11], looks.gradient[11] = 0, 0
+    start = looks.poses.copy()
+    start[11, 0, 3] = leap / 2
+    found, _ = smooth(looks, start, np.arange(20), np.arange(20) / FPS, CENTRE)
+    assert np.delete(shift(found, true), 11).max() < 0.02
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_short_recordings(count: int) -> None:
     true = lifted(10, 8, 9)[:count]
