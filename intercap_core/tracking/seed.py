@@ -7,7 +7,7 @@ import logging
 import numpy as np
 
 from intercap_core.tracking.fit import Fit, MotionPrior
-from intercap_core.tracking.follow import follow
+from intercap_core.tracking.follow import follow, value_to_believe
 from intercap_core.tracking.lost import judged
 from intercap_core.tracking.observer import Observer
 from intercap_core.tracking.search import same_pose
@@ -31,19 +31,26 @@ class NotFound(Exception):
 
 def find_seed(observer: Observer) -> tuple[int, Fit]:
     """The frame to start from and the pose there. Raises NotFound where there is none."""
-    best: tuple[int, list[Fit]] | None = None
-    value = 0.0
+    seen: list[tuple[int, list[Fit]]] = []
     for tried, t in enumerate(observer.frames_to_search()):
-        if tried >= SEARCHED_MAX or (tried >= SEARCHED and best is not None):
+        if tried >= SEARCHED_MAX or (tried >= SEARCHED and seen):
             break
         found = observer.search(t)
-        if found and (best is None or observer.value(t, found[0]) > value):
-            best, value = (t, found), observer.value(t, found[0])
-        if value > SURE:
-            break
-    if best is None:
+        if found:
+            seen.append((t, found))
+            if observer.value(t, found[0]) > SURE:
+                break
+    if not seen:
         raise NotFound
-    t, found = best
+    t, found = max(seen, key=lambda one: observer.value(one[0], one[1][0]))
+    if observer.value(t, found[0]) < value_to_believe(observer, t):
+        # nobody is at anything that looks like it: then it is what looks like it most
+        t, fit = max(
+            ((t, fit) for t, found in seen for fit in found),
+            key=lambda one: observer.plausibility(one[1]),
+        )
+        observer.places.claim(observer.mesh.centre_at(fit.pose))
+        found = sorted(dict(seen)[t], key=lambda fit: -observer.value(t, fit))
     log.info("seed frame %d, confidence %.2f", t, found[0].confidence)
     return t, _settled(observer, t, found)
 
