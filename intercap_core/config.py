@@ -83,6 +83,14 @@ class DetectionsSettings(Model):
     the mean of ImageNet (maskrcnn-benchmark); auto = by the kind of its outputs."""
     segmentation_device: Literal["cpu", "cuda"] = "cpu"
     """Where the model runs; cuda needs the package onnxruntime-gpu."""
+    keypoint_model: Path | None = None
+    """ONNX model for people's keypoints (RTMPose, RTMW or DWPose exports); it sees the images of
+    which no file of keypoints says anything."""
+    keypoint_device: Literal["cpu", "cuda"] = "cpu"
+    """Where the model of keypoints runs."""
+    keypoint_full_confidence: Positive = 1.0
+    """Confidence of a keypoint, as files or the model state it, that counts as 1; raw responses of
+    RTMW reach 5 and more."""
 
 
 class SceneSettings(Model):

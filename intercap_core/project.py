@@ -183,16 +183,17 @@ def _check_files(project: Project) -> None:
 
 
 def _check_detectors(project: Project) -> None:
-    """The model and the class names are shared by sequences as well."""
+    """The models and the class names are shared by sequences as well."""
     settings = project.config.detections
-    for field in ("segmentation_model", "segmentation_labels", "category_names"):
+    models = ("segmentation_model", "keypoint_model")
+    for field in (*models, "segmentation_labels", "category_names"):
         file = getattr(settings, field)
         if isinstance(file, Path) and not file.is_file():
             raise UserError(
                 f"{project.path}: detections.{field} is {file}, and there is no such file; correct "
                 "the path"
             )
-        if isinstance(file, Path) and field != "segmentation_model":
+        if isinstance(file, Path) and field not in models:
             read_label_map(file)
 
 

@@ -40,11 +40,15 @@ def check_device(project: Project) -> None:
 
 
 def check_detector(project: Project) -> list[Fault]:
-    """Open the segmentation model that the settings name; notes of objects that it does not know.
+    """Open the models that the settings name; notes of objects that segmentation does not know.
 
-    Raises UserError where it cannot be run here.
+    Raises UserError where one cannot be run here.
     """
     settings = project.config.detections
+    if settings.keypoint_model is not None:
+        from intercap_core.detection.onnx_pose import PoseModel
+
+        PoseModel.load(settings)
     if settings.segmentation_model is None:
         return []
     from intercap_core.detection.onnx_segmentation import Segmenter
@@ -112,6 +116,7 @@ def notes_of_sequences(project: Project) -> list[Fault]:
 def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
     from intercap_core.capture.layouts import open_layout
     from intercap_core.detection.candidate_files import has_candidates
+    from intercap_core.detection.keypoint_files import has_keypoints
 
     try:
         layout = open_layout(row)
@@ -127,7 +132,9 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
         )
     recorded = [name for name in known if name in layout.names]
     beside = row.layout == "behave"
-    modelled = project.config.detections.segmentation_model is not None
+    settings = project.config.detections
+    segmented = settings.segmentation_model is not None
+    modelled = segmented or settings.keypoint_model is not None
     nothing = row.keypoints is None and row.candidates is None and not beside and not modelled
     if nothing and recorded:
         notes.append(
@@ -136,12 +143,16 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
         )
     if row.keypoints is not None and row.keypoints.is_dir():
         folder = row.keypoints
-        without = [name for name in recorded if not (folder / name).is_dir()]
-        notes += [f"{folder} has no folder {name}; add this camera's keypoints" for name in without]
+        without = [n for n in recorded if not has_keypoints(folder, n)]
+        if settings.keypoint_model is None:
+            notes += [
+                f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
+                for name in without
+            ]
     if row.candidates is not None and row.candidates.is_dir():
         folder = row.candidates
         having = [name for name in recorded if has_candidates(folder, name, row.layout)]
-        without = [name for name in recorded if name not in having and not modelled]
+        without = [name for name in recorded if name not in having and not segmented]
         notes += [f"{folder} has no {name}.json; add this camera's candidates" for name in without]
         notes += _notes_of_candidates(project, row, layout, having)
     return notes

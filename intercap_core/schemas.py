@@ -67,12 +67,13 @@ DETECTIONS = Schema(
     attributes={"sequence": "sequence name"},
     optional_attributes={
         "segmentation_model": "name and SHA-256 of the model that saw images without candidates",
+        "keypoint_model": "name and SHA-256 of the model that saw images without keypoints",
     },
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
         "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),
         "note": Field(("C",), "str", "what is degraded about this camera's detections, in words"),
-        "keypoints_found": Field(("T", "C"), "bool", "a readable keypoint file exists for this image"),
+        "keypoints_found": Field(("T", "C"), "bool", "keypoints are known for this image (maybe of nobody)"),
         "candidates_found": Field(("T", "C"), "bool", "candidates are known for this image (maybe none)"),
         "cameras/{camera}/people_offsets": Field(("T+1",), "int64", "first person of each set, and the end"),
         "cameras/{camera}/people": Field(("P", "135", "3"), "float32", "x, y, confidence in the 135-point order", "px", "colour image"),
@@ -140,7 +141,7 @@ PERSON = Schema(
         "camera_names": Field(("C",), "str", "one name a camera"),
         "person": Field(("T", "C"), "int32", "index among the people of the image that shows this moment (image_of of the scene), -1 = not seen"),
         "keypoints": Field(("T", "C", "135", "3"), "float32", "the subject's x, y, confidence in the image that shows this moment, as exposed (time_offset of the scene later); 0 = not seen", "px", "colour image"),
-        "joints": Field(("T", "135", "3"), "float32", "keypoints at the set's time, triangulated, or lifted by one view's depth where few are; NaN = neither", "m", "master"),
+        "joints": Field(("T", "135", "3"), "float32", "keypoints at the set's time, triangulated, or lifted by one view's depth where few are, neck and mid hip else the middles of shoulders and hips; NaN = not known", "m", "master"),
         "joint_views": Field(("T", "135"), "int8", "views that agree on the point; 1 = lifted by depth"),
         "joint_error": Field(("T", "135"), "float32", "RMS reprojection error of those views; NaN = not triangulated", "px"),
         "inlier": Field(("T", "C", "135"), "bool", "this view agrees on the point"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from intercap_core.detection.coco import (
     CandidateFile,
@@ -27,6 +28,8 @@ from intercap_core.detection.mask_files import (
     read_masks,
     release_masks,
 )
+
+Result = TypeVar("Result")
 
 ALL_IMAGES = ("coco_instances_results.json", "predictions.json")  # in the camera's own folder
 FILES_NAMED = 3  # broken files or entries that a note names; more are counted
@@ -95,8 +98,37 @@ def read_camera(
 
 def _add_file(found: Candidates, content: CandidateFile, images: CameraImages, path: Path) -> None:
     """Sort one file's results by image."""
-    spoken = content.images
-    keys = [*(key for key, _ in content.results), *content.faulty, *(spoken or ())]
+    useless = bool(content.entries) and len(content.faults) == content.entries
+    by_image, absent = sorted_by_image(
+        content.results, content.images, content.faulty, images, useless=useless
+    )
+    for place, instances in by_image.items():
+        found.by_image.setdefault(place, []).extend(instances)
+    if content.faults:
+        first = "; ".join(content.faults[:FILES_NAMED])
+        found.notes.append(
+            f"{len(content.faults)} of {content.entries} results in {short(path)} left out: {first}"
+        )
+    if content.scaled:
+        found.notes.append(f"{content.scaled} masks in {short(path)} scaled to the image's size")
+    note_absent(found.notes, absent, images, short(path))
+
+
+def sorted_by_image(
+    results: list[tuple[ImageKey, Result]],
+    spoken: list[ImageKey] | None,
+    faulty: list[ImageKey],
+    images: CameraImages,
+    *,
+    useless: bool,
+) -> tuple[dict[int, list[Result]], list[str]]:
+    """Results by image number, and what images are called that were not recorded.
+
+    Images of which the file speaks, all where it does not say (``spoken`` None), have a list, maybe
+    an empty one; those of entries that could not be used (``faulty``) only with results. A
+    ``useless`` file, none of whose entries could be used, speaks of no image by itself.
+    """
+    keys = [*(key for key, _ in results), *faulty, *(spoken or ())]
     by_name = images.numbers_of_names(key.name for key in keys if key.name is not None)
     ids = {key.number for key in keys if key.number is not None}
     if len(images.recorded & ids) > len(images.recorded.intersection(by_name.values())):
@@ -107,34 +139,26 @@ def _add_file(found: Candidates, content: CandidateFile, images: CameraImages, p
             return by_name.get(key.name)
         return key.number
 
-    if content.entries and len(content.faults) == content.entries and spoken is None:
+    if useless and spoken is None:
         known: set[int] = set()  # nothing of it can be used, so it says nothing of other images
     elif spoken is None:
         known = set(images.recorded)
     else:
         known = {n for n in map(number, spoken) if n is not None}
     # An image whose results are all unusable is not one without instances.
-    known -= {n for n in map(number, content.faulty) if n is not None}
-    for n in known & images.recorded:
-        found.by_image.setdefault(n, [])
+    known -= {n for n in map(number, faulty) if n is not None}
+    by_image: dict[int, list[Result]] = {n: [] for n in sorted(known & images.recorded)}
     absent = []
-    for key, instance in content.results:
+    for key, result in results:
         place = number(key)
         if place is not None and place in images.recorded:
-            found.by_image.setdefault(place, []).append(instance)
+            by_image.setdefault(place, []).append(result)
         else:
             absent.append(key.name if key.name is not None else str(key.number))
-    if content.faults:
-        first = "; ".join(content.faults[:FILES_NAMED])
-        found.notes.append(
-            f"{len(content.faults)} of {content.entries} results in {short(path)} left out: {first}"
-        )
-    if content.scaled:
-        found.notes.append(f"{content.scaled} masks in {short(path)} scaled to the image's size")
-    _note_absent(found, absent, images, short(path))
+    return by_image, absent
 
 
-def _note_absent(found: Candidates, names: list[str], images: CameraImages, where: str) -> None:
+def note_absent(notes: list[str], names: list[str], images: CameraImages, where: str) -> None:
     """Note results of images that were not recorded."""
     if not names:
         return
@@ -143,7 +167,7 @@ def _note_absent(found: Candidates, names: list[str], images: CameraImages, wher
         has += f", {images.stems[0]} to {images.stems[-1]}"
     off_by_one = {str(max(images.recorded, default=-1) + 1)} == set(names)
     hint = "; image numbers count from 0" if off_by_one else ""
-    found.notes.append(
+    notes.append(
         f"{len(names)} results in {where} are of images that the recording does not have (first: "
         f"{names[0]:.80}; it has {has}){hint}"
     )

@@ -91,15 +91,15 @@ def candidates_of(
         stated, images = _stated(content, names)
     if not isinstance(entries, list):
         raise UnreadableCandidates(
-            f"holds {_short(content)}, expected a list of results, or 'annotations' with one"
+            f"holds {short_of(content)}, expected a list of results, or 'annotations' with one"
         )
     found = CandidateFile(images=images)
     for index, entry in enumerate(entries):
         image = ImageKey(None, None)
         try:
             if not isinstance(entry, dict):
-                raise ValueError(f"expected a result, found {_short(entry)}")
-            image = _image(entry, stated, one_image)
+                raise ValueError(f"expected a result, found {short_of(entry)}")
+            image = image_of(entry, stated.files, one_image)
             score = _score(entry)
             if score < min_score:
                 continue
@@ -174,24 +174,41 @@ def _stated(
             ) from None
     size = _size(content.get("img_width"), content.get("img_height"))
     corners = content.get("box_format") == "xyxy"
-    if "images" not in content:
+    listed = listed_images(content)
+    if listed is None:
         return _Stated({**names, **own}, {}, {}, size, corners), None
-    images, files, sizes = [], {}, {}
-    values = content["images"]
+    sizes = {
+        value["id"]: own_size
+        for value in content["images"]
+        if (own_size := _size(value.get("width"), value.get("height"))) is not None
+    }
+    return _Stated({**names, **own}, files_of(listed), sizes, size, corners), listed
+
+
+def listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
+    """The images that a data set lists, None = it lists none.
+
+    Raises :class:`UnreadableCandidates` where they are no objects with an id.
+    """
+    if "images" not in content:
+        return None
+    values, images = content["images"], []
     if not isinstance(values, list):
         raise UnreadableCandidates("'images' must be a list of objects with id")
     for value in values:
         number = value.get("id") if isinstance(value, dict) else None
         if type(number) is not int or not 0 <= number <= _LARGEST_ID:
-            raise UnreadableCandidates(f"'images' must list objects with id, found {_short(value)}")
+            raise UnreadableCandidates(
+                f"'images' must list objects with id, found {short_of(value)}"
+            )
         name = value.get("file_name")
-        if isinstance(name, str):
-            files[number] = name
-        own_size = _size(value.get("width"), value.get("height"))
-        if own_size is not None:
-            sizes[number] = own_size
-        images.append(ImageKey(number, files.get(number)))
-    return _Stated({**names, **own}, files, sizes, size, corners), images
+        images.append(ImageKey(number, name if isinstance(name, str) else None))
+    return images
+
+
+def files_of(images: list[ImageKey]) -> dict[int, str]:
+    """Names of images by id, where they have one."""
+    return {i.number: i.name for i in images if i.number is not None and i.name is not None}
 
 
 def _size(width: Any, height: Any) -> tuple[int, int] | None:
@@ -200,7 +217,11 @@ def _size(width: Any, height: Any) -> tuple[int, int] | None:
     return None
 
 
-def _image(entry: dict[str, Any], stated: _Stated, one_image: bool) -> ImageKey:
+def image_of(entry: dict[str, Any], files: Mapping[int, str], one_image: bool) -> ImageKey:
+    """What an entry calls its image; ``files`` are the names of images by id.
+
+    ``one_image``: it need not. Raises ValueError where it must and does not.
+    """
     value, name = entry.get("image_id"), entry.get("file_name", entry.get("image_path"))
     if isinstance(value, str):
         value, name = None, value
@@ -211,9 +232,9 @@ def _image(entry: dict[str, Any], stated: _Stated, one_image: bool) -> ImageKey:
     if type(value) is not int or not 0 <= value <= _LARGEST_ID:
         raise ValueError(
             "image_id must be the whole number of a colour image from 0, or its file's name, "
-            f"found {_short(value)}"
+            f"found {short_of(value)}"
         )
-    return ImageKey(value, stated.files.get(value) if name is None else name)
+    return ImageKey(value, files.get(value) if name is None else name)
 
 
 def _instance(
@@ -234,9 +255,9 @@ def _instance(
     try:
         x, y, w, h = (float(v) for v in box)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"bbox is {_short(box)}, expected x, y, width, height") from None
+        raise ValueError(f"bbox is {short_of(box)}, expected x, y, width, height") from None
     if not all(math.isfinite(v) for v in (x, y, w, h)):
-        raise ValueError(f"bbox is {_short(box)}, expected finite numbers")
+        raise ValueError(f"bbox is {short_of(box)}, expected finite numbers")
     if corners:
         w, h = w - x, h - y
     masks.Runs(rle, size[1], size[0])  # raises where the string is no mask of the image
@@ -252,7 +273,7 @@ def _score(entry: dict[str, Any]) -> float:
     except OverflowError:
         score = math.inf
     if not math.isfinite(score):
-        raise ValueError(f"score is {_short(value)}, expected a number")
+        raise ValueError(f"score is {short_of(value)}, expected a number")
     return score
 
 
@@ -266,14 +287,14 @@ def _label(entry: dict[str, Any], names: Mapping[int, str]) -> str:
         return ""
     for key in present:
         if type(entry[key]) is int:
-            return names.get(entry[key], f"category {_short(entry[key])}")
+            return names.get(entry[key], f"category {short_of(entry[key])}")
     raise ValueError(
-        f"{present[0]} is {_short(entry[present[0]])}, expected a class's number or name; "
+        f"{present[0]} is {short_of(entry[present[0]])}, expected a class's number or name; "
         "category_id or category_name says it"
     )
 
 
-def _short(value: Any) -> str:
+def short_of(value: Any) -> str:
     """A found value in words of bounded length."""
     if isinstance(value, dict):
         keys = ", ".join(str(key)[:40] for key in list(value)[:5])

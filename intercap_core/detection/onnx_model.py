@@ -17,10 +17,13 @@ import numpy as np
 
 from intercap_core.errors import UserError
 
-PixelValues = Literal["rgb", "bgr255", "bgr_mean"]
+PixelValues = Literal["rgb", "bgr255", "bgr_mean", "imagenet"]
 
 # Mean of ImageNet as Caffe's models have it, blue first: what maskrcnn-benchmark subtracts.
 CAFFE_MEAN_BGR = np.array([102.9801, 115.9465, 122.7717], np.float32)
+# Mean and deviation of ImageNet's pixels, red first: what torchvision and mmpose normalise by.
+IMAGENET_MEAN_RGB = np.array([123.675, 116.28, 103.53], np.float32)
+IMAGENET_DEVIATION_RGB = np.array([58.395, 57.12, 57.375], np.float32)
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 
@@ -139,13 +142,19 @@ class OnnxModel:
         canvas[fit.top : fit.top + height, fit.left : fit.left + width] = cv2.resize(
             picture, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         )
-        if values == "rgb":
+        return self.prepared(canvas, values)
+
+    def prepared(self, canvas: np.ndarray, values: PixelValues) -> np.ndarray:
+        """A BGR picture (h, w, 3) uint8 of the input's size as the model takes it: (3, h, w)."""
+        if values in ("rgb", "imagenet"):
             canvas = canvas[..., ::-1]
         if self._dtype == np.uint8:
             return canvas.transpose(2, 0, 1)
         pixels = canvas.astype(np.float32)
         if values == "rgb":
             pixels /= 255
+        elif values == "imagenet":
+            pixels = (pixels - IMAGENET_MEAN_RGB) / IMAGENET_DEVIATION_RGB
         elif values == "bgr_mean":
             pixels -= CAFFE_MEAN_BGR
         return pixels.transpose(2, 0, 1)

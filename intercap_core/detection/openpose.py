@@ -6,7 +6,6 @@ Body 25, hands 21 each and face 70 points become 135: body, left hand, right han
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,10 +40,6 @@ _JAW_LINE, _INNER_FACE = slice(0, 17), slice(17, 68)
 _FILE_NAME = re.compile(r"(?!\.)(?:.*?_)?(\d+)_keypoints\.json")
 
 
-class UnreadableJson(Exception):
-    """The file is not JSON: cut or empty, as a detector that was stopped leaves it."""
-
-
 def keypoint_files(folder: Path) -> dict[int, Path]:
     """Find the files of one camera, by the number of the image, ``[name_]<number>_keypoints.json``.
 
@@ -71,24 +66,24 @@ def named_keypoint_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     return {name: path for name, path in paths.items() if path.is_file()}
 
 
-def read_people(path: Path) -> np.ndarray:
-    """Read one file: (P, 135, 3) float32 of x, y (px) and confidence; P may be 0.
+def is_openpose(content: Any) -> bool:
+    """Whether parsed JSON is OpenPose's, or BEHAVE's with its lists of one person."""
+    return isinstance(content, dict) and ("people" in content or "body_joints" in content)
 
-    A point that is not finite, or has no confidence, becomes zeros. A hand or face that the
-    detector did not look for (an empty list) has confidence 0. BEHAVE's files hold one person.
-    Raises :class:`UnreadableJson` for a file that is not JSON, and UserError where it is JSON of
-    another layout.
+
+def people_of(content: dict[str, Any], path: Path) -> np.ndarray:
+    """The people of one file's parsed JSON: (P, 135, 3) float64 of x, y (px) and confidence.
+
+    Numbers are as written. A hand or face that the detector did not look for (an empty list) has
+    confidence 0. BEHAVE's files hold one person. P may be 0. Raises UserError where a list is not
+    of its length; ``path`` is named in it.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise UnreadableJson(f"{path}: not valid JSON ({error})") from None
-    people = content.get("people") if isinstance(content, dict) else None
-    if isinstance(content, dict) and "people" not in content and "body_joints" in content:
+    people = content.get("people")
+    if "people" not in content:
         people = [{name: content.get(theirs, []) for name, theirs in _BEHAVE_LISTS.items()}]
     if not isinstance(people, list):
         raise UserError(f"{path}: has no list 'people'; expected a file as OpenPose writes it")
-    result = np.zeros((len(people), NUM_KEYPOINTS, 3), np.float32)
+    result = np.zeros((len(people), NUM_KEYPOINTS, 3))
     for index, person in enumerate(people):
         if not isinstance(person, dict):
             raise UserError(f"{path}: people[{index}] is not an object with keypoint lists")
@@ -112,7 +107,7 @@ def _points(values: Any, count: int, where: str) -> np.ndarray:
             "points); run OpenPose with its BODY_25 model, hands and face"
         )
     if not values:
-        return np.zeros((count, 3), np.float32)
+        return np.zeros((count, 3))
     try:
         # None stands for NaN in JSON that was written by careful libraries.
         points = np.array([np.nan if v is None else v for v in values], np.float64)
@@ -120,6 +115,4 @@ def _points(values: Any, count: int, where: str) -> np.ndarray:
         raise UserError(f"{where} holds something that is not a number; write it again") from None
     if points.ndim != 1:
         raise UserError(f"{where} holds lists, expected one flat list of {3 * count} numbers")
-    points = points.reshape(count, 3)
-    known = np.isfinite(points).all(1) & (points[:, 2] > 0) & (np.abs(points) < 1e6).all(1)
-    return np.where(known[:, None], points, 0).astype(np.float32)
+    return points.reshape(count, 3)

@@ -8,6 +8,7 @@ import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
+from intercap_core.detection.middles import fill_middles
 from intercap_core.detection.read import Detections
 from intercap_core.detection.sides import BODY_POINTS
 from intercap_core.detection.subject import NOBODY, find_subject
@@ -23,7 +24,7 @@ class SubjectViews:
     """``keypoints`` (T, C, 135, 3) x, y, confidence of the subject, 0 = not seen, sides put right;
     ``inlier`` (T, C, 135): the view agrees with the others; ``joints`` (T, 135, 3) triangulated
     from the body's 25 keypoints, master frame, metres, NaN = not known (hands and face always);
-    ``views`` (T, 135): how many agree."""
+    ``views`` (T, 135): how many agree, 0 for a neck or mid hip between shoulders or hips."""
 
     keypoints: np.ndarray
     inlier: np.ndarray
@@ -75,9 +76,11 @@ def triangulated(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
     keypoints = keypoints.copy()
     keypoints[:, :, BODY_POINTS] = body[:, :, BODY_POINTS]
     inlier = np.swapaxes(found.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
+    joints = found.points.reshape(sets, NUM_KEYPOINTS, 3)
+    fill_middles(joints)
     return SubjectViews(
         keypoints,
         inlier,
-        found.points.reshape(sets, NUM_KEYPOINTS, 3),
+        joints,
         found.views.reshape(sets, NUM_KEYPOINTS),
     )

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.config import DetectionsSettings, SequenceEntry
-from intercap_core.detection import candidate_files, openpose
+from intercap_core.detection import candidate_files, keypoint_files
 from intercap_core.detection.candidate_files import Candidates
 from intercap_core.detection.image_numbers import CameraImages, camera_images
 from intercap_core.detection.instance import Instance, boxes_of
+from intercap_core.detection.keypoint_files import People
+from intercap_core.detection.keypoint_values import NOBODY, Values
 from intercap_core.detection.label_maps import class_names
 from intercap_core.detection.mask_files import BehaveFiles
 from intercap_core.errors import UserError
@@ -25,8 +26,9 @@ from intercap_core.schemas import DETECTIONS, FRAMES
 
 log = logging.getLogger(__name__)
 
-NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
-IMAGES_PER_LINE = 100  # segmented between two lines of the log
+IMAGES_PER_LINE = 100  # seen by a model between two lines of the log
+
+Image = tuple[int, int]  # frame set and camera
 
 
 @dataclass
@@ -47,15 +49,16 @@ def run(
     sequence: SequenceEntry,
     settings: DetectionsSettings,
 ) -> None:
-    """Read the sequence's OpenPose and candidate files and write the detections artefact.
+    """Read the sequence's files of keypoints and candidates and write the detections artefact.
 
     A file belongs to the colour image of its number: in the camera's own recording, or in the
     image file's name where the layout is the InterCap release's. Of a plain folder of images,
     damaged ones count too, and files may be named after the images. BEHAVE's keypoints and masks
     lie beside its images and are read from there unless the row names others. A segmentation model
-    sees the images of which no file says anything. Missing or broken files, entries that cannot
-    be used and missing cameras are noted, not fatal. Raises UserError where neither keypoints nor
-    candidates are found for any image, or a keypoint file has another layout than it must.
+    sees the images of which no file of candidates says anything, then a model of keypoints those of
+    which no file of keypoints does. Missing or broken files, entries that cannot be used and
+    missing cameras are noted, not fatal. Raises UserError where neither keypoints nor candidates
+    are found for any image, or none of a camera's keypoints can be used.
     """
     with artefacts.read(frames, FRAMES) as source:
         images = camera_images(source, sequence)
@@ -68,6 +71,9 @@ def run(
     if settings.segmentation_model is not None:
         _segment(frames, images, found, settings)
         attributes["segmentation_model"] = _identity(settings.segmentation_model)
+    if settings.keypoint_model is not None:
+        _find_people(frames, images, found, settings)
+        attributes["keypoint_model"] = _identity(settings.keypoint_model)
     if not any(d.keypoints_found.any() or d.candidates_found.any() for d in found):
         _raise_nothing(sequence, cameras, found)
     with artefacts.write(
@@ -101,7 +107,8 @@ def _raise_nothing(
         f"sequence {sequence.sequence}: no detections for any of its images (keypoints "
         f"{sequence.keypoints or 'not named'}, candidates "
         f"{sequence.candidates or 'not named'}{f'; {reasons}' if reasons else ''}); expected "
-        f"<keypoints>/{cameras[0]}/<image>_keypoints.json and <candidates>/{cameras[0]}.json; "
+        f"<keypoints>/{cameras[0]}/<image>_keypoints.json or <keypoints>/{cameras[0]}.json, and "
+        f"<candidates>/{cameras[0]}.json; "
         "run the detectors or correct the paths in the table of sequences"
     )
 
@@ -140,14 +147,13 @@ def _read_camera(
     if not images.sets:
         return result
     times = {t: int(images.time_us[t]) for t in images.sets}
+    full = settings.keypoint_full_confidence
     if sequence.keypoints is not None:
-        folder = sequence.keypoints / name
-        if folder.is_dir():
-            _add_people(result, _keypoint_files(folder, images))
-        else:
-            result.notes.append(f"no folder of keypoints {folder.parent.name}/{folder.name}")
+        people = keypoint_files.read_camera(sequence.keypoints, images, full_confidence=full)
+        _add_people(result, people, images)
     elif beside is not None:
-        _add_people(result, {t: beside.keypoints(time, name) for t, time in times.items()})
+        paths = {int(images.number[t]): beside.keypoints(time, name) for t, time in times.items()}
+        _add_people(result, keypoint_files.read_files(paths, images, full_confidence=full), images)
     if sequence.candidates is not None:
         candidates = candidate_files.read_camera(
             sequence.candidates,
@@ -165,34 +171,14 @@ def _read_camera(
     return result
 
 
-def _keypoint_files(folder: Path, images: CameraImages) -> dict[int, Path | None]:
-    """The file of each frame set: by the image's name where any is so named, else by number."""
-    numbers = {t: int(images.number[t]) for t in images.sets}
-    named = openpose.named_keypoint_files(folder, images.stems)
-    if named:
-        return {t: named.get(images.stems[number]) for t, number in numbers.items()}
-    numbered = openpose.keypoint_files(folder)
-    return {t: numbered.get(number) for t, number in numbers.items()}
-
-
-def _add_people(result: CameraDetections, files: dict[int, Path | None]) -> None:
-    """Read the keypoint file of each frame set, None = there is none."""
-    missing, broken = 0, []
-    for t, path in files.items():
-        if path is None:
-            missing += 1
-            continue
-        try:
-            people = openpose.read_people(path)
-        except openpose.UnreadableJson:
-            broken.append(candidate_files.short(path))
-            continue
-        # BEHAVE states "nobody" as a person without any confidence.
-        result.people[t] = people[(people[..., 2] > 0).any(1)]
-        result.keypoints_found[t] = True
-    if missing:
-        result.notes.append(f"no keypoint file for {missing} images")
-    candidate_files.note_broken(result.notes, "keypoint files", broken)
+def _add_people(result: CameraDetections, people: People, images: CameraImages) -> None:
+    """Give each frame set the people of its image."""
+    for t in images.sets:
+        found = people.by_image.get(int(images.number[t]))
+        if found is not None:
+            result.people[t] = found
+            result.keypoints_found[t] = True
+    result.notes += people.notes
 
 
 def _add_candidates(result: CameraDetections, candidates: Candidates, images: CameraImages) -> None:
@@ -212,37 +198,76 @@ def _segment(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find instances in the images of which no file says anything."""
-    from intercap_core.capture.frames import Frames
     from intercap_core.detection.onnx_segmentation import Segmenter
 
-    wanted = [
-        (t, c)
-        for c, camera in enumerate(images)
-        for t in camera.sets
-        if not found[c].candidates_found[t]
-    ]
+    wanted = _unknown(images, [d.candidates_found for d in found])
     if not wanted:
         return
     segmenter = Segmenter.load(settings)
     damaged = [0] * len(images)
-    with Frames.open(frames) as recording:
-
-        def pictures() -> Iterator[tuple[tuple[int, int], np.ndarray]]:
-            for t, c in wanted:
-                try:
-                    picture = recording.colour(t, c)
-                except UserError:
-                    picture = None
-                if picture is None:
-                    damaged[c] += 1
-                else:
-                    yield (t, c), picture
-
-        for number, ((t, c), instances) in enumerate(segmenter.segment(pictures()), start=1):
-            found[c].instances[t] = instances
-            found[c].candidates_found[t] = True
-            if number % IMAGES_PER_LINE == 0 or number == len(wanted):
-                log.info("segmented %d of %d images", number, len(wanted))
+    pictures = _pictures(frames, wanted, damaged)
+    for number, ((t, c), instances) in enumerate(segmenter.segment(pictures), start=1):
+        found[c].instances[t] = instances
+        found[c].candidates_found[t] = True
+        _tell("segmented", number, len(wanted))
     for detections, count in zip(found, damaged, strict=True):
         if count:
             detections.notes.append(f"{count} damaged images not segmented")
+
+
+def _find_people(
+    frames: Path,
+    images: list[CameraImages],
+    found: list[CameraDetections],
+    settings: DetectionsSettings,
+) -> None:
+    """Let the model find keypoints in the images of which no file says anything."""
+    from intercap_core.detection.onnx_pose import PoseModel
+
+    wanted = _unknown(images, [d.keypoints_found for d in found])
+    if not wanted:
+        return
+    model = PoseModel.load(settings)
+    damaged = [0] * len(images)
+    values = [Values(camera.size, settings.keypoint_full_confidence) for camera in images]
+    for number, ((t, c), picture) in enumerate(_pictures(frames, wanted, damaged), start=1):
+        found[c].people[t] = values[c].clean(model.find(picture, found[c].instances[t]))
+        found[c].keypoints_found[t] = True
+        _tell("found people in", number, len(wanted))
+    for detections, count, counted in zip(found, damaged, values, strict=True):
+        detections.notes += counted.notes()
+        if count:
+            detections.notes.append(f"{count} damaged images not looked at for keypoints")
+
+
+def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]:
+    """The images of which nothing is ``known`` (T,), by camera."""
+    return [
+        (t, c)
+        for c, (camera, found) in enumerate(zip(images, known, strict=True))
+        for t in camera.sets
+        if not found[t]
+    ]
+
+
+def _pictures(
+    frames: Path, wanted: list[Image], damaged: list[int]
+) -> Iterator[tuple[Image, np.ndarray]]:
+    """The wanted images (H, W, 3); ``damaged`` counts for each camera those that do not decode."""
+    from intercap_core.capture.frames import Frames
+
+    with Frames.open(frames) as recording:
+        for t, c in wanted:
+            try:
+                picture = recording.colour(t, c)
+            except UserError:
+                picture = None
+            if picture is None:
+                damaged[c] += 1
+            else:
+                yield (t, c), picture
+
+
+def _tell(done: str, number: int, count: int) -> None:
+    if number % IMAGES_PER_LINE == 0 or number == count:
+        log.info("%s %d of %d images", done, number, count)

@@ -14,6 +14,7 @@ from intercap_core.config import PersonSettings
 from intercap_core.detection.exposure import at_set_times
 from intercap_core.detection.image_segments import ImageCandidate, ViewSegments
 from intercap_core.detection.lifting import Lifter
+from intercap_core.detection.middles import fill_middles
 from intercap_core.detection.person_masks import choose_mask
 from intercap_core.detection.read import (
     FROM_DETECTOR,
@@ -66,6 +67,7 @@ def run(
         )
         keypoints = moved[..., [3, 4, 2]]
         lifted = lifter.fill(person, keypoints, points)
+        fill_middles(points.points.reshape(found.num_sets, NUM_KEYPOINTS, 3))
         missing = ((person != NOBODY).sum(1) < 2) & ~lifted
         if missing.all():
             raise UserError(

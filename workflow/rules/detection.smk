@@ -1,14 +1,17 @@
-# Files that the settings name for all sequences: a model, and what its classes and those of files of
-# candidates are called.
+# Files that the settings name for all sequences: models, and what classes are called.
 DETECTORS = [
     path
     for path in (
         SETTINGS.detections.segmentation_model,
+        SETTINGS.detections.keypoint_model,
         SETTINGS.detections.segmentation_labels,
         SETTINGS.detections.category_names,
     )
     if isinstance(path, Path)
 ]
+WITH_MODEL = bool(
+    SETTINGS.detections.segmentation_model or SETTINGS.detections.keypoint_model
+)
 MODEL_THREADS = 8
 
 
@@ -27,10 +30,10 @@ rule detections:
         f"{BENCHMARKS}/{{sequence}}/detections.tsv"
     conda:
         ENVIRONMENT
-    threads: MODEL_THREADS if SETTINGS.detections.segmentation_model else 1
+    threads: MODEL_THREADS if WITH_MODEL else 1
     resources:
-        mem_mb=memory(4000 if SETTINGS.detections.segmentation_model else 1500),
-        runtime=240 if SETTINGS.detections.segmentation_model else 30,
+        mem_mb=memory(4000 if WITH_MODEL else 1500),
+        runtime=240 if WITH_MODEL else 30,
     params:
         settings=settings_of("detections"),
         code=code_of("detections"),
