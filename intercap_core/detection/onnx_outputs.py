@@ -154,12 +154,10 @@ def _instance(
     return Instance(label, score, (float(x), float(y), float(width), float(height)), rle)
 
 
-def suppressed(
-    corners: np.ndarray, scores: np.ndarray, classes: np.ndarray, *, iou: float = NMS_IOU
-) -> np.ndarray:
+def suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Indices (K,) of the boxes (N, 4) that stay, best first: greedy non-maximum suppression.
 
-    A box goes where a better one of its own class overlaps it by more than ``iou``.
+    A box goes where a better one of its own class overlaps it by more than ``NMS_IOU``.
     """
     order = np.argsort(-scores, kind="stable")[:MOST_BOXES]
     boxes, kinds = corners[order], classes[order]
@@ -173,5 +171,5 @@ def suppressed(
         high = np.minimum(boxes[i, 2:], boxes[:, 2:])
         common = np.prod(np.maximum(high - low, 0), 1)
         overlap = common / np.maximum(area[i] + area - common, 1e-9)
-        alive &= (overlap <= iou) | (kinds != kinds[i])
+        alive &= (overlap <= NMS_IOU) | (kinds != kinds[i])
     return order[kept]

@@ -22,7 +22,6 @@ from intercap_core.config import DetectionsSettings
 from intercap_core.detection.instance import Instance
 from intercap_core.detection.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
 from intercap_core.detection.onnx_model import OnnxModel
-from intercap_core.detection.onnx_outputs import suppressed
 from intercap_core.detection.person_masks import PERSON_LABEL
 from intercap_core.errors import UserError
 
@@ -33,7 +32,9 @@ MOST_PEOPLE = 10  # of one image
 # Where no detector gave a box, the whole image is looked through. A person counts with this many
 # points of the body at this confidence.
 FOUND_CONFIDENCE, FOUND_POINTS = 0.3, 6
-SAME_PERSON_IOU = 0.5  # of boxes
+# Somebody is in several tiles, or a mixture of two people in one: this share of the points is
+# already a better one's, within a share of the person's size.
+SAME_PERSON, SAME_POINT = 0.5, 0.05
 _FLOATS = ("tensor(float)", "tensor(float16)")
 
 
@@ -117,11 +118,15 @@ class PoseModel:
             return people, np.zeros((0, 4))
         low = np.where(sure[..., None], people[..., :2], np.inf).min(1)
         high = np.where(sure[..., None], people[..., :2], -np.inf).max(1)
-        scores = people[:, BODY, 2].mean(1)
-        one_class = np.zeros(len(people), int)
-        kept = suppressed(np.concatenate([low, high], 1), scores, one_class, iou=SAME_PERSON_IOU)
-        kept = kept[:MOST_PEOPLE]
-        return people[kept], np.concatenate([low, high - low], 1)[kept]
+        best_first = np.argsort(-people[:, BODY, 2].mean(1), kind="stable")
+        kept: list[int] = []
+        for i in best_first.tolist():
+            near = SAME_POINT * np.linalg.norm(high[i] - low[i])
+            apart = np.linalg.norm(people[kept, :, :2] - people[i, :, :2], axis=-1)
+            taken = ((apart < near) & sure[kept]).any(0)
+            if taken[sure[i]].mean() < SAME_PERSON:
+                kept.append(i)
+        return people[kept][:MOST_PEOPLE], np.concatenate([low, high - low], 1)[kept][:MOST_PEOPLE]
 
     def _look(self, picture: np.ndarray, boxes: np.ndarray, padding: float) -> np.ndarray:
         """People (N, 135, 3) in boxes (N, 4) of x, y, width, height; confidence as the model's."""
