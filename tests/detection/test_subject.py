@@ -83,3 +83,29 @@ def test_ghosts_that_no_two_views_share_are_nobody(tmp_path, subject):
     ]
     assert (subject_of(tmp_path, people) == -1).mean() > 0.9
     assert (subject_of(tmp_path, [[[] for _ in range(6)] for _ in range(T)]) == -1).all()
+
+
+def test_after_a_second_of_nobody_the_subject_is_still_the_same(tmp_path):
+    """Two people in any order, as a detector without neck and mid hip sees them; for a second the
+    files say that nobody is there."""
+    sets = 45
+    both = [
+        seen_by(walking(sets, np.array([-0.2, 0.1]), np.array([0.01, 0.005])), RIG, UP),
+        seen_by(walking(sets, np.array([1.2, 0.9]), np.array([-0.01, -0.02])), RIG, UP),
+    ]
+    rng = np.random.default_rng(7)
+    first = rng.integers(0, 2, (sets, 6))
+    for keypoints in both:
+        keypoints[..., :2] += rng.normal(0, 4, keypoints[..., :2].shape)
+        keypoints[:, :, [1, 8]] = 0
+    people = [
+        [[both[first[t, c]][t, c], both[1 - first[t, c]][t, c]] for c in range(6)]
+        for t in range(sets)
+    ]
+    gap = slice(15, 30)
+    people[gap] = [[[] for _ in range(6)] for _ in range(15)]
+    path = write_detections(tmp_path / "detections.h5", RIG, people)
+    found = find_subject(Detections.load(path), RIG, np.arange(sets) / 15, min_confidence=0.3)
+    expected = first.astype(np.int32)
+    expected[gap] = -1
+    np.testing.assert_array_equal(found, expected)
