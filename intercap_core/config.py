@@ -331,7 +331,8 @@ class SequenceEntry(Model):
     calibration: Path
     """Camera poses: a rig JSON file, or a folder of Color*.json files as InterCap released."""
     keypoints: Path | None = None
-    """Folder of <camera>/<frame>_keypoints.json files as OpenPose writes them."""
+    """Folder of people's keypoints: <camera>/<image>_keypoints.json as OpenPose writes them, or
+    <camera>.json or <camera>/<image>.json in the manner of COCO-WholeBody; docs/detectors.md."""
     candidates: Path | None = None
     """Folder of <camera>.json files: instance segmentation in COCO's result format."""
     truth: Path | None = None

@@ -1,8 +1,9 @@
 """Which of the 135 keypoints a detector's points are: by name, for the layouts in use.
 
-COCO's 17 body points, with COCO-WholeBody's feet, face and hands (133), Halpe's 26 and 136; a
-layout is known by its number of points. Order of COCO-WholeBody: body, feet, face (dlib's 68), left
-hand, right hand; sides are the person's own, as in OpenPose.
+COCO's 17 body points, with COCO-WholeBody's feet, face and hands (133), the same as DWPose's tools
+sort them (134), Halpe's 26 and 136; a layout is known by its number of points. Order of
+COCO-WholeBody: body, feet, face (dlib's 68), left hand, right hand; sides are the person's own, as
+in OpenPose.
 """
 
 from __future__ import annotations
@@ -28,6 +29,12 @@ HALPE_BODY = (
     *COCO_BODY, "head", "neck", "mid_hip", "left_big_toe", "right_big_toe", "left_small_toe",
     "right_small_toe", "left_heel", "right_heel",
 )  # fmt: skip
+# OpenPose's older body. The neck that DWPose and rtmlib insert is computed, so it is left out.
+DWPOSE_BODY = (
+    "nose", "middle_of_shoulders", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder",
+    "left_elbow", "left_wrist", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee",
+    "left_ankle", "right_eye", "left_eye", "right_ear", "left_ear",
+)  # fmt: skip
 WHOLE_BODY = (*COCO_BODY, *COCO_FEET, *FACE_68, *HANDS)
 LAYOUTS: dict[int, tuple[str, ...]] = {
     len(names): names
@@ -36,6 +43,7 @@ LAYOUTS: dict[int, tuple[str, ...]] = {
         (*COCO_BODY, *COCO_FEET),
         HALPE_BODY,
         WHOLE_BODY,
+        (*DWPOSE_BODY, *COCO_FEET, *FACE_68, *HANDS),
         (*HALPE_BODY, *FACE_68, *HANDS),
     )
 }

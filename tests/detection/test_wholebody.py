@@ -56,8 +56,8 @@ def only(content, **options) -> np.ndarray:
 def test_every_layout_names_known_points_once():
     for count, names in LAYOUTS.items():
         assert len(names) == len(set(names)) == count
-        assert set(names) - set(KEYPOINT_NAMES) <= {"head"}
-    assert sorted(LAYOUTS) == [17, 23, 26, 133, 136]
+        assert set(names) - set(KEYPOINT_NAMES) <= {"head", "middle_of_shoulders"}
+    assert sorted(LAYOUTS) == [17, 23, 26, 133, 134, 136]
     assert set(KEYPOINT_NAMES) - set(WHOLE_BODY) == {"neck", "mid_hip"}
 
 
@@ -114,6 +114,15 @@ def test_alphapose_names_its_images():
     }  # fmt: skip
     for number, name in published.items():
         np.testing.assert_allclose(person[AT(name)], points(136)[number], err_msg=name)
+
+
+def test_dwposes_own_order_is_the_same_person():
+    """As its tools make it of COCO-WholeBody's: the neck inserted, then sorted."""
+    whole = points()
+    sorted_ = np.insert(whole, 17, whole[[5, 6]].mean(0), axis=0)
+    at = [1, 2, 3, 4, 6, 7, 8, 9, 10, 12, 13, 14, 15, 16, 17]
+    sorted_[at] = sorted_[[17, 6, 8, 10, 7, 9, 12, 14, 16, 13, 15, 2, 1, 4, 3]]
+    np.testing.assert_allclose(only([WHOLE | {"keypoints": flat(sorted_)}]), only([WHOLE]))
 
 
 def test_body_models_leave_hands_and_face_unseen():
