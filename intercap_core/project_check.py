@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from intercap_core.config import SequenceEntry
+from intercap_core.config import DetectionsSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
@@ -149,6 +150,8 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
                 f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
                 for name in without
             ]
+        having = [name for name in recorded if name not in without]
+        notes += _notes_of_keypoints(settings, folder, layout, having)
     if row.candidates is not None and row.candidates.is_dir():
         folder = row.candidates
         having = [name for name in recorded if has_candidates(folder, name, row.layout)]
@@ -156,6 +159,30 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
         notes += [f"{folder} has no {name}.json; add this camera's candidates" for name in without]
         notes += _notes_of_candidates(project, row, layout, having)
     return notes
+
+
+def _notes_of_keypoints(
+    settings: DetectionsSettings, folder: Path, layout: Layout, cameras: list[str]
+) -> list[str]:
+    """What a look at the first people of each camera shows: their form, place and confidence."""
+    from intercap_core.detection.keypoint_check import look_at_keypoints
+
+    notes: list[str] = []
+    for name in cameras:
+        size = _colour_size(layout, name)
+        if size is not None:
+            full = settings.keypoint_full_confidence
+            notes += look_at_keypoints(folder, name, size=size, full_confidence=full)
+    return notes
+
+
+def _colour_size(layout: Layout, camera: str) -> tuple[int, int] | None:
+    """Width and height of a camera's images, None = told as a fault elsewhere."""
+    try:
+        with layout.open(camera) as recording:
+            return recording.camera.colour.width, recording.camera.colour.height
+    except UserError:
+        return None
 
 
 def _notes_of_candidates(
@@ -170,16 +197,11 @@ def _notes_of_candidates(
     notes: list[str] = []
     labels: set[str] = set()
     for name in cameras:
-        try:
-            with layout.open(name) as recording:
-                lens = recording.camera.colour
-        except UserError:
-            continue  # told as a fault
+        size = _colour_size(layout, name)
+        if size is None:
+            continue
         seen = look_at_candidates(
-            row.candidates,
-            name,
-            size=(lens.width, lens.height),
-            names=class_names(settings.category_names),
+            row.candidates, name, size=size, names=class_names(settings.category_names)
         )
         notes += seen.notes
         labels |= seen.labels

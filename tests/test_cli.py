@@ -218,7 +218,7 @@ def test_check_notes_cameras_without_recording_or_detections(
     (small_project / "masks").mkdir()
     missing = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml"), exclude))]
     assert [text.partition(": ")[2].partition(";")[0] for text in missing] == [
-        "rec records k1", "points has no folder k1", "masks has no k1.json",
+        "rec records k1", "points has no folder k1 and no k1.json", "masks has no k1.json",
     ]  # fmt: skip
     assert "rig.json also has k2" in missing[0]
     (small_project / "points" / "k1").mkdir()
@@ -264,6 +264,40 @@ def test_check_looks_at_the_first_candidates(
     assert not says or says in notes[0]
 
 
+WHOLE_BODY = [v for i in range(133) for v in (10.0 + i, 20.0, 0.5)]
+FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("k1.json", "{", "k1.json is not valid JSON"),
+        ("k1.json", {"bodies": []}, "k1.json holds an object with bodies, expected OpenPose's"),
+        ("k1.json", [{"image_id": 0, "keypoints": [1.0] * 54}],
+         "1 of its first 1 people cannot be used (first: entry 0 (image 0): has 18 keypoints"),
+        ("k1.json", [{"image_id": 0, "keypoints": FAR_OUT}], "another size"),
+        ("k1/0_keypoints.json", {"people": [{"pose_keypoints_2d": [1.0] * 54}]}, "54 numbers"),
+        ("k1/0.json", [{"keypoints": [*WHOLE_BODY[:-1], 7.0]}], "1 of 133 confidences are beyond"),
+        ("k1.json", [{"image_id": 0, "keypoints": WHOLE_BODY}] * 300, ""),
+        ("k1/0_keypoints.json", {"people": []}, ""),
+    ],
+)  # fmt: skip
+def test_check_looks_at_the_first_keypoints(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: object, says: str
+) -> None:
+    monkeypatch.chdir(small_project)
+    table = Path("sequences.tsv")
+    head, good, *_ = table.read_text().splitlines()
+    table.write_text(f"{head}\tkeypoints\n{good}\tpoints\n")
+    Path("points/k1").mkdir(parents=True)
+    text = content if isinstance(content, str) else json.dumps(content)
+    Path("points", name).write_text(text)
+    notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
+    notes = [note for note in notes if "candidates" not in note]
+    assert len(notes) == bool(says), notes
+    assert not says or says in notes[0]
+
+
 def test_objects_that_the_model_does_not_know_are_noted(
     small_project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,16 +316,17 @@ def test_objects_that_the_model_does_not_know_are_noted(
         assert not notes or "(suitcase, cup) is a label of object 'cup' (mug)" in str(notes[0])
 
 
-def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path) -> None:
+@pytest.mark.parametrize("model", ["segmentation_model", "keypoint_model"])
+def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path, model: str) -> None:
     (small_project / "model.onnx").write_text("not a model")
     config = small_project / "config.yaml"
-    config.write_text(config.read_text() + "detections: {segmentation_model: model.onnx}\n")
+    config.write_text(config.read_text() + f"detections: {{{model}: model.onnx}}\n")
     done = intercap("check", "config.yaml", folder=small_project)
     assert done.returncode == 1 and "model.onnx: " in done.stderr
     assert "Traceback" not in done.stderr
     (small_project / "model.onnx").unlink()
     done = intercap("check", "config.yaml", folder=small_project)
-    assert "segmentation_model is model.onnx, and there is no such file" in done.stderr
+    assert f"{model} is model.onnx, and there is no such file" in done.stderr
 
 
 def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,7 +39,7 @@ HAND_POINTS = 21
 # Vertices of MediaPipe's face mesh at dlib's 68 landmarks, the person's right side first. The jaw's
 # are on the mesh's outline, from temple to temple.
 JAW = (
-    127, 234, 132, 58, 172, 150, 149, 148, 152, 377, 378, 379, 397, 288, 361, 454, 356,
+    127, 234, 93, 132, 58, 136, 150, 148, 152, 377, 379, 365, 288, 361, 323, 454, 356,
 )  # fmt: skip
 RIGHT_BROW, LEFT_BROW = (70, 63, 105, 66, 107), (336, 296, 334, 293, 300)
 NOSE_BRIDGE, NOSTRILS = (168, 197, 5, 4), (98, 97, 2, 326, 327)

@@ -69,6 +69,14 @@ def camera_file(folder: Path, camera: str) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
+def image_files(folder: Path) -> list[Path]:
+    """The JSON files in a camera's folder, one an image."""
+    if not folder.is_dir():
+        return []
+    paths = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in paths if path.suffix.lower() == ".json")
+
+
 def has_keypoints(folder: Path, camera: str) -> bool:
     """Whether any file, or a folder for files, speaks of the camera."""
     return camera_file(folder, camera) is not None or (folder / camera).is_dir()
@@ -130,11 +138,7 @@ def _add_image_files(reading: _Reading, folder: Path, images: CameraImages) -> N
     if numbered:
         _add_files(reading, {n: numbered.get(n) for n in numbers})
         return
-    paths = {
-        path.name.removeprefix(RESULTS): path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() == ".json" and not path.name.startswith(".")
-    }
+    paths = {path.name.removeprefix(RESULTS): path for path in image_files(folder)}
     places = images.numbers_of_names(paths)
     by_number = {place: paths[name] for name, place in places.items()}
     absent = [name for name in paths if places.get(name) not in images.recorded]
