@@ -31,7 +31,7 @@ def look_at_keypoints(
         if content is None:
             return []
         if whole is None and openpose.is_openpose(content):
-            values.clean(openpose.people_of(content, path))
+            values.clean(openpose.people_of(content, str(path)))
         else:
             found = people_of(content, one_image=whole is None)
             if found.faults:

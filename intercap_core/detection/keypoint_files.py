@@ -25,7 +25,7 @@ from intercap_core.detection.candidate_files import (
 from intercap_core.detection.coco import UnreadableCandidates, read_json
 from intercap_core.detection.image_numbers import CameraImages
 from intercap_core.detection.keypoint_values import NOBODY, Values
-from intercap_core.detection.wholebody import PeopleFile, people_of
+from intercap_core.detection.wholebody import people_of
 from intercap_core.errors import UserError
 
 RESULTS = "results_"  # what mmpose's demo puts before the name of an image or a video
@@ -50,12 +50,14 @@ class _Reading:
     faults: list[str] = field(default_factory=list)  # people or files of another layout
     used: bool = False  # anything could be read
 
-    def finished(self, camera: str) -> People:
+    def finished(self, folder: Path, camera: str) -> People:
         """The people, with notes; raises UserError where all that was found is of no use."""
         notes = self.people.notes
         note_broken(notes, "keypoint files", self.broken)
         if self.faults and not self.used:
-            raise UserError(f"camera {camera}: none of its keypoints can be used: {self.faults[0]}")
+            raise UserError(
+                f"{folder}: none of camera {camera}'s keypoints can be used: {self.faults[0]}"
+            )
         if self.faults:
             first = "; ".join(self.faults[:FILES_NAMED])
             notes.append(f"{len(self.faults)} people or files of keypoints left out: {first}")
@@ -90,30 +92,42 @@ def read_camera(folder: Path, images: CameraImages, *, full_confidence: float) -
     reading = _Reading(Values(images.size, full_confidence))
     path = camera_file(folder, images.name)
     if path is not None:
-        try:
-            _add_file(reading, people_of(read_json(path)), images, path)
-        except UnreadableCandidates as error:
-            reading.faults.append(f"{path} {error}")
+        _add_camera_file(reading, images, path)
     elif (folder / images.name).is_dir():
         _add_image_files(reading, folder / images.name, images)
     else:
         reading.people.notes.append(
             f"no keypoints {folder.name}/{images.name}/ or {folder.name}/{images.name}.json"
         )
-    return reading.finished(images.name)
+    return reading.finished(folder, images.name)
 
 
 def read_files(
-    files: Mapping[int, Path | None], images: CameraImages, *, full_confidence: float
+    folder: Path,
+    files: Mapping[int, Path | None],
+    images: CameraImages,
+    *,
+    full_confidence: float,
 ) -> People:
-    """Read the file of each image, None = there is none; fails as :func:`read_camera` does."""
+    """Read the file of each image, None = there is none, somewhere below ``folder``; fails as
+    :func:`read_camera` does."""
     reading = _Reading(Values(images.size, full_confidence))
     _add_files(reading, files)
-    return reading.finished(images.name)
+    return reading.finished(folder, images.name)
 
 
-def _add_file(reading: _Reading, content: PeopleFile, images: CameraImages, path: Path) -> None:
-    """Sort the people of one file by image."""
+def _add_camera_file(reading: _Reading, images: CameraImages, path: Path) -> None:
+    """Read one file of all images and sort its people by image."""
+    try:
+        parsed = read_json(path)
+    except UnreadableCandidates as error:
+        reading.people.notes.append(f"{short(path)} {error}")
+        return
+    try:
+        content = people_of(parsed)
+    except UnreadableCandidates as error:
+        reading.faults.append(f"{short(path)} {error}")
+        return
     useless = bool(content.entries) and len(content.faults) == content.entries
     by_image, absent = sorted_by_image(
         content.results, content.images, content.faulty, images, useless=useless
@@ -162,9 +176,11 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None]) -> None:
             continue
         try:
             people = _people_of_image(reading, content, path)
-        except (UserError, UnreadableCandidates) as error:
-            told = str(error)
-            reading.faults.append(told if isinstance(error, UserError) else f"{path} {told}")
+        except UserError as error:
+            reading.faults.append(str(error))
+            continue
+        except UnreadableCandidates as error:
+            reading.faults.append(f"{short(path)} {error}")
             continue
         if people is not None:
             reading.people.by_image[number] = reading.values.clean(people)
@@ -176,9 +192,9 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None]) -> None:
 def _people_of_image(reading: _Reading, content: Any, path: Path) -> np.ndarray | None:
     """People (P, 135, 3) of a file of one image, None = all of them are of no use."""
     if openpose.is_openpose(content):
-        return openpose.people_of(content, path)
+        return openpose.people_of(content, short(path))
     found = people_of(content, one_image=True)
-    reading.faults += [f"{path}, {fault}" for fault in found.faults]
+    reading.faults += [f"{short(path)}, {fault}" for fault in found.faults]
     if found.faults and not found.results:
         return None
     return np.stack([one for _, one in found.results]) if found.results else NOBODY

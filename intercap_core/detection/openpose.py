@@ -71,25 +71,25 @@ def is_openpose(content: Any) -> bool:
     return isinstance(content, dict) and ("people" in content or "body_joints" in content)
 
 
-def people_of(content: dict[str, Any], path: Path) -> np.ndarray:
+def people_of(content: dict[str, Any], name: str) -> np.ndarray:
     """The people of one file's parsed JSON: (P, 135, 3) float64 of x, y (px) and confidence.
 
     Numbers are as written. A hand or face that the detector did not look for (an empty list) has
     confidence 0. BEHAVE's files hold one person. P may be 0. Raises UserError where a list is not
-    of its length; ``path`` is named in it.
+    of its length; ``name`` of the file is in it.
     """
     people = content.get("people")
     if "people" not in content:
-        people = [{name: content.get(theirs, []) for name, theirs in _BEHAVE_LISTS.items()}]
+        people = [{key: content.get(theirs, []) for key, theirs in _BEHAVE_LISTS.items()}]
     if not isinstance(people, list):
-        raise UserError(f"{path}: has no list 'people'; expected a file as OpenPose writes it")
+        raise UserError(f"{name}: has no list 'people'; expected a file as OpenPose writes it")
     result = np.zeros((len(people), NUM_KEYPOINTS, 3))
     for index, person in enumerate(people):
         if not isinstance(person, dict):
-            raise UserError(f"{path}: people[{index}] is not an object with keypoint lists")
+            raise UserError(f"{name}: people[{index}] is not an object with keypoint lists")
         lists = {
-            name: _points(person.get(name, []), count, f"{path}: people[{index}].{name}")
-            for name, count in _LISTS.items()
+            key: _points(person.get(key, []), count, f"{name}: people[{index}].{key}")
+            for key, count in _LISTS.items()
         }
         face = lists["face_keypoints_2d"]
         result[index, BODY] = lists["pose_keypoints_2d"]

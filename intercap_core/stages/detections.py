@@ -153,7 +153,8 @@ def _read_camera(
         _add_people(result, people, images)
     elif beside is not None:
         paths = {int(images.number[t]): beside.keypoints(time, name) for t, time in times.items()}
-        _add_people(result, keypoint_files.read_files(paths, images, full_confidence=full), images)
+        people = keypoint_files.read_files(sequence.recordings, paths, images, full_confidence=full)
+        _add_people(result, people, images)
     if sequence.candidates is not None:
         candidates = candidate_files.read_camera(
             sequence.candidates,

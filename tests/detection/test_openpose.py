@@ -38,7 +38,7 @@ def write(tmp_path, content) -> Path:
 
 def read_people(content) -> np.ndarray:
     assert is_openpose(content)
-    return people_of(content, Path("a_keypoints.json"))
+    return people_of(content, "a_keypoints.json")
 
 
 def test_lists_land_in_the_shared_order():

@@ -124,7 +124,7 @@ def test_keypoints_of_another_length_name_file_and_camera(capture, tmp_path):
     (tmp_path / "keypoints").mkdir()
     people = [{"image_id": 0, "keypoints": [1.0] * 54}]
     (tmp_path / "keypoints" / "right.json").write_text(json.dumps(people))
-    words = r"camera right: none of its keypoints can be used: keypoints/right.json, entry 0"
+    words = r"none of camera right's keypoints can be used: keypoints/right.json, entry 0"
     with pytest.raises(UserError, match=words):
         run(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
 

@@ -109,6 +109,19 @@ def test_points_views_and_flags(tmp_path, detected):
         ) == T * 6 + 1
 
 
+def test_without_neck_and_mid_hip_they_are_between_shoulders_and_hips(tmp_path, detected):
+    lacking = detected.copy()
+    lacking[:, :, [1, 8]] = 0  # as COCO's layouts have it
+    people = [[[lacking[t, c]] for c in range(6)] for t in range(T)]
+    with artefacts.read(run(tmp_path, people), PERSON) as found:
+        joints = found["joints"]
+        assert not found["missing"].any() and (found["person"] == 0).all()
+        assert (found["joint_views"][:, [1, 8]] == 0).all()
+        assert (found["keypoints"][:, :, [1, 8], 2] == 0).all()
+        np.testing.assert_allclose(joints[:, 1], joints[:, [2, 5]].mean(1), atol=1e-6)
+        np.testing.assert_allclose(joints[:, 8], joints[:, [9, 12]].mean(1), atol=1e-6)
+
+
 def test_masks_follow_the_points_not_the_label_or_the_order(tmp_path, detected):
     people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
     own = silhouette(detected[0, 0])
