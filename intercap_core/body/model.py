@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.jacobian import Linearisation, blend, linearise, shaped_points
+from intercap_core.body.jacobian import Linearisation, linearise, shaped_points
 from intercap_core.body.joints import PARENTS
 from intercap_core.body.keypoints import KeypointMap, keypoint_map
 from intercap_core.body.kinematics import PosedJoints, pose_joints, rotation_from_axis_angle
@@ -23,6 +23,7 @@ from intercap_core.body.maps import MARKER_NAMES, load_maps
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.regions import find_regions
 from intercap_core.body.selection import Selection, select
+from intercap_core.body.skinning import skin
 
 _KEPT_SELECTIONS = 8
 _MOUTH_OUTLINE = slice(31, 43)  # landmarks 48 to 59 of dlib's 68
@@ -160,8 +161,7 @@ class BodyModel:
         """Posed vertices (B,V,3), or of `vertex_ids` (N,) alone (B,N,3), and joints (B,55,3)."""
         selection = self._select(vertex_ids, joints=False)
         points, posed, _ = self._rest(selection, params)
-        matrix, offset = blend(selection, posed)
-        vertices = (matrix @ points[..., None])[..., 0] + offset
+        vertices = skin(points, posed.rotations, posed.offsets, selection.weights)
         return BodyOutput(vertices, posed.joints)
 
     __call__ = forward
