@@ -10,11 +10,8 @@ degrees) and as many threads. Adds its figures, keys ``object.<measure>``, to th
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,11 +23,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from bench.command import add_figures, from_command_line
 from bench.object_baseline import FrameFit, Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
 from bench.object_convergence import draw_convergence
 from bench.object_scaling import tracking_scaling
-from intercap_core.errors import UserError
 from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
 from intercap_core.project import load_project
 from intercap_core.tracking.evidence import View
@@ -222,7 +219,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         "threads": THREADS,
         **tracking_scaling(clip.whole),
     }
-    _merge(output, {f"object.{key}": round(float(value), 4) for key, value in figures.items()})
+    add_figures(output, "object", figures)
     picture = project.results / "object_convergence.png"
     draw_convergence(clip, picture)
     title = (
@@ -231,14 +228,6 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     )
     _print(title, ours, single, found, reached, figures)
     print(output, picture, sep="\n")
-
-
-def _merge(output: Path, figures: dict[str, float]) -> None:
-    """Put the figures into the JSON that is there, in place of older ones of the object."""
-    known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
-    kept = {key: value for key, value in known.items() if not key.startswith("object.")}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 
 
 def _print(
@@ -283,19 +272,5 @@ def _print(
     console.print(grown)
 
 
-def main() -> None:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
-    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
-    parser.add_argument("--frames", type=int, default=FRAMES)
-    arguments = parser.parse_args()
-    try:
-        measure(arguments.settings, arguments.output, arguments.frames)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
-
-
 if __name__ == "__main__":
-    main()
+    from_command_line(measure, (__doc__ or "").splitlines()[0], FRAMES)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from bench.object_baseline import Recipe
 from bench.object_clip import ObjectClip
-from bench.object_speed import Run, _merge, one_pass, paper, until, whole_track
+from bench.object_speed import Run, one_pass, paper, until, whole_track
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.tracking.evidence import View, ViewGeometry
@@ -83,11 +80,3 @@ def test_the_shortest_schedule_that_reaches_our_accuracy() -> None:
 def test_the_shortest_schedule_near_its_best_where_none_reaches_ours() -> None:
     found = [(5, _run(9.0)), (40, _run(3.1)), (75, _run(2.9, lost=0.2)), (150, _run(3.0))]
     assert until(_run(1.0), found) == (40, found[1][1], False)
-
-
-def test_figures_replace_older_ones_and_leave_the_others(tmp_path: Path) -> None:
-    output = tmp_path / "bench.json"
-    output.write_text('{"object.old": 1, "object_track.seconds_per_frame": 2}')
-    _merge(output, {"object.ms_per_frame": 3.0})
-    found = json.loads(output.read_text())
-    assert found == {"object_track.seconds_per_frame": 2, "object.ms_per_frame": 3.0}

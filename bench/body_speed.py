@@ -1,0 +1,229 @@
+"""The body's fit beside the paper's recipe: seconds a frame and errors, in one run.
+
+    python -m bench.body_speed [config/bench/config.yaml] [--output results/bench.json]
+
+Wants the artefacts that ``intercap bench`` computes. Both read the same keypoints, clouds and
+cameras of the first sequence, decoded beforehand, start from the same triangulated joints and have
+as many threads. The recipe is measured as published, every frame through all its stages, and as
+quick as it can be made: later frames go on from the one before through the last stage alone, and
+end when they are as good as ours, or as good as they get, which the truth says. Adds its figures,
+keys ``body.<measure>``, to the output, those of the body model's forward among them.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "2")  # read when the libraries start
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from bench.body_baseline import STAGES, FrameFit, fit_by_lbfgs
+from bench.body_clip import BodyClip
+from bench.body_forward import BATCH, forward_times
+from bench.command import add_figures, from_command_line
+from intercap_core.body.parameters import TRANSL
+from intercap_core.errors import UserError
+from intercap_core.fitting.schedule import Fitter
+from intercap_core.fitting.start import place_trunk
+from intercap_core.project import load_project
+
+THREADS = int(os.environ["OMP_NUM_THREADS"])
+FRAMES = 6
+RECIPE_FRAMES = 2  # of them by the whole recipe, which takes long
+AS_GOOD = 1.02  # times our error: reached
+NEAR_BEST = 1.05  # times a frame's smallest error: as good as it gets
+SPARSE = 10  # every so-many-th vertex while the recipe's path is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One way to fit N frames: seconds a frame, and each frame's error (N,), mm over vertices."""
+
+    seconds: float
+    pve: np.ndarray
+
+    @property
+    def pve_mm(self) -> float:
+        return float(self.pve.mean())
+
+
+def ours(clip: BodyClip) -> Run:
+    """What the stage does with all frames of the clip."""
+    begin = time.perf_counter()
+    fit = Fitter(clip.model, clip.seen, clip.clouds, clip.settings).run()
+    vectors = fit.vectors.cpu()
+    seconds = time.perf_counter() - begin
+    if len(fit.frames) != len(clip):
+        raise UserError(f"{clip.seen.sequence}: frames without a person cannot be compared")
+    return Run(seconds / len(clip), clip.errors(vectors.to(clip.model.device), fit.frames))
+
+
+def one_by_one(clip: BodyClip) -> Run:
+    """The same, every frame on its own."""
+    runs = [ours(clip.part(slice(t, t + 1))) for t in range(len(clip))]
+    return Run(float(np.mean([r.seconds for r in runs])), np.concatenate([r.pve for r in runs]))
+
+
+def placed(clip: BodyClip) -> Tensor:
+    """Bodies (T, P) at rest, laid on the triangulated trunk: where our fit and the recipe start."""
+    model, rest = clip.model, clip.model.zeros()
+    keypoints = model.keypoints_of(rest)[0].double().cpu().numpy()
+    pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().cpu().numpy()
+    at = torch.as_tensor(place_trunk(keypoints, clip.seen.joints, pelvis)).to(model.template)
+    vectors = model.zeros(len(at)).vector().clone()
+    vectors[:, :3], vectors[:, TRANSL] = at[:, :3], at[:, 3:]
+    vectors[:, 75:120], vectors[:, 120:165] = model.hand_mean
+    return vectors
+
+
+def paper(clip: BodyClip) -> tuple[list[FrameFit], list[FrameFit]]:
+    """Fits of the first frames by all stages, and of all frames but the first by the last stage.
+
+    Every frame but the first starts from the frame before it.
+    """
+    start = placed(clip)[0]
+    whole: list[FrameFit] = []
+    short: list[FrameFit] = []
+    for t in track(range(len(clip)), "the paper's recipe"):
+        before = (short or whole)[-1].end if whole else start
+        if t < RECIPE_FRAMES:
+            whole.append(fit_by_lbfgs(clip.model, clip.seen, t, clip.clouds[t], before))
+        if t:
+            short.append(
+                fit_by_lbfgs(clip.model, clip.seen, t, clip.clouds[t], before, STAGES[-1:])
+            )
+    return whole, short
+
+
+def finished(clip: BodyClip, fits: list[FrameFit], first: int) -> Run:
+    """The fits of frames ``first``, ``first + 1``, ... at their end."""
+    frames = np.arange(first, first + len(fits))
+    seconds = float(np.mean([fit.seconds[-1] for fit in fits]))
+    return Run(seconds, clip.errors(torch.stack([fit.end for fit in fits]), frames))
+
+
+def until(clip: BodyClip, fits: list[FrameFit], first: int, wanted: np.ndarray) -> tuple[Run, bool]:
+    """The fits where they first come to the errors ``wanted`` (N,), or near their smallest.
+
+    Also whether every frame came to ours.
+    """
+    seconds, errors, reached = [], [], []
+    for t, fit in enumerate(fits, first):
+        path = fit.vectors[fit.best]
+        pve = clip.errors(path, np.full(len(path), t), step=SPARSE)
+        e, is_as_good = moment(pve, wanted[t])
+        seconds.append(fit.seconds[e])
+        errors.append(clip.errors(path[e : e + 1], np.array([t])))
+        reached.append(is_as_good)
+    return Run(float(np.mean(seconds)), np.concatenate(errors)), all(reached)
+
+
+def moment(pve: np.ndarray, wanted: float) -> tuple[int, bool]:
+    """Number of the first evaluation whose error (E,) is as good as wanted, or else nearly as small
+    as it gets; which."""
+    if pve.min() <= AS_GOOD * wanted:
+        return int(np.argmax(pve <= AS_GOOD * wanted)), True
+    return int(np.argmax(pve <= NEAR_BEST * pve.min())), False
+
+
+def measure(settings: Path, output: Path, frames: int) -> None:
+    """Measure, print and add to the output; see the module's text."""
+    torch.set_num_threads(THREADS)
+    project = load_project(settings)
+    sequence = next(iter(project.sequences))
+    recording = BodyClip.load(project, sequence)
+    first = max((len(recording) - frames) // 2, 0)
+    at = slice(first, first + frames)
+    clip = recording.part(at)
+    ours(clip.part(slice(0, 2)))  # imports and warms up
+
+    all_at_once = ours(recording)
+    together, alone = ours(clip), one_by_one(clip)
+    whole, short = paper(clip)
+    again = ours(recording)  # before and after, should the machine have been disturbed
+    fit = Run((all_at_once.seconds + again.seconds) / 2, all_at_once.pve[at])
+    recipe, quick = finished(clip, whole, 0), finished(clip, short, 1)
+    reached, is_as_good = until(clip, short, 1, fit.pve)
+    figures = {
+        "fps": 1 / fit.seconds,
+        "fps_frames_together": 1 / together.seconds,
+        "fps_one_by_one": 1 / alone.seconds,
+        "pve_mm": fit.pve_mm,
+        "one_by_one_pve_mm": alone.pve_mm,
+        "baseline_fps": 1 / recipe.seconds,
+        "baseline_pve_mm": recipe.pve_mm,
+        "baseline_quick_fps": 1 / quick.seconds,
+        "baseline_quick_pve_mm": quick.pve_mm,
+        "baseline_until_fps": 1 / reached.seconds,
+        "baseline_until_pve_mm": reached.pve_mm,
+        "baseline_reaches_our_accuracy": float(is_as_good),
+        "baseline_ms_per_evaluation": _milliseconds_an_evaluation(whole + short),
+        "speedup_recipe": recipe.seconds / fit.seconds,
+        "speedup_accuracy": reached.seconds / fit.seconds,
+        "speedup": min(recipe.seconds, reached.seconds) / fit.seconds,
+        "speedup_one_by_one": min(recipe.seconds, reached.seconds) / alone.seconds,
+        **forward_times(),
+        "frames": len(clip),
+        "threads": THREADS,
+    }
+    if torch.cuda.is_available():
+        on_gpu = recording.on(torch.device("cuda"))
+        ours(on_gpu)
+        figures["gpu_fps"] = 1 / ours(on_gpu).seconds
+    add_figures(output, "body", figures)
+    rows = {
+        f"ours, {len(recording)} frames at once": fit,
+        f"ours, {len(clip)} frames at once": together,
+        "ours, frame by frame": alone,
+        f"the paper's recipe ({len(whole)} frames)": recipe,
+        "its last stage, from the frame before": quick,
+        f"the same, until {'as good as ours' if is_as_good else 'its best'}": reached,
+    }
+    title = f"{sequence}: {len(recording.seen.rig)} views, {THREADS} threads each"
+    _print(title, rows, figures)
+    print(output)
+
+
+def _milliseconds_an_evaluation(fits: list[FrameFit]) -> float:
+    return 1e3 * float(np.median(np.concatenate([np.diff(fit.seconds) for fit in fits])))
+
+
+def _print(title: str, rows: dict[str, Run], figures: dict[str, float]) -> None:
+    console = Console()
+    table = Table(
+        "body", "ms a frame", "times ours", "mm a vertex", "worst frame", title=title, box=None
+    )
+    least = next(iter(rows.values())).seconds
+    for name, run in rows.items():
+        table.add_row(
+            name, f"{1e3 * run.seconds:.0f}", f"{run.seconds / least:.1f}",
+            f"{run.pve_mm:.1f}", f"{run.pve.max():.1f}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(
+        f"speed-up {figures['speedup_recipe']:.0f} over the recipe, "
+        f"{figures['speedup_accuracy']:.0f} over its quickest way",
+        highlight=False,
+    )
+    forward = Table(f"body model, {BATCH} bodies", "forward, ms", "with gradient, ms", box=None)
+    for name, key in (
+        ("ours", "forward"),
+        ("body-models", "forward_body_models"),
+        ("smplfitter", "forward_smplfitter"),
+    ):
+        times = (figures[f"{key}{kind}_ms_b{BATCH}"] for kind in ("", "_backward"))
+        forward.add_row(name, *(f"{ms:.0f}" for ms in times))
+    console.print(forward)
+
+
+if __name__ == "__main__":
+    from_command_line(measure, (__doc__ or "").splitlines()[0], FRAMES)

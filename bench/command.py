@@ -1,0 +1,36 @@
+"""What the comparisons share: their command line, and where their figures go."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from intercap_core.errors import UserError
+
+
+def add_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
+    """Put ``<area>.<measure>`` into the JSON that is there, in place of the area's older ones."""
+    known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
+    kept = {key: value for key, value in known.items() if not key.startswith(f"{area}.")}
+    new = {f"{area}.{key}": round(float(value), 4) for key, value in figures.items()}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps({**kept, **new}, indent=1) + "\n", encoding="utf-8")
+
+
+def from_command_line(
+    measure: Callable[[Path, Path, int], None], description: str, frames: int
+) -> None:
+    """Read the command line and ``measure(settings, output, frames)``."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
+    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
+    parser.add_argument("--frames", type=int, default=frames)
+    arguments = parser.parse_args()
+    try:
+        measure(arguments.settings, arguments.output, arguments.frames)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from None
