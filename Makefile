@@ -4,7 +4,7 @@
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track), tables and results/evaluation.json
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker
-#                beside the paper's recipe, results/bench.json
+#                and the body's fit beside the paper's recipe, results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -46,6 +46,7 @@ evaluate: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/intercap bench --cores $(CORES)
 	$(BIN)/python -m bench.object_speed
+	$(BIN)/python -m bench.body_speed
 
 docs: $(STAMP)
 	$(BIN)/intercap docs
