@@ -184,9 +184,9 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         f"ours, {len(recording)} frames at once": fit,
         f"ours, {len(clip)} frames at once": together,
         "ours, frame by frame": alone,
-        f"the paper's recipe ({len(whole)} frames)": recipe,
-        "its last stage, from the frame before": quick,
-        f"the same, until {'as good as ours' if is_as_good else 'its best'}": reached,
+        f"the recipe, {len(whole)} frames": recipe,
+        "its last stage, warm": quick,
+        "until our accuracy" if is_as_good else "until its best": reached,
     }
     title = f"{sequence}: {len(recording.seen.rig)} views, {THREADS} threads each"
     _print(title, rows, figures)

@@ -195,8 +195,7 @@ def match(
     centre = v.mean(0)
     ours = torch.cat([v - centre, _NORMAL_LENGTH * n], 1)
     theirs = torch.cat([points - centre, _NORMAL_LENGTH * normals], 1)
-    score = (ours * ours).sum(1) - 2 * theirs @ ours.T
-    sample = score.argmin(1)
+    sample = _smallest(torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2))
     near = patch[sample]
     gap = points[:, None] - vertices[near]
     best = (gap * gap).sum(2).argmin(1, keepdim=True)
@@ -207,6 +206,13 @@ def match(
     sideways = (gap - distance[:, None] * normal).norm(dim=1)
     valid = ((normal * normals).sum(1) > _TURNED_AWAY) & (distance.abs() < reach)
     return Matches(sample, distance, valid & (sideways < 0.03))
+
+
+def _smallest(score: Tensor) -> Tensor:
+    """Column (M,) of each row's smallest; on the CPU by numpy, which vectorises it."""
+    if score.device.type != "cpu":
+        return score.argmin(1)
+    return torch.from_numpy(score.numpy().argmin(1))
 
 
 def gather(
