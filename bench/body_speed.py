@@ -138,6 +138,7 @@ def moment(pve: np.ndarray, wanted: float) -> tuple[int, bool]:
 def measure(settings: Path, output: Path, frames: int) -> None:
     """Measure, print and add to the output; see the module's text."""
     torch.set_num_threads(THREADS)
+    forward = forward_times()
     project = load_project(settings)
     sequence = next(iter(project.sequences))
     recording = BodyClip.load(project, sequence)
@@ -171,7 +172,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         "speedup_accuracy": reached.seconds / fit.seconds,
         "speedup": min(recipe.seconds, reached.seconds) / fit.seconds,
         "speedup_one_by_one": min(recipe.seconds, reached.seconds) / alone.seconds,
-        **forward_times(),
+        **forward,
         "frames": len(clip),
         "threads": THREADS,
     }
