@@ -1,9 +1,9 @@
-"""Limbs whose left and right a detector exchanged, found by the views that disagree.
+"""Limbs whose left and right a detector exchanged.
 
-A view's limb counts as exchanged when the points that the views agree on fit it much better with
-the sides exchanged. Each set stands alone: where most views exchange a limb at once, it is taken
-to be as they say. Few views do not outvote each other: there the limb's motion in the image
-decides, which an exchange makes jump and jump back.
+The views of each set are brought to agree (:mod:`.agreement`), and all sets together tell which
+side is the left (:mod:`.facing`). After that a view's limb counts as exchanged when the points that
+the views agree on fit it much better with the sides exchanged. A view that stands alone has its
+limb's motion in the image, which an exchange makes jump and jump back.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.camera.rig import Rig
+from intercap_core.detection.agreement import agree
+from intercap_core.detection.facing import exchange_points, mirrored
 from intercap_core.detection.sides import LIMBS, PARTNER
 from intercap_core.detection.triangulation import (
     Triangulation,
@@ -30,15 +32,34 @@ JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
 
 
 def triangulate_people(
-    keypoints: np.ndarray, rig: Rig, *, min_confidence: float, max_error_px: float
+    keypoints: np.ndarray,
+    rig: Rig,
+    times: np.ndarray | None = None,
+    *,
+    min_confidence: float,
+    max_error_px: float,
 ) -> tuple[np.ndarray, Triangulation]:
-    """Triangulate the subject, exchanging sides where views say so.
+    """Triangulate the subject, exchanging sides where views, build or motion say so.
 
-    ``keypoints`` (T, C, 135, 3 or more): x, y, confidence, and whatever else goes with a point.
-    Returns them with limbs exchanged back, and the triangulation of T * 135 points, set by set.
+    ``keypoints`` (T, C, 135, 3 or more): x, y, confidence, and whatever else goes with a point;
+    ``times`` (T,) seconds, None: motion from set to set is not judged. Returns them with limbs
+    exchanged back, and the triangulation of T * 135 points, set by set.
     """
     keypoints = keypoints.copy()
+    exchanged = agree(keypoints, rig, min_confidence=min_confidence)
     found = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    seeing = np.stack(
+        [(keypoints[:, :, limb, 2] >= min_confidence).any(2).sum(1) for limb in LIMBS], 1
+    )
+    share = exchanged.sum(1) / np.maximum(seeing, 1)
+    turned = mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
+    if turned.any():
+        keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
+        found = Triangulation(*(
+            exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned)
+            .reshape(part.shape)
+            for part in (found.points, found.inlier, found.error, found.view_error)
+        ))  # fmt: skip
     for _ in range(ROUNDS):
         exchanged = exchange(keypoints, found.points.reshape(len(keypoints), -1, 3), rig,
                              min_confidence=min_confidence, max_error_px=max_error_px)  # fmt: skip

@@ -62,6 +62,7 @@ def run(
         moved, points = triangulate_people(
             np.concatenate([moved, keypoints[..., :2]], -1),
             rig,
+            times,
             min_confidence=confident,
             max_error_px=settings.max_reprojection_px,
         )
