@@ -54,18 +54,19 @@ def agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarr
             )  # fmt: skip
             apart = ways[:, i] != ways[:, j]
             cost += np.where(apart, (other - same)[:, None], 0)
-        seen = (weight[:, order][:, :, limb] > 0).any(2)
+        seen = np.asarray((weight[:, order][:, :, limb] > 0).any(2))
         count = seen.sum(1)[:, None]
         plain = seen.astype(int) @ ways.T
         unusual, mirrored = plain, count - plain
         if number >= _LIKE_ARMS:
             # what takes a back for a front names head and hands as it does the arms
             arms = exchanged[:, order, 0]
-            unlike = ((ways[None] != arms[:, None]) & seen[:, None]).sum(2)
+            unlike = ((ways[None] ^ arms[:, None]) & seen[:, None]).sum(2)
             unusual = np.minimum(unusual, unlike)
             mirrored = np.minimum(mirrored, count - unlike)
         best = (cost + _PRICE * np.minimum(unusual, mirrored)).argmin(1)
-        other = (mirrored < unusual)[np.arange(sets), best, None]
+        sets_at = (np.arange(sets), best)
+        other = (mirrored[sets_at] < unusual[sets_at])[:, None]
         chosen = (ways[best] ^ other) & seen
         exchanged[:, order, number] = chosen
         t, c = np.nonzero(exchanged[..., number])

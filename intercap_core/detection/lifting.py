@@ -1,8 +1,9 @@
 """Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
 
 Depth measures the skin, a keypoint is a joint: the point lies deeper on the pixel's ray by how
-thick the body is there. A joint that something covers is put behind what covers it, too near; where
-a view from the side shows that one shoulder or hip must be covered, it and its limb are left out.
+thick the body is there. What covers a joint would put it too near: the room, which the scene knows,
+is looked past, and where a view from the side shows that one shoulder or hip must be covered, it
+and its limb are left out.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ _NEAREST_SHARE = 0.2  # of the samples: nearer ones may float
 _SURFACE_M = 0.05  # samples this far behind the nearest are another surface
 # Shoulders, hips nearer to each other than this, half of an adult's breadth: one hides the other.
 _BREADTH_M = (0.18, 0.09)
+_AT_BACKGROUND_MM = 40  # of the room's depth: the room
+_ENOUGH_BODY = 6  # points before the room; with fewer, the person is taken for part of it
 _ENOUGH_POINTS = 8  # of the body: a set with so many triangulated needs no lifting
 
 
@@ -54,36 +57,46 @@ INSETS_M = _insets()
 class Relief:
     """What a depth image shows, as the colour camera sees it.
 
-    ``pixels`` (N, 2) of the colour image and ``distance`` (N,) along the ray, metres.
+    ``pixels`` (N, 2) of the colour image and ``distance`` (N,) along the ray, metres; ``room`` (N,)
+    bool where the scene's background is seen.
     """
 
     camera: Camera
     pixels: np.ndarray
     distance: np.ndarray
+    room: np.ndarray
 
     @classmethod
-    def of(cls, depth: np.ndarray, camera: Camera, bias_m: float) -> Relief:
+    def of(
+        cls, depth: np.ndarray, camera: Camera, bias_m: float, background: np.ndarray | None
+    ) -> Relief:
         """Every second pixel of every second row of ``depth`` (H, W) uint16 mm.
 
-        ``bias_m`` is subtracted from the depth. The scene's background is not taken away: who
-        stands still for long is part of it.
+        ``bias_m`` is subtracted from the depth. ``background`` (H, W) of the scene, None = unknown.
         """
         thinned = np.zeros_like(depth)
         thinned[::2, ::2] = depth[::2, ::2]
-        points = depth_points(thinned, camera).points
+        points, index = depth_points(thinned, camera)
+        room = np.zeros(len(index), bool)
+        if background is not None:
+            behind, here = background.ravel()[index].astype(int), depth.ravel()[index].astype(int)
+            room = (behind > 0) & (here > behind - _AT_BACKGROUND_MM)
         if bias_m:
             points = points * (1 - np.float32(bias_m) / points[:, 2:])
         assert camera.colour_from_depth is not None
         points = apply(camera.colour_from_depth, points)
-        points = points[camera.colour.inside_model(points)]
-        return cls(camera, camera.colour.project(points), np.linalg.norm(points, axis=1))
+        inside = camera.colour.inside_model(points)
+        points = points[inside]
+        distance = np.linalg.norm(points, axis=1)
+        return cls(camera, camera.colour.project(points), distance, room[inside])
 
     def lift(self, pixels: np.ndarray, seen: np.ndarray, inset_m: np.ndarray) -> np.ndarray:
         """Points (K, 3), master frame, of keypoints at ``pixels`` (K, 2) where ``seen`` (K,).
 
-        ``inset_m`` (K,): how deep each lies. NaN where nothing is measured.
+        ``inset_m`` (K,): how deep each lies. NaN where nothing is measured, or only the room; but
+        who stands still for long is part of the room: then that counts.
         """
-        result = np.full((len(pixels), 3), np.nan)
+        result, of_room = np.full((len(pixels), 3), np.nan), np.zeros(len(pixels), bool)
         rays = self.camera.colour.unproject(pixels)
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         wanted = np.flatnonzero(seen & np.isfinite(rays).all(1))
@@ -93,12 +106,17 @@ class Relief:
         around = self._tree.query_ball_point(pixels[wanted], reach.max(), p=np.inf)
         for k, near in zip(wanted, around, strict=True):
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
-            found = self.distance[near][away < reach[near]]
+            around_it = np.asarray(near)[away < reach[near]]
+            before = around_it[~self.room[around_it]]
+            of_room[k] = len(before) < _MIN_SAMPLES
+            found = self.distance[around_it if of_room[k] else before]
             if len(found) < _MIN_SAMPLES:
                 continue
             nearest = np.quantile(found, _NEAREST_SHARE)
             surface = np.median(found[found < nearest + _SURFACE_M])
             result[k] = rays[k] * (surface + inset_m[k])
+        if (np.isfinite(result[:, 0]) & ~of_room).sum() >= _ENOUGH_BODY:
+            result[of_room] = np.nan
         return apply(self.camera.master_from_colour, result)
 
     @cached_property
@@ -116,6 +134,9 @@ class Lifter:
         self._frames, self._min_confidence = frames, min_confidence
         self._rig = Rig.from_artefact(scene)
         self._bias = np.nan_to_num(scene["depth_bias"])
+        known = set(scene.keys("cameras/"))
+        keys = (f"cameras/{name}/background" for name in self._rig.names)
+        self._background = [scene[key] if key in known else None for key in keys]
         self._relief = lru_cache(maxsize=len(self._rig))(self._load)
 
     def _load(self, t: int, c: int) -> Relief | None:
@@ -123,7 +144,7 @@ class Lifter:
         depth = self._frames.depth(t, c) if camera.depth is not None else None
         if depth is None:
             return None
-        return Relief.of(depth, camera, float(self._bias[c]))
+        return Relief.of(depth, camera, float(self._bias[c]), self._background[c])
 
     def people(self, t: int, c: int, people: np.ndarray) -> np.ndarray:
         """Points (P, 25, 3) of body keypoints (P, 25, 3) in view ``c`` of set ``t``; see

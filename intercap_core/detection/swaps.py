@@ -46,12 +46,12 @@ def triangulate_people(
     exchanged back, and the triangulation of T * 135 points, set by set.
     """
     keypoints = keypoints.copy()
-    exchanged = agree(keypoints, rig, min_confidence=min_confidence)
+    agreed = agree(keypoints, rig, min_confidence=min_confidence)
     found = _triangulate(keypoints, rig, min_confidence, max_error_px)
     seeing = np.stack(
         [(keypoints[:, :, limb, 2] >= min_confidence).any(2).sum(1) for limb in LIMBS], 1
     )
-    share = exchanged.sum(1) / np.maximum(seeing, 1)
+    share = agreed.sum(1) / np.maximum(seeing, 1)
     turned = mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
     if turned.any():
         keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
