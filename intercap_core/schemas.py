@@ -15,6 +15,9 @@ CONTACT_REGIONS = (
     "back", "chest", "left_forearm", "right_forearm", "mouth", "left_shoulder", "right_shoulder",
 )  # fmt: skip
 METRIC_REGIONS = CONTACT_REGIONS[:12]
+BODY_PARTS = (
+    "trunk", "left_arm", "right_arm", "left_leg", "right_leg", "left_hand", "right_hand", "face",
+)  # fmt: skip
 
 _CAMERA_MODELS = {
     "camera_names": Field(("C",), "str", "one name a camera, in the order of every C axis"),
@@ -219,7 +222,7 @@ def _body(*, one_shape: bool) -> dict[str, Field]:
 
 BODY_FIT = Schema(
     name="body_fit",
-    version=1,
+    version=2,
     stage="body_fit",
     attributes={
         "sequence": "sequence name",
@@ -234,6 +237,15 @@ BODY_FIT = Schema(
         ),
         "failed": Field(("T",), "bool", "no believable fit in this frame"),
         "bridged": Field(("T",), "bool", "filled in from its neighbours"),
+        "uncertain": Field(
+            ("T",), "bool", "fitted, but what was seen leaves room for a bad body: see part_names"
+        ),
+        "part_names": Field(("P",), "str", "parts of the body, in the order of the axis P"),
+        "undetermined": Field(
+            ("T", "P"),
+            "bool",
+            "what was seen does not determine this part, or most of it disagrees with the fit",
+        ),
         "keypoint_offsets": Field(
             ("25", "3"),
             "float32",

@@ -7,6 +7,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from intercap_core.body.parameters import NUM_POSE
 
+_FEWEST_BRIDGES = 5  # built where the truth is known, to tell how far off one is
+_SPEED = 1.0  # m/s: people walk, and move their hands, at about this
+_SIGMA_RANGE = (0.03, 0.5)  # an arm's length at most
+
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Fill rows of parameter vectors (T,P) that are not ``known`` (T,), by time (T,), seconds.
@@ -47,6 +51,29 @@ def continuous(rotation_vectors: np.ndarray) -> np.ndarray:
     return result
 
 
-def seconds_to_known(known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Time (T,) from each frame to the nearest known one, seconds."""
-    return np.abs(times[:, None] - times[known][None]).min(1)
+def bridged_sigma(
+    joints: np.ndarray, known: np.ndarray, sigma: np.ndarray, times: np.ndarray
+) -> np.ndarray:
+    """Stated deviation (T,J), metres, of joints (T,J,3) whose unknown frames were bridged.
+
+    ``sigma`` (T,J) is that of the known frames (T,). The known frames say how far off such a bridge
+    is: it is built over all their stretches of the same length. Where there are too few of those, a
+    joint is off by what people move in the time to the nearest known frame.
+    """
+    result = sigma.copy()
+    at = np.flatnonzero(known)
+    away = np.abs(times[:, None] - times[at][None]).min(1)
+    for t in np.flatnonzero(~known):
+        before, after = at[at < t][-1:], at[at > t][:1]
+        ends = np.concatenate([before, after])
+        steps = ends - t
+        tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
+        tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
+        if len(tried) < _FEWEST_BRIDGES:
+            off = np.full(joints.shape[1], np.clip(_SPEED * away[t], *_SIGMA_RANGE))
+        else:
+            share = (t - ends[0]) / (ends[1] - ends[0]) if len(ends) == 2 else 0.0
+            built = (1 - share) * joints[tried + steps[0]] + share * joints[tried + steps[-1]]
+            off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))
+        result[t] = np.hypot(off, np.max(sigma[ends], axis=0))
+    return result

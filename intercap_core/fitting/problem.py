@@ -20,7 +20,7 @@ from intercap_core.energy.body_keypoints import Keypoints, KeypointSet, PointTer
 from intercap_core.solve.levenberg_marquardt import NormalEquations
 
 NUM_OFFSETS = 25  # OpenPose's body keypoints
-_KEYPOINT_SCALE = 4.0  # sigmas at which a keypoint starts to count as an outlier
+KEYPOINT_SCALE = 4.0  # sigmas at which a keypoint starts to count as an outlier
 _CHUNK = 32  # frames whose dense rows are held at once
 
 # The detector's idea of a joint differs from the body model's by about this much.
@@ -232,7 +232,7 @@ class BodyProblem:
                     views.sigma[index],
                     views.lenses,
                     views.colour_from_master,
-                    scale=_KEYPOINT_SCALE,
+                    scale=KEYPOINT_SCALE,
                     shift=None if views.shift is None else views.shift[index],
                 )
             )
@@ -243,7 +243,7 @@ class BodyProblem:
                     targets.points[index],
                     targets.confidence[index],
                     sigma=targets.sigma,
-                    scale=_KEYPOINT_SCALE,
+                    scale=KEYPOINT_SCALE,
                 )
             )
         if not terms:

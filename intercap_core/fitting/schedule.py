@@ -16,7 +16,8 @@ from intercap_core.config import BodyFitSettings
 from intercap_core.energy.body_cloud import COVERINGS
 from intercap_core.fitting.evidence import Evidence
 from intercap_core.fitting.observations import Observations, PersonCloud
-from intercap_core.fitting.problem import BodyProblem, Targets
+from intercap_core.fitting.problem import KEYPOINT_SCALE, BodyProblem, Targets
+from intercap_core.fitting.quality import PartEvidence, compare
 from intercap_core.fitting.start import place_trunk, turned_around
 from intercap_core.solve.levenberg_marquardt import Solution, minimise
 
@@ -47,9 +48,8 @@ class Fit:
 
     vectors (N,P) parameters; hessian (N,n,n) of the energy by the parameters ``columns`` (n,);
     excess (N,) >= 1: mean square of the keypoints' residuals over their variance.
-    keypoint_error (N,): median distance of the body's keypoints, metres. pixel_residual (N,C) px,
-    cloud_residual (N,) m: medians, NaN = nothing seen. settled: what all frames share beside the
-    shape.
+    pixel_residual (N,C) px, cloud_residual (N,) m: medians, NaN = nothing seen. settled: what all
+    frames share beside the shape. parts: how the observations bear out each part of the body.
     """
 
     frames: np.ndarray
@@ -57,10 +57,10 @@ class Fit:
     columns: Tensor
     hessian: Tensor
     excess: Tensor
-    keypoint_error: Tensor
     pixel_residual: Tensor
     cloud_residual: Tensor
     settled: Settled
+    parts: PartEvidence
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
@@ -168,8 +168,9 @@ class Fitter:
         """Residuals of the solution."""
         assert problem.views is not None
         evidence, pixels = self.evidence, self._pixels(problem)
+        views, index = problem.views, problem.keypoints.index
+        every = (evidence.pixel_residuals(problem) / views.sigma[..., None]).norm(dim=-1)
         whitened = pixels / problem.views.sigma[:, :, BODY]
-        metres = whitened * evidence.keypoint_sigma[BODY]
         return Fit(
             frames=self.frames,
             vectors=problem.base,
@@ -177,11 +178,13 @@ class Fitter:
             hessian=hessian,
             # the median of a chi-squared variable with two degrees of freedom is 2 ln 2
             excess=((whitened**2 / 2).flatten(1).nanmedian(1).values / np.log(2)).clamp_min(1.0),
-            keypoint_error=metres.flatten(1).nanmedian(1).values,
             pixel_residual=pixels.nanmedian(2).values,
             cloud_residual=evidence.cloud_residual,
             settled=Settled(
                 problem.offsets, problem.u, evidence.keypoint_sigma, evidence.cloud_noise
+            ),
+            parts=compare(
+                every, views.confidence, index, evidence.keypoint_sigma[index], KEYPOINT_SCALE
             ),
         )
 

@@ -17,21 +17,22 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import body_path
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
 from intercap_core.errors import UserError
-from intercap_core.fitting.bridge import bridge, continuous, seconds_to_known
+from intercap_core.fitting import quality
+from intercap_core.fitting.bridge import bridge, bridged_sigma, continuous
 from intercap_core.fitting.observations import person_clouds, read_observations
 from intercap_core.fitting.schedule import Fitter
 from intercap_core.fitting.uncertainty import joint_sigma
 from intercap_core.project import digest
-from intercap_core.schemas import BODY_FIT
+from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
 NUM_BETAS, NUM_EXPRESSION = 10, 10
-# A body whose keypoints are this far off, in the median, is not the person's.
+# A body whose trunk's keypoints are this far off, in the median, is not the person's.
 _BAD_RESIDUAL_M = 0.06
-# A bridged joint is off by what people move meanwhile: at walking pace, at most an arm's length.
-_BRIDGED_SPEED = 1.0
-_BRIDGED_SIGMA_RANGE = (0.03, 0.5)
+# What the metrics call a bad body, by the mean error of its surface.
+_BAD_BODY_M = 0.040
 
 
 def run(
@@ -65,14 +66,15 @@ def run(
     fit = Fitter(model, seen, clouds, settings).run()
 
     fitted = np.zeros(seen.num_frames, bool)
-    believed = fit.keypoint_error < _BAD_RESIDUAL_M
+    # limbs may be guessed at behind a table: it is the trunk that says whose body this is
+    believed = quality.trunk_distance(fit.parts) < _BAD_RESIDUAL_M
     # one view's keypoints do not say how far away the body is, its points do
     placed = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
-    fitted[fit.frames[(believed & placed).cpu().numpy()]] = True
+    fitted[fit.frames[believed & placed.cpu().numpy()]] = True
     if not fitted.any():
         raise UserError(
-            f"{person}: sequence {seen.sequence}: in every frame the fitted body is more than "
-            f"{1000 * _BAD_RESIDUAL_M:.0f} mm from the keypoints, or rests on one view without "
+            f"{person}: sequence {seen.sequence}: in every frame the fitted trunk is more than "
+            f"{1000 * _BAD_RESIDUAL_M:.0f} mm from its keypoints, or rests on one view without "
             "points of the person; check the camera poses, and that keypoints and masks belong to "
             "this recording"
         )
@@ -82,11 +84,16 @@ def run(
     vectors[:, :3] = continuous(vectors[:, :3])
 
     sigma = np.zeros((seen.num_frames, 55))
-    sigma[fit.frames] = (
-        joint_sigma(model, fit.vectors, fit.columns, fit.hessian, fit.excess).cpu().numpy()
-    )
-    away = _BRIDGED_SPEED * seconds_to_known(fitted, seen.times)
-    sigma[~fitted] = np.clip(away[~fitted], *_BRIDGED_SIGMA_RANGE)[:, None]
+    stated = joint_sigma(model, fit.vectors, fit.columns, fit.hessian, fit.excess).cpu().numpy()
+    sigma[fit.frames] = quality.disputed_sigma(stated, fit.parts)
+    params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
+    joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
+    undetermined = np.ones((seen.num_frames, len(BODY_PARTS)), bool)
+    undetermined[fit.frames] = quality.undetermined(sigma[fit.frames], fit.parts)
+    undetermined[~fitted] = True
+    sigma = bridged_sigma(joints.astype(float), fitted, sigma, seen.times)
+    share = model.skinning_weights.double().mean(0).cpu().numpy()
+    uncertain = fitted & (quality.expected_error(sigma, share) > _BAD_BODY_M)
 
     keypoint_residual = np.full((seen.num_frames, len(seen.rig)), np.nan)
     keypoint_residual[fit.frames] = fit.pixel_residual.cpu().numpy()
@@ -101,7 +108,7 @@ def run(
         gender=subject.gender,
         body_model=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
     ) as writer:
-        _put_bodies(writer, model, vectors)
+        _put_bodies(writer, params, joints)
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", sigma)
@@ -111,13 +118,15 @@ def run(
         writer.put("covering_noise", fit.settled.cloud_noise.cpu().numpy())
         writer.put("failed", ~fitted)
         writer.put("bridged", ~fitted)
+        writer.put("uncertain", uncertain)
+        writer.put("part_names", list(BODY_PARTS))
+        writer.put("undetermined", undetermined)
 
 
-def _put_bodies(writer: artefacts.Writer, model: BodyModel, vectors: np.ndarray) -> None:
-    params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
+def _put_bodies(writer: artefacts.Writer, params: BodyParameters, joints: np.ndarray) -> None:
     for name in (
         "betas", "expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose",
         "reye_pose", "left_hand_pose", "right_hand_pose",
     ):  # fmt: skip
         writer.put(name, getattr(params, name).cpu().numpy())
-    writer.put("joints", model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy())
+    writer.put("joints", joints)

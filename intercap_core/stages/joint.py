@@ -89,7 +89,7 @@ def run(
     ):
         start, model = _start(body, track, body_models, device)
         joint_sigma = body["joint_sigma"].astype(float)
-        failed, bridged = body["failed"], body["bridged"]
+        failed, bridged, uncertain = body["failed"], body["bridged"], body["uncertain"]
         lost, disagree, ambiguous = track["lost"], track["disagree"], track["ambiguous"]
         tracked = TrackedPoses.from_track(
             start.rotation,
@@ -159,7 +159,9 @@ def run(
         if minimum.converged and change < _SETTLED and retimed < _RETIMED_S:
             break
     after = minimum.equations.energy
-    flagged, reasons = _flags(failed, bridged, lost, disagree, ambiguous, problem, state)
+    flagged, reasons = _flags(
+        failed | bridged, uncertain, lost, disagree, ambiguous, problem, state
+    )
     report = data.residuals(state)
     offsets = data.estimate_offsets(known_offsets)
 
@@ -253,8 +255,8 @@ def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:
 
 
 def _flags(
-    failed: np.ndarray,
-    bridged: np.ndarray,
+    filled: np.ndarray,
+    uncertain: np.ndarray,
     lost: np.ndarray,
     disagree: np.ndarray,
     ambiguous: np.ndarray,
@@ -265,7 +267,8 @@ def _flags(
     _, near = problem.proximity(state)
     deep = near.distance.min(axis=1) < -0.03
     causes = (
-        (failed | bridged, "body not seen well enough, filled in"),
+        (filled, "body not seen well enough, filled in"),
+        (uncertain, "body not determined by what was seen"),
         (lost, "object lost, filled in"),
         (disagree, "object passes disagree"),
         (ambiguous, "object pose ambiguous"),

@@ -144,6 +144,7 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
         ambiguous = artefact["ambiguous"]
     with artefacts.read(body_fit, BODY_FIT) as artefact:
         failed, bridged = artefact["failed"], artefact["bridged"]
+        uncertain = artefact["uncertain"]
     with artefacts.read(joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
     unseen = np.asarray(~images.available.any(1))
@@ -157,6 +158,7 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
             (ambiguous & ~lost & alone, "object pose ambiguous"),
             (failed & alone, "body fit failed"),
             (bridged & ~failed & alone, "body filled in from neighbouring frames"),
+            (uncertain & alone, "body not determined by what was seen"),
         ]
     )
     for t in np.flatnonzero(joint_flags):

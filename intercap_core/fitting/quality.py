@@ -1,0 +1,153 @@
+"""Which parts of a fitted body can be believed: determined by what was seen, and not against it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
+from intercap_core.body.keypoints import (
+    CONTOUR,
+    FACE,
+    KEYPOINT_NAMES,
+    LEFT_HAND,
+    RIGHT_HAND,
+)
+from intercap_core.schemas import BODY_PARTS
+
+# A coordinate's deviation of 26 mm puts half of such joints more than 40 mm off (the median of a
+# chi variable with three degrees of freedom is 1.538): what counts as a bad body. Fingers lie
+# 20 mm apart; half of a hand's joints farther off than that are taken for a neighbour's.
+_LARGEST_SIGMA_M = 0.026
+_LARGEST_HAND_SIGMA_M = 0.013
+# Keypoints beyond the robust term's scale no longer pull: more than half of a part's against it.
+_DISAGREE = 0.5
+_FACE_SEEN = 0.5  # of the face's landmarks, by some view
+_MEDIAN_CHI_2 = 1.1774  # median length of a two-dimensional normal error, in deviations
+_MEAN_CHI_3 = 1.5958  # mean length of a three-dimensional normal error, in deviations
+
+_LIMBS = {"arm": ("elbow", "wrist"), "leg": ("knee", "ankle", "big_toe", "small_toe", "heel")}
+_JOINTED = ("arm", "leg")
+_TRUNK = ("neck", "left_shoulder", "right_shoulder", "mid_hip", "left_hip", "right_hip")
+_JOINTS = {"arm": ("elbow", "wrist"), "leg": ("knee", "ankle", "foot")}
+_TRUNK_JOINTS = ("pelvis", "left_hip", "right_hip", "spine2", "neck", "left_shoulder",
+                 "right_shoulder", "head")  # fmt: skip
+
+
+def _keypoints_of(part: str) -> np.ndarray:
+    """(K,) indices of the part's keypoints."""
+    side, _, limb = part.partition("_")
+    if part == "trunk":
+        return np.array([KEYPOINT_NAMES.index(name) for name in _TRUNK])
+    if part == "face":
+        return np.r_[FACE, CONTOUR]
+    if limb == "hand":
+        return np.r_[LEFT_HAND if side == "left" else RIGHT_HAND]
+    return np.array([KEYPOINT_NAMES.index(f"{side}_{name}") for name in _LIMBS[limb]])
+
+
+def _joints_of(part: str) -> list[int]:
+    """Indices of the part's joints; of the face the head."""
+    side, _, limb = part.partition("_")
+    if part == "trunk":
+        return [JOINT_INDEX[name] for name in _TRUNK_JOINTS]
+    if part == "face":
+        return [JOINT_INDEX["head"], JOINT_INDEX["jaw"]]
+    if limb == "hand":
+        first = JOINT_NAMES.index(f"{side}_index1")
+        return list(range(first, first + 15))
+    return [JOINT_INDEX[f"{side}_{name}"] for name in _JOINTS[limb]]
+
+
+class PartEvidence(NamedTuple):
+    """How the observations of N frames bear out each of the 8 parts.
+
+    against (N,8): share of a part's observations that are outliers, weighted by confidence, of arms
+    and legs that of their worst point; NaN = nothing of it was seen. distance (N,8): their median
+    distance, metres, NaN likewise. seen (N,8): share of a part's keypoints that some view bears
+    out.
+    """
+
+    against: Tensor
+    distance: Tensor
+    seen: Tensor
+
+
+def compare(
+    whitened: Tensor, confidence: Tensor, index: Tensor, sigma: Tensor, scale: float
+) -> PartEvidence:
+    """Residuals (N,C,K), in sigmas (K,) metres, of the keypoints ``index`` (K,), part by part.
+
+    confidence (N,C,K), 0 = not seen; what is more than ``scale`` sigmas off is an outlier.
+    """
+    size = (len(whitened), len(BODY_PARTS))
+    unknown = whitened.new_full(size, torch.nan)
+    result = PartEvidence(unknown, unknown.clone(), whitened.new_zeros(size))
+    metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
+    for column, part in enumerate(BODY_PARTS):
+        at = torch.isin(index, torch.as_tensor(_keypoints_of(part), device=index.device))
+        if not bool(at.any()):
+            continue
+        weight, good = confidence[:, :, at], whitened[:, :, at] <= scale
+        over = (1,) if part.endswith(_JOINTED) else (1, 2)
+        share = 1 - (weight * good).sum(over) / weight.sum(over)
+        # an elbow that is right says nothing of a wrist
+        result.against[:, column] = share if share.ndim == 1 else _worst(share)
+        result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
+        result.seen[:, column] = ((weight > 0) & good).any(1).to(weight).mean(1)
+    return result
+
+
+def _worst(share: Tensor) -> Tensor:
+    """Largest (N,) of (N,K), NaN left out; NaN where all are."""
+    largest = share.nan_to_num(nan=-1.0).amax(1)
+    return torch.where(largest < 0, torch.nan, largest)
+
+
+def trunk_distance(evidence: PartEvidence) -> np.ndarray:
+    """Median distance (N,) of the trunk's keypoints, metres; NaN = none seen."""
+    return evidence.distance[:, BODY_PARTS.index("trunk")].cpu().numpy()
+
+
+def disputed_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
+    """Deviations (N,55), metres, with those of parts that most observations contradict widened.
+
+    The truth may be where the observations are: the deviation that their distance, seen in two
+    dimensions, amounts to is added, in squares.
+    """
+    result = sigma.copy()
+    disputed = evidence.against.cpu().numpy() > _DISAGREE
+    distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
+    for column, part in enumerate(BODY_PARTS):
+        joints = _joints_of(part)
+        result[:, joints] = np.hypot(result[:, joints], distance[:, column, None])
+    return result
+
+
+def undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
+    """Parts (N,8) bool that the observations leave open, or that most of them contradict.
+
+    sigma (N,55): stated deviation of the joints, metres.
+    """
+    found = evidence.against.cpu().numpy() > _DISAGREE
+    for column, part in enumerate(BODY_PARTS):
+        limit = _LARGEST_HAND_SIGMA_M if part.endswith("hand") else _LARGEST_SIGMA_M
+        found[:, column] |= _rms(sigma[:, _joints_of(part)]) > limit
+    face = BODY_PARTS.index("face")
+    found[:, face] |= evidence.seen[:, face].cpu().numpy() < _FACE_SEEN
+    return found
+
+
+def expected_error(sigma: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Mean error (N,) of the surface that ``sigma`` (N,55) makes likely, metres.
+
+    share (55,) of the surface that hangs on each joint.
+    """
+    return _MEAN_CHI_3 * sigma @ share
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt((values**2).mean(1))
