@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from intercap_core.body.parameters import NUM_POSE
 
 _FEWEST_BRIDGES = 5  # built where the truth is known, to tell how far off one is
-_SPEED = 1.0  # m/s: people walk, and move their hands, at about this
-_SIGMA_RANGE = (0.03, 0.5)  # an arm's length at most
+_WALKING, _STANDING = 1.0, 0.1  # m/s: where nothing is known of the speed; people sway
+_LARGEST_SIGMA = 0.5  # m, an arm's length
 
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -56,24 +56,34 @@ def bridged_sigma(
 ) -> np.ndarray:
     """Stated deviation (T,J), metres, of joints (T,J,3) whose unknown frames were bridged.
 
-    ``sigma`` (T,J) is that of the known frames (T,). The known frames say how far off such a bridge
-    is: it is built over all their stretches of the same length. Where there are too few of those, a
-    joint is off by what people move in the time to the nearest known frame.
+    ``sigma`` (T,J) is that of the known frames (T,); ``times`` (T,) seconds. The known frames say
+    how far off such a bridge is: it is built over all their stretches of the same length. Where
+    there are too few of those, a joint is off by what it moves, at the speed it has elsewhere, in
+    the time to the nearest known frame.
     """
     result = sigma.copy()
     at = np.flatnonzero(known)
     away = np.abs(times[:, None] - times[at][None]).min(1)
+    speed = _speed(joints, known, times)
     for t in np.flatnonzero(~known):
-        before, after = at[at < t][-1:], at[at > t][:1]
-        ends = np.concatenate([before, after])
+        ends = np.concatenate([at[at < t][-1:], at[at > t][:1]])
         steps = ends - t
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
         if len(tried) < _FEWEST_BRIDGES:
-            off = np.full(joints.shape[1], np.clip(_SPEED * away[t], *_SIGMA_RANGE))
+            off = np.minimum(speed * away[t], _LARGEST_SIGMA)
         else:
             share = (t - ends[0]) / (ends[1] - ends[0]) if len(ends) == 2 else 0.0
             built = (1 - share) * joints[tried + steps[0]] + share * joints[tried + steps[-1]]
             off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))
-        result[t] = np.hypot(off, np.max(sigma[ends], axis=0))
+        result[t] = np.hypot(off, sigma[ends].max(0))
     return result
+
+
+def _speed(joints: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Usual speed (J,) along one coordinate, m/s, between neighbouring known frames."""
+    pairs = np.flatnonzero(known[1:] & known[:-1])
+    if len(pairs) < _FEWEST_BRIDGES:
+        return np.full(joints.shape[1], _WALKING)
+    moved = (joints[pairs + 1] - joints[pairs]) / np.diff(times)[pairs, None, None]
+    return np.maximum(np.sqrt((moved**2).mean((0, 2))), _STANDING)

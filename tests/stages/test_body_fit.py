@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
@@ -20,7 +22,7 @@ from intercap_core.energy.body_cloud import COVERINGS
 from intercap_core.errors import UserError
 from intercap_core.fitting.problem import BodyProblem, Views
 from intercap_core.fitting.schedule import columns_of
-from intercap_core.schemas import BODY_FIT
+from intercap_core.schemas import BODY_FIT, BODY_PARTS, PERSON
 from intercap_core.solve.levenberg_marquardt import minimise
 from intercap_core.stages import body_fit
 
@@ -266,6 +268,50 @@ def test_the_same_input_gives_the_same_bytes(clothed) -> None:
     capture, _, folder = clothed
     capture.fit(folder / "again.h5")
     assert (folder / "again.h5").read_bytes() == (folder / "body_fit.h5").read_bytes()
+
+
+def test_parts_that_nobody_sees_or_views_guess_are_named(model, clothed, tmp_path) -> None:
+    """The left hand unseen in frame 1, the right leg guessed apart in frame 4."""
+    capture, found, _ = clothed
+    names = list(found["part_names"].astype(str))
+    assert names == list(BODY_PARTS)
+    seen = ~found["failed"]
+    assert not found["undetermined"][seen].any() and found["undetermined"][~seen].all()
+    assert not found["uncertain"].any()
+
+    def guess(keypoints: np.ndarray) -> None:
+        keypoints[1, :, LEFT_HAND] = 0
+        shift = 60 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [0.7, 0.7]])
+        leg = [KEYPOINT_NAMES.index(f"right_{name}") for name in ("knee", "ankle", "heel")]
+        keypoints[4][:, leg, :2] += shift[:, None]
+
+    changed = with_keypoints(capture.inputs.person, tmp_path / "person.h5", guess)
+    body_fit.run(
+        frames=capture.inputs.frames, scene=capture.inputs.scene, person=changed,
+        output=tmp_path / "body_fit.h5", subject=SUBJECT, body_models=BodyModels(),
+        settings=SETTINGS,
+    )  # fmt: skip
+    with artefacts.read(tmp_path / "body_fit.h5", BODY_FIT) as read:
+        open_parts, failed = read["undetermined"], read["failed"]
+    expected = np.zeros_like(open_parts)
+    expected[3] = True
+    expected[1, names.index("left_hand")] = expected[4, names.index("right_leg")] = True
+    np.testing.assert_array_equal(open_parts, expected)
+    assert failed.tolist() == [t == 3 for t in range(6)]
+
+
+def with_keypoints(source: Path, target: Path, change: Callable[[np.ndarray], None]) -> Path:
+    """A copy of a person artefact with its keypoints (T,C,135,3) changed in place."""
+    with (
+        artefacts.read(source, PERSON) as read,
+        artefacts.write(target, PERSON, sequence="test", images_alone=False) as writer,
+    ):
+        for key in read.keys(""):
+            values = read.text(key) if key == "camera_names" else read[key]
+            if key == "keypoints":
+                change(values)
+            writer.put(key, values)
+    return target
 
 
 def test_two_cameras_without_depth_are_enough(model: BodyModel, tmp_path: Path) -> None:
