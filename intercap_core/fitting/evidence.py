@@ -73,6 +73,8 @@ class Evidence:
         self.patch = torch.as_tensor(self.samples.patch, device=model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
         self.group = torch.as_tensor(self.samples.group, device=model.device)
+        carrier = model.skinning_weights.argmax(1).cpu().numpy()
+        self.sample_joints = carrier[self.samples.vertex]
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
         self.by_view: ViewDistances | None = None

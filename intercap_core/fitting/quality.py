@@ -26,6 +26,12 @@ _LARGEST_HAND_SIGMA_M = 0.013
 # Keypoints beyond the robust term's scale no longer pull: more than half of a part's against it.
 _DISAGREE = 0.5
 _FACE_SEEN = 0.5  # of the face's landmarks, by some view
+_MEASURED = 0.15  # of a part's samples: half of what a view sees of a limb, which is a third
+# A forearm or shin seen by one view leans towards it or away, the ends up to twice its length
+# (0.25 m and more) apart, of a finger (0.08 m) likewise: by this in the mean square, along one
+# coordinate.
+_MIRRORED_M = {"arm": 0.10, "leg": 0.10, "hand": 0.03}
+MEDIAN_CHI_3 = 1.5382  # median length of a three-dimensional normal error, in deviations
 _MEDIAN_CHI_2 = 1.1774  # median length of a two-dimensional normal error, in deviations
 _MEAN_CHI_3 = 1.5958  # mean length of a three-dimensional normal error, in deviations
 
@@ -62,30 +68,51 @@ def _joints_of(part: str) -> list[int]:
     return [JOINT_INDEX[f"{side}_{name}"] for name in _JOINTS[limb]]
 
 
+def _carriers_of(part: str) -> list[int]:
+    """Joints whose bones carry the part's skin."""
+    side, _, limb = part.partition("_")
+    if limb == "hand":
+        return [JOINT_INDEX[f"{side}_wrist"], *_joints_of(part)]
+    bones = {"arm": ("shoulder", "elbow"), "leg": ("hip", "knee", "ankle", "foot")}
+    if limb in bones:
+        return [JOINT_INDEX[f"{side}_{name}"] for name in bones[limb]]
+    return _joints_of(part)
+
+
 class PartEvidence(NamedTuple):
     """How the observations of N frames bear out each of the 8 parts.
 
     against (N,8): share of a part's observations that are outliers, weighted by confidence, of arms
     and legs that of their worst point; NaN = nothing of it was seen. distance (N,8): their median
     distance, metres, NaN likewise. seen (N,8): share of a part's keypoints that some view bears
-    out.
+    out. views (N,8): how many do, in the median. measured (N,8): share of the part's samples that
+    have points.
     """
 
     against: Tensor
     distance: Tensor
     seen: Tensor
+    views: Tensor
+    measured: Tensor
 
 
 def compare(
-    whitened: Tensor, confidence: Tensor, index: Tensor, sigma: Tensor, scale: float
+    whitened: Tensor,
+    confidence: Tensor,
+    index: Tensor,
+    sigma: Tensor,
+    scale: float,
+    samples: tuple[np.ndarray, Tensor] | None = None,
 ) -> PartEvidence:
     """Residuals (N,C,K), in sigmas (K,) metres, of the keypoints ``index`` (K,), part by part.
 
     confidence (N,C,K), 0 = not seen; what is more than ``scale`` sigmas off is an outlier.
+    ``samples``: the joint (S,) that each of the cloud's samples hangs on and its weight (N,S), 0 =
+    no points; None without clouds.
     """
     size = (len(whitened), len(BODY_PARTS))
-    unknown = whitened.new_full(size, torch.nan)
-    result = PartEvidence(unknown, unknown.clone(), whitened.new_zeros(size))
+    unknown, none = whitened.new_full(size, torch.nan), whitened.new_zeros(size)
+    result = PartEvidence(unknown, unknown.clone(), none, none.clone(), none.clone())
     metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
     for column, part in enumerate(BODY_PARTS):
         at = torch.isin(index, torch.as_tensor(_keypoints_of(part), device=index.device))
@@ -97,7 +124,12 @@ def compare(
         # an elbow that is right says nothing of a wrist
         result.against[:, column] = share if share.ndim == 1 else _worst(share)
         result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
-        result.seen[:, column] = ((weight > 0) & good).any(1).to(weight).mean(1)
+        borne_out = ((weight > 0) & good).sum(1)
+        result.seen[:, column] = (borne_out > 0).to(weight).mean(1)
+        result.views[:, column] = borne_out.to(weight).median(1).values
+        if samples is not None:
+            on_part = np.isin(samples[0], _carriers_of(part))
+            result.measured[:, column] = (samples[1][:, on_part] > 0).to(weight).mean(1)
     return result
 
 
@@ -112,15 +144,29 @@ def trunk_distance(evidence: PartEvidence) -> np.ndarray:
     return evidence.distance[:, BODY_PARTS.index("trunk")].cpu().numpy()
 
 
-def disputed_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Deviations (N,55), metres, with those of parts that most observations contradict widened.
+def unmeasured(evidence: PartEvidence) -> np.ndarray:
+    """Limbs and hands (N,8) bool that one view alone bears out, without points of theirs."""
+    found = (evidence.views < 2) & (evidence.measured < _MEASURED) & (evidence.seen > 0)
+    result = np.asarray(found.cpu().numpy())
+    result[:, [BODY_PARTS.index(part) for part in ("trunk", "face")]] = False
+    return result
 
-    The truth may be where the observations are: the deviation that their distance, seen in two
-    dimensions, amounts to is added, in squares.
+
+def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
+    """Deviations (N,55), metres, with those of parts widened of which the fit is one of several.
+
+    Where most observations contradict a part, the truth may be where they are: the deviation that
+    their distance, seen in two dimensions, amounts to is added, in squares. A limb that one view
+    alone sees may lean towards it or away. What is wrong of an arm is wrong of its hand.
     """
-    result = sigma.copy()
     disputed = evidence.against.cpu().numpy() > _DISAGREE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
+    mirrored = [_MIRRORED_M.get(part.partition("_")[2], 0.0) for part in BODY_PARTS]
+    distance = np.hypot(distance, np.where(unmeasured(evidence), mirrored, 0))
+    for side in ("left", "right"):
+        arm, hand = BODY_PARTS.index(f"{side}_arm"), BODY_PARTS.index(f"{side}_hand")
+        distance[:, hand] = np.maximum(distance[:, hand], distance[:, arm])
+    result = sigma.copy()
     for column, part in enumerate(BODY_PARTS):
         joints = _joints_of(part)
         result[:, joints] = np.hypot(result[:, joints], distance[:, column, None])
@@ -134,7 +180,10 @@ def undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     """
     found = evidence.against.cpu().numpy() > _DISAGREE
     for column, part in enumerate(BODY_PARTS):
-        limit = _LARGEST_HAND_SIGMA_M if part.endswith("hand") else _LARGEST_SIGMA_M
+        limit = _LARGEST_SIGMA_M
+        if part.endswith("hand"):
+            limit = _LARGEST_HAND_SIGMA_M
+            found[:, column] |= evidence.seen[:, column].cpu().numpy() == 0
         found[:, column] |= _rms(sigma[:, _joints_of(part)]) > limit
     face = BODY_PARTS.index("face")
     found[:, face] |= evidence.seen[:, face].cpu().numpy() < _FACE_SEEN

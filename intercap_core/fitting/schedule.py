@@ -18,6 +18,7 @@ from intercap_core.fitting.evidence import Evidence
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import KEYPOINT_SCALE, BodyProblem, Targets
 from intercap_core.fitting.quality import PartEvidence, compare
+from intercap_core.fitting.recover import recover
 from intercap_core.fitting.start import place_trunk, turned_around
 from intercap_core.solve.levenberg_marquardt import Solution, minimise
 
@@ -119,6 +120,7 @@ class Fitter:
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
             problem.targets = None
+        recover(problem, evidence.seen.times[self.frames])
         # Faces and hands of a shape outside the model's space would bend the whole body to fit:
         # what is shared is settled by now, and stays.
         problem.fit_shared, problem.one_shape = False, False
@@ -184,7 +186,12 @@ class Fitter:
                 problem.offsets, problem.u, evidence.keypoint_sigma, evidence.cloud_noise
             ),
             parts=compare(
-                every, views.confidence, index, evidence.keypoint_sigma[index], KEYPOINT_SCALE
+                every,
+                views.confidence,
+                index,
+                evidence.keypoint_sigma[index],
+                KEYPOINT_SCALE,
+                None if problem.rows is None else (evidence.sample_joints, problem.rows.weight),
             ),
         )
 

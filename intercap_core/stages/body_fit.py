@@ -23,6 +23,7 @@ from intercap_core.errors import UserError
 from intercap_core.fitting import quality
 from intercap_core.fitting.bridge import bridge, bridged_sigma, continuous
 from intercap_core.fitting.observations import person_clouds, read_observations
+from intercap_core.fitting.recover import jumps
 from intercap_core.fitting.schedule import Fitter
 from intercap_core.fitting.uncertainty import joint_sigma
 from intercap_core.project import digest
@@ -83,11 +84,16 @@ def run(
     vectors = bridge(vectors, fitted, seen.times)
     vectors[:, :3] = continuous(vectors[:, :3])
 
-    sigma = np.zeros((seen.num_frames, 55))
-    stated = joint_sigma(model, fit.vectors, fit.columns, fit.hessian, fit.excess).cpu().numpy()
-    sigma[fit.frames] = quality.disputed_sigma(stated, fit.parts)
     params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
+    sigma = np.zeros((seen.num_frames, 55))
+    stated = joint_sigma(model, fit.vectors, fit.columns, fit.hessian, fit.excess).cpu().numpy()
+    # what has left the motion of its neighbours may well belong among them
+    jumped = np.zeros_like(sigma)
+    jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted])
+    sigma[fit.frames] = np.hypot(
+        quality.widened_sigma(stated, fit.parts), jumped[fit.frames] / quality.MEDIAN_CHI_3
+    )
     undetermined = np.ones((seen.num_frames, len(BODY_PARTS)), bool)
     undetermined[fit.frames] = quality.undetermined(sigma[fit.frames], fit.parts)
     undetermined[~fitted] = True

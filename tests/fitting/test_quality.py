@@ -37,7 +37,7 @@ def test_a_good_fit_has_nothing_open(fine):
     assert torch.equal(evidence.against, torch.zeros(1, 8))
     assert torch.equal(evidence.seen, torch.ones(1, 8))
     assert quality.trunk_distance(evidence) == pytest.approx(0.014)
-    np.testing.assert_array_equal(quality.disputed_sigma(sigma, evidence), sigma)
+    np.testing.assert_array_equal(quality.widened_sigma(sigma, evidence), sigma)
 
 
 def test_a_wrist_that_most_views_put_elsewhere(fine):
@@ -54,7 +54,7 @@ def test_a_disputed_hand_says_how_far_off_it_may_be(fine):
     whitened, confidence, sigma = fine
     whitened[:, :, 46:67] = 10.0
     evidence = _evidence(whitened, confidence)
-    widened = quality.disputed_sigma(sigma, evidence)
+    widened = quality.widened_sigma(sigma, evidence)
     right = JOINT_INDEX["right_index1"]
     assert widened[0, right] == pytest.approx(np.hypot(0.008, 0.2 / 1.1774))
     assert widened[0, JOINT_INDEX["left_index1"]] == 0.008
@@ -69,7 +69,21 @@ def test_what_nobody_sees_is_open_by_its_deviation(fine):
     evidence = _evidence(whitened, confidence)
     assert torch.isnan(evidence.against).all() and np.isnan(quality.trunk_distance(evidence)).all()
     sigma[0, [JOINT_INDEX["right_knee"], JOINT_INDEX["right_ankle"]]] = 0.09
-    assert _open(evidence, sigma) == ["right_leg", "face"]
+    assert _open(evidence, sigma) == ["right_leg", "left_hand", "right_hand", "face"]
+
+
+def test_a_limb_that_one_view_sees_needs_points_of_its_own(fine):
+    whitened, confidence, sigma = fine
+    confidence[:, 1:] = 0
+    joints = np.array([JOINT_INDEX["left_elbow"]] * 4 + [JOINT_INDEX["right_elbow"]] * 4)
+    weight = torch.tensor([[0.0, 0, 0, 0, 0, 0, 5, 5]])
+    evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, weight))
+    found = quality.unmeasured(evidence)[0]
+    at = BODY_PARTS.index
+    assert found[at("left_arm")] and not found[at("right_arm")] and not found[at("trunk")]
+    widened = quality.widened_sigma(sigma, evidence)
+    assert widened[0, JOINT_INDEX["left_wrist"]] > 0.1
+    assert widened[0, JOINT_INDEX["right_wrist"]] == 0.008
 
 
 def test_the_expected_error_is_the_mean_of_a_normal_one():
