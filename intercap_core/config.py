@@ -63,6 +63,10 @@ class FramesSettings(Model):
 
     max_skew_ms: Positive = 8.0
     """An image belongs to a set when its device time is within this many milliseconds of it."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to use, by name; empty = all. The others count as not recorded."""
+    depth: bool = True
+    """Use depth; without, the recordings count as those of cameras that have none."""
 
 
 class DetectionsSettings(Model):

@@ -53,8 +53,11 @@ class View:
         return self.colour_times[self.colour_usable]
 
 
-def extract(name: str, layout: Layout, writer: artefacts.Writer) -> View:
-    """Copy one camera's images into the artefact; whatever is wrong becomes a note of the view."""
+def extract(name: str, layout: Layout, writer: artefacts.Writer, *, depth: bool = True) -> View:
+    """Copy one camera's images into the artefact; whatever is wrong becomes a note of the view.
+
+    Without ``depth`` its colour alone.
+    """
     view = View(name)
     if name not in layout.extrinsics.master_from_colour:
         calibration = layout.sequence.calibration.name
@@ -68,7 +71,7 @@ def extract(name: str, layout: Layout, writer: artefacts.Writer) -> View:
             view.source, view.camera = recording.source, recording.camera
             view.fps, view.serial = recording.fps, recording.serial
             view.depth_delay_us = recording.depth_delay_us
-            _Copy(recording, view, writer).run()
+            _Copy(recording, view, writer, depth=depth).run()
     except UserError as error:
         view.notes.append(str(error))
         view.camera = None
@@ -87,9 +90,12 @@ def _without_folders(text: str, layout: Layout) -> str:
 class _Copy:
     """The copying of one recording."""
 
-    def __init__(self, recording: CameraRecording, view: View, writer: artefacts.Writer) -> None:
+    def __init__(
+        self, recording: CameraRecording, view: View, writer: artefacts.Writer, *, depth: bool
+    ) -> None:
         self.recording, self.view, self.writer = recording, view, writer
-        lens = recording.camera.depth
+        lens = recording.camera.depth if depth else None
+        self.left_out = recording.camera.depth is not None and not depth
         self.group = f"cameras/{view.name}"
         self.colour = writer.stream(f"{self.group}/colour")
         self.depth = (
@@ -188,10 +194,16 @@ class _Copy:
             view.notes.append(f"{self.damaged} damaged images left out")
         if self.other_size:
             view.notes.append(f"{self.other_size} images of another size left out")
-        if self.depth is None:
+        if self.left_out:
+            view.notes.append("its depth is left out (frames.depth)")
+            self._use_without_depth()
+        elif self.depth is None:
             view.notes.append("has no depth")
         elif not self.measured:
             empty = f"depth is zero in all {len(self.depth_times)} images"
             view.notes.append(f"{empty}: used without depth" if self.depth_times else "no depth")
-            if view.camera is not None:
-                view.camera = replace(view.camera, depth=None, colour_from_depth=None)
+            self._use_without_depth()
+
+    def _use_without_depth(self) -> None:
+        if self.view.camera is not None:
+            self.view.camera = replace(self.view.camera, depth=None, colour_from_depth=None)

@@ -43,18 +43,24 @@ def run(
     """Write the frames artefact of one sequence.
 
     Reads the sequence's recordings in the layout that its row names. A camera without a usable
-    recording or without a pose is kept with ``present`` = False and a note; what else is degraded
-    is noted too. The frame of the poses stays that of the calibration's master, also where the
-    master's own recording is missing. Sets listed in ``frames_to_drop`` get no image. Raises
-    UserError where no camera can be used, and for an unreadable calibration or a set to drop that
-    is not there.
+    recording or without a pose, or that the settings leave out, is kept with ``present`` = False
+    and a note; what else is degraded is noted too. The frame of the poses stays that of the
+    calibration's master, also where the master's own recording is missing. Sets listed in
+    ``frames_to_drop`` get no image. Raises UserError where no camera can be used, for an unreadable
+    calibration, and where a set to drop or a camera to use is not there.
     """
     layout = open_layout(sequence)
     extrinsics = layout.extrinsics
     known = list(extrinsics.master_from_colour)
     names = known + [name for name in layout.names if name not in known]
+    used = _used(names, settings, sequence)
     with artefacts.write(output, FRAMES, settings_digest=digest(settings)) as writer:
-        views = [extract(name, layout, writer) for name in names]
+        views = [
+            extract(name, layout, writer, depth=settings.depth)
+            if name in used
+            else View(name, notes=["left out (frames.cameras)"])
+            for name in names
+        ]
         _note_same_devices(views)
         _require_usable(views, sequence)
         master = names.index(extrinsics.master)
@@ -85,6 +91,17 @@ def run(
         writer.attributes.update(
             sequence=sequence.sequence, master=extrinsics.master, fps=views[clock].fps
         )
+
+
+def _used(names: Sequence[str], settings: FramesSettings, sequence: SequenceEntry) -> set[str]:
+    """The cameras that the settings do not leave out."""
+    strange = [name for name in settings.cameras if name not in names]
+    if strange:
+        raise UserError(
+            f"settings: frames.cameras names {strange[0]!r}, the cameras of sequence "
+            f"{sequence.sequence!r} are {', '.join(names)}; correct the settings"
+        )
+    return set(settings.cameras or names)
 
 
 def _note_same_devices(views: list[View]) -> None:

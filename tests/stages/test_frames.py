@@ -149,6 +149,20 @@ def test_a_rig_without_depth_gives_colour(capture):
         assert frames.colour_available.all() and not frames.depth_available.any()
 
 
+def test_cameras_and_depth_can_be_left_out(capture):
+    output = capture.calibration.parent / "frames.h5"
+    chosen = FramesSettings(cameras=("k1", "k3"), depth=False)
+    stage.run(sequence=capture, output=output, settings=chosen)
+    with Frames.open(output) as frames:
+        assert frames.rig.names == ("k1", "k2", "k3")
+        assert frames.present.tolist() == [True, False, True]
+        assert not frames.available[:, 1].any() and not frames.depth_available.any()
+        assert [camera.depth for camera in frames.rig] == [None] * 3
+        assert frames.colour_jpeg(0, 2) == jpeg_at(2, 0)
+    assert notes_of(output)["k2"] == "left out (frames.cameras)"
+    assert "its depth is left out (frames.depth)" in notes_of(output)["k1"]
+
+
 def test_a_device_with_a_clock_of_its_own_is_set_aside(capture):
     record(capture.recordings, 2, range(6), clock_us=90_000_000)
     output = run(capture)
@@ -193,9 +207,15 @@ def too_wide_a_window(capture):
     stage.run(sequence=capture, output=output, settings=FramesSettings(max_skew_ms=40))
 
 
+def unknown_camera(capture):
+    output = capture.calibration.parent / "frames.h5"
+    stage.run(sequence=capture, output=output, settings=FramesSettings(cameras=("k1", "K2")))
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
+        (unknown_camera, "frames.cameras names 'K2', the cameras of sequence 's1' are k1, k2, k3"),
         (drop_too_far, "drop_frames holds 6, the recording has frame sets 0 to 5"),
         (nothing_readable, "'s1': no camera in .* can be used .*k2: k2.mkv: is empty"),
         (no_folder, "no such folder"),
