@@ -2,7 +2,8 @@
 # make test      the whole test suite
 # make lint      ruff, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
-#                of config/object to the object's track), tables and results/evaluation.json
+#                of config/object to the object's track and the body's fit, those of config/body to
+#                the latter), tables and results/evaluation.json
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker
 #                and the body's fit beside the paper's recipe, results/bench.json
 # make docs      the generated pages and schemas, and the rule graph

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from intercap_core.metrics import capture
 from intercap_core.metrics.capture import CaptureErrors
 from intercap_core.project import Project
-from intercap_core.stage_evaluation import take_to
+from intercap_core.stage_evaluation import console_of, number, take_to
 
 _WIDTH = 112
 
@@ -45,8 +44,7 @@ def evaluate_captures(project: Project, *, cores: int = 0) -> CaptureEvaluation:
 
 def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:
     """One table with a row for each capture, one of the figures with a column for each project."""
-    console = Console()
-    console.width = max(console.width, _WIDTH)  # a table that is cut when piped is of no use
+    console = console_of(_WIDTH)
     heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
              "deg")  # fmt: skip
     table = Table("capture", *heads, box=None, title="captures against truth, after scene")
@@ -61,8 +59,8 @@ def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:
                 _mean_mm(np.abs(e.offset), 2),
                 f"{e.slips.found} of {e.slips.found + e.slips.missed}",
                 str(e.slips.false),
-                _number(1e3 * e.ground_m, 2),
-                _number(e.ground_deg, 3),
+                number(1e3 * e.ground_m, 2),
+                number(e.ground_deg, 3),
             )
         for name in found.missing:
             table.add_row(name, "no scene")
@@ -72,13 +70,9 @@ def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:
     table.title = "all captures, after scene"
     for name in names:
         values = (found.figures.get(name, math.nan) for found in evaluations)
-        table.add_row(name, *(_number(value, 3) for value in values))
+        table.add_row(name, *(number(value, 3) for value in values))
     console.print(table)
 
 
 def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
-    return _number(1e3 * float(values.mean()), digits) if len(values) else ""
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+    return number(1e3 * float(values.mean()), digits) if len(values) else ""

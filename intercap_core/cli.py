@@ -57,6 +57,7 @@ class Part(StrEnum):
     sequences = "sequences"
     captures = "captures"
     objects = "objects"
+    bodies = "bodies"
 
 
 DEFAULT_SETTINGS = Path("config/config.yaml")
@@ -67,6 +68,16 @@ OBJECT_SETTINGS = [
     Path(f"config/object/{name}.yaml")
     for name in ("config", "no_detector", "noise_05", "noise_2", "family_b")
 ]
+BODY_SETTINGS = [
+    *(Path(f"config/object/{name}.yaml") for name in ("config", "noise_05", "noise_2", "family_b")),
+    *(
+        Path(f"config/body/{name}.yaml")
+        for name in (
+            "per_frame_shape", "rgb_only", "four_view", "four_view_rgb_only", "two_view",
+            "two_view_rgb_only", "one_view",
+        )
+    ),
+]  # fmt: skip
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
 SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
 Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all.")]
@@ -195,9 +206,13 @@ def evaluate(
         list[Path],
         typer.Option(metavar="SETTINGS", help="Recordings taken to the object track; may repeat."),
     ] = OBJECT_SETTINGS,
+    bodies: Annotated[
+        list[Path],
+        typer.Option(metavar="SETTINGS", help="Recordings taken to the body's fit; may repeat."),
+    ] = BODY_SETTINGS,
     only: Annotated[
         Part | None,
-        typer.Option(help="One part: taken to the end, to the scene, or to the object's track."),
+        typer.Option(help="One part: to the end, the scene, the object's track, the body's fit."),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
         "results/evaluation.json"
@@ -206,7 +221,7 @@ def evaluate(
 ) -> None:
     """Run the evaluation captures and print the tables against truth.
 
-    Examples: intercap evaluate; intercap evaluate --only objects --output object.json
+    Examples: intercap evaluate; intercap evaluate --only bodies --output body.json
     """
     from intercap_core.evaluation import evaluate as run_evaluation
 
@@ -214,7 +229,8 @@ def evaluate(
     whole = settings if only in (None, Part.sequences) else None
     scenes = captures if only in (None, Part.captures) else []
     tracks = objects if only in (None, Part.objects) else []
-    raise typer.Exit(run_evaluation(whole, scenes, tracks, output, cores=cores))
+    fits = bodies if only in (None, Part.bodies) else []
+    raise typer.Exit(run_evaluation(whole, scenes, tracks, fits, output, cores=cores))
 
 
 @app.command(rich_help_panel=WHOLE)

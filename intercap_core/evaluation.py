@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from intercap_core import body_evaluation
 from intercap_core.capture_evaluation import evaluate_captures, print_captures
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
@@ -25,6 +26,7 @@ def evaluate(
     settings: Path | None,
     captures: Sequence[Path],
     objects: Sequence[Path],
+    bodies: Sequence[Path],
     output: Path,
     *,
     cores: int = 0,
@@ -32,14 +34,17 @@ def evaluate(
     """Bring the evaluation captures up to date, print the tables and write ``output``.
 
     ``settings`` are of recordings that are taken to the end, ``captures`` of those that are taken
-    to the scene alone, ``objects`` of those that are taken to the object's track. ``output`` is
-    flat JSON with keys ``area.measure``: areas of annotated recordings end in ``_annotated``, those
-    of ``captures`` have their dataset's name, that of ``objects`` is ``object``. Returns the
-    workflow's exit status; sequences that failed are left out of the figures and named. Raises
-    UserError where a project's settings are wrong, or none of its sequences has a result.
+    to the scene alone, ``objects`` of those that are taken to the object's track, ``bodies`` to the
+    body's fit. ``output`` is flat JSON with keys ``area.measure``: areas of annotated recordings
+    end in ``_annotated``, those of ``captures`` have their dataset's name, that of ``objects`` is
+    ``object``, that of ``bodies`` is ``body``. Returns the workflow's exit status; sequences that
+    failed are left out of the figures and named. Raises UserError where a project's settings are
+    wrong, or none of its sequences has a result.
     """
     # faults are told before any work
-    projects, tracked = ([load_project(path) for path in paths] for paths in (captures, objects))
+    projects, tracked, fitted = (
+        [load_project(path) for path in paths] for paths in (captures, objects, bodies)
+    )
     status, flat = 0, dict[str, float]()
     if settings is not None:
         status, flat = _evaluate_sequences(settings, cores)
@@ -55,6 +60,12 @@ def evaluate(
         flat |= {key: _rounded(value) for key, value in track.flat().items()}
     if tracks:
         print_objects(tracks)
+    fits = [body_evaluation.evaluate_bodies(project, cores=cores) for project in fitted]
+    flat |= {key: _rounded(value) for key, value in body_evaluation.flat(fits).items()}
+    for fit in fits:
+        status = status or fit.status
+    if fits:
+        body_evaluation.print_bodies(fits)
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     print(output)

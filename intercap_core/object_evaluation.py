@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich.console import Console
 from rich.table import Table
 
 from intercap_core.metrics import object_errors
 from intercap_core.metrics.object_errors import ObjectErrors
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.stage_evaluation import take_to
+from intercap_core.stage_evaluation import console_of, number, take_to, variant
 
 AREA = "object"
 _WIDTH = 120
@@ -47,8 +45,7 @@ class ObjectEvaluation:
 
         Those of a dataset called object_<variant> are ``object.<variant>_lost_share`` and so on.
         """
-        variant = self.dataset.removeprefix(AREA).strip("_")
-        start = f"{variant}_" if variant else ""
+        start = variant(self.dataset, AREA)
         found = {f"{AREA}.{start}recordings": float(len(self.errors))}
         groups = {"": object_errors.figures(self.errors)}
         groups |= {f"{name}.": object_errors.figures(e) for name, e in self.objects.items()}
@@ -81,14 +78,13 @@ def evaluate_objects(project: Project, *, cores: int = 0) -> ObjectEvaluation:
 
 def print_objects(evaluations: Sequence[ObjectEvaluation]) -> None:
     """For each project a row an object and one for all, then a row for each number of views."""
-    console = Console()
-    console.width = max(console.width, _WIDTH)  # a table that is cut when piped is of no use
+    console = console_of(_WIDTH)
     for found in evaluations:
         table = Table("object", *_COLUMNS, box=None)
         table.title = f"{found.dataset}: objects against truth, after object_track"
         for name, errors in {**found.objects, "all": list(found.errors)}.items():
             figures = object_errors.figures(errors)
-            cells = (_number(figures.get(key), digits) for key, digits in _COLUMNS.values())
+            cells = (number(figures.get(key), digits) for key, digits in _COLUMNS.values())
             table.add_row(name, *cells)
         for name in found.missing:
             table.add_row(f"{name}: no track")
@@ -97,10 +93,6 @@ def print_objects(evaluations: Sequence[ObjectEvaluation]) -> None:
         for name, figures in object_errors.by_views(found.errors).items():
             digits = (0, 1, 2, 3)
             table.add_row(
-                name, *(_number(v, d) for v, d in zip(figures.values(), digits, strict=True))
+                name, *(number(v, d) for v, d in zip(figures.values(), digits, strict=True))
             )
         console.print(table)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from rich.console import Console
 
 from intercap_core.errors import UserError
 from intercap_core.project import Project
@@ -42,3 +45,25 @@ def take_to(project: Project, stage: str, *, cores: int = 0) -> Taken:
     if not made:
         raise UserError(f"{project.path}: no sequence has a {stage}; look into {project.logs}")
     return Taken(made, truths, [name for name in wanted if name not in made], status)
+
+
+def variant(dataset: str, *areas: str) -> str:
+    """What stands before a measure's name: "noise2_" of object_noise2 in the area object."""
+    for area in areas:
+        if dataset == area or dataset.startswith(f"{area}_"):
+            dataset = dataset.removeprefix(area)
+            break
+    name = dataset.strip("_")
+    return f"{name}_" if name else ""
+
+
+def console_of(width: int) -> Console:
+    """A console for tables of this width: one that is cut when piped is of no use."""
+    console = Console()
+    console.width = max(console.width, width)
+    return console
+
+
+def number(value: float | None, digits: int) -> str:
+    """A cell of a table; empty where the figure is not known."""
+    return "" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from intercap_core import body_evaluation
+from intercap_core.body_evaluation import BodyEvaluation
 from intercap_core.capture_evaluation import CaptureEvaluation, evaluate_captures, print_captures
-from intercap_core.cli import OBJECT_SETTINGS
+from intercap_core.cli import BODY_SETTINGS, OBJECT_SETTINGS
 from intercap_core.errors import UserError
 from intercap_core.metrics import capture
+from intercap_core.metrics.body_errors import BodyErrors
 from intercap_core.metrics.capture import CaptureErrors, SlipCounts
 from intercap_core.metrics.object_errors import ObjectErrors
 from intercap_core.object_evaluation import ObjectEvaluation, print_objects
@@ -96,4 +99,72 @@ def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixtu
     printed = capsys.readouterr().out
     for words in ("cup", "all", "kick_s09: no track", "2.1", "0.50"):
         assert words in printed
+    assert "nan" not in printed
+
+
+def test_bodies_with_less_are_fitted_to_recordings_that_others_make() -> None:
+    projects = [load_project(path) for path in BODY_SETTINGS]
+    first = projects[0]
+    assert first.config.studio is not None
+    made = {row.recordings for row in first.sequences.values()}
+    others = [project for project in projects if project.config.studio is None]
+    assert len(others) == 7
+    for project in others:
+        assert {row.recordings for row in project.sequences.values()} <= made
+    assert [body_evaluation.rig_of(project.config) for project in others] == [
+        "all views, a shape a frame",
+        "all views, no depth",
+        "4 views",
+        "4 views, no depth",
+        "2 views",
+        "2 views, no depth",
+        "1 view",
+    ]
+    assert {path for path in Path("config/body").glob("*.yaml")} < set(BODY_SETTINGS)
+
+
+def _body(name: str, pve_mm: float, *, interaction: str = "drink", flagged: bool = False):
+    def of(*shape: int) -> np.ndarray:
+        return np.full((2, *shape), 1e-3 * pve_mm)
+
+    return BodyErrors(
+        name, interaction, Path(f"{name}.h5"), 6, of(), of(), of(22), of(2), of(2),
+        np.ones((2, 2), bool), of(), of(), of(), np.ones((2, 22)), np.ones((2, 30)),
+        np.full(2, flagged), {},
+    )  # fmt: skip
+
+
+def _bodies() -> list[BodyEvaluation]:
+    main = [_body("a", 5), _body("b", 7, interaction="sit")]
+    return [
+        BodyEvaluation("object", "all views", main, [], 0),
+        BodyEvaluation("object_noise2", "all views", [_body("c", 50, flagged=True)], [], 0),
+        BodyEvaluation("body_two_view", "2 views", [_body("b", 90)], ["a"], 1),
+    ]
+
+
+def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
+    flat = body_evaluation.flat(_bodies())
+    assert flat["body.pve_mm"] == pytest.approx(6)
+    assert flat["body.sit.mpjpe_mm"] == pytest.approx(7)
+    assert flat["body.noise2_pve_mm"] == flat["body.drink.noise2_pve_mm"] == pytest.approx(50)
+    assert flat["body.two_view_mpjpe_mm"] == pytest.approx(90)
+    assert "body.drink.two_view_mpjpe_mm" not in flat
+    assert flat["body.compared_pve_mm"] == pytest.approx(7)  # of b, which two views saw as well
+    assert flat["body.joint_left_knee_mm"] == pytest.approx(6)
+    # bad frames are those of c, which are flagged, and those of b by two views, which are not
+    assert flat["body.bad_frames_recall"] == pytest.approx(0.5)
+    assert flat["body.bad_frames_precision"] == 1
+    assert flat["body.bad_frames_share"] == pytest.approx(0.5)
+    assert flat["body.two_view_bad_frames_recall"] == 0
+
+
+def test_bodies_are_printed_by_interaction_rig_joint_and_worst_frame(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    body_evaluation.print_bodies(_bodies())
+    printed = capsys.readouterr().out
+    for words in ("drink", "sit", "2 views: a: no fit", "left_knee", "object_noise2/c", "yes"):
+        assert words in printed
+    assert "bad frames in all: 4 of 8; flags' recall 0.50, precision 1.00" in printed
     assert "nan" not in printed

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from intercap_core import artefacts
 from intercap_core.camera.clouds import colour_lookup, depth_points
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.detection.masks import Runs
+from intercap_core.schemas import PERSON
 
 # Depth pixels are looked at only this far around the projected meshes: a fit that is further off
 # than this has an error that needs no exact figure.
@@ -75,12 +78,21 @@ def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarr
     return (rows * step + y0) * lens.width + columns * step + x0
 
 
+def read_person_masks(person: Path) -> list[list[bytes]]:
+    """Masks (T, C) of the person artefact, COCO RLE, empty = none."""
+    with artefacts.read(person, PERSON) as people:
+        masks = artefacts.unpack_ragged(people["mask_offsets"], people["mask_rle"])
+        sets, cameras = people["person"].shape
+    return [masks[t * cameras : (t + 1) * cameras] for t in range(sets)]
+
+
 class SegmentedClouds:
     """Person's and object's points of every frame, over all views.
 
     ``frames`` are read by the moment that their images show (:meth:`Frames.showing`);
     ``person_masks`` (T, C) of COCO RLE bytes, empty = none; ``candidate_masks`` the same of the
-    candidate that the object's track kept; ``depth_bias`` (C,) of the scene.
+    candidate that the object's track kept, None where it does not matter; ``depth_bias`` (C,) of
+    the scene.
     """
 
     def __init__(
@@ -88,7 +100,7 @@ class SegmentedClouds:
         frames: Frames,
         rig: Rig,
         person_masks: list[list[bytes]],
-        candidate_masks: list[list[bytes]],
+        candidate_masks: list[list[bytes]] | None,
         depth_bias: np.ndarray,
     ) -> None:
         self._frames = frames
@@ -105,7 +117,7 @@ class SegmentedClouds:
                 continue
             colour = camera.colour
             runs = [
-                Runs(masks[t][c], colour.height, colour.width) if masks[t][c] else None
+                Runs(masks[t][c], colour.height, colour.width) if masks and masks[t][c] else None
                 for masks in self._masks
             ]
             bias = float(self._bias[c])

@@ -27,12 +27,14 @@ _TIPS = [
 
 @dataclass(frozen=True, eq=False)
 class BodyTrack:
-    """T bodies. ``sigma`` (T, 55) stated deviation of the joints or None, ``joints`` (T, 55, 3)."""
+    """T bodies. ``sigma`` (T, 55) stated deviation of the joints or None, ``joints`` (T, 55, 3);
+    ``flagged`` (T,): the stage itself does not trust the frame."""
 
     model: BodyModel
     parameters: BodyParameters
     joints: np.ndarray
     tips: np.ndarray
+    flagged: np.ndarray
     sigma: np.ndarray | None = None
 
     def vertices(self) -> Iterator[np.ndarray]:
@@ -58,13 +60,16 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
     """Bodies of the ``"body_fit"`` or ``"joint"`` artefact; raises UserError as reading does."""
     with artefacts.read(path, BODY_FIT if stage == "body_fit" else JOINT) as artefact:
         parameters = read_parameters(artefact)
-        sigma = artefact["joint_sigma"] if stage == "body_fit" else None
+        first = stage == "body_fit"
+        sigma = artefact["joint_sigma"] if first else None
+        flags = ("failed", "bridged") if first else ("flagged",)
+        flagged = np.any([artefact[flag] for flag in flags], axis=0)
     model = load_model(body_models, gender, parameters)
     with torch.no_grad():
         ids = model.keypoint_map.vertex_ids
         posed = model.forward(parameters, vertex_ids=ids)
         tips = model.keypoints(posed)[:, _TIPS].numpy()
-    return BodyTrack(model, parameters, posed.joints.numpy(), tips, sigma)
+    return BodyTrack(model, parameters, posed.joints.numpy(), tips, flagged, sigma)
 
 
 def read_object(path: Path, stage: str) -> ObjectTrack:

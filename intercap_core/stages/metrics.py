@@ -19,7 +19,7 @@ from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.flags import merge_reasons
 from intercap_core.metrics.measurement import Measurement, Values
 from intercap_core.metrics.proximity import PosedObject
-from intercap_core.metrics.segmented import SegmentedClouds
+from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack, read_body, read_object
 from intercap_core.project import digest
 from intercap_core.rigid.mesh import ObjectMesh
@@ -110,10 +110,7 @@ def _clouds(
     found = Detections.load(detections).showing(scene["image_of"]).with_candidates_of(person)
     with artefacts.read(object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]
-    with artefacts.read(person, PERSON) as people:
-        masks = artefacts.unpack_ragged(people["mask_offsets"], people["mask_rle"])
     total, cameras = kept.shape
-    person_masks = [masks[t * cameras : (t + 1) * cameras] for t in range(total)]
     candidates = [
         [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
         for t in range(total)
@@ -121,7 +118,7 @@ def _clouds(
     return SegmentedClouds(
         images,
         Rig.from_artefact(scene),
-        person_masks,
+        read_person_masks(person),
         candidates,
         scene["depth_bias"],
     )
