@@ -30,8 +30,16 @@ class BodyClouds:
     """The person's points of one recording, as stage ``body_fit`` is given them: its masks, all
     views that have depth, refined extrinsics."""
 
-    def __init__(self, images: Frames, rig: Rig, clouds: SegmentedClouds, model: BodyModel) -> None:
-        self._images, self._rig, self._clouds = images, rig, clouds
+    def __init__(
+        self,
+        images: Frames,
+        rig: Rig,
+        masks: list[list[bytes]],
+        depth_bias: np.ndarray,
+        model: BodyModel,
+    ) -> None:
+        self._images, self._rig, self._masks = images, rig, masks
+        self._clouds = SegmentedClouds(images, rig, masks, None, depth_bias)
         self._faces = model.faces.numpy()
         template = model.template.numpy().astype(np.float64)
         self._samples = sample_surface(template, self._faces, SURFACE_SAMPLES)
@@ -45,16 +53,14 @@ class BodyClouds:
         with Frames.open(frames) as images, artefacts.read(scene, SCENE) as found:
             rig = Rig.from_artefact(found)
             images = images.showing(found["image_of"])
-            masks = read_person_masks(person)
-            clouds = SegmentedClouds(images, rig, masks, None, found["depth_bias"])
-            yield cls(images, rig, clouds, model)
+            yield cls(images, rig, read_person_masks(person), found["depth_bias"], model)
 
     def measure(self, t: int, vertices: np.ndarray, truth: Truth) -> dict[str, float]:
         """Mean distances of frame ``t`` by CLOUD_KEYS, metres; NaN where no point was measured.
 
         ``vertices`` (V, 3) fitted. Of points to the mesh; of samples of the mesh to the points,
-        those that a depth camera that was running truly sees; the floors are the same of the true
-        body, which no fit of a body without clothes can go far below.
+        those that some depth image in which the person was segmented truly shows. The floors are
+        the same of the true body, which no fit of a body without clothes can go far below.
         """
         assert truth.vertices is not None
         true = truth.vertices[t].astype(np.float64)
@@ -74,10 +80,10 @@ class BodyClouds:
         return found
 
     def _seen(self, t: int, true: np.ndarray, truth: Truth) -> np.ndarray:
-        """Which samples of the true body (N,) the depth cameras of this frame truly see."""
+        """Which samples of the true body (N,) are truly seen by depth that has a mask."""
         assert truth.visible is not None
         there = self._images.depth_available[t]
-        cameras = [camera for c, camera in enumerate(self._rig) if there[c]]
+        cameras = [c for i, c in enumerate(self._rig) if there[i] and self._masks[t][i]]
         object_ = truth.object_vertices @ truth.rotation[t].T + truth.translation[t]
         sight = Sight([(true, self._faces), (object_, truth.object_faces)])
         points = self._samples.of(true, self._faces)
