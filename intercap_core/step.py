@@ -144,6 +144,7 @@ def run_dataset(project: Project) -> Path:
                         "detections",
                         "person",
                         "object_track",
+                        "body_fit",
                         "joint",
                         "metrics",
                     )

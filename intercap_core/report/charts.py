@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
 import numpy as np
+
+from intercap_core.metrics import flags
 
 _WIDTH, _HEIGHT = 520, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 34, 44
@@ -155,6 +157,48 @@ def state_timeline(
     for tick in ticks(0, total, 8):
         if tick < total and tick == int(tick):
             parts.append(_text(at_x(tick + 0.5), height - 6, _number(tick), "tick", "middle"))
+    return "".join([*parts, "</svg>"])
+
+
+def state_runs(states: Sequence[str], words: Mapping[str, str]) -> list[tuple[int, int, str, str]]:
+    """Runs of the same state for a :class:`StateRow`, with what ``words`` say of it."""
+    return [
+        (a, b, state, f"{a}–{b}: {words[state]}" if b > a else f"{a}: {words[state]}")
+        for a, b, state in flags.ranges(states)
+    ]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A number, drawn as a bar with a thin line on to the ``most`` it comes to."""
+
+    name: str
+    value: float
+    most: float
+    beside: str
+
+
+def bars(rows: Sequence[Bar], unit: str) -> str:
+    """One bar a row, with its value."""
+    top = max([*(row.most for row in rows), 1e-9])
+    left, inner, tall = _room_for([row.name for row in rows]), 300, 16
+    width, height = left + inner + 150, tall * len(rows) + 40
+    parts = [_open(width, height, unit)]
+    for tick in ticks(0, top):
+        x = left + inner * tick / top
+        parts.append(f'<line class="grid" {_same("x", x)} y1="2" y2="{height - 36}"/>')
+        parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
+    for index, row in enumerate(rows):
+        y = tall * index + 4
+        parts.append(_text(left - 8, y + 9, row.name, "tick", "end"))
+        for value, css, down, thick in ((row.most, "faint", 3, 3), (row.value, "c1", 0, 9)):
+            parts.append(
+                f'<rect class="bar {css}" x="{left}" y="{y + down}" '
+                f'width="{max(1.0, inner * value / top):.1f}" height="{thick}"/>'
+            )
+        text = f"{row.value:.1f}, {row.beside}"
+        parts.append(_text(left + inner + 10, y + 9, text, "tick", "start"))
+    parts.append(_text(left + inner / 2, height - 6, unit, "label", "middle"))
     return "".join([*parts, "</svg>"])
 
 

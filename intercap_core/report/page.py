@@ -17,14 +17,15 @@ from markupsafe import Markup
 
 from intercap_core.metrics import figures, flags
 from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.report import capture, charts, measures
+from intercap_core.report import body, capture, charts, measures
 from intercap_core.report import track as tracks
+from intercap_core.report.body import BodyFacts
 from intercap_core.report.capture import CaptureFacts
 from intercap_core.report.capture_pictures import CapturePicture
 from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
 from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.report.sheets import Sheet
 from intercap_core.report.track import TrackFacts
-from intercap_core.report.track_pictures import TrackSheet
 from intercap_core.schemas import METRIC_REGIONS
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -56,9 +57,9 @@ class ObjectHeat:
 class Content:
     """All that the page is made from.
 
-    ``captures`` and ``tracks`` of the sequences that are shown. ``residuals`` by sequence: name,
-    before and after of each camera pair, metres. ``trace`` by sequence: what to print of each
-    stage. ``failed``: sequences without a result and why.
+    ``captures``, ``tracks`` and ``bodies`` of the sequences that are shown. ``residuals`` by
+    sequence: name, before and after of each camera pair, metres. ``trace`` by sequence: what to
+    print of each stage. ``failed``: sequences without a result and why.
     """
 
     dataset: str
@@ -67,6 +68,7 @@ class Content:
     details: Sequence[Detail]
     captures: Sequence[CaptureFacts]
     tracks: Sequence[TrackFacts]
+    bodies: Sequence[BodyFacts]
     body_heat: Sequence[HeatPicture]
     body_top: float
     body_frames: int
@@ -110,7 +112,8 @@ def _context(content: Content) -> dict[str, Any]:
         "heat": _heat(content),
         "cameras": measures.cameras(content.sequences, content.residuals),
         "captures": [_capture(facts) for facts in content.captures],
-        "tracks": [_track(facts) for facts in content.tracks],
+        "tracks": [_with_sheet(tracks.context(facts)) for facts in content.tracks],
+        "bodies": [_with_sheet(body.context(facts)) for facts in content.bodies],
         "worst": sorted(rows, key=lambda row: row["rank"])[:_WORST],
         "flagged_runs": runs[:_MAX_RUNS],
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
@@ -225,11 +228,12 @@ def _capture(facts: CaptureFacts) -> dict[str, Any]:
     return found
 
 
-def _track(facts: TrackFacts) -> dict[str, Any]:
-    found = tracks.context(facts)
-    if facts.sheet is not None:
-        rows = ", ".join(map(str, facts.sheet.frames))
-        found["sheet"] = _embedded(facts.sheet, f"{facts.name}, frames {rows} in every camera")
+def _with_sheet(found: dict[str, Any]) -> dict[str, Any]:
+    """A section's context with its sheet, where it has one, as the page embeds it."""
+    sheet = found["sheet"]
+    if sheet is not None:
+        rows = ", ".join(map(str, sheet.frames))
+        found["sheet"] = _embedded(sheet, f"{found['name']}, frames {rows} in every camera")
     return found
 
 
@@ -304,11 +308,11 @@ def _counted(count: int, what: str) -> str:
 
 
 def _embedded(
-    picture: HeatPicture | Overlay | CapturePicture | TrackSheet, caption: str
+    picture: HeatPicture | Overlay | CapturePicture | Sheet, caption: str
 ) -> dict[str, Any]:
     if isinstance(picture, CapturePicture):
         kind, data = picture.kind, picture.data
-    elif isinstance(picture, Overlay | TrackSheet):
+    elif isinstance(picture, Overlay | Sheet):
         kind, data = "jpeg", picture.jpeg
     else:
         kind, data = "png", picture.png

@@ -14,13 +14,12 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
 from intercap_core.errors import UserError
-from intercap_core.metrics import flags
 from intercap_core.report import charts
 from intercap_core.report.overlays import choose_frames
+from intercap_core.report.sheets import Sheet
 from intercap_core.report.track_pictures import (
     CANDIDATE_COLOUR,
     TRACK_COLOUR,
-    TrackSheet,
     track_sheet,
 )
 from intercap_core.rigid.mesh import ObjectMesh
@@ -62,7 +61,7 @@ class TrackFacts:
     sigma_mm: np.ndarray
     sigma_deg: np.ndarray
     recovered: list[int]
-    sheet: TrackSheet | None
+    sheet: Sheet | None
     note: str = ""
 
 
@@ -109,7 +108,7 @@ def _sheet(
     poses: np.ndarray,
     kept: Callable[[int, int], bytes],
     overlap: np.ndarray,
-) -> tuple[TrackSheet | None, str]:
+) -> tuple[Sheet | None, str]:
     """The sheet, or None and why: one broken image must not cost the whole report."""
     try:
         with artefacts.read(scene, SCENE) as setting, Frames.open(frames) as images:
@@ -124,7 +123,7 @@ def _sheet(
 def context(facts: TrackFacts) -> dict[str, Any]:
     """What the template needs; the sheet is left as it is."""
     total = len(facts.state)
-    states = _runs(facts.state, TRACK_STATES)
+    states = charts.state_runs(facts.state, TRACK_STATES)
     rows = [charts.StateRow("track", states, _counted(facts))]
     for c, name in enumerate(facts.cameras):
         overlap = facts.overlap[:, c]
@@ -134,7 +133,7 @@ def context(facts: TrackFacts) -> dict[str, Any]:
         if kept.any():
             beside += f" · IoU {_median(overlap):.2f}"
             beside += _also(1e3 * facts.depth[:, c], "mm") + _also(facts.contour[:, c], "px")
-        rows.append(charts.StateRow(name, _runs(seen, VIEW_STATES), beside))
+        rows.append(charts.StateRow(name, charts.state_runs(seen, VIEW_STATES), beside))
     marks = [(t - 1, f"{t}: found again") for t in facts.recovered]
     return {
         "name": facts.name,
@@ -165,13 +164,6 @@ def _states(lost: np.ndarray, doubtful: np.ndarray, resting: np.ndarray) -> list
 
 def _grade(overlap: float) -> str:
     return "agrees" if overlap >= GOOD_OVERLAP else "partly"
-
-
-def _runs(states: list[str], words: dict[str, str]) -> list[tuple[int, int, str, str]]:
-    return [
-        (a, b, state, f"{a}–{b}: {words[state]}" if b > a else f"{a}: {words[state]}")
-        for a, b, state in flags.ranges(states)
-    ]
 
 
 def _counted(facts: TrackFacts) -> str:

@@ -24,13 +24,14 @@ from intercap_core.metrics.contact import CONTACT_M
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.heatmaps import Heatmaps, collect
 from intercap_core.report import tables
+from intercap_core.report.body import read_fit
 from intercap_core.report.capture import read_capture
 from intercap_core.report.heat_pictures import body_pictures, object_pictures
 from intercap_core.report.overlays import Fit, choose_cameras, choose_frames, overlays
 from intercap_core.report.page import Content, Detail, ObjectHeat, render
 from intercap_core.report.track import TrackFacts, read_track
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.schemas import FRAMES, HEATMAPS, JOINT, METRICS, OBJECT_TRACK, SCENE
+from intercap_core.schemas import BODY_FIT, FRAMES, HEATMAPS, JOINT, METRICS, OBJECT_TRACK, SCENE
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,7 @@ class SequenceArtefacts:
     detections: Path
     person: Path
     object_track: Path
+    body_fit: Path
     joint: Path
     metrics: Path
 
@@ -96,6 +98,11 @@ def run(
         for name, s in zip(sequences, measured, strict=True)
         if name in shown
     ]
+    bodies = [
+        read_fit(p.frames, p.scene, p.person, p.body_fit, body_models, subjects[s.subject].gender)
+        for p, s in zip(sequences.values(), measured, strict=True)
+        if s.name in shown
+    ]
     first = next(iter(sequences.values()))
     with artefacts.read(first.joint, JOINT) as artefact:
         model = load_model(
@@ -110,6 +117,7 @@ def run(
         details=details,
         captures=captures,
         tracks=tracks,
+        bodies=bodies,
         body_heat=body_pictures(model, heat.body, body_top),
         body_top=body_top,
         body_frames=heat.body_frames,
@@ -207,6 +215,7 @@ def _trace(paths: SequenceArtefacts) -> dict[str, str]:
         (paths.frames, FRAMES),
         (paths.scene, SCENE),
         (paths.object_track, OBJECT_TRACK),
+        (paths.body_fit, BODY_FIT),
         (paths.joint, JOINT),
         (paths.metrics, METRICS),
     )

@@ -55,6 +55,7 @@ def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Pat
                     "detections",
                     "person",
                     "object_track",
+                    "body_fit",
                     "joint",
                     "metrics",
                 )

@@ -266,7 +266,15 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
                 metrics=measured,
                 **{
                     s: paths[s]
-                    for s in ("frames", "scene", "detections", "person", "object_track", "joint")
+                    for s in (
+                        "frames",
+                        "scene",
+                        "detections",
+                        "person",
+                        "object_track",
+                        "body_fit",
+                        "joint",
+                    )
                 },
             )
         },

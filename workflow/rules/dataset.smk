@@ -6,6 +6,7 @@ rule dataset:
         detections=expand(rules.detections.output.detections, sequence=SEQUENCES),
         person=expand(rules.person.output.person, sequence=SEQUENCES),
         object_track=expand(rules.object_track.output.object_track, sequence=SEQUENCES),
+        body_fit=expand(rules.body_fit.output.body_fit, sequence=SEQUENCES),
         joint=expand(rules.joint.output.joint, sequence=SEQUENCES),
         metrics=expand(rules.metrics.output.metrics, sequence=SEQUENCES),
     output:
