@@ -13,9 +13,10 @@ from torch import Tensor
 
 from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
-from intercap_core.energy import body_cloud, body_keypoints
+from intercap_core.energy import body_cloud, body_keypoints, body_self
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows
 from intercap_core.energy.body_keypoints import KeypointSet
+from intercap_core.energy.body_self import SelfContact
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import BodyProblem, Views
 from intercap_core.solve.velocity import limited_velocity
@@ -70,6 +71,7 @@ class Evidence:
         self.clouds = [clouds[t] for t in self.frames]
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
         self.samples = body_cloud.choose_samples(model)
+        self.self_contact = SelfContact.of(model, self.samples)
         self.patch = torch.as_tensor(self.samples.patch, device=model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
         self.group = torch.as_tensor(self.samples.group, device=model.device)
@@ -197,6 +199,24 @@ class Evidence:
                 found = 1.4826 * float(away[:, part][known].median())
                 low, high = (covering.noise * factor for factor in _NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
+
+    def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
+        """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
+        not asked for."""
+        if not problem.self_weight:
+            return None
+        params = self.model.parameters(problem.base)
+        found = []
+        for start in range(0, len(self.frames), _VERTEX_CHUNK):
+            vertices = self.model.forward(
+                params.frames(slice(start, start + _VERTEX_CHUNK))
+            ).vertices
+            normals = body_cloud.vertex_normals(vertices, self.model.faces)
+            found += [
+                body_self.find(self.self_contact, *one)
+                for one in zip(vertices, normals, strict=True)
+            ]
+        return body_self.join(found)
 
     def match(self, problem: BodyProblem, reach: float) -> CloudRows:
         """Correspondences of all frames at the problem's bodies, within ``reach`` metres."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.energy import body_cloud, body_keypoints, body_priors
+from intercap_core.energy import body_cloud, body_keypoints, body_priors, body_self
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows, Samples
 from intercap_core.energy.body_keypoints import Keypoints, KeypointSet, PointTerm
 from intercap_core.solve.levenberg_marquardt import NormalEquations
@@ -64,7 +64,8 @@ class BodyProblem:
     keypoints: those that take part, the 25 of the body first. base (T,P): parameters that are not
     fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they
     belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
-    where ``fit_shared`` says so, else fixed.
+    where ``fit_shared`` says so, else fixed. touching: the body's parts that are inside each other,
+    and the weight of that.
     """
 
     model: BodyModel
@@ -78,6 +79,8 @@ class BodyProblem:
     views: Views | None = None
     targets: Targets | None = None
     rows: CloudRows | None = None
+    touching: body_self.Pairs | None = None
+    self_weight: float = 1.0
     fit_shared: bool = False
     _sample_ids: Tensor = field(init=False)
     _group: Tensor = field(init=False)
@@ -159,6 +162,9 @@ class BodyProblem:
             points = self.model.forward(params, vertex_ids=self._sample_ids).vertices
             rows = CloudRows(*(part[index] for part in self.rows))
             total = total + body_cloud.cost(points, rows, self._rest * u.exp(), self._group)
+        if self.touching is not None:
+            inside = body_self.cost(self.model, params, self.touching, index)
+            total = total + self.self_weight * inside
         return total
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
@@ -207,6 +213,12 @@ class BodyProblem:
                 hessian[:, :n, u_at] += cloud.cross
                 hessian[:, u_at, :n] += cloud.cross.transpose(1, 2)
             total = total + cloud.cost
+        if self.touching is not None:
+            inside = body_self.assemble(self.model, params, self.touching, index, columns)
+            if inside is not None:
+                gradient[inside.present, :n] += self.self_weight * inside.gradient
+                hessian[inside.present, :n, :n] += self.self_weight * inside.hessian
+                total = total.index_add(0, inside.present, self.self_weight * inside.cost)
         cost, prior_gradient, prior_hessian = body_priors.assemble(
             self.model, x, shape=not self.one_shape
         )

@@ -106,6 +106,7 @@ class Fitter:
             columns_of(self.model, hands=False, face=False, betas=not self.one_shape),
             self.one_shape,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
+            self_weight=self.settings.self_penetration_weight,
         )  # fmt: skip
         problem.targets = self._lifted()
         for widened in _WIDENED if problem.targets else (1.0, 1.0):
@@ -131,6 +132,7 @@ class Fitter:
         for last in (False, True):
             if evidence.has_cloud:
                 problem.rows = evidence.match(problem, _REACH_M[-1])
+            problem.touching = evidence.touch(problem)
             evidence.refine_sigma(problem)
             evidence.look(problem, hands=hands, face=face)
             solution = self._minimise(problem, 5, keep_normal=last)
@@ -148,12 +150,14 @@ class Fitter:
             ),
             False,
             offsets=settled.offsets.to(base), u=settled.covering.to(base),
+            self_weight=self.settings.self_penetration_weight,
         )  # fmt: skip
 
     def observe(self, problem: BodyProblem) -> None:
         """Take correspondences, visibility and pixel sigmas anew at the problem's bodies."""
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, _REACH_M[-1])
+        problem.touching = self.evidence.touch(problem)
         self.evidence.look(problem, hands=self.settings.hands, face=self.settings.face)
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 All frames are fitted at once by second-order steps. There is no term between frames: each stands
 on what its own views show, apart from one shape, the clothing's thickness and the detector's fixed
-offsets, which all frames share. Self-penetration (E_P_self of equation 3) is not penalised.
+offsets, which all frames share.
 """
 
 from __future__ import annotations
