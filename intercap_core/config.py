@@ -147,6 +147,8 @@ class BodyFitSettings(Model):
     """Person points kept of each frame's fused cloud."""
     cloud_weight: Positive = 1.0
     """Weight of the cloud against the keypoints (lambda_D)."""
+    self_penetration_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of the body's parts not entering each other (lambda_P of equation 2); 0 = not asked."""
 
 
 class JointSettings(Model):
