@@ -148,7 +148,7 @@ class BodyFitSettings(Model):
     cloud_weight: Positive = 1.0
     """Weight of the cloud against the keypoints (lambda_D)."""
     self_penetration_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of the body's parts not entering each other (lambda_P of equation 2); 0 = not asked."""
+    """Weight of the body's parts not entering each other (lambda_P of equation 2)."""
 
 
 class JointSettings(Model):
@@ -270,6 +270,11 @@ class BodyModels(Model):
     """SMPLX_FEMALE.npz."""
     male: Path | None = None
     """SMPLX_MALE.npz."""
+    vposer: Path | None = None
+    """VPoser's weights, the prior of the body's pose: TR00_E096.pt (version 1) or a V02_05 .ckpt;
+    without, the open prior is used."""
+    vposer_version: Literal[1, 2] | None = None
+    """Version that the file must have; without, it is told from the weights."""
 
 
 class Config(Model):

@@ -173,11 +173,11 @@ def _check_files(project: Project) -> None:
                     f"{tidy(project.path.parent / project.config.objects)}: object {name!r} has "
                     f"{field} {file}, and there is no such file; correct the path"
                 )
-    for gender, file in project.config.body_models:
-        if file is not None and not file.is_file():
+    for field, file in project.config.body_models:
+        if isinstance(file, Path) and not file.is_file():
             raise UserError(
-                f"{project.path}: body_models.{gender} is {file}, and there is no such file; "
-                "correct the path, or remove the line to use the open body"
+                f"{project.path}: body_models.{field} is {file}, and there is no such file; "
+                "correct the path, or remove the line to use what is open"
             )
     _check_detectors(project)
 

@@ -10,6 +10,7 @@ import torch
 from intercap_core.artefacts import Artefact
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyModels
 
 _NAMES = (
@@ -21,6 +22,17 @@ _NAMES = (
 def body_path(body_models: BodyModels, gender: str) -> Path | None:
     """The body file for a gender: its own, else the neutral one, else None (the open body)."""
     return getattr(body_models, gender, None) or body_models.neutral
+
+
+def load_pose_prior(body_models: BodyModels, model: BodyModel) -> VPoser | None:
+    """The VPoser that the settings name, on the body's device; None = the open prior.
+
+    Raises UserError for a file that is none, or of another version than named.
+    """
+    if body_models.vposer is None:
+        return None
+    version = body_models.vposer_version
+    return VPoser.load(body_models.vposer, version, device=model.device, dtype=model.dtype)
 
 
 def read_parameters(artefact: Artefact) -> BodyParameters:

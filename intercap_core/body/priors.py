@@ -81,18 +81,18 @@ def bending(vector: Tensor) -> DiagonalRows:
     return DiagonalRows(residuals, sign * residuals, columns)
 
 
-def rest_pose(vector: Tensor) -> DiagonalRows:
+def rest_pose(vector: Tensor, *, first: int = 1) -> DiagonalRows:
     """A weak pull to standing at ease: r = (theta - mean) / spread for the 21 body joints, the jaw
-    and the eyes.
+    and the eyes, from joint ``first`` on.
 
     Means and spreads are broad guesses of everyday poses (`joint_limits.REST_SPREAD_DEG`): they
     only hold what nothing has seen.
     """
-    columns = torch.arange(3, 75, device=vector.device)
+    columns = torch.arange(3 * first, 75, device=vector.device)
     table = torch.deg2rad(torch.tensor(REST_SPREAD_DEG, dtype=vector.dtype, device=vector.device))[
-        1:25
+        first:25
     ].reshape(-1, 2)
-    residuals = (vector[:, 3:75] - table[:, 0]) / table[:, 1]
+    residuals = (vector[:, 3 * first : 75] - table[:, 0]) / table[:, 1]
     return DiagonalRows(residuals, (1 / table[:, 1]).expand_as(residuals), columns)
 
 

@@ -3,6 +3,13 @@
 Version 1 (`TR00_E096.pt`) and version 2 (`V02_05`, a Lightning checkpoint) decode a 32-number code
 to the 21 body rotations by three linear layers; they differ in key names and in the leaky ReLU's
 slope, and their codes are not interchangeable. A code's prior is a standard normal.
+
+The fit keeps the pose itself as its parameter: a pose is what a code decodes to, give or take some
+degrees, so that observations can leave what the network rebuilds exactly,
+
+    E_theta_b(theta) = min over z of |z|^2 / 2 + |theta - decode(z)|^2 / 2 s^2,
+
+the paper's |z|^2 for s = 0. Around the best code that is a Gaussian over theta.
 """
 
 from __future__ import annotations
@@ -10,6 +17,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +33,24 @@ _VERSIONS = {
 }
 _PREFIXES = ("module.", "vp_model.")
 _MATRIX_LOG_EPSILON = 1e-7
+_SPREAD = 0.1  # rad about what a code decodes to: poses of AMASS are rebuilt to some 5 degrees
+_CODE_STEPS = 12
+_CODE_DAMPING = 0.3  # of a unit code: far from linear, the decoder's steps are held back
+
+
+class PoseGaussian(NamedTuple):
+    """What a pose prior says around B poses: mean (B,63) rad, precision (B,63,63)."""
+
+    mean: Tensor
+    precision: Tensor
+
+    def of_frames(self, index: Tensor) -> PoseGaussian:
+        return PoseGaussian(self.mean[index], self.precision[index])
+
+    def cost(self, body_pose: Tensor) -> Tensor:
+        """(B,) of poses (B,63)."""
+        away = body_pose - self.mean
+        return 0.5 * (away[:, None] @ self.precision @ away[..., None])[:, 0, 0]
 
 
 @dataclass(frozen=True)
@@ -36,8 +62,18 @@ class VPoser:
     slope: float
 
     @classmethod
-    def load(cls, path: Path, dtype: torch.dtype = torch.float32) -> VPoser:
-        """Read either version; `UserError` if the file is missing or holds no decoder."""
+    def load(
+        cls,
+        path: Path,
+        version: Literal[1, 2] | None = None,
+        *,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> VPoser:
+        """Read the weights; the version is told by their names where it is not given.
+
+        `UserError` if the file is missing, holds no decoder, or that of another version than given.
+        """
         if not path.is_file():
             raise UserError(
                 f"VPoser file {path} does not exist: expected TR00_E096.pt (version 1) or a V02_05 "
@@ -51,15 +87,23 @@ class VPoser:
                 f"({type(error).__name__}): save its state_dict alone with torch.save and use that."
             ) from error
         state = read.get("state_dict", read) if isinstance(read, dict) else {}
-        weights = {_bare(str(name)): value for name, value in state.items()}
-        for version, (names, slope) in _VERSIONS.items():
-            if all(f"{name}.weight" in weights for name in names):
+        weights = {
+            _bare(str(name)): value for name, value in state.items() if isinstance(value, Tensor)
+        }
+        for found, (names, slope) in _VERSIONS.items():
+            parts = [(f"{name}.weight", f"{name}.bias") for name in names]
+            if all(part in weights for pair in parts for part in pair):
+                if version not in (None, found):
+                    raise UserError(
+                        f"VPoser file {path} holds the weights of version {found}, and version "
+                        f"{version} is named: codes of the two mean different poses; name version "
+                        f"{found}, or take the file of version {version}."
+                    )
+                _check(path, tuple((weights[w], weights[b]) for w, b in parts))
                 layers = tuple(
-                    (weights[f"{name}.weight"].to(dtype), weights[f"{name}.bias"].to(dtype))
-                    for name in names
+                    (weights[w].to(device, dtype), weights[b].to(device, dtype)) for w, b in parts
                 )
-                _check(path, layers)
-                return cls(version, layers, slope)
+                return cls(found, layers, slope)
         raise UserError(
             f"VPoser file {path} has no decoder of version 1 or 2: expected keys such as "
             "bodyprior_dec_fc1.weight or vp_model.decoder_net.0.weight; take the published file."
@@ -80,6 +124,36 @@ class VPoser:
     def decode(self, code: Tensor) -> Tensor:
         """(B,32) -> body_pose (B,63), axis-angle."""
         return axis_angle_from_rotation(self.rotations(code)).reshape(*code.shape[:-1], 63)
+
+    def around(self, body_pose: Tensor) -> PoseGaussian:
+        """The prior around poses (B,63), at the codes that explain them best (Gauss-Newton)."""
+        code = body_pose.new_zeros(len(body_pose), LATENT)
+        eye = torch.eye(LATENT, dtype=code.dtype, device=code.device)
+        decoded, by_code = self.decode_with_jacobian(code)
+        cost = self._cost(code, decoded, body_pose)
+        damping = torch.full_like(cost, _CODE_DAMPING)
+        for _ in range(_CODE_STEPS):
+            gradient = code - (by_code.mT @ (body_pose - decoded)[..., None])[..., 0] / _SPREAD**2
+            hessian = by_code.mT @ by_code / _SPREAD**2 + (1 + damping)[:, None, None] * eye
+            trial = code - torch.linalg.solve(hessian, gradient)
+            trial_decoded, trial_by = self.decode_with_jacobian(trial)
+            trial_cost = self._cost(trial, trial_decoded, body_pose)
+            better = trial_cost <= cost
+            code = torch.where(better[:, None], trial, code)
+            decoded = torch.where(better[:, None], trial_decoded, decoded)
+            by_code = torch.where(better[:, None, None], trial_by, by_code)
+            cost = torch.where(better, trial_cost, cost)
+            damping = torch.where(better, 0.3 * damping, 10 * damping + 1)
+        # theta = decoded + J (z - code) + noise, z standard normal: the noise's and z's covariance
+        mean = decoded - (by_code @ code[..., None])[..., 0]
+        pose_eye = torch.eye(body_pose.shape[1], dtype=code.dtype, device=code.device)
+        covariance = by_code @ by_code.mT + _SPREAD**2 * pose_eye
+        precision = torch.linalg.inv(covariance)
+        return PoseGaussian(mean, 0.5 * (precision + precision.mT))
+
+    def _cost(self, code: Tensor, decoded: Tensor, body_pose: Tensor) -> Tensor:
+        away = (body_pose - decoded) / _SPREAD
+        return 0.5 * ((code**2).sum(1) + (away**2).sum(1))
 
     def decode_with_jacobian(self, code: Tensor) -> tuple[Tensor, Tensor]:
         """(B,32) -> body_pose (B,63) and its derivative by the code (B,63,32)."""
@@ -113,6 +187,11 @@ def _bare(name: str) -> str:
 
 
 def _check(path: Path, layers: tuple[tuple[Tensor, Tensor], ...]) -> None:
+    parts = [part for pair in layers for part in pair]
+    if not all(part.is_floating_point() and bool(part.isfinite().all()) for part in parts):
+        raise UserError(
+            f"VPoser file {path} has weights that are not finite numbers: take the published file."
+        )
     hidden = layers[0][0].shape[0]
     expected = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
     found = tuple(tuple(weight.shape) for weight, _ in layers)

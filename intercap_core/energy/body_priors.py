@@ -2,8 +2,8 @@
 
 The terms themselves are in :mod:`intercap_core.body.priors`; here they are weighed and summed. With
 observations weighed by their noise, Gaussian priors have weight one: they are in units of their own
-spread. The open default stands in for VPoser: a broad Gaussian about standing at ease and
-anatomical limits.
+spread. E_theta_b is VPoser where the user has it; the open default is a broad Gaussian about
+standing at ease. Anatomical limits hold with either.
 """
 
 from __future__ import annotations
@@ -14,47 +14,64 @@ import torch
 from torch import Tensor
 
 from intercap_core.body import priors
+from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body.vposer import PoseGaussian
 
 _LIMIT_WEIGHT = 1 / math.radians(4)  # ranges are means plus two deviations: a soft edge
 _BENDING_WEIGHT = 1 / 6  # exp(sign theta) = 1 at the straight limb, where it should cost little
+_BODY_POSE = slice(3, 66)
 _SMALLEST_HAND_DEVIATION = 0.03  # components that hardly vary among grasps still give a little
 
 
 def terms(
-    model: BodyModel, vector: Tensor
+    model: BodyModel, vector: Tensor, *, body_pose: bool = True
 ) -> list[tuple[priors.DiagonalRows | priors.LinearRows, float]]:
-    """All prior terms and weights at parameter vectors (B,P), shape and expression left out."""
+    """All prior terms and weights at parameter vectors (B,P), shape and expression left out.
+
+    ``body_pose``: with the open default's Gaussian of the 21 body joints.
+    """
     deviation = model.hand_deviation.clamp_min(_SMALLEST_HAND_DEVIATION)
     own = (model.hand_mean, model.hand_components, deviation)
     hands = [(priors.hand_pose(vector, *own, side=side), 1.0) for side in (0, 1)]
     return [
-        (priors.rest_pose(vector), 1.0),
+        (priors.rest_pose(vector, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
         (priors.joint_limits(vector), _LIMIT_WEIGHT),
         (priors.bending(vector), _BENDING_WEIGHT),
         *hands,
     ]
 
 
-def cost(model: BodyModel, vector: Tensor, *, shape: bool) -> Tensor:
-    """(B,) at (B,P); ``shape``: betas included (else they are the caller's), expression always."""
+def cost(
+    model: BodyModel, vector: Tensor, *, shape: bool, pose: PoseGaussian | None = None
+) -> Tensor:
+    """(B,) at (B,P); ``shape``: betas included (else they are the caller's), expression always;
+    ``pose`` instead of the open prior of the body's pose."""
     total = 0.5 * (vector[:, _quadratic(model, shape)] ** 2).sum(1)
-    for rows, weight in terms(model, vector):
+    if pose is not None:
+        total = total + pose.cost(vector[:, _BODY_POSE])
+    for rows, weight in terms(model, vector, body_pose=pose is None):
         total = total + rows.energy(weight)
     return total
 
 
-def assemble(model: BodyModel, vector: Tensor, *, shape: bool) -> tuple[Tensor, Tensor, Tensor]:
+def assemble(
+    model: BodyModel, vector: Tensor, *, shape: bool, pose: PoseGaussian | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (B,), gradient (B,P) and Gauss-Newton Hessian (B,P,P) of all priors at (B,P)."""
     batch, size = vector.shape
     gradient, hessian = torch.zeros_like(vector), vector.new_zeros(batch, size, size)
-    for rows, weight in terms(model, vector):
+    if pose is not None:
+        away = vector[:, _BODY_POSE] - pose.mean
+        gradient[:, _BODY_POSE] += (pose.precision @ away[..., None])[..., 0]
+        hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
+    for rows, weight in terms(model, vector, body_pose=pose is None):
         rows.add_to(hessian, gradient, weight)
     at = _quadratic(model, shape)
     gradient[:, at] += vector[:, at]
     hessian.diagonal(dim1=1, dim2=2)[:, at] += 1
-    return cost(model, vector, shape=shape), gradient, hessian
+    return cost(model, vector, shape=shape, pose=pose), gradient, hessian
 
 
 def _quadratic(model: BodyModel, shape: bool) -> slice:

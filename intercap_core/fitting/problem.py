@@ -14,6 +14,7 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body.vposer import PoseGaussian
 from intercap_core.energy import body_cloud, body_keypoints, body_priors, body_self
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows, Samples
 from intercap_core.energy.body_keypoints import Keypoints, KeypointSet, PointTerm
@@ -65,7 +66,7 @@ class BodyProblem:
     fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they
     belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
     where ``fit_shared`` says so, else fixed. touching: the body's parts that are inside each other,
-    and the weight of that.
+    and the weight of that. pose: what a learned prior says of each frame's pose.
     """
 
     model: BodyModel
@@ -81,6 +82,7 @@ class BodyProblem:
     rows: CloudRows | None = None
     touching: body_self.Pairs | None = None
     self_weight: float = 1.0
+    pose: PoseGaussian | None = None
     fit_shared: bool = False
     _sample_ids: Tensor = field(init=False)
     _group: Tensor = field(init=False)
@@ -157,7 +159,7 @@ class BodyProblem:
         keypoints = body_keypoints.evaluate(
             self.model, params, self.keypoints, offsets, derivatives=False
         )
-        total = self._points(keypoints, index).cost + self._prior_cost(x, shared)
+        total = self._points(keypoints, index).cost + self._prior_cost(x, shared, index)
         if self.rows is not None:
             points = self.model.forward(params, vertex_ids=self._sample_ids).vertices
             rows = CloudRows(*(part[index] for part in self.rows))
@@ -220,7 +222,7 @@ class BodyProblem:
                 hessian[inside.present, :n, :n] += self.self_weight * inside.hessian
                 total = total.index_add(0, inside.present, self.self_weight * inside.cost)
         cost, prior_gradient, prior_hessian = body_priors.assemble(
-            self.model, x, shape=not self.one_shape
+            self.model, x, shape=not self.one_shape, pose=self._pose(index)
         )
         own_at = slice(0, own.shape[1])
         gradient[:, own_at] += prior_gradient[:, self.columns]
@@ -262,8 +264,11 @@ class BodyProblem:
             raise ValueError("the problem has neither views nor targets")
         return PointTerm(*(sum(part[1:], start=part[0]) for part in zip(*terms, strict=True)))
 
-    def _prior_cost(self, x: Tensor, shared: Tensor) -> Tensor:
-        cost = body_priors.cost(self.model, x, shape=not self.one_shape)
+    def _pose(self, index: Tensor) -> PoseGaussian | None:
+        return None if self.pose is None else self.pose.of_frames(index)
+
+    def _prior_cost(self, x: Tensor, shared: Tensor, index: Tensor) -> Tensor:
+        cost = body_priors.cost(self.model, x, shape=not self.one_shape, pose=self._pose(index))
         if len(shared):
             cost = cost + 0.5 * (self._shared_precision() * shared**2).sum()
         return cost

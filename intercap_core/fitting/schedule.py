@@ -12,6 +12,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyFitSettings
 from intercap_core.energy.body_cloud import COVERINGS
 from intercap_core.fitting.evidence import Evidence
@@ -89,8 +90,9 @@ class Fitter:
         seen: Observations,
         clouds: list[PersonCloud | None],
         settings: BodyFitSettings,
+        pose_prior: VPoser | None = None,
     ) -> None:
-        self.model, self.settings = model, settings
+        self.model, self.settings, self.pose_prior = model, settings, pose_prior
         self.evidence = Evidence(model, seen, clouds, settings.cloud_weight)
         self.frames = self.evidence.frames
         self.one_shape = settings.shape == "shared"
@@ -158,6 +160,7 @@ class Fitter:
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, _REACH_M[-1])
         problem.touching = self.evidence.touch(problem)
+        self._expect_pose(problem)
         self.evidence.look(problem, hands=self.settings.hands, face=self.settings.face)
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
@@ -200,6 +203,7 @@ class Fitter:
         )
 
     def _minimise(self, problem: BodyProblem, trials: int, keep_normal: bool = False) -> Solution:
+        self._expect_pose(problem)
         shared = problem.shared_start()
         solution = minimise(
             problem,
@@ -211,6 +215,11 @@ class Fitter:
         )
         problem.accept(solution.own, solution.shared)
         return solution
+
+    def _expect_pose(self, problem: BodyProblem) -> None:
+        """Take what the learned prior, where there is one, says around the problem's poses."""
+        if self.pose_prior is not None:
+            problem.pose = self.pose_prior.around(problem.base[:, 3:66])
 
     # --- rounds ------------------------------------------------------------------------------
 

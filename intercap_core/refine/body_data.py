@@ -11,6 +11,7 @@ import torch
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.model import BodyModel
+from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyFitSettings
 from intercap_core.fitting.observations import person_clouds, read_observations
 from intercap_core.fitting.problem import BodyProblem
@@ -56,11 +57,12 @@ class BodyData:
         model: BodyModel,
         state: State,
         settings: BodyFitSettings,
+        pose_prior: VPoser | None = None,
     ) -> BodyData:
         """Read the images' evidence and what the body fit found to be constant."""
         seen = read_observations(scene, person)
         clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
-        fitter = Fitter(model, seen, clouds, settings)
+        fitter = Fitter(model, seen, clouds, settings, pose_prior)
         settled = Settled(
             *(
                 torch.from_numpy(body_fit[name])

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from intercap_core import artefacts
-from intercap_core.body.artefact import body_path
+from intercap_core.body.artefact import body_path, load_pose_prior
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
@@ -56,6 +56,7 @@ def run(
     """
     path = body_path(body_models, subject.gender) or OPEN_BODY
     model = BodyModel.load(path, num_betas=NUM_BETAS, num_expression=NUM_EXPRESSION, device=device)
+    pose_prior = load_pose_prior(body_models, model)
     seen = read_observations(scene, person)
     if not seen.usable.any():
         raise UserError(
@@ -64,7 +65,7 @@ def run(
             "keypoints and the camera poses of this sequence"
         )
     clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
-    fit = Fitter(model, seen, clouds, settings).run()
+    fit = Fitter(model, seen, clouds, settings, pose_prior).run()
 
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be guessed at behind a table: it is the trunk that says whose body this is

@@ -16,7 +16,7 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.body.artefact import body_path
+from intercap_core.body.artefact import body_path, load_pose_prior
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.config import (
@@ -114,6 +114,7 @@ def run(
             model=model,
             state=start,
             settings=body_settings,
+            pose_prior=load_pose_prior(body_models, model),
         )
         floor = (
             Ground(source["ground_point"], source["ground_normal"])

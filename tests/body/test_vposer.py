@@ -69,6 +69,47 @@ def test_jacobian_equals_finite_differences(tmp_path: Path) -> None:
         assert torch.allclose(jacobian[:, :, k], numeric, atol=1e-6)
 
 
+@pytest.mark.parametrize(("held", "named"), [(1, 2), (2, 1)])
+def test_weights_of_the_other_version_are_named(held: int, named: int, tmp_path: Path) -> None:
+    path = _save(tmp_path, held)
+    with pytest.raises(UserError, match=f"weights of version {held}, and version {named}") as said:
+        VPoser.load(path, named)
+    assert str(path) in str(said.value)
+    assert VPoser.load(path, held).version == held
+
+
+def test_prior_around_a_pose_is_the_best_code_s(tmp_path: Path) -> None:
+    """Its cost is that of the best code, found by another optimiser."""
+    state = _state(1)
+    state["bodyprior_dec_out.weight"] *= 0.2  # turns well below a half, about none
+    state["bodyprior_dec_out.bias"] = torch.tensor([1.0, 0, 0, 1, 0, 0]).repeat(21)
+    torch.save(state, tmp_path / "tame.pt")
+    prior = VPoser.load(tmp_path / "tame.pt", dtype=torch.float64)
+    generator = torch.Generator().manual_seed(7)
+    pose = prior.decode(0.7 * torch.randn(2, 32, generator=generator, dtype=torch.float64))
+    pose = pose + 0.05 * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+
+    def best(pose: torch.Tensor) -> torch.Tensor:
+        code = torch.zeros(len(pose), 32, dtype=torch.float64, requires_grad=True)
+        search = torch.optim.LBFGS([code], max_iter=400, line_search_fn="strong_wolfe")
+
+        def energy() -> torch.Tensor:
+            away = (pose - prior.decode(code)) / 0.1
+            return 0.5 * ((code**2).sum(1) + (away**2).sum(1))
+
+        def closure() -> torch.Tensor:
+            search.zero_grad()
+            total = energy().sum()
+            total.backward()
+            return total
+
+        search.step(closure)
+        return energy().detach()
+
+    gaussian = prior.around(pose)
+    torch.testing.assert_close(gaussian.cost(pose), best(pose), rtol=0.02, atol=0.02)
+
+
 def test_matrix_logarithm_inverts_rodrigues() -> None:
     axis = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
     angles = torch.tensor([0.0, 1e-6, 1e-3, 0.5, 2.0, 3.1], dtype=torch.float64)
@@ -84,11 +125,14 @@ def test_files_that_are_no_vposer_are_named(tmp_path: Path) -> None:
     state = _state(1)
     state["bodyprior_dec_out.weight"] = torch.zeros(10, 512)
     torch.save(state, short)
+    blank = tmp_path / "blank.pt"
+    torch.save(_state(1) | {"bodyprior_dec_out.bias": torch.full((126,), torch.nan)}, blank)
     text.write_text("no weights")
     for path, words in (
         (tmp_path / "none.pt", "does not exist"),
         (other, "no decoder"),
         (short, "shapes"),
+        (blank, "not finite"),
         (text, "damaged"),
     ):
         with pytest.raises(UserError, match=words) as caught:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
+from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body.model import BodyModel
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
@@ -321,6 +322,34 @@ def test_two_cameras_without_depth_are_enough(model: BodyModel, tmp_path: Path) 
     assert not found["failed"].any()
     assert np.isnan(found["cloud_residual"]).all()
     assert vertices.max() < 25 and joints.max() < 25 and hands.max() < 30
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_vposer_that_is_named_takes_part(version: int, model, tmp_path: Path) -> None:
+    """A decoder that knows one pose alone draws the fit to it; one of another version is refused."""
+    names = {
+        1: ("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"),
+        2: ("vp_model.decoder_net.0", "vp_model.decoder_net.3", "vp_model.decoder_net.5"),
+    }[version]
+    shapes = ((64, 32), (64, 64), (126, 64))
+    state = {f"{n}.weight": torch.zeros(s) for n, s in zip(names, shapes, strict=True)}
+    state |= {f"{n}.bias": torch.zeros(s[0]) for n, s in zip(names, shapes, strict=True)}
+    # spine1 bent by 0.4 rad about x, all other joints straight
+    pose = torch.zeros(21, 3)
+    pose[2, 0] = 0.4
+    state[f"{names[2]}.bias"] = rotation_from_axis_angle(pose)[..., :2].reshape(126)
+    weights = tmp_path / "weights.pt"
+    torch.save(state if version == 1 else {"state_dict": state}, weights)
+    capture = Capture(model, tmp_path, 2, cameras=3, depth=False)
+    settings = BodyFitSettings(hands=False, face=False)
+    found = {}
+    for name, models in (("open", BodyModels()), ("learned", BodyModels(vposer=weights))):
+        read = capture.fit(tmp_path / f"{name}.h5", settings=settings, body_models=models)
+        found[name] = np.abs(read["body_pose"] - pose.reshape(63).numpy()).mean()
+    assert found["learned"] < 0.8 * found["open"]
+    other = BodyModels(vposer=weights, vposer_version=3 - version)
+    with pytest.raises(UserError, match=f"holds the weights of version {version}"):
+        capture.fit(tmp_path / "never.h5", body_models=other)
 
 
 def test_free_shape_in_every_frame(model: BodyModel, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ rule body_fit:
     """The body in every frame."""
     input:
         body=body_file,
+        pose_prior=pose_prior_file,
         frames=rules.frames.output.frames,
         scene=rules.scene.output.scene,
         person=rules.person.output.person,

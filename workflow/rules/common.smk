@@ -118,7 +118,13 @@ def object_files(wildcards):
 def body_file(wildcards):
     """Input function: the licensed body file of the subject's gender, where one is set."""
     _, _, subject = of_sequence(wildcards)
-    return existing(getattr(SETTINGS.body_models, subject.gender))
+    models = SETTINGS.body_models
+    return existing(getattr(models, subject.gender) or models.neutral)
+
+
+def pose_prior_file(wildcards):
+    """Input function: the pose prior's weights, where the settings name them."""
+    return existing(SETTINGS.body_models.vposer)
 
 
 def settings_of(stage):

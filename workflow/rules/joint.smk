@@ -3,6 +3,7 @@ rule joint:
     input:
         object=object_files,
         body=body_file,
+        pose_prior=pose_prior_file,
         frames=rules.frames.output.frames,
         scene=rules.scene.output.scene,
         person=rules.person.output.person,
