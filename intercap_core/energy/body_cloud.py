@@ -11,6 +11,9 @@ the vertices that the point's camera sees. The measured surface is clothing and 
 with one thickness c_g > 0 for each kind of covering g (trunk, upper arms, thighs, head, ...),
 shared by all frames. c0_g are everyday garments; hands and face are bare.
 
+The way back, from vertices that a camera should see to what it measured, is in
+:mod:`intercap_core.fitting.free_space`.
+
 Points are gathered on a fixed sparse set of vertices, the samples: the solver sees one row for each
 sample and frame, the mean distance of the points around it. Errors of neighbouring points are the
 same fold of cloth, so a sample counts as one measurement however many points it has.

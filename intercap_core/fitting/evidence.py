@@ -14,9 +14,10 @@ from torch import Tensor
 from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_cloud, body_keypoints, body_self
-from intercap_core.energy.body_cloud import COVERINGS, CloudRows
+from intercap_core.energy.body_cloud import COVERINGS, CloudRows, Matches
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.body_self import SelfContact
+from intercap_core.fitting.free_space import seen_through
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import BodyProblem, Views
 from intercap_core.solve.velocity import limited_velocity
@@ -37,6 +38,7 @@ _NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
 _SAMPLE_SHARE = 0.25
 _FULL_SAMPLE = 2.0  # points with which a sample counts half
 _HUBER_M = 0.012
+_SEEN_THROUGH_TRUST = 1.0  # of a sample that sticks out of the person, beside a point's
 _VERTEX_CHUNK = 16
 # Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
 _MAX_SPEED = 6.0
@@ -200,6 +202,34 @@ class Evidence:
                 low, high = (covering.noise * factor for factor in _NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
+    def _with_seen_through(
+        self,
+        found: Matches,
+        cloud: PersonCloud,
+        where: Tensor,
+        normal: Tensor,
+        shift: Tensor | None,
+        frame: int,
+    ) -> tuple[Matches, Tensor]:
+        """One frame's matches and their trust, with those of samples that stick out of the person.
+
+        where, normal (S,3) of the samples; matches count samples by camera.
+        """
+        size, sample, distance = len(where), [found.sample], [found.distance]
+        for window in cloud.windows:
+            view = window.view
+            late = where if shift is None else where + shift[frame, view]
+            out, away = seen_through(
+                window, self.seen.rig[view], float(self.seen.depth_bias[view]),
+                late.double().cpu().numpy(), normal.double().cpu().numpy(),
+            )  # fmt: skip
+            sample.append(torch.as_tensor(view * size + out, device=where.device))
+            distance.append(-self._tensor(away))
+        extra = sum(len(part) for part in sample[1:])
+        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), _SEEN_THROUGH_TRUST)])
+        valid = torch.cat([found.valid, found.valid.new_ones(extra)])
+        return Matches(torch.cat(sample), torch.cat(distance), valid), trust
+
     def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
         """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
         not asked for."""
@@ -251,8 +281,9 @@ class Evidence:
                 self.cloud_residual[t] = found.distance[found.valid].abs().nanmedian()
                 # gathered by camera and sample: those that several cameras see tell their offsets
                 found = found._replace(sample=cloud.view * size + found.sample)
+                found, trust = self._with_seen_through(found, cloud, where[t], normal[t], shift, t)
                 apart, number = body_cloud.gather(
-                    found, cloud.trust, expected, views * size, huber=_HUBER_M
+                    found, trust, expected, views * size, huber=_HUBER_M
                 )
                 of_views[t], points[t] = apart.reshape(views, -1), number.reshape(views, -1)
         self.by_view = ViewDistances(of_views, points, normal)

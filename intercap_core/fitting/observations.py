@@ -18,6 +18,7 @@ from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.detection.masks import Runs
 from intercap_core.errors import UserError
+from intercap_core.fitting.free_space import STEP_PX, DepthWindow
 from intercap_core.schemas import PERSON, SCENE
 
 _OUTLIER_TRUST = 0.2  # of a view that disagrees with the triangulated point
@@ -105,13 +106,14 @@ class PersonCloud:
     """One frame's person points of all views, master frame.
 
     points, normals (M,3) float32, metres, normals towards the camera; trust (M,) in (0,1]; view
-    (M,) index of the camera.
+    (M,) index of the camera; windows: what each camera's depth shows around the person.
     """
 
     points: Tensor
     normals: Tensor
     trust: Tensor
     view: Tensor
+    windows: tuple[DepthWindow, ...] = ()
 
 
 def person_clouds(
@@ -127,7 +129,7 @@ def person_clouds(
 def _fused(
     reader: Frames, seen: Observations, t: int, count: int, device: torch.device
 ) -> PersonCloud | None:
-    parts = []
+    parts, windows = [], []
     for c, camera in enumerate(seen.rig):
         rle = seen.masks[t * len(seen.rig) + c]
         if not rle or camera.depth is None:
@@ -139,6 +141,7 @@ def _fused(
         part = view_points(depth, camera, runs, seen.background[c], seen.depth_bias[c])
         if part is not None:
             parts.append((*part, np.full(len(part[0]), c)))
+            windows.append(_depth_window(depth, camera, runs, c))
     if not parts:
         return None
     points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
@@ -149,7 +152,16 @@ def _fused(
         torch.as_tensor(normals[pick], dtype=torch.float32, device=device),
         torch.as_tensor(trust[pick], dtype=torch.float32, device=device),
         torch.as_tensor(view[pick], device=device),
+        tuple(windows),
     )
+
+
+def _depth_window(depth: np.ndarray, camera: Camera, mask: Runs, view: int) -> DepthWindow:
+    box = _window(camera, mask, depth)
+    assert box is not None
+    rows, columns = box
+    kept = depth[rows.start : rows.stop : STEP_PX, columns.start : columns.stop : STEP_PX]
+    return DepthWindow(view, (rows.start, columns.start), kept.copy())
 
 
 def view_points(
