@@ -31,11 +31,11 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.energy.body_cloud import Samples
 from intercap_core.solve.robust import geman_mcclure
 
-# Skin yields by some millimetres where parts press on each other, and the body's shape is some
-# millimetres off as well.
+# Skin yields by some millimetres where parts press on each other.
 TOLERANCE = 0.003
-SIGMA = 0.005
-REACH = 0.025  # depth beyond which the push fades
+# The fitted skin is off by about this much, on either side.
+SIGMA = 0.008
+REACH = 0.015  # depth beyond which the push fades
 # Neighbouring samples are inside together: about four of them make one measurement.
 _WEIGHT = 0.25 / SIGMA**2
 # Samples nearer over the surface than this times the mean thickness of what they lie on are joined;

@@ -147,6 +147,6 @@ def test_a_fit_to_keypoints_of_penetrating_limbs_comes_apart(
     here = model.parameters(problem.base)
     after = _depth(model, here, _find(model, contact, here))
     assert before > 0.008
-    assert after - term.TOLERANCE < 0.35 * (before - term.TOLERANCE)
+    assert after - term.TOLERANCE < 0.5 * (before - term.TOLERANCE)
     moved = (model.keypoints_of(here)[:, :67] - truth).norm(dim=2)
     assert float(moved.median()) < 0.03
