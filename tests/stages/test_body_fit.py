@@ -326,7 +326,7 @@ def test_two_cameras_without_depth_are_enough(model: BodyModel, tmp_path: Path) 
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_the_vposer_that_is_named_takes_part(version: int, model, tmp_path: Path) -> None:
-    """A decoder that knows one pose alone draws the fit to it; one of another version is refused."""
+    """A decoder that knows one pose alone draws the fit to it; another version is refused."""
     names = {
         1: ("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"),
         2: ("vp_model.decoder_net.0", "vp_model.decoder_net.3", "vp_model.decoder_net.5"),
