@@ -18,6 +18,7 @@ _REQUIRED = (
 )  # fmt: skip
 _SMPLX_SHAPE_COLUMNS = 300  # a full file's expression starts here
 _HEIGHT_M = (0.3, 3.0)  # from a newborn to more than the tallest person
+_OTHER_MODELS = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL-H"}  # by their joints
 _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the open body"
 
 
@@ -100,11 +101,10 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
             )
     tree = arrays.get("kintree_table")
     joints = tree.shape[-1] if tree is not None and tree.ndim == 2 else None
-    if joints in (24, 52):
-        kind = "SMPL" if joints == 24 else "SMPL-H"
+    if joints in _OTHER_MODELS:
         raise UserError(
-            f"Body file {path} is a {kind} model with {joints} joints; expected SMPL-X with "
-            f"{NUM_JOINTS}: {_HINT}."
+            f"Body file {path} is a {_OTHER_MODELS[joints]} model with {joints} joints; expected "
+            f"SMPL-X with {NUM_JOINTS}: {_HINT}."
         )
     if joints is not None and joints != NUM_JOINTS:
         raise UserError(

@@ -179,6 +179,8 @@ BAD_FILES: dict[str, tuple[Callable[[dict], dict], str]] = {
     "SMPL": (_tree(24), "SMPL model with 24 joints"),
     "SMPL-H": (_tree(52), "SMPL-H model with 52 joints"),
     "other": (_tree(54), "54 joints"),
+    "hand alone": (_tree(16), "MANO model with 16 joints"),
+    "head alone": (_tree(5), "FLAME model with 5 joints"),
     "no hands": (_without("hands_componentsl"), "lacks the hands"),
     "no weights": (_without("weights"), "weights"),
     "short regressor": (lambda a: a | {"J_regressor": a["J_regressor"][:54]}, "J_regressor"),
