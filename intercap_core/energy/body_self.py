@@ -160,8 +160,8 @@ class Pairs(NamedTuple):
         if not bool(kept.any()):
             return None
         present, frame = at[kept].unique(return_inverse=True)
-        chosen = (part[kept] for part in (self.inner, self.outer, self.normal))
-        return Pairs(frame, *chosen, self.vertices), present
+        inner, outer, normal = self.inner[kept], self.outer[kept], self.normal[kept]
+        return Pairs(frame, inner, outer, normal, self.vertices), present
 
 
 def join(found: list[tuple[Tensor, Tensor, Tensor]]) -> Pairs | None:

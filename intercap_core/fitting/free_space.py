@@ -19,7 +19,7 @@ import numpy as np
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
 
-STEP_PX = 2  # of the pixels and rows of a depth image, so many are kept one
+STEP_PX = 1  # of so many pixels and rows of a depth image one is kept
 _BEHIND_M = 0.06  # farther behind the vertex is not the person's surface there
 _FACING = 0.1  # cosine between normal and line of sight; larger ones look away
 _REACH_M = 0.05
@@ -70,7 +70,9 @@ def seen_through(
     way = np.arange(_WAY_M, _REACH_M + _WAY_M / 2, _WAY_M)
     inward = local[index, None] - way[:, None] * outward[index, None]
     through = _past(window, camera, depth_bias, inward)
-    ends = ~through.all(1)
+    # the nearest step is within the image's own error: counting only those that err outward would
+    # make everybody thinner
+    ends = ~through.all(1) & through[:, 0]
     # half a step back: the edge is between the last that is seen through and the first that is not
     return index[ends], way[through[ends].argmin(1)] - _WAY_M / 2
 
