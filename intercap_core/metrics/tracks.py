@@ -62,7 +62,7 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
         parameters = read_parameters(artefact)
         first = stage == "body_fit"
         sigma = artefact["joint_sigma"] if first else None
-        flags = ("failed", "bridged") if first else ("flagged",)
+        flags = ("failed", "bridged", "uncertain") if first else ("flagged",)
         flagged = np.any([artefact[flag] for flag in flags], axis=0)
     model = load_model(body_models, gender, parameters)
     with torch.no_grad():

@@ -36,7 +36,11 @@ VIEW_STATES = {
     "partly": "further off",
     "nothing": "person not seen",
 }
-FIT_STATES = {"moving": "fitted", "lost": "not fitted: bridged between its neighbours"}
+FIT_STATES = {
+    "moving": "fitted",
+    "doubtful": "not determined by what was seen",
+    "lost": "not fitted: bridged between its neighbours",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +101,10 @@ def read_fit(
             pixels=fit["keypoint_residual"],
             cloud_mm=1e3 * fit["cloud_residual"],
             sigma_mm=1e3 * fit["joint_sigma"],
-            state=["lost" if u else "moving" for u in untrusted],
+            state=[
+                "lost" if bad else "doubtful" if unsure else "moving"
+                for bad, unsure in zip(untrusted, fit["uncertain"], strict=True)
+            ],
             sheet=sheet,
             note=note,
         )
@@ -105,8 +112,9 @@ def read_fit(
 
 def context(facts: BodyFacts) -> dict[str, Any]:
     """What the template needs; the sheet is left as it is."""
-    bridged = facts.state.count("lost")
-    beside = f"{bridged} bridged" if bridged else "no frame in doubt"
+    bridged, unsure = facts.state.count("lost"), facts.state.count("doubtful")
+    doubts = [f"{n} {word}" for n, word in ((bridged, "bridged"), (unsure, "doubtful")) if n]
+    beside = ", ".join(doubts) or "no frame in doubt"
     if np.isfinite(facts.cloud_mm).any():
         beside += f" · points {np.nanmedian(facts.cloud_mm):.1f} mm off"
     rows = [charts.StateRow("fit", charts.state_runs(facts.state, FIT_STATES), beside)]
