@@ -32,6 +32,7 @@ ASSIST_STEPS = 8
 FOREARM_TWIST = 0.6  # share of the wrist's roll that the forearm takes
 LEG_REACH = 0.984
 SETTLE_M = 0.004  # over which the pelvis gives way where a leg is at its reach
+HAND_HALF = 0.045  # half a hand, a sleeve and a trouser leg, metres: between the wrist and the hip
 SPLAY = 0.12  # rad, feet and knees outward
 STAND = 0.990  # of the leg's length when standing
 _J = JOINT_INDEX
@@ -78,6 +79,22 @@ def _sole_depth(subject: Subject, side: int) -> float:
     return float(subject.rest_joints[7 + side, 1] - subject.rest[share > 0.5, 1].min())
 
 
+def _girth(subject: Subject) -> float:
+    """How far hips and thighs reach to the side of the pelvis, metres."""
+    legs = np.asarray(subject.weights[:, [0, 1, 2, 4, 5]].sum(1)).ravel() > 0.5
+    return float(np.abs(subject.rest[legs, 0] - subject.rest_joints[0, 0]).max())
+
+
+def _thigh_height(subject: Subject, side: int) -> float:
+    """How far the front of the thigh's further half is from the line of hip and knee, metres."""
+    hip, knee = subject.rest_joints[1 + side], subject.rest_joints[4 + side]
+    own = np.asarray(subject.weights[:, [1 + side]].todense()).ravel() > 0.5
+    share = (subject.rest[own, 1] - hip[1]) / (knee[1] - hip[1])
+    flexed = subject.rest[own, 2] + subject.bulges[4 + side, own, 2]  # a bent hip thickens it
+    height = flexed - hip[2] - share * (knee[2] - hip[2])
+    return float(height[(share > 0.45) & (share < 0.85)].max())
+
+
 class Puppet:
     """One subject that can be posed."""
 
@@ -95,6 +112,8 @@ class Puppet:
         self.hip_width = float(rest[_J["left_hip"], 0] - rest[_J["right_hip"], 0]) / 2
         self.hip_drop = float(rest[0, 1] - rest[[1, 2], 1].mean())
         self.ankle_height = np.array([_sole_depth(subject, side) for side in (0, 1)])
+        self.girth = _girth(subject)
+        self.thigh_height = [_thigh_height(subject, side) for side in (0, 1)]
         self.stand = STAND * self.leg + float(self.ankle_height.min()) + self.hip_drop
 
     # --- the parts of a pose ---------------------------------------------------------------
@@ -176,12 +195,17 @@ class Puppet:
                    swing: np.ndarray) -> Pose:  # fmt: skip
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
-        base = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
+        # where the chest's left is: its front may point down and back in a deep stoop
+        base = facing(np.arctan2(-world[:, 9, 0, 0], world[:, 9, 1, 0]))
         left, up, forward = base[..., 0], base[..., 1], base[..., 2]
         shoulder = self.arm_root(world, pelvis, side)
         reach = 0.955 * self.arms[side]
-        offset = (sign * 0.085 * left + (0.05 + swing)[:, None] * forward) - reach * 0.965 * up
-        position = shoulder + offset
+        # beside the hips, however broad they are
+        beside = self.girth + HAND_HALF - sign * ((shoulder - pelvis) * left).sum(1)
+        out = np.clip(beside, 0.085, 0.6 * reach)
+        down = np.sqrt((0.97 * reach) ** 2 - out**2)
+        position = shoulder + sign * out[:, None] * left - down[:, None] * up
+        position += (0.05 + swing)[:, None] * forward
         fingers = unit(-up + (0.10 + swing)[:, None] * forward - 0.02 * sign * left)
         palm = unit(-sign * left - 0.25 * forward)
         return Pose(position, self.wrist_rotation(side, fingers, palm))

@@ -10,6 +10,7 @@ import pytest
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
+from intercap_core.rigid.distance import DistanceField
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.studio.hands import OPEN, Hand, shape
 from intercap_core.studio.skeleton import REACH_FREE, Skeleton, turn
@@ -132,6 +133,21 @@ def test_expected_regions_touch_for_long(played: tuple[str, Stage, Moment]) -> N
     assert expected <= touching
     assert contact[first:last].any(1).all()
     assert not contact[:5].any()
+
+
+def test_hands_stay_out_of_the_body(played: tuple[str, Stage, Moment]) -> None:
+    """As far as flesh gives way, but for a thumb that passes the hip as one sits down."""
+    _, stage, moment = played
+    part = stage.subject.weights.toarray().argmax(1)
+    faces = stage.subject.faces
+    for elbow, wrist, first in ((18, 20, 25), (19, 21, 40)):
+        hand = (part == wrist) | ((part >= first) & (part < first + 15))
+        rest = faces[~(hand | (part == elbow))[faces].any(1)]
+        depths = []
+        for t in range(2, stage.frames, 4):
+            surface = DistanceField(moment.body[t], rest, watertight=False, threads=2)
+            depths.append(-surface.signed_distance(moment.body[t][hand]).min())
+        assert max(depths) < 0.055 and np.median(depths) < 0.015
 
 
 def test_planted_feet_do_not_slide_or_sink(played: tuple[str, Stage, Moment]) -> None:

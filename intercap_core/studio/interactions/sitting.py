@@ -34,6 +34,8 @@ from intercap_core.studio.skeleton import local_rotations, unit
 RIGHT, LEFT = 1, 0
 SIT_S, SEATED_S = 0.68, 1.50
 CALF_M, THIGH_M = 0.055, 0.065  # half their thickness, at the knee
+AROUND_M = 0.14  # sidewards, between the lap and hanging
+PALM_M = 0.056  # from the wrist to what a level palm lies on, with trousers
 STEEPEST_RAD = 0.75  # of a foot that stands on its ball
 PRESSED_M = 0.014  # flesh gives way by this much on the seat
 TOUCH_M = 0.0006  # how deep the palm presses the seat
@@ -183,7 +185,7 @@ class Sitting(Interaction):
         bone = puppet.skeleton.bone(f"{name}_hip", f"{name}_knee")
         along = unit(thigh @ bone)
         above = unit(thigh @ np.array([0, 0, 1.0]))
-        position = hip + 0.52 * (thigh @ bone) + 0.105 * above
+        position = hip + 0.52 * (thigh @ bone) + (puppet.thigh_height[side] + PALM_M) * above
         position[:, 1] += 0.012 * sign
         fingers = unit(along + np.array([0.0, -0.15 * sign, 0.0]) + 0.10 * above)
         return Pose(position, puppet.wrist_rotation(side, fingers, -above))
@@ -194,15 +196,26 @@ class Sitting(Interaction):
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         rising = ramp(times, self.rise_s + 0.10, self.risen_s + 0.05)
         if side == LEFT:
-            return self.left_wrist(idle, world, pelvis, times).towards(idle, rising)
+            wrist = self.left_wrist(idle, world, pelvis, times).towards(idle, rising)
+            return self._around_thigh(wrist, rising, LEFT)
         thigh = self.on_thigh(world, pelvis, side)
         place = self.palm_place
         aside = place.copy()
         aside[:3, 3] += (0.0, -0.05, 0.11)
-        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.72, 1.10))
-        wrist = wrist.towards(Pose.still(place, count), ramp(times, 0.94, 1.20))
-        wrist = wrist.towards(Pose.still(aside, count), ramp(times, 1.30, 1.48))
-        return wrist.towards(thigh, ramp(times, 1.36, self.on_thigh_s)).towards(idle, rising)
+        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.54, 1.00))
+        wrist = wrist.towards(Pose.still(place, count), ramp(times, 0.86, 1.12))
+        # out of the way of the hips that come down beside it
+        off = aside.copy()
+        off[1, 3] -= 0.10
+        wrist = wrist.towards(Pose.still(off, count), ramp(times, 1.12, 1.34))
+        lifting = ramp(times, 1.36, self.on_thigh_s)
+        wrist = self._around_thigh(wrist.towards(thigh, lifting), lifting, RIGHT)
+        return self._around_thigh(wrist.towards(idle, rising), rising, RIGHT)
+
+    def _around_thigh(self, wrist: Pose, share: np.ndarray, side: int) -> Pose:
+        """The wrist led outwards while it is on its way (``share`` (N,)) past the thigh."""
+        out = AROUND_M * 4 * share * (1 - share) * (1, -1)[side]
+        return Pose(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
 
     def left_wrist(self, idle: Pose, world: np.ndarray, pelvis: np.ndarray,
                    times: np.ndarray) -> Pose:  # fmt: skip
