@@ -106,7 +106,7 @@ class Relief:
         around = self._tree.query_ball_point(pixels[wanted], reach.max(), p=np.inf)
         for k, near in zip(wanted, around, strict=True):
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
-            around_it = np.asarray(near)[away < reach[near]]
+            around_it = np.asarray(near, int)[away < reach[near]]
             before = around_it[~self.room[around_it]]
             of_room[k] = len(before) < _MIN_SAMPLES
             found = self.distance[around_it if of_room[k] else before]

@@ -45,3 +45,10 @@ def test_who_stands_still_for_long_is_part_of_the_room_and_still_lifted():
     still = _wall(2400)
     z = _depths(Relief.of(still, CAMERA, 0.0, still))
     assert np.isfinite(z).sum() >= 8 and np.nanmax(np.abs(z - 2.4)) < 0.2
+
+
+def test_keypoints_where_nothing_at_all_is_measured_are_not_lifted():
+    half = _wall(2400)
+    half[half.shape[0] // 2 - 20 :] = 0
+    z = _depths(Relief.of(half, CAMERA, 0.0, None))
+    assert 2 <= np.isfinite(z).sum() <= 6 and np.nanmax(np.abs(z - 2.4)) < 0.2
