@@ -176,6 +176,16 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
 
 
+def turn_frames(posed: PosedJoints, axis_angle: Tensor) -> tuple[Tensor, Tensor]:
+    """Turn of each joint for a change of its axis-angle, in the world and in its parent's frame:
+    (B,55,3,3) twice."""
+    parent = torch.tensor([max(p, 0) for p in PARENTS], device=axis_angle.device)
+    around = posed.rotations[:, parent].clone()
+    around[:, 0] = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    turn_of_local = left_jacobian(axis_angle)
+    return around @ turn_of_local, turn_of_local
+
+
 def linearise(
     selection: Selection,
     points: Tensor,
@@ -195,12 +205,7 @@ def linearise(
     turns = torch.einsum("nlk,bnki->bnli", selection.below, parts)
     turns = turns - selection.below.sum(2)[..., None] * posed.joints[:, selection.chain]
 
-    parent = torch.tensor([max(p, 0) for p in PARENTS], device=points.device)
-    around = posed.rotations[:, parent].clone()
-    around[:, 0] = torch.eye(3, dtype=points.dtype, device=points.device)
-    turn_of_local = left_jacobian(axis_angle)
-    frames = around @ turn_of_local
-
+    frames, turn_of_local = turn_frames(posed, axis_angle)
     _, moved_offsets = joint_shape_derivatives(posed, joint_directions)
     size = joint_directions.shape[-1]
     shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -51,6 +52,16 @@ class Selection:
     below: Tensor
     blocks: tuple[Block, ...]
     num_vertices: int
+
+    @cached_property
+    def limbs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The blocks as arrays: points (N,) block by block, where each starts and the last ends,
+        and which of the 55 joints move each, bool."""
+        rows = [block.rows.cpu().numpy() for block in self.blocks]
+        moved_by = np.zeros((len(rows), NUM_JOINTS), bool)
+        for block, flags in zip(self.blocks, moved_by, strict=True):
+            flags[block.joints.cpu().numpy()] = True
+        return np.concatenate(rows), np.cumsum([0, *map(len, rows)]), moved_by
 
 
 _IS_ANCESTOR = np.zeros((NUM_JOINTS, NUM_JOINTS), bool)  # [joint, ancestor or itself]

@@ -31,7 +31,7 @@ from intercap_core.solve.robust import geman_mcclure
 
 
 class Keypoints(NamedTuple):
-    """points (B,K,3) with offsets applied, derivatives (B,K,3,P), bone rotations (B,K,3,3)."""
+    """points (B,K,3) with offsets applied, derivatives (B,K,3,n), bone rotations (B,K,3,3)."""
 
     points: Tensor
     derivatives: Tensor | None
@@ -98,8 +98,12 @@ def evaluate(
     offsets: Tensor,
     *,
     derivatives: bool,
+    columns: Tensor | None = None,
 ) -> Keypoints:
-    """Keypoints (B,K,3) of B bodies; offsets (K,3), metres, in the frames of their bones."""
+    """Keypoints (B,K,3) of B bodies; offsets (K,3), metres, in the frames of their bones.
+
+    Derivatives, if asked for, are by the chosen ``columns`` (n,) of the parameters, or by all.
+    """
     local = rotation_from_axis_angle(params.full_pose())
     still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
     world = pose_joints(still, local, still[:, 0]).rotations
@@ -109,6 +113,10 @@ def evaluate(
         output = model.forward(params, vertex_ids=chosen.vertices)
         points = chosen.matrix @ torch.cat([output.vertices, output.joints], 1)
         return Keypoints(points + arms, None, rotations)
+    if columns is None:
+        columns = torch.arange(model.num_parameters, device=model.device)
+    if model.has_kernels:
+        return _evaluate_compiled(model, params, chosen, arms, rotations, columns)
     linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
     full = linear.full()
     batch, _, _, size = full.shape
@@ -120,7 +128,29 @@ def evaluate(
     by[:, moved, :, : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(
         batch, len(moved), 3, 3 * NUM_JOINTS
     )
-    return Keypoints(chosen.matrix @ linear.points + arms, by, rotations)
+    return Keypoints(chosen.matrix @ linear.points + arms, by[..., columns], rotations)
+
+
+def _evaluate_compiled(
+    model: BodyModel,
+    params: BodyParameters,
+    chosen: KeypointSet,
+    arms: Tensor,
+    rotations: Tensor,
+    columns: Tensor,
+) -> Keypoints:
+    from intercap_core.body.jacobian_kernel import mixed_rows
+
+    chain, _ = model.chain(params, vertex_ids=chosen.vertices, joints=True)
+    place = np.full(model.num_parameters, -1)
+    place[columns.numpy()] = np.arange(len(columns))
+    row, ids = np.nonzero(chosen.matrix.numpy())
+    starts = np.searchsorted(row, np.arange(len(chosen.index) + 1))
+    shares = chosen.matrix.numpy()[row, ids]
+    by = torch.zeros(*arms.shape, len(columns), dtype=arms.dtype)
+    turned_by = chosen.turned_by.numpy()
+    points = mixed_rows(chain, place, starts, ids, shares, arms.numpy(), turned_by, by.numpy())
+    return Keypoints(torch.from_numpy(points), by, rotations)
 
 
 def reprojection(
@@ -191,11 +221,11 @@ def triangulated(
     )
 
 
-def assemble(term: PointTerm, keypoints: Keypoints, columns: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient (B,n) and Hessian (B,n,n) by the chosen columns (n,) of the body's parameters."""
+def assemble(term: PointTerm, keypoints: Keypoints) -> tuple[Tensor, Tensor]:
+    """Gradient (B,n) and Hessian (B,n,n) by the parameters that the derivatives are by."""
     if keypoints.derivatives is None:
         raise ValueError("keypoints were evaluated without derivatives")
-    by = keypoints.derivatives[..., columns]
+    by = keypoints.derivatives
     batch, _, _, size = by.shape
     pulled = (term.matrix @ by).reshape(batch, -1, size)
     flat = by.reshape(batch, -1, size)
@@ -204,11 +234,11 @@ def assemble(term: PointTerm, keypoints: Keypoints, columns: Tensor) -> tuple[Te
 
 
 def assemble_offsets(
-    term: PointTerm, keypoints: Keypoints, columns: Tensor, count: int
+    term: PointTerm, keypoints: Keypoints, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The part of the offsets of the first ``count`` keypoints.
 
-    Returns gradient (B,3 count), cross block (B,n,3 count) with the body's columns (n,), and the
+    Returns gradient (B,3 count), cross block (B,n,3 count) with the body's parameters, and the
     offsets' own block (B,3 count,3 count), block diagonal.
     """
     if keypoints.derivatives is None:
@@ -217,8 +247,8 @@ def assemble_offsets(
     batch = rotation.shape[0]
     gradient = (rotation.transpose(2, 3) @ term.gradient[:, :count, :, None])[..., 0]
     turned = term.matrix[:, :count] @ rotation
-    by = keypoints.derivatives[:, :count][..., columns]
-    cross = (by.transpose(2, 3) @ turned).permute(0, 2, 1, 3).reshape(batch, len(columns), -1)
+    by = keypoints.derivatives[:, :count]
+    cross = (by.transpose(2, 3) @ turned).permute(0, 2, 1, 3).flatten(2)
     own = rotation.new_zeros(batch, count, 3, count, 3)
     each = torch.arange(count, device=rotation.device)
     own[:, each, :, each, :] = (rotation.transpose(2, 3) @ turned).transpose(0, 1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -187,20 +188,31 @@ class BodyProblem:
         gradient = x.new_zeros(len(x), size)
         hessian = x.new_zeros(len(x), size, size)
         keypoints = body_keypoints.evaluate(
-            self.model, params, self.keypoints, offsets, derivatives=True
+            self.model, params, self.keypoints, offsets, derivatives=True, columns=columns
         )
         term = self._points(keypoints, index)
-        gradient[:, :n], hessian[:, :n, :n] = body_keypoints.assemble(term, keypoints, columns)
+        gradient[:, :n], hessian[:, :n, :n] = body_keypoints.assemble(term, keypoints)
         offset_at = slice(n, n + 3 * NUM_OFFSETS)
         u_at = slice(n + 3 * NUM_OFFSETS, size)
         if self.fit_shared:
-            g, cross, block = body_keypoints.assemble_offsets(term, keypoints, columns, NUM_OFFSETS)
+            g, cross, block = body_keypoints.assemble_offsets(term, keypoints, NUM_OFFSETS)
             gradient[:, offset_at] += g
             hessian[:, offset_at, offset_at] += block
             hessian[:, :n, offset_at] += cross
             hessian[:, offset_at, :n] += cross.transpose(1, 2)
         total = term.cost
-        if self.rows is not None:
+        if self.rows is not None and self.model.has_kernels:
+            place = np.full(x.shape[1], -1)
+            place[columns.numpy()] = np.arange(n)
+            first_u = u_at.start if self.fit_shared else -1
+            place_u = np.where(self.fit_shared, first_u + np.arange(len(u)), -1)
+            rows = CloudRows(*(part[index] for part in self.rows))
+            total = total.contiguous()
+            body_cloud.add_compiled(
+                self.model, params, self._sample_ids, rows, self._rest * u.exp(), self._group,
+                place, place_u, NormalEquations(total, gradient, hessian),
+            )  # fmt: skip
+        elif self.rows is not None:
             linear = self.model.linearise(params, vertex_ids=self._sample_ids)
             rows = CloudRows(*(part[index] for part in self.rows))
             by = linear.along(rows.normal[:, :, None])[:, :, 0][..., columns]

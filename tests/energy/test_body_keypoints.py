@@ -81,7 +81,6 @@ def test_gradient_of_the_whole_term(model: BodyModel) -> None:
     offsets = 0.02 * _random(K, 3, seed=1)
     views, x = _views(), _vector(model)
     shift = 0.01 * _random(2, 3, K, 3, seed=8)
-    columns = torch.arange(model.num_parameters)
 
     def cost(x: Tensor, offsets: Tensor) -> Tensor:
         found = term.evaluate(model, model.parameters(x), carried, offsets, derivatives=False)
@@ -89,8 +88,8 @@ def test_gradient_of_the_whole_term(model: BodyModel) -> None:
 
     found = term.evaluate(model, model.parameters(x), carried, offsets, derivatives=True)
     result = term.reprojection(found.points, *views, scale=4.0, shift=shift)
-    gradient, hessian = term.assemble(result, found, columns)
-    by_offset, cross, block = term.assemble_offsets(result, found, columns, 25)
+    gradient, hessian = term.assemble(result, found)
+    by_offset, cross, block = term.assemble_offsets(result, found, 25)
     torch.testing.assert_close(hessian, hessian.transpose(1, 2), atol=1e-6, rtol=1e-6)
     assert bool((torch.linalg.eigvalsh(block) > -1e-6).all())
     assert cross.shape == (2, model.num_parameters, 75)
