@@ -17,6 +17,7 @@ _REQUIRED = (
     "dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords",
 )  # fmt: skip
 _SMPLX_SHAPE_COLUMNS = 300  # a full file's expression starts here
+_HAND_COMPONENTS = (6, 45)
 _HEIGHT_M = (0.3, 3.0)  # from a newborn to more than the tallest person
 _OTHER_MODELS = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL-H"}  # by their joints
 _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the open body"
@@ -24,7 +25,11 @@ _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the op
 
 @dataclass(frozen=True)
 class BodyFile:
-    """The arrays of the file in float64; posedirs is None if the file has no pose blend shapes."""
+    """The arrays of the file in float64; posedirs is None if the file has no pose blend shapes.
+
+    hand_mean (2,45), hand_components (2,H,45) and hand_deviation (2,H), None = not told, are those
+    asked for.
+    """
 
     path: Path
     template: np.ndarray
@@ -43,8 +48,19 @@ class BodyFile:
     contour_barycentric: np.ndarray
 
 
-def load_body_file(path: Path | None, num_betas: int, num_expression: int) -> BodyFile:
-    """Read and check; `UserError` for anything but a complete SMPL-X file."""
+def load_body_file(
+    path: Path | None,
+    num_betas: int,
+    num_expression: int,
+    *,
+    num_hand_components: int = 45,
+    flat_hand_mean: bool = False,
+) -> BodyFile:
+    """Read and check; `UserError` for anything but a complete SMPL-X file.
+
+    The first ``num_hand_components`` of each hand are kept; with ``flat_hand_mean`` they count from
+    the flat hand (mean of zero).
+    """
     path = OPEN_BODY if path is None else Path(path)
     arrays = _read(path)
     _check(path, arrays)
@@ -54,6 +70,7 @@ def load_body_file(path: Path | None, num_betas: int, num_expression: int) -> Bo
         posedirs = posedirs.astype(np.float64)
     else:
         posedirs = None
+    hands = _hands(path, arrays, num_hand_components, flat_hand_mean)
     return BodyFile(
         path=path,
         template=arrays["v_template"].astype(np.float64),
@@ -63,11 +80,9 @@ def load_body_file(path: Path | None, num_betas: int, num_expression: int) -> Bo
         posedirs=posedirs,
         joint_regressor=arrays["J_regressor"].astype(np.float64),
         weights=arrays["weights"] / arrays["weights"].sum(1, keepdims=True, dtype=np.float64),
-        hand_mean=np.stack([arrays["hands_meanl"], arrays["hands_meanr"]]).astype(np.float64),
-        hand_components=np.stack([arrays["hands_componentsl"], arrays["hands_componentsr"]]).astype(
-            np.float64
-        ),
-        hand_deviation=_hand_deviation(arrays),
+        hand_mean=hands[0],
+        hand_components=hands[1],
+        hand_deviation=hands[2],
         landmark_faces=arrays["lmk_faces_idx"].astype(np.int64),
         landmark_barycentric=arrays["lmk_bary_coords"].astype(np.float64),
         contour_faces=arrays["dynamic_lmk_faces_idx"].astype(np.int64),
@@ -202,6 +217,29 @@ def _directions(
             f"{num_betas} and {num_expression} were asked for: ask for fewer."
         )
     return table[:, :, :num_betas], table[:, :, start : start + num_expression]
+
+
+def _hands(
+    path: Path, arrays: dict[str, np.ndarray], count: int, flat: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Mean (2,45), first components (2,count,45) and their usual size (2,count) about that mean."""
+    fewest, most = _HAND_COMPONENTS
+    if not fewest <= count <= most:
+        raise UserError(
+            f"Body file {path}: {count} hand components were asked for; expected {fewest} to "
+            f"{most}: ask for as many."
+        )
+    mean = np.stack([arrays["hands_meanl"], arrays["hands_meanr"]]).astype(np.float64)
+    components = np.stack([arrays["hands_componentsl"], arrays["hands_componentsr"]])
+    components = components[:, :count].astype(np.float64)
+    deviation = _hand_deviation(arrays)
+    if deviation is not None:
+        deviation = deviation[:, :count]
+    if flat:
+        if deviation is not None:  # about zero, the mean is part of what is usual
+            deviation = np.hypot(deviation, np.einsum("skj,sj->sk", components, mean))
+        mean = np.zeros_like(mean)
+    return mean, components, deviation
 
 
 def _hand_deviation(arrays: dict[str, np.ndarray]) -> np.ndarray | None:

@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body.contour import FaceContour, contour_rows
 from intercap_core.body.jacobian import Linearisation, linearise, shaped_points, turn_frames
-from intercap_core.body.joints import PARENTS
-from intercap_core.body.keypoints import KeypointMap, keypoint_map
+from intercap_core.body.joints import JOINT_INDEX, PARENTS
+from intercap_core.body.keypoints import CONTOUR, KeypointMap, keypoint_map
 from intercap_core.body.kinematics import (
     PosedJoints,
     joint_shape_derivatives,
@@ -65,9 +66,10 @@ class BodyModel:
     """A body of V vertices and 55 joints in SMPL-X's conventions (y up, facing +z, metres).
 
     faces (F,3) int64. parents: of each joint, -1 for the pelvis. hand_mean (2,45) and
-    hand_components (2,45,45), left then right: axis-angle = mean + coefficients @ components;
-    hand_deviation (2,45): usual size of each coefficient. keypoint_map, regions (name to vertex
-    ids), markers (81,) LEMO's marker vertices by `marker_names`.
+    hand_components (2,H,45), left then right: axis-angle = mean + coefficients @ components;
+    hand_deviation (2,H): usual size of each coefficient. keypoint_map, contour (the jaw line from
+    every side), regions (name to vertex ids), markers (81,) LEMO's marker vertices by
+    `marker_names`.
     """
 
     marker_names = MARKER_NAMES
@@ -94,7 +96,9 @@ class BodyModel:
         self.hand_components = tensor(file.hand_components)
         deviation = file.hand_deviation
         self.hand_deviation = tensor(
-            np.full((2, 45), _FALLBACK_HAND_DEVIATION) if deviation is None else deviation
+            np.full(file.hand_components.shape[:2], _FALLBACK_HAND_DEVIATION)
+            if deviation is None
+            else deviation
         )
 
         maps = load_maps(file.path, len(file.template))
@@ -107,6 +111,9 @@ class BodyModel:
             file.contour_barycentric[0],
         )
         self._keypoint_matrix = tensor(self.keypoint_map.matrix)
+        self.contour = FaceContour.build(
+            file.faces, file.contour_faces, file.contour_barycentric, device, dtype
+        )
         self.markers = maps.markers
         self.regions = maps.regions or _regions(file, rest_joints)
         self._selections: OrderedDict[bytes, Selection] = OrderedDict()
@@ -118,14 +125,26 @@ class BodyModel:
         *,
         num_betas: int = 10,
         num_expression: int = 10,
+        num_hand_components: int = 45,
+        flat_hand_mean: bool = False,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> BodyModel:
         """Load an SMPL-X npz (300+100 or 10+10 shape columns), or the open body without a path.
 
-        Raises `UserError` for a file that is missing, is SMPL or SMPL-H, or is incomplete.
+        ``num_hand_components``, 6 to 45, are kept of each hand's pose space (fits of the whole pose
+        want all); ``flat_hand_mean``: coefficients count from the flat hand, not from the mean
+        one. Raises `UserError` for a file that is missing, is SMPL or SMPL-H, or is incomplete, or
+        where more components are asked for than it has.
         """
-        return cls(load_body_file(path, num_betas, num_expression), torch.device(device), dtype)
+        file = load_body_file(
+            path,
+            num_betas,
+            num_expression,
+            num_hand_components=num_hand_components,
+            flat_hand_mean=flat_hand_mean,
+        )
+        return cls(file, torch.device(device), dtype)
 
     @property
     def num_vertices(self) -> int:
@@ -160,7 +179,8 @@ class BodyModel:
         return BodyParameters.from_vector(vector, num_betas=self.num_betas)
 
     def hand_pose(self, coefficients: Tensor, side: int) -> Tensor:
-        """(B,n) coefficients of the first components -> (B,45) axis-angle; side 0 left, 1 right."""
+        """(B,n) coefficients of the first n of the H components -> (B,45) axis-angle; side 0 left,
+        1 right."""
         count = coefficients.shape[-1]
         return self.hand_mean[side] + coefficients @ self.hand_components[side, :count]
 
@@ -258,6 +278,39 @@ class BodyModel:
         batch = full.shape[0]
         mixed = self._keypoint_matrix @ full.reshape(batch, full.shape[1], -1)
         return self._keypoint_matrix @ lin.points, mixed.reshape(batch, -1, *full.shape[2:])
+
+    def keypoints_by_view(self, params: BodyParameters, camera_from_master: Tensor) -> Tensor:
+        """(B,C,135,3), master frame: keypoints as cameras (C,3,3) or (C,4,4) see them.
+
+        They differ in the jaw line alone, which follows the head's yaw in each view. Bodies are in
+        the master frame.
+        """
+        views = len(camera_from_master)
+        points = self.keypoints_of(params)[:, None].repeat(1, views, 1, 1)
+        vertices = self.forward(params, vertex_ids=self.contour.vertex_ids).vertices
+        rows = self.contour_rows(params, camera_from_master)
+        points[:, :, CONTOUR] = self.contour.mix(vertices, rows)
+        return points
+
+    def contour_jacobian(
+        self, params: BodyParameters, camera_from_master: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Jaw lines (B,C,17,3) in those cameras and their derivatives (B,C,17,3,P), rows held."""
+        rows = self.contour_rows(params, camera_from_master)
+        lin = self.linearise(params, vertex_ids=self.contour.vertex_ids)
+        return self.contour.mix(lin.points, rows), self.contour.mix(lin.full(), rows)
+
+    def contour_rows(self, params: BodyParameters, camera_from_master: Tensor) -> Tensor:
+        """(B,C) rows of `contour` for cameras (C,3,3) or (C,4,4); see there.
+
+        The head's own turn counts with the neck's: the face hangs on the head (smplx stops at the
+        neck, which on FLAME carries the face).
+        """
+        with torch.no_grad():
+            local = rotation_from_axis_angle(params.full_pose())
+            still = local.new_zeros(local.shape[0], len(PARENTS), 3)
+            head = pose_joints(still, local, still[:, 0]).rotations[:, JOINT_INDEX["head"]]
+            return contour_rows(head, camera_from_master[:, :3, :3].to(head))
 
     def _select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool) -> Selection:
         """The selection for these vertices; the last few are kept."""

@@ -39,6 +39,24 @@ def test_equals_autograd(pose_blend_shapes: bool, body64: BodyModel, full_file: 
     assert torch.allclose(result.joints, out.joints, atol=1e-12)
 
 
+@pytest.mark.parametrize("gendered_file", ["female"], indirect=True)
+def test_equals_autograd_in_all_blocks_of_a_full_file(gendered_file: Path) -> None:
+    """Random poses; 165 pose, 3 translation, 300 shape and 100 expression parameters."""
+    model = BodyModel.load(gendered_file, num_betas=300, num_expression=100, dtype=torch.float64)
+    vector = random_vector(3, model.num_parameters, 11, torch.float64)
+    ids = torch.tensor([7, 5060, 8563, 13429])
+    result = model.jacobian(model.parameters(vector), vertex_ids=ids, joints=True)
+    assert result.d_joints is not None
+    ours = torch.cat([result.d_vertices, result.d_joints], 1)
+    for at in range(3):
+        expected = _by_autograd(model, vector[at], ids)
+        assert (ours[at] - expected).abs().max() < 1e-10
+    blocks = {"pose": slice(0, 165), "transl": slice(165, 168), "betas": slice(168, 468),
+              "expression": slice(468, 568)}  # fmt: skip
+    for name, columns in blocks.items():
+        assert (ours[..., columns].abs().amax((0, 1, 2)) > 1e-6).all(), name
+
+
 def test_equals_finite_differences(body64: BodyModel) -> None:
     vector = random_vector(1, body64.num_parameters, 8, torch.float64)
     ids = torch.tensor([11, 4711, 8563])

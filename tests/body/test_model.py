@@ -130,6 +130,40 @@ def test_hand_components_are_orthonormal_and_mirrored(body64: BodyModel) -> None
     assert torch.equal(pose[0], body64.hand_mean[1])
 
 
+@pytest.mark.parametrize("count", [6, 12, 45])
+def test_hands_of_few_components_are_those_of_all_with_the_rest_zero(
+    count: int, body64: BodyModel
+) -> None:
+    model = BodyModel.load(num_hand_components=count, dtype=torch.float64)
+    assert model.hand_components.shape == (2, count, 45)
+    assert model.hand_deviation.shape == (2, count)
+    code = torch.linspace(-1, 1, 2 * count, dtype=torch.float64).reshape(2, count)
+    for side in (0, 1):
+        rest = code.new_zeros(2, 45 - count)
+        expected = body64.hand_pose(torch.cat([code, rest], 1), side)
+        assert torch.allclose(model.hand_pose(code, side), expected, atol=1e-14)
+
+
+def test_flat_hands_are_the_mean_of_coefficients_that_count_from_them(body64: BodyModel) -> None:
+    flat = BodyModel.load(flat_hand_mean=True, dtype=torch.float64)
+    assert not flat.hand_mean.any()
+    assert torch.equal(with_hand_mean(flat, flat.zeros()).vector(), flat.zeros().vector())
+    for side in (0, 1):
+        code = body64.hand_components[side] @ body64.hand_mean[side]
+        mean = flat.hand_pose(code[None], side)[0]  # the components span all poses
+        assert torch.allclose(mean, body64.hand_mean[side], atol=1e-5)
+        usual = torch.hypot(body64.hand_deviation[side], code)
+        assert torch.allclose(flat.hand_deviation[side], usual, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [5, 46])
+def test_too_few_or_too_many_hand_components_are_named(count: int) -> None:
+    with pytest.raises(
+        UserError, match=f"{count} hand components were asked for; expected 6 to 45"
+    ):
+        BodyModel.load(num_hand_components=count)
+
+
 def test_regressor_rows_sum_to_one_and_weights_are_a_partition(body: BodyModel) -> None:
     arrays = open_arrays()
     assert np.abs(arrays["J_regressor"].sum(1) - 1).max() < 1e-4
