@@ -124,12 +124,11 @@ class Fitter:
             evidence.refine_cloud_noise(problem)
             problem.targets = None
         recover(problem, evidence.seen.times[self.frames])
-        # Faces and hands of a shape outside the model's space would bend the whole body to fit:
-        # what is shared is settled by now, and stays.
-        problem.fit_shared, problem.one_shape = False, False
         hands, face = self.settings.hands, self.settings.face
         if hands or face:
             self._extremities(problem, hands=hands, face=face)
+        # What is shared stays free: only hands that are fitted tell how long forearms and hands
+        # are, and where the detector's wrist lies on a forearm whose twist they give.
         problem.columns = columns_of(self.model, hands=hands, face=face, betas=not self.one_shape)
         for last in (False, True):
             if evidence.has_cloud:
@@ -139,7 +138,8 @@ class Fitter:
             evidence.look(problem, hands=hands, face=face)
             solution = self._minimise(problem, 5, keep_normal=last)
         assert solution.normal is not None
-        return self._report(problem, solution.normal.hessian)
+        own = len(problem.columns)
+        return self._report(problem, solution.normal.hessian[:, :own, :own])
 
     def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
         """The last round's problem at other bodies (N,P), with what a fit found to be constant."""
