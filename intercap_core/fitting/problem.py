@@ -30,7 +30,7 @@ OFFSET_SIGMA = 0.010
 # How much one frame's data outweigh what they are worth for quantities that never change: their
 # errors persist over frames, so priors on shared parameters count once for each so many frames.
 _OFFSET_PRIOR_PER_FRAME = 0.3
-_SHAPE_PRIOR_PER_FRAME = 2.0
+_SHAPE_PRIOR_PER_FRAME = 1.0  # what a frame with a shape of its own has
 _COVERING_PRIOR_PER_FRAME = 2.0
 
 
