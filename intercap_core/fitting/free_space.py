@@ -19,7 +19,6 @@ import numpy as np
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
 
-STEP_PX = 1  # of so many pixels and rows of a depth image one is kept
 _BEHIND_M = 0.06  # farther behind the vertex is not the person's surface there
 _FACING = 0.1  # cosine between normal and line of sight; larger ones look away
 _REACH_M = 0.05
@@ -28,8 +27,7 @@ _WAY_M = 0.01  # steps along the way in
 
 @dataclass(frozen=True, eq=False)
 class DepthWindow:
-    """Part of the depth image of camera ``view``: every ``STEP_PX``-th pixel, (h,w) uint16 mm, from
-    pixel ``first`` (row, column) on."""
+    """Part of camera ``view``'s depth image: (h,w) uint16 mm, its first pixel's row, column."""
 
     view: int
     first: tuple[int, int]
@@ -39,7 +37,7 @@ class DepthWindow:
         """Depth (...,) in metres at pixels (...,2) x, y of the whole image; 0 = unknown."""
         known = np.isfinite(pixels).all(-1)
         place = np.where(known[..., None], pixels, -1e6) - np.array(self.first[::-1])
-        column, row = np.rint(np.moveaxis(place / STEP_PX, -1, 0)).astype(np.int64)
+        column, row = np.rint(np.moveaxis(place, -1, 0)).astype(np.int64)
         height, width = self.depth.shape
         known &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
         found = self.depth[np.where(known, row, 0), np.where(known, column, 0)]

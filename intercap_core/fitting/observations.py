@@ -18,7 +18,7 @@ from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.detection.masks import Runs
 from intercap_core.errors import UserError
-from intercap_core.fitting.free_space import STEP_PX, DepthWindow
+from intercap_core.fitting.free_space import DepthWindow
 from intercap_core.schemas import PERSON, SCENE
 
 _OUTLIER_TRUST = 0.2  # of a view that disagrees with the triangulated point
@@ -157,11 +157,12 @@ def _fused(
 
 
 def _depth_window(depth: np.ndarray, camera: Camera, mask: Runs, view: int) -> DepthWindow:
+    """What camera ``view`` measured around the person: the part of ``depth`` (H,W) uint16 mm that
+    can fall on ``mask``, which is not empty."""
     box = _window(camera, mask, depth)
     assert box is not None
     rows, columns = box
-    kept = depth[rows.start : rows.stop : STEP_PX, columns.start : columns.stop : STEP_PX]
-    return DepthWindow(view, (rows.start, columns.start), kept.copy())
+    return DepthWindow(view, (rows.start, columns.start), depth[rows, columns].copy())
 
 
 def view_points(

@@ -97,4 +97,6 @@ def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> Bo
         views=views,
         targets=targets,
         rows=None,
+        touching=None,
+        pose=None if problem.pose is None else problem.pose.of_frames(at),
     )

@@ -165,21 +165,24 @@ class Fitter:
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
         """Median pixel error (N,C) and cloud distance (N,), metres; NaN = nothing seen."""
-        return self._pixels(problem).nanmedian(2).values, self.evidence.cloud_residual
+        found = self._of_body(problem, self.evidence.pixel_residuals(problem))
+        return found.nanmedian(2).values, self.evidence.cloud_residual
 
-    def _pixels(self, problem: BodyProblem) -> Tensor:
-        """Errors (N,C,25) of the body's keypoints, px, NaN = not seen."""
+    def _of_body(self, problem: BodyProblem, residuals: Tensor) -> Tensor:
+        """Errors (N,C,25) of the body's keypoints, px, NaN = not seen, from ``residuals``
+        (N,C,K,2)."""
         assert problem.views is not None
-        pixels = self.evidence.pixel_residuals(problem)[:, :, BODY].norm(dim=-1)
+        pixels = residuals[:, :, BODY].norm(dim=-1)
         return torch.where(problem.views.confidence[:, :, BODY] > 0, pixels, torch.nan)
 
     def _report(self, problem: BodyProblem, hessian: Tensor) -> Fit:
         """Residuals of the solution."""
         assert problem.views is not None
-        evidence, pixels = self.evidence, self._pixels(problem)
-        views, index = problem.views, problem.keypoints.index
-        every = (evidence.pixel_residuals(problem) / views.sigma[..., None]).norm(dim=-1)
-        whitened = pixels / problem.views.sigma[:, :, BODY]
+        evidence, views, index = self.evidence, problem.views, problem.keypoints.index
+        residuals = evidence.pixel_residuals(problem)
+        pixels = self._of_body(problem, residuals)
+        every = residuals.norm(dim=-1) / views.sigma
+        whitened = pixels / views.sigma[:, :, BODY]
         return Fit(
             frames=self.frames,
             vectors=problem.base,

@@ -178,16 +178,23 @@ class Bar:
     beside: str
 
 
+def _upright_grid(top: float, left: float, inner: float, height: float) -> list[str]:
+    """Lines and numbers at values from 0 to ``top``, over ``inner`` px from ``left`` on."""
+    parts = []
+    for tick in ticks(0, top):
+        x = left + inner * tick / top
+        parts.append(f'<line class="grid" {_same("x", x)} y1="2" y2="{height - 36}"/>')
+        parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
+    return parts
+
+
 def bars(rows: Sequence[Bar], unit: str) -> str:
     """One bar a row, with its value."""
     top = max([*(row.most for row in rows), 1e-9])
     left, inner, tall = _room_for([row.name for row in rows]), 300, 16
     width, height = left + inner + 150, tall * len(rows) + 40
     parts = [_open(width, height, unit)]
-    for tick in ticks(0, top):
-        x = left + inner * tick / top
-        parts.append(f'<line class="grid" {_same("x", x)} y1="2" y2="{height - 36}"/>')
-        parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
+    parts += _upright_grid(top, left, inner, height)
     for index, row in enumerate(rows):
         y = tall * index + 4
         parts.append(_text(left - 8, y + 9, row.name, "tick", "end"))
@@ -219,10 +226,7 @@ def bar_pairs(rows: Sequence[BarPair], unit: str) -> str:
     left, inner, tall = _room_for([row.name for row in rows]), 360, 24
     width, height = left + inner + 190, tall * len(rows) + 40
     parts = [_open(width, height, f"before and after, {unit}")]
-    for tick in ticks(0, top):
-        x = left + inner * tick / top
-        parts.append(f'<line class="grid" {_same("x", x)} y1="2" y2="{height - 36}"/>')
-        parts.append(_text(x, height - 22, _number(tick), "tick", "middle"))
+    parts += _upright_grid(top, left, inner, height)
     for index, row in enumerate(rows):
         y = tall * index + 4
         parts.append(_text(left - 8, y + 12, row.name, "tick", "end"))

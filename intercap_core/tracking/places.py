@@ -31,8 +31,8 @@ _BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what th
 
 @dataclass(eq=False)
 class Standing:
-    """A place (3,) where something was in ``share`` of the surveyed frames: in ``frames``, and in
-    those of ``beside`` while the object was elsewhere."""
+    """A place (3,), metres, master frame, where something was in ``share`` of the surveyed frames:
+    in ``frames``, and in those of ``beside`` while the object was elsewhere."""
 
     place: np.ndarray
     share: float

@@ -7,7 +7,7 @@ import pytest
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
-from intercap_core.fitting.free_space import STEP_PX, DepthWindow, seen_through
+from intercap_core.fitting.free_space import DepthWindow, seen_through
 
 LENS = Intrinsics(320, 288, 252.0, 252.0, 159.5, 143.5)
 CAMERA = Camera("k1", LENS, LENS, np.eye(4), np.eye(4))
@@ -17,7 +17,7 @@ def _window(person_mm: int, background_mm: int) -> DepthWindow:
     """A person whose right border, in the image, is at pixel 200: x = 0.32 m at two metres."""
     depth = np.full((288, 320), background_mm, np.uint16)
     depth[:, :200] = person_mm
-    return DepthWindow(0, (0, 0), depth[::STEP_PX, ::STEP_PX])
+    return DepthWindow(0, (0, 0), depth)
 
 
 EDGE_ON = (0.98, 0.0, -0.199)  # the normal where the line of sight grazes a round limb
@@ -29,7 +29,7 @@ def test_a_point_outside_the_border_is_as_far_out_as_it_is(out_m: float) -> None
     points = np.array([[BORDER_M + out_m, 0.0, 2.0]])
     index, away = seen_through(_window(2000, 4000), CAMERA, 0.0, points, np.array([EDGE_ON]))
     assert index.tolist() == [0]
-    assert away[0] == pytest.approx(out_m, abs=0.014)  # of a step, and of every second pixel
+    assert away[0] == pytest.approx(out_m, abs=0.014)  # of a step and of a pixel
 
 
 @pytest.mark.parametrize(

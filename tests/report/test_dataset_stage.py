@@ -20,6 +20,7 @@ from intercap_core.config import MetricsSettings, ReportSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import HEATMAPS, METRICS
 from intercap_core.stages import dataset, metrics
+from intercap_core.step import READS
 
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
@@ -48,18 +49,7 @@ def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Pat
     dataset.run(
         dataset="demo",
         sequences={
-            name: dataset.SequenceArtefacts(
-                **capture.inputs(
-                    "frames",
-                    "scene",
-                    "detections",
-                    "person",
-                    "object_track",
-                    "body_fit",
-                    "joint",
-                    "metrics",
-                )
-            )
+            name: dataset.SequenceArtefacts(**capture.inputs(*READS["metrics"], "metrics"))
             for name, capture in captures.items()
         },
         objects={capture.object_.name: capture.object_ for capture in captures.values()},

@@ -11,6 +11,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from plain_capture import detect, plain_entry, write_rig
 
 pytest.importorskip("onnxruntime")
 tiny_pose = pytest.importorskip("tiny_pose", exc_type=ImportError)
@@ -18,15 +19,11 @@ tiny_pose = pytest.importorskip("tiny_pose", exc_type=ImportError)
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
 from intercap_core.config import (  # noqa: E402
-    DetectionsSettings,
-    FramesSettings,
     SequenceEntry,
 )
 from intercap_core.detection import masks  # noqa: E402
-from intercap_core.detection.read import Detections  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402
-from intercap_core.stages import detections, frames  # noqa: E402
 
 SIZE, COUNT = (640, 360), 3
 SEEN = [KEYPOINT_NAMES.index(name) for name in tiny_pose.NAMES]
@@ -39,43 +36,17 @@ def places(number: int, camera: int) -> np.ndarray:
 @pytest.fixture
 def capture(tmp_path) -> SequenceEntry:
     """Two cameras that see somebody walk; the second's last image shows nobody."""
-    lens = {
-        "image_size": SIZE,
-        "camera_matrix": [[500, 0, 320], [0, 500, 180], [0, 0, 1]],
-        "distortion_coefficients": [0, 0, 0, 0],
-    }
-    cameras = {}
-    for c, name in enumerate(("left", "right")):
-        cameras[name] = lens | {"R": [0, 0, 0], "T": [c, 0, 0]}
-        folder = tmp_path / "recordings" / name
-        folder.mkdir(parents=True)
+    for c, folder in enumerate(write_rig(tmp_path, SIZE, 500).values()):
         for number in range(COUNT):
             nobody = c == 1 and number == COUNT - 1
             image = tiny_pose.picture(SIZE, [] if nobody else [places(number, c)])
             options = [cv2.IMWRITE_JPEG_QUALITY, 95]
             cv2.imwrite(str(folder / f"shot_{number + 1:04d}.jpg"), image, options)
-    (tmp_path / "rig.json").write_text(json.dumps({"fps": 10, "cameras": cameras}))
-    return SequenceEntry(
-        sequence="s1", subject="a", object="b", layout="plain",
-        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
-    )  # fmt: skip
+    return plain_entry(tmp_path)
 
 
 def whole_body(x: float) -> list[float]:
     return [v for i in range(133) for v in (x + i, 50.0, 0.5)]
-
-
-def run(capture, output="detections.h5", **settings) -> Detections:
-    out = capture.recordings.parent
-    if not (out / "frames.h5").exists():
-        frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())
-    detections.run(
-        frames=out / "frames.h5",
-        output=out / output,
-        sequence=capture,
-        settings=DetectionsSettings(**settings),
-    )
-    return Detections.load(out / output)
 
 
 def test_files_count_and_the_model_fills_the_rest(capture, tmp_path, caplog):
@@ -92,7 +63,7 @@ def test_files_count_and_the_model_fills_the_rest(capture, tmp_path, caplog):
     row = capture.model_copy(update={"keypoints": keypoints, "candidates": candidates})
     path = tiny_pose.simcc(tmp_path / "pose.onnx")
     with caplog.at_level(logging.INFO, "intercap_core"):
-        read = run(row, keypoint_model=path, keypoint_full_confidence=2.0)
+        read = detect(row, keypoint_model=path, keypoint_full_confidence=2.0)
     assert read.keypoints_found.all() and "found people in 5 of 5 images" in caplog.text
     np.testing.assert_allclose(read.people(0, 0)[:, 0], [[7, 50, 0.25]])
     for t, c in ((1, 0), (2, 0), (0, 1), (1, 1)):
@@ -103,7 +74,7 @@ def test_files_count_and_the_model_fills_the_rest(capture, tmp_path, caplog):
     with artefacts.read(tmp_path / "detections.h5", DETECTIONS) as artefact:
         name, digest = artefact.attributes["keypoint_model"].split()
     assert name == "pose.onnx" and digest == hashlib.sha256(path.read_bytes()).hexdigest()
-    run(row, "again.h5", keypoint_model=path, keypoint_full_confidence=2.0)
+    detect(row, "again.h5", keypoint_model=path, keypoint_full_confidence=2.0)
     first, second = (tmp_path / name for name in ("detections.h5", "again.h5"))
     assert first.read_bytes() == second.read_bytes()
 
@@ -114,7 +85,7 @@ def test_one_file_a_camera_and_none_for_the_other(capture, tmp_path):
     ]
     (tmp_path / "keypoints").mkdir()
     (tmp_path / "keypoints" / "left.json").write_text(json.dumps(people))
-    read = run(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
+    read = detect(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
     assert [read.people(t, 0)[:, 0, 0].tolist() for t in range(COUNT)] == [[10], [], [30, 30]]
     assert read.keypoints_found.all(0).tolist() == [True, False]
     assert read.notes[1] == "no keypoints keypoints/right/ or keypoints/right.json"
@@ -126,7 +97,7 @@ def test_keypoints_of_another_length_name_file_and_camera(capture, tmp_path):
     (tmp_path / "keypoints" / "right.json").write_text(json.dumps(people))
     words = r"none of camera right's keypoints can be used: keypoints/right.json, entry 0"
     with pytest.raises(UserError, match=words):
-        run(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
+        detect(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
 
 
 def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
@@ -134,7 +105,7 @@ def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
 
     path = tiny_onnx.thresholder(tmp_path / "other.onnx")
     with pytest.raises(UserError, match=r"other.onnx: its outputs .* are not those of a pose"):
-        run(capture, keypoint_model=path)
+        detect(capture, keypoint_model=path)
     assert not (tmp_path / "detections.h5").exists()
 
 

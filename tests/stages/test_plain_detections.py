@@ -8,13 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from plain_capture import detect, plain_entry, write_rig
 
 from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
 from intercap_core.detection.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.stages import detections, frames
 
-SIZE, FPS = (64, 48), 10
+SIZE = (64, 48)
 CUT, ABSENT = 2, 4  # numbers of the right camera's damaged image and of the one that is not there
 
 
@@ -27,39 +28,21 @@ def keypoints(path: Path, x: float) -> None:
 @pytest.fixture
 def capture(tmp_path) -> SequenceEntry:
     """Two folders of images 1 to 6; of the right one, one is cut off and one is absent."""
-    lens = {
-        "image_size": SIZE,
-        "camera_matrix": [[60, 0, 32], [0, 60, 24], [0, 0, 1]],
-        "distortion_coefficients": [0, 0, 0, 0],
-    }
-    cameras = {}
-    for c, name in enumerate(("left", "right")):
-        cameras[name] = lens | {"R": [0, 0, 0], "T": [c, 0, 0]}
-        (tmp_path / "recordings" / name).mkdir(parents=True)
+    images = write_rig(tmp_path, SIZE, 60)
+    for c, folder in enumerate(images.values()):
         for number in range(1, 7):
-            path = tmp_path / "recordings" / name / f"shot_{number:04d}.jpg"
+            path = folder / f"shot_{number:04d}.jpg"
             cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0], 3), 30 * number + c, np.uint8))
-    right = tmp_path / "recordings" / "right"
+    right = images["right"]
     (right / f"shot_{ABSENT:04d}.jpg").unlink()
     cut = right / f"shot_{CUT:04d}.jpg"
     cut.write_bytes(cut.read_bytes()[:200])
-    (tmp_path / "rig.json").write_text(json.dumps({"fps": FPS, "cameras": cameras}))
-    return SequenceEntry(
-        sequence="s1", subject="a", object="b", layout="plain",
-        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
-        keypoints=tmp_path / "keypoints",
-    )  # fmt: skip
+    return plain_entry(tmp_path, keypoints=tmp_path / "keypoints")
 
 
 def found(capture: SequenceEntry) -> dict[str, list[float]]:
     """By camera the first x of each frame set's person; 0 = nobody."""
-    out = capture.recordings.parent
-    frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())
-    detections.run(
-        frames=out / "frames.h5", output=out / "detections.h5", sequence=capture,
-        settings=DetectionsSettings(),
-    )  # fmt: skip
-    read = Detections.load(out / "detections.h5")
+    read = detect(capture)
     people = {
         name: [read.people(t, c) for t in range(read.num_sets)]
         for c, name in enumerate(("left", "right"))

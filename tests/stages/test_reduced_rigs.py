@@ -29,6 +29,7 @@ from intercap_core.errors import UserError
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
 from intercap_core.stages import body_fit, dataset, export, joint, metrics, object_track, person
+from intercap_core.step import READS
 from tests.rigid.conftest import catalogue
 from tests.tracking.object_capture import ObjectCapture
 
@@ -264,18 +265,7 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
         sequences={
             "cap": dataset.SequenceArtefacts(
                 metrics=measured,
-                **{
-                    s: paths[s]
-                    for s in (
-                        "frames",
-                        "scene",
-                        "detections",
-                        "person",
-                        "object_track",
-                        "body_fit",
-                        "joint",
-                    )
-                },
+                **{s: paths[s] for s in READS["metrics"]},
             )
         },
         objects={capture.object_.name: capture.object_},

@@ -9,20 +9,17 @@ import logging
 import cv2
 import numpy as np
 import pytest
+from plain_capture import detect, plain_entry, write_rig
 
 pytest.importorskip("onnxruntime")
 tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.config import (  # noqa: E402
-    DetectionsSettings,
-    FramesSettings,
     SequenceEntry,
 )
 from intercap_core.detection import masks  # noqa: E402
-from intercap_core.detection.read import Detections  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402
-from intercap_core.stages import detections, frames  # noqa: E402
 
 WIDTH, HEIGHT, COUNT = 160, 96, 5
 NAMES = {"names": "{0: 'suitcase', 1: 'cup'}"}
@@ -37,44 +34,18 @@ def thing(number: int) -> np.ndarray:
 @pytest.fixture
 def capture(tmp_path) -> SequenceEntry:
     """Two cameras that see a red disc move; the model's candidates are those of 'left'."""
-    lens = {
-        "image_size": [WIDTH, HEIGHT],
-        "camera_matrix": [[150, 0, 80], [0, 150, 48], [0, 0, 1]],
-        "distortion_coefficients": [0, 0, 0, 0],
-    }
-    cameras = {}
-    for c, name in enumerate(("left", "right")):
-        cameras[name] = lens | {"R": [0, 0, 0], "T": [c, 0, 0]}
-        folder = tmp_path / "recordings" / name
-        folder.mkdir(parents=True)
+    for c, folder in enumerate(write_rig(tmp_path, (WIDTH, HEIGHT), 150).values()):
         for number in range(COUNT):
             image = np.full((HEIGHT, WIDTH, 3), 110 + 5 * c, np.uint8)
             image[thing(number)] = (20, 20, 230)
             cv2.imwrite(str(folder / f"shot_{number + 1:04d}.jpg"), image)
-    (tmp_path / "rig.json").write_text(json.dumps({"fps": 10, "cameras": cameras}))
     candidates = tmp_path / "candidates"
     candidates.mkdir()
     mask = masks.encode(thing(0)).decode()
     entry = {"image_id": 0, "category_name": "from a file", "score": 0.5,
              "segmentation": {"size": [HEIGHT, WIDTH], "counts": mask}}  # fmt: skip
     (candidates / "right.json").write_text(json.dumps([entry]))
-    return SequenceEntry(
-        sequence="s1", subject="a", object="b", layout="plain", candidates=candidates,
-        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
-    )  # fmt: skip
-
-
-def run(capture, output, **settings):
-    out = capture.recordings.parent
-    if not (out / "frames.h5").exists():
-        frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())
-    detections.run(
-        frames=out / "frames.h5",
-        output=out / output,
-        sequence=capture,
-        settings=DetectionsSettings(**settings),
-    )
-    return Detections.load(out / output)
+    return plain_entry(tmp_path, candidates=candidates)
 
 
 @pytest.mark.parametrize("make", ["yolo", "mask_rcnn"])
@@ -85,7 +56,7 @@ def test_images_without_candidates_are_segmented(capture, tmp_path, caplog, make
     else:
         tiny_onnx.mask_rcnn(path, "detectron2")
     with caplog.at_level(logging.INFO, "intercap_core"):
-        read = run(capture, "detections.h5", segmentation_model=path)
+        read = detect(capture, "detections.h5", segmentation_model=path)
     assert read.candidates_found.all() and read.notes == ("no candidates candidates/left.json", "")
     for t in range(COUNT):
         (left,) = read.candidates(t, 0)
@@ -101,7 +72,7 @@ def test_images_without_candidates_are_segmented(capture, tmp_path, caplog, make
     moved = tmp_path / "elsewhere" / "model.onnx"
     moved.parent.mkdir()
     path.rename(moved)
-    run(capture, "again.h5", segmentation_model=moved)
+    detect(capture, "again.h5", segmentation_model=moved)
     first, second = (tmp_path / name for name in ("detections.h5", "again.h5"))
     assert first.read_bytes() == second.read_bytes()
 
@@ -110,7 +81,7 @@ def test_without_a_model_nothing_is_loaded(capture):
     import subprocess
     import sys
 
-    run(capture, "detections.h5")
+    detect(capture, "detections.h5")
     words = (
         "import sys, intercap_core.stages.detections; "
         "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detection.onnx_model' "
