@@ -48,8 +48,8 @@ def full_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def gendered_file(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Path]:
-    """Full files as the three licensed ones are: each its own template, weights of the joints, 300
-    + 100 directions none of which is zero, pose blend shapes, hands."""
+    """Full files as the three licensed ones are: each its own template, weights of the joints (none
+    negative), 300 + 100 directions none of which is zero, pose blend shapes, hands."""
     gender: str = request.param
     rng = np.random.default_rng(["neutral", "female", "male"].index(gender))
     arrays = open_arrays()
@@ -59,7 +59,7 @@ def gendered_file(
         return size * rng.standard_normal(shape, dtype=np.float32)
 
     template = arrays["v_template"] * rng.uniform(0.9, 1.1, 3) + random(count, 3, size=1e-3)
-    regressor = arrays["J_regressor"] * rng.uniform(0.5, 1.5, count)
+    regressor = np.abs(arrays["J_regressor"]) * rng.uniform(0.5, 1.5, count)
     arrays |= {
         "v_template": template,
         "shapedirs": random(count, 3, 400, size=3e-4),

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from intercap_core.body.joints import PARENTS
 from intercap_core.body.kinematics import left_jacobian, rotation_from_axis_angle
 from intercap_core.body.model import BodyModel
 
@@ -39,22 +40,78 @@ def test_equals_autograd(pose_blend_shapes: bool, body64: BodyModel, full_file: 
     assert torch.allclose(result.joints, out.joints, atol=1e-12)
 
 
-@pytest.mark.parametrize("gendered_file", ["female"], indirect=True)
-def test_equals_autograd_in_all_blocks_of_a_full_file(gendered_file: Path) -> None:
-    """Random poses; 165 pose, 3 translation, 300 shape and 100 expression parameters."""
-    model = BodyModel.load(gendered_file, num_betas=300, num_expression=100, dtype=torch.float64)
-    vector = random_vector(3, model.num_parameters, 11, torch.float64)
-    ids = torch.tensor([7, 5060, 8563, 13429])
+# Points of trunk, head, jaw, eyes, feet, hands and fingers
+_ALL_OVER = torch.tensor([7, 50, 3000, 5060, 8563, 9316, 11519, 13357, 13429])
+
+
+def _limbs(model: BodyModel) -> torch.Tensor:
+    """A vertex of each joint that moves any most."""
+    weights = model.skinning_weights
+    return torch.unique(torch.where(weights.amax(0) > 0, weights.argmax(0), 0))
+
+
+# Autograd in float64 at the same parameters is what both types are measured by
+@pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-12), (torch.float32, 5e-6)])
+def test_vertices_and_joints_of_a_full_file_by_all_parameters(
+    dtype: torch.dtype, bound: float, gendered_file: Path
+) -> None:
+    """A batch of random poses; 165 pose, 3 translation, 300 shape, 100 expression parameters."""
+    options = {"num_betas": 300, "num_expression": 100}
+    model = BodyModel.load(gendered_file, dtype=dtype, **options)
+    exact = BodyModel.load(gendered_file, dtype=torch.float64, **options)
+    vector = random_vector(2, model.num_parameters, 11, dtype)
+    vector[:, 168:] *= 0.2
+    ids = torch.cat([_ALL_OVER, _limbs(model)[::7]])
     result = model.jacobian(model.parameters(vector), vertex_ids=ids, joints=True)
     assert result.d_joints is not None
     ours = torch.cat([result.d_vertices, result.d_joints], 1)
-    for at in range(3):
-        expected = _by_autograd(model, vector[at], ids)
-        assert (ours[at] - expected).abs().max() < 1e-10
+    assert ours.dtype == dtype
+    for at in range(2):
+        expected = _by_autograd(exact, vector[at].double(), ids)
+        assert (ours[at] - expected).abs().max() < bound
     blocks = {"pose": slice(0, 165), "transl": slice(165, 168), "betas": slice(168, 468),
               "expression": slice(468, 568)}  # fmt: skip
     for name, columns in blocks.items():
         assert (ours[..., columns].abs().amax((0, 1, 2)) > 1e-6).all(), name
+
+
+@pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-12), (torch.float32, 5e-6)])
+def test_vertices_and_joints_of_the_open_body_by_all_parameters(
+    dtype: torch.dtype, bound: float, body64: BodyModel
+) -> None:
+    model = BodyModel.load(dtype=dtype)
+    vector = random_vector(2, model.num_parameters, 12, dtype)
+    ids = _limbs(model)
+    result = model.jacobian(model.parameters(vector), vertex_ids=ids, joints=True)
+    assert result.d_joints is not None
+    for at in range(2):
+        expected = _by_autograd(body64, vector[at].double(), ids)
+        assert (result.d_vertices[at] - expected[: len(ids)]).abs().max() < bound
+        assert (result.d_joints[at] - expected[len(ids) :]).abs().max() < bound
+    assert (result.d_vertices.abs().amax((0, 1, 2)) > 1e-6).all()
+    pose_and_shape = result.d_joints.abs().amax((0, 1, 2))[:178]
+    ends = {3 * joint + axis for joint in range(55) if joint not in PARENTS for axis in range(3)}
+    assert {int(i) for i in (pose_and_shape < 1e-6).nonzero()} == ends, "what moves no joint"
+
+
+@pytest.mark.parametrize("file", ["open", "full"])
+def test_all_vertices_and_joints_pull_as_autograd_says(
+    file: str, body64: BodyModel, full_file: Path
+) -> None:
+    """A random pull at every vertex and joint of a batch, taken back to all parameters at once."""
+    model = body64 if file == "open" else BodyModel.load(full_file, dtype=torch.float64)
+    vector = random_vector(2, model.num_parameters, 13, torch.float64)
+    generator = torch.Generator().manual_seed(14)
+    shape = (2, model.num_vertices + 55, 3)
+    pull = torch.randn(shape, generator=generator, dtype=torch.float64) / shape[1] ** 0.5
+    free = vector.clone().requires_grad_()
+    out = model.forward(model.parameters(free))
+    points = torch.cat([out.vertices, out.joints], 1)
+    (expected,) = torch.autograd.grad((points * pull).sum(), free)
+    result = model.jacobian(model.parameters(vector), joints=True)
+    assert result.d_joints is not None
+    full = torch.cat([result.d_vertices, result.d_joints], 1)
+    assert (torch.einsum("bnc,bncp->bp", pull, full) - expected).abs().max() < 1e-11
 
 
 def test_equals_finite_differences(body64: BodyModel) -> None:
