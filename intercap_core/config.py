@@ -88,13 +88,16 @@ class DetectionsSettings(Model):
     segmentation_device: Literal["cpu", "cuda"] = "cpu"
     """Where the model runs; cuda needs the package onnxruntime-gpu."""
     keypoint_model: Path | None = None
-    """ONNX model for people's keypoints (RTMPose, RTMW or DWPose exports); it sees the images of
-    which no file of keypoints says anything."""
+    """ONNX model for people's keypoints (RTMPose, RTMW, DWPose, HRNet or ViTPose exports); it sees
+    the images of which no file of keypoints says anything."""
     keypoint_device: Literal["cpu", "cuda"] = "cpu"
     """Where the model of keypoints runs."""
     keypoint_full_confidence: Positive = 1.0
     """Confidence of a keypoint, as files or the model state it, that counts as 1; raw responses of
     RTMW reach 5 and more."""
+    keypoint_heatmap_grid: Literal["msra", "udp"] = "msra"
+    """How a model of heatmaps was trained. msra: a cell is so many pixels (mmpose's HRNet, with or
+    without DARK); udp: the last cell stands for the last pixel (ViTPose)."""
 
 
 class SceneSettings(Model):

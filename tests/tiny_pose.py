@@ -1,4 +1,5 @@
-"""A tiny ONNX model with the outputs of RTMPose that finds coloured dots, and people made of them.
+"""Tiny ONNX models with the outputs of RTMPose or of HRNet that find coloured dots, and people made
+of them.
 
 The responses are computed in the graph from the image that it is given, so that whatever goes wrong
 before or after the model shows in the result.
@@ -53,6 +54,34 @@ def picture(size: tuple[int, int], people: list[np.ndarray], radius: int = 8) ->
     return image
 
 
+def _responses(graph: Graph) -> str:
+    """(B, 24, H, W): how near each pixel's surroundings are to each dot's colour."""
+    deviation, mean = (graph.constant(v.reshape(1, 3, 1, 1) / 255) for v in (DEVIATION, MEAN))
+    pixels = graph.add("Add", graph.add("Mul", "input", deviation), mean)
+    square = graph.add("ReduceSumSquare", pixels, axes=[1], keepdims=1)
+    both = graph.add("Concat", pixels, square, axis=1)
+    colours = COLOURS / 255
+    weights = np.column_stack([2 * colours, -np.ones(len(colours))]) / (REACH / 255) ** 2
+    offset = 1 - (colours**2).sum(1) / (REACH / 255) ** 2
+    near = graph.add("Conv", both, graph.constant(weights[..., None, None]), graph.constant(offset))
+    smooth = graph.add("Relu", near)
+    for _ in range(2):
+        smooth = graph.add(
+            "AveragePool", smooth, kernel_shape=[BLUR, BLUR], strides=[1, 1],
+            pads=[BLUR // 2] * 4, count_include_pad=1,
+        )  # fmt: skip
+    return smooth
+
+
+def _choice(layout: tuple[str, ...], gain: float) -> np.ndarray:
+    """(K, 24): which dot is which point of the layout."""
+    choice = np.zeros((len(layout), len(NAMES)))
+    for i, name in enumerate(NAMES):
+        if name in layout:
+            choice[layout.index(name), i] = STRENGTH * gain
+    return choice
+
+
 def simcc(
     path: Path,
     size: tuple[int, int] = (192, 256),
@@ -68,24 +97,8 @@ def simcc(
     Outputs come in the order of ``names``; the one with an x is of columns.
     """
     graph = Graph()
-    deviation, mean = (graph.constant(v.reshape(1, 3, 1, 1) / 255) for v in (DEVIATION, MEAN))
-    pixels = graph.add("Add", graph.add("Mul", "input", deviation), mean)
-    square = graph.add("ReduceSumSquare", pixels, axes=[1], keepdims=1)
-    both = graph.add("Concat", pixels, square, axis=1)
-    colours = COLOURS / 255
-    weights = np.column_stack([2 * colours, -np.ones(len(colours))]) / (REACH / 255) ** 2
-    offset = 1 - (colours**2).sum(1) / (REACH / 255) ** 2
-    near = graph.add("Conv", both, graph.constant(weights[..., None, None]), graph.constant(offset))
-    smooth = graph.add("Relu", near)
-    for _ in range(2):
-        smooth = graph.add(
-            "AveragePool", smooth, kernel_shape=[BLUR, BLUR], strides=[1, 1],
-            pads=[BLUR // 2] * 4, count_include_pad=1,
-        )  # fmt: skip
-    choice = np.zeros((len(layout), len(NAMES)))
-    for i, name in enumerate(NAMES):
-        if name in layout:
-            choice[layout.index(name), i] = STRENGTH * gain
+    smooth = _responses(graph)
+    choice = _choice(layout, gain)
     count = len(layout)
     declared = {}
     for kind, axis, bins, length in (
@@ -104,4 +117,37 @@ def simcc(
         path,
         [("input", TensorProto.FLOAT, [batch or "batch", 3, height, width])],
         [(name, *declared[name]) for name in names],
+    )
+
+
+def heatmaps(
+    path: Path,
+    size: tuple[int, int] = (192, 256),
+    *,
+    batch: int | None = None,
+    gain: float = 1.0,
+    layout: tuple[str, ...] = WHOLE_BODY,
+    stride: tuple[int, int] = (4, 4),
+    grid: str = "msra",
+) -> Path:
+    """The same in maps of cells ``stride`` (x, y) pixels wide: with "msra" cell i is pixel
+    i stride's response, with "udp" cells lie from the first to the last pixel."""
+    graph = Graph()
+    smooth = _responses(graph)
+    cells = (size[0] // stride[0], size[1] // stride[1])
+    if grid == "msra":
+        ints = ([0, 0], [size[1], size[0]], [2, 3], stride[::-1])
+        coarse = graph.add("Slice", smooth, *(graph.constant(v, np.int64) for v in ints))
+    else:
+        coarse = graph.add(
+            "Resize", smooth, "", graph.constant([1, 1, cells[1] / size[1], cells[0] / size[0]]),
+            mode="linear", coordinate_transformation_mode="align_corners",
+        )  # fmt: skip
+    choice = _choice(layout, gain)[..., None, None]
+    graph.add("Conv", coarse, graph.constant(choice), name="output")
+    shape = [batch or "batch", len(layout), *cells[::-1]]
+    return graph.save(
+        path,
+        [("input", TensorProto.FLOAT, [batch or "batch", 3, size[1], size[0]])],
+        [("output", TensorProto.FLOAT, shape)],
     )

@@ -1,10 +1,9 @@
-"""Whole-body keypoints by a user's ONNX model: RTMPose, RTMW and DWPose exports, top down.
+"""Whole-body keypoints by a user's ONNX model: RTMPose, DWPose, HRNet or ViTPose exports, top down.
 
 Such a model sees one person at a time, cut out around a box, and says for every point how likely it
-is in each column and each row, in bins finer than pixels (SimCC: "SimCC: a Simple Coordinate
-Classification Perspective for Human Pose Estimation", ECCV 2022). Cutting out and reading follow
-mmpose: the box is widened by a quarter and to the input's shape, pixels are RGB less ImageNet's
-mean, a point is at its likeliest bin and its confidence is the smaller of the two responses.
+is in each column and each row, in bins finer than pixels (SimCC), or in each cell of a map that is
+coarser than the input. Cutting out and reading follow mmpose: the box is widened by a quarter and
+to the input's shape, pixels are RGB less ImageNet's mean.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from intercap_core.detection.instance import Instance
 from intercap_core.detection.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
 from intercap_core.detection.onnx_model import OnnxModel
 from intercap_core.detection.person_masks import PERSON_LABEL
+from intercap_core.detection.pose_responses import HeatmapGrid, heatmap_points, simcc_points
 from intercap_core.errors import UserError
 
 PADDING = 1.25  # of a box, as mmpose trains and tests
@@ -67,10 +67,17 @@ class Crop:
 class PoseModel:
     """A model of people's keypoints. Obtained from :meth:`load`."""
 
-    def __init__(self, model: OnnxModel, outputs: tuple[int, int], full_confidence: float) -> None:
+    def __init__(
+        self,
+        model: OnnxModel,
+        outputs: tuple[int, ...],
+        full_confidence: float,
+        grid: HeatmapGrid,
+    ) -> None:
+        """``outputs``: the numbers of columns and rows, or of the heatmaps alone."""
         assert model.size is not None
         self._model, self._outputs, self._size = model, outputs, model.size
-        self._full_confidence = full_confidence
+        self._full_confidence, self._grid = full_confidence, grid
 
     @classmethod
     def load(cls, settings: DetectionsSettings) -> PoseModel:
@@ -80,7 +87,7 @@ class PoseModel:
         """
         assert settings.keypoint_model is not None
         model = OnnxModel.load(settings.keypoint_model, settings.keypoint_device)
-        outputs = _simcc_outputs(model)
+        outputs = _simcc_outputs(model) or _heatmap_output(model)
         if outputs is None or not model.batched:
             raise _unknown(model, [f"{n} {list(shape)}" for n, shape, _ in model.outputs])
         if model.size is None:
@@ -91,7 +98,9 @@ class PoseModel:
         count = model.outputs[outputs[0]][1][1]
         if isinstance(count, int) and count not in LAYOUTS:
             raise _other_points(model, count)
-        return cls(model, outputs, settings.keypoint_full_confidence)
+        return cls(
+            model, outputs, settings.keypoint_full_confidence, settings.keypoint_heatmap_grid
+        )
 
     def find(self, picture: np.ndarray, instances: list[Instance]) -> np.ndarray:
         """People (P, 135, 3) in a picture (H, W, 3) uint8 BGR, confidence as the model's.
@@ -148,18 +157,16 @@ class PoseModel:
             if missing > 0:  # the model insists on its number
                 images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
             outputs = self._model.run(images)
-            columns, rows = (outputs[i] for i in self._outputs)
-            yield self._points(columns, rows)[: len(part)]
+            yield self._points([outputs[i] for i in self._outputs])[: len(part)]
 
-    def _points(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Points (B, K, 3) of the responses in bins of columns (B, K, X) and rows (B, K, Y)."""
-        shapes = [list(columns.shape), list(rows.shape)]
-        bins = columns.shape[-1] / self._size[0], rows.shape[-1] / self._size[1]
-        if columns.ndim != 3 or shapes[0][:2] != shapes[1][:2] or abs(bins[0] - bins[1]) > 1e-6:
-            raise _unknown(self._model, [str(shape) for shape in shapes])
-        x, y = columns.argmax(-1) / bins[0], rows.argmax(-1) / bins[1]
-        response = np.minimum(columns.max(-1), rows.max(-1))
-        return np.stack([x, y, np.where(response > 0, response, 0)], -1)
+    def _points(self, responses: list[np.ndarray]) -> np.ndarray:
+        """Points (B, K, 3) of columns (B, K, X) and rows (B, K, Y), or of heatmaps (B, K, h, w)."""
+        shapes = [r.shape for r in responses]
+        if len(responses) == 2 and _same_bins(shapes, self._size):
+            return simcc_points(responses[0], responses[1], self._size)
+        if len(responses) == 1 and _coarser(shapes[0][2:], self._size):
+            return heatmap_points(responses[0], self._size, self._grid)
+        raise _unknown(self._model, [str(list(shape)) for shape in shapes])
 
     def _layout(self, points: np.ndarray) -> tuple[str, ...]:
         if len(points) not in LAYOUTS:
@@ -201,11 +208,42 @@ def _simcc_outputs(model: OnnxModel) -> tuple[int, int] | None:
     return (1, 0) if "y" in names[0] or "x" in names[1] else (0, 1)
 
 
+def _heatmap_output(model: OnnxModel) -> tuple[int] | None:
+    """The number of the only output, where that is maps coarser than the input."""
+    if len(model.outputs) != 1:
+        return None
+    _, shape, kind = model.outputs[0]
+    if len(shape) != 4 or kind not in _FLOATS:
+        return None
+    cells = tuple(n for n in shape[2:] if isinstance(n, int))
+    if len(cells) == 2 and model.size is not None and not _coarser(cells, model.size):
+        return None
+    return (0,)
+
+
+def _same_bins(shapes: list[tuple[int, ...]], size: tuple[int, int]) -> bool:
+    """Whether columns and rows are of the same people and points in bins of the same width."""
+    columns, rows = shapes
+    if len(columns) != 3 or columns[:2] != rows[:2]:
+        return False
+    return abs(columns[2] / size[0] - rows[2] / size[1]) < 1e-6
+
+
+def _coarser(cells: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Whether maps of ``cells`` (height, width) are of an input of ``size`` (width, height), whose
+    cells are squares of several pixels."""
+    if len(cells) != 2 or min(cells) < 1:
+        return False
+    stride = size[0] / cells[1]
+    return stride > 1 and abs(size[1] / cells[0] - stride) < 1e-6
+
+
 def _unknown(model: OnnxModel, found: list[str]) -> UserError:
     return UserError(
         f"{Path(model.path)}: its outputs ({'; '.join(found)}) are not those of a pose model; "
-        "expected simcc_x and simcc_y (people, points, bins) of RTMPose, RTMW or DWPose; export it "
-        "as docs/detectors.md shows"
+        "expected simcc_x and simcc_y (people, points, bins) of RTMPose, RTMW or DWPose, or "
+        "heatmaps (people, points, height, width) of HRNet or ViTPose; export it as "
+        "docs/detectors.md shows"
     )
 
 

@@ -33,6 +33,13 @@ def model(tmp_path, **options) -> PoseModel:
     return PoseModel.load(DetectionsSettings(keypoint_model=path, keypoint_full_confidence=full))
 
 
+def map_model(tmp_path, **options) -> PoseModel:
+    settings = {"keypoint_full_confidence": options.get("gain", 1.0),
+                "keypoint_heatmap_grid": options.get("grid", "msra")}  # fmt: skip
+    path = tiny_pose.heatmaps(tmp_path / "maps.onnx", **options)
+    return PoseModel.load(DetectionsSettings(keypoint_model=path, **settings))
+
+
 def apart(people: np.ndarray, places: np.ndarray) -> float:
     """Largest distance, px, of the one person's dots."""
     (found,) = people
@@ -55,6 +62,38 @@ def test_people_in_their_boxes(tmp_path, options):
     for one, places in zip(people, (RIGHT, LEFT), strict=True):
         assert apart(one[None], places) < 1.6, "a pixel of the input, of 1.3 of the image"
         assert (one[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"size": (288, 384)}, {"batch": 1}, {"batch": 3}, {"grid": "udp"}, {"gain": 5.0},
+     {"stride": (2, 2)}],
+    ids=["192x256", "288x384", "one", "three", "udp", "raw", "fine"],
+)  # fmt: skip
+def test_people_in_their_boxes_by_heatmaps(tmp_path, options):
+    image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
+    people = map_model(tmp_path, **options).find(image, [around(LEFT, score=0.5), around(RIGHT)])
+    assert people.shape == (2, 135, 3)
+    for one, places in zip(people, (RIGHT, LEFT), strict=True):
+        assert apart(one[None], places) < 1.0, "a fifth of a cell, of 5.4 pixels of the image"
+        assert (one[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
+
+
+def test_the_grid_that_a_model_was_not_trained_with_is_off_by_half_a_cell(tmp_path):
+    """What the setting is for: up to 0.75 of a cell at the far edge."""
+    image = tiny_pose.picture(SIZE, [LEFT])
+    for grid, other in (("msra", "udp"), ("udp", "msra")):
+        path = tiny_pose.heatmaps(tmp_path / f"{grid}.onnx", grid=grid)
+        settings = DetectionsSettings(keypoint_model=path, keypoint_heatmap_grid=other)
+        assert 2.0 < apart(PoseModel.load(settings).find(image, [around(LEFT)]), LEFT) < 4.5
+
+
+def test_heatmaps_without_a_box_and_with_nobody(tmp_path):
+    pose = map_model(tmp_path)
+    assert apart(pose.find(tiny_pose.picture(SIZE, [RIGHT]), []), RIGHT) < 1.0
+    assert pose.find(tiny_pose.picture(SIZE, []), []).shape == (0, 135, 3)
+    (ghost,) = pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])
+    assert (ghost[:, 2] == 0).all()
 
 
 @pytest.mark.parametrize("places", [LEFT, RIGHT, tiny_pose.person((115, 20), 330)])
@@ -134,6 +173,17 @@ def test_body_models_are_taken_and_others_refused(tmp_path):
     assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
     with pytest.raises(UserError, match="finds 21 points, expected one of 17, 23, 26, 133, 134"):
         model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
+
+
+def test_heatmaps_of_other_points_or_shapes_are_told(tmp_path):
+    (body,) = map_model(tmp_path, layout=LAYOUTS[17]).find(
+        tiny_pose.picture(SIZE, [LEFT]), [around(LEFT)]
+    )
+    assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
+    with pytest.raises(UserError, match="finds 21 points, expected one of 17, 23, 26, 133, 134"):
+        map_model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
+    with pytest.raises(UserError, match=r"\['batch', 133, 32, 48\].* not those of a pose"):
+        map_model(tmp_path, stride=(4, 8))
 
 
 @pytest.mark.parametrize(
