@@ -14,7 +14,6 @@ the paper's |z|^2 for s = 0. Around the best code that is a Gaussian over theta.
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -23,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from intercap_core.body.checkpoint import read_checkpoint
 from intercap_core.errors import UserError
 
 LATENT = 32
@@ -79,17 +79,7 @@ class VPoser:
                 f"VPoser file {path} does not exist: expected TR00_E096.pt (version 1) or a V02_05 "
                 ".ckpt (version 2); leave the setting out to use joint limits alone."
             )
-        try:
-            read = torch.load(path, map_location="cpu", weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
-            raise UserError(
-                f"VPoser file {path} holds more than plain tensors or is damaged "
-                f"({type(error).__name__}): save its state_dict alone with torch.save and use that."
-            ) from error
-        state = read.get("state_dict", read) if isinstance(read, dict) else {}
-        weights = {
-            _bare(str(name)): value for name, value in state.items() if isinstance(value, Tensor)
-        }
+        weights = _tensors(path)
         for found, (names, slope) in _VERSIONS.items():
             parts = [(f"{name}.weight", f"{name}.bias") for name in names]
             if all(part in weights for pair in parts for part in pair):
@@ -180,6 +170,22 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
     return factor[..., None] * skewed
 
 
+def _tensors(path: Path) -> dict[str, Tensor]:
+    """The file's tensors by name, without what frameworks put before the names."""
+    try:
+        read = read_checkpoint(path)
+    except Exception as error:  # a damaged file can raise nearly anything
+        raise UserError(
+            f"VPoser file {path} is damaged or none that torch.save wrote "
+            f"({type(error).__name__}): expected TR00_E096.pt (version 1) or a V02_05 .ckpt "
+            "(version 2); take the published file."
+        ) from error
+    state = read.get("state_dict", read) if isinstance(read, dict) else {}
+    if not isinstance(state, dict):
+        return {}
+    return {_bare(str(name)): value for name, value in state.items() if isinstance(value, Tensor)}
+
+
 def _bare(name: str) -> str:
     for prefix in _PREFIXES:
         name = name.removeprefix(prefix)
@@ -187,16 +193,18 @@ def _bare(name: str) -> str:
 
 
 def _check(path: Path, layers: tuple[tuple[Tensor, Tensor], ...]) -> None:
-    parts = [part for pair in layers for part in pair]
-    if not all(part.is_floating_point() and bool(part.isfinite().all()) for part in parts):
-        raise UserError(
-            f"VPoser file {path} has weights that are not finite numbers: take the published file."
-        )
-    hidden = layers[0][0].shape[0]
-    expected = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
-    found = tuple(tuple(weight.shape) for weight, _ in layers)
-    if found != expected:
+    found = tuple(tuple(tuple(part.shape) for part in pair) for pair in layers)
+    hidden = len(layers[0][1]) if layers[0][1].ndim else 0
+    sizes = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
+    expected = tuple((size, size[:1]) for size in sizes)
+    if found != expected or not hidden:
         raise UserError(
             f"VPoser file {path} has decoder layers of shapes {found}; expected {expected}: take "
             "the published file."
+        )
+    parts = [part for pair in layers for part in pair]
+    dense = all(part.layout is torch.strided and part.is_floating_point() for part in parts)
+    if not (dense and all(bool(part.isfinite().all()) for part in parts)):
+        raise UserError(
+            f"VPoser file {path} has weights that are not finite numbers: take the published file."
         )

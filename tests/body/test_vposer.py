@@ -119,6 +119,41 @@ def test_matrix_logarithm_inverts_rodrigues() -> None:
     )
 
 
+class Callback:
+    """Of a training framework, as a checkpoint names it."""
+
+
+class Hyperparameters(dict):
+    pass
+
+
+class Malicious:
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.trace,)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_what_else_a_checkpoint_holds_is_neither_wanted_nor_run(
+    zipped: bool, tmp_path: Path
+) -> None:
+    trace = tmp_path / "run"
+    held = {
+        "callbacks": {Callback: {"best": Callback()}},
+        "hyper_parameters": Hyperparameters(rate=1e-3),
+        "other": [Malicious(trace), {1, 2}],
+        "state_dict": _state(2),
+    }
+    path = tmp_path / "V02_05.ckpt"
+    torch.save(held, path, _use_new_zipfile_serialization=zipped)
+    prior = VPoser.load(path)
+    assert prior.version == 2 and not trace.exists()
+    weight, _ = prior.layers[0]
+    assert torch.equal(weight, _state(2)["vp_model.decoder_net.0.weight"])
+
+
 def test_files_that_are_no_vposer_are_named(tmp_path: Path) -> None:
     other, short, text = (tmp_path / n for n in ("other.pt", "short.pt", "text.pt"))
     torch.save({"a.weight": torch.zeros(2)}, other)
@@ -128,7 +163,20 @@ def test_files_that_are_no_vposer_are_named(tmp_path: Path) -> None:
     blank = tmp_path / "blank.pt"
     torch.save(_state(1) | {"bodyprior_dec_out.bias": torch.full((126,), torch.nan)}, blank)
     text.write_text("no weights")
+    nothing, scalars, biases, sparse, cut = (
+        tmp_path / f"{n}.pt" for n in ("nothing", "scalars", "biases", "sparse", "cut")
+    )
+    torch.save({"state_dict": None}, nothing)
+    torch.save({name: torch.tensor(1.0) for name in _state(1)}, scalars)
+    torch.save(_state(1) | {"bodyprior_dec_fc1.bias": torch.zeros(5)}, biases)
+    torch.save({n: v.to_sparse() if v.ndim == 2 else v for n, v in _state(1).items()}, sparse)
+    cut.write_bytes(_save(tmp_path, 1).read_bytes()[:-1000])
     for path, words in (
+        (nothing, "no decoder"),
+        (scalars, "shapes"),
+        (biases, "shapes"),
+        (sparse, "not finite numbers"),
+        (cut, "damaged"),
         (tmp_path / "none.pt", "does not exist"),
         (other, "no decoder"),
         (short, "shapes"),
