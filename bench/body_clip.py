@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from intercap_core.artefacts import read
-from intercap_core.body.artefact import body_path
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyFitSettings
@@ -54,7 +53,7 @@ class BodyClip:
         """
         row = project.sequences[sequence]
         gender = project.subjects[row.subject].gender
-        model = BodyModel.load(body_path(project.config.body_models, gender) or OPEN_BODY)
+        model = BodyModel.load(project.config.body_models.of(gender) or OPEN_BODY)
         settings = project.config.body_fit
         frames, scene, person = (
             project.artefact(sequence, stage) for stage in ("frames", "scene", "person")

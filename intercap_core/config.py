@@ -279,6 +279,10 @@ class BodyModels(Model):
     vposer_version: Literal[1, 2] | None = None
     """Version that the file must have; without, it is told from the weights."""
 
+    def of(self, gender: str) -> Path | None:
+        """The body file for a gender: its own, else the neutral one, else None (the open body)."""
+        return getattr(self, gender) or self.neutral
+
 
 class Config(Model):
     """config.yaml."""

@@ -16,6 +16,8 @@ import torch
 import yaml
 
 from intercap_core import artefacts
+from intercap_core.body.artefact import file_digest
+from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.camera.intrinsics import Intrinsics
@@ -334,7 +336,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         _fill(writer, OBJECT_TRACK, T=total, C=count)
     identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}
     with artefacts.write(
-        capture.paths["body_fit"], BODY_FIT, body_model="open", **identity
+        capture.paths["body_fit"], BODY_FIT, body_model=file_digest(OPEN_BODY), **identity
     ) as writer:
         for key, value in body.items():
             writer.put(key, value)
@@ -343,8 +345,8 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("bridged", np.zeros(total, bool))
         _fill(writer, BODY_FIT, T=total, C=count)
     with artefacts.write(
-        capture.paths["joint"], JOINT, body_model="open", object=capture.object_.name,
-        iterations=3, **identity,
+        capture.paths["joint"], JOINT, body_model=file_digest(OPEN_BODY),
+        object=capture.object_.name, iterations=3, **identity,
     ) as writer:  # fmt: skip
         for key, value in body.items():
             writer.put(key, value[0] if key == "betas" else value)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from intercap_core.artefacts import Artefact
+from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyModels
+from intercap_core.errors import UserError
 
 _NAMES = (
     "betas", "expression", "global_orient", "body_pose", "left_hand_pose", "right_hand_pose",
@@ -19,9 +22,9 @@ _NAMES = (
 )  # fmt: skip
 
 
-def body_path(body_models: BodyModels, gender: str) -> Path | None:
-    """The body file for a gender: its own, else the neutral one, else None (the open body)."""
-    return getattr(body_models, gender, None) or body_models.neutral
+def file_digest(path: Path) -> str:
+    """What the artefacts of fitted bodies say of the body file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def load_pose_prior(body_models: BodyModels, model: BodyModel) -> VPoser | None:
@@ -43,10 +46,25 @@ def read_parameters(artefact: Artefact) -> BodyParameters:
     return BodyParameters(**values)
 
 
-def load_model(body_models: BodyModels, gender: str, parameters: BodyParameters) -> BodyModel:
-    """The body that the parameters belong to. Raises UserError for a broken body file."""
-    return BodyModel.load(
-        body_path(body_models, gender),
-        num_betas=parameters.betas.shape[1],
-        num_expression=parameters.expression.shape[1],
+def load_model(
+    body_models: BodyModels, gender: str, artefact: Artefact, *, device: torch.device | str = "cpu"
+) -> BodyModel:
+    """The body that a body_fit or joint artefact was fitted with.
+
+    Raises UserError for a broken body file, or another one than was fitted.
+    """
+    path = body_models.of(gender) or OPEN_BODY
+    model = BodyModel.load(
+        path,
+        num_betas=artefact["betas"].shape[-1],
+        num_expression=artefact["expression"].shape[-1],
+        device=device,
     )
+    told = artefact.attributes
+    if file_digest(path) != told["body_model"]:
+        raise UserError(
+            f"{artefact.path}: the bodies of sequence {told['sequence']!r} were fitted with "
+            f"another body file than {path}, which the settings give for a {gender} subject; name "
+            "that file again, or re-run stage 'body_fit' and what follows"
+        )
+    return model

@@ -73,7 +73,7 @@ def read_motion(joint: Path, fps: float, body_models: BodyModels, gender: str) -
         single = read_parameters(artefact)
         rotation, translation = artefact["rotation"], artefact["translation"]
         told = artefact.attributes
-    model = load_model(body_models, gender, single)
+        model = load_model(body_models, gender, artefact)
     vector = single.vector().double()
     parameters = BodyParameters.from_vector(vector, num_betas=model.num_betas)
     # Expression moves the joints of a licensed file by nothing measurable: the first frame's serves

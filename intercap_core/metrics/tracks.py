@@ -64,7 +64,7 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
         sigma = artefact["joint_sigma"] if first else None
         flags = ("failed", "bridged", "uncertain") if first else ("flagged",)
         flagged = np.any([artefact[flag] for flag in flags], axis=0)
-    model = load_model(body_models, gender, parameters)
+        model = load_model(body_models, gender, artefact)
     with torch.no_grad():
         ids = model.keypoint_map.vertex_ids
         posed = model.forward(parameters, vertex_ids=ids)

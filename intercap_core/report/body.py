@@ -79,7 +79,7 @@ def read_fit(
         parameters = read_parameters(fit)
         worst = fit["joint_sigma"][:, BODY_JOINTS].max(1)
         shown = choose_frames(worst, _ROWS)
-        model = load_model(body_models, gender, parameters)
+        model = load_model(body_models, gender, fit)
         with torch.no_grad():
             posed = model.forward(parameters.frames(torch.tensor(shown)))
             points = model.keypoints(posed).double().numpy()

@@ -7,14 +7,13 @@ offsets, which all frames share.
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from intercap_core import artefacts
-from intercap_core.body.artefact import body_path, load_pose_prior
+from intercap_core.body.artefact import file_digest, load_pose_prior
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
@@ -54,7 +53,7 @@ def run(
     between their neighbours. Raises UserError where no frame at all can be fitted, the body file
     cannot be used, or the artefacts do not belong together.
     """
-    path = body_path(body_models, subject.gender) or OPEN_BODY
+    path = body_models.of(subject.gender) or OPEN_BODY
     model = BodyModel.load(path, num_betas=NUM_BETAS, num_expression=NUM_EXPRESSION, device=device)
     pose_prior = load_pose_prior(body_models, model)
     seen = read_observations(scene, person)
@@ -113,7 +112,7 @@ def run(
         sequence=seen.sequence,
         subject=subject.subject,
         gender=subject.gender,
-        body_model=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        body_model=file_digest(path),
     ) as writer:
         _put_bodies(writer, params, joints)
         writer.put("keypoint_residual", keypoint_residual)

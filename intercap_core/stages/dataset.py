@@ -105,9 +105,7 @@ def run(
     ]
     first = next(iter(sequences.values()))
     with artefacts.read(first.joint, JOINT) as artefact:
-        model = load_model(
-            body_models, str(artefact.attributes["gender"]), read_parameters(artefact)
-        )
+        model = load_model(body_models, str(artefact.attributes["gender"]), artefact)
     body_top = _top(heat.body)
     drawn = sorted(heat.objects, key=lambda name: (-heat.objects[name].frames, name))[:_MAX_OBJECTS]
     content = Content(
@@ -143,7 +141,7 @@ def _detail(
     mesh = ObjectMesh.load(objects[measured.object_])
     with artefacts.read(paths.joint, JOINT) as joint:
         parameters = read_parameters(joint)
-        model = load_model(body_models, subjects[measured.subject].gender, parameters)
+        model = load_model(body_models, subjects[measured.subject].gender, joint)
         fit = Fit(model, parameters, joint["rotation"], joint["translation"], mesh)
     with artefacts.read(paths.scene, SCENE) as scene:
         rig, image_of = Rig.from_artefact(scene), scene["image_of"]

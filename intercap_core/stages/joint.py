@@ -16,7 +16,7 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.body.artefact import body_path, load_pose_prior
+from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.config import (
@@ -204,12 +204,7 @@ def _start(
     betas = body["betas"].astype(float)
     good = ~body["failed"]
     shape = betas[good].mean(axis=0) if good.any() else betas.mean(axis=0)
-    model = BodyModel.load(
-        body_path(body_models, str(body.attributes["gender"])),
-        num_betas=betas.shape[1],
-        num_expression=body["expression"].shape[1],
-        device=device,
-    )
+    model = load_model(body_models, str(body.attributes["gender"]), body, device=device)
     rotation, translation = bridge_poses(track["rotation"], track["translation"], ~track["lost"])
     expression = body["expression"].astype(float)
     return State(vector, shape, expression, rotation, translation), model

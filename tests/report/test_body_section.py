@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from intercap_core.errors import UserError
 from intercap_core.report import body, charts
 from intercap_core.report.body_pictures import FIT_COLOUR, KEYPOINT_COLOUR
 from intercap_core.report.sheets import Crop
@@ -51,6 +52,15 @@ def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -
     assert "deviation of the least sure joint" in over_time
     assert "left wrist" in by_joint and "20.0, up to 20.0" in by_joint
     assert "10.0, up to 40.0" in by_joint and "right fingers" in by_joint
+
+
+def test_another_body_file_than_was_fitted_is_named(made: fitted.Capture, tmp_path: Path) -> None:
+    other = tmp_path / "fitted.h5"
+    other.write_bytes(made.paths["body_fit"].read_bytes())
+    with h5py.File(other, "r+") as fit:
+        fit.attrs["body_model"] = "0123456789abcdef"
+    with pytest.raises(UserError, match=r"fitted\.h5: the bodies of .* with another body file"):
+        _facts(made, body_fit=other)
 
 
 def test_the_sheet_shows_fit_and_keypoints(made: fitted.Capture) -> None:

@@ -118,8 +118,7 @@ def object_files(wildcards):
 def body_file(wildcards):
     """Input function: the licensed body file of the subject's gender, where one is set."""
     _, _, subject = of_sequence(wildcards)
-    models = SETTINGS.body_models
-    return existing(getattr(models, subject.gender) or models.neutral)
+    return existing(SETTINGS.body_models.of(subject.gender))
 
 
 def pose_prior_file(wildcards):
