@@ -91,6 +91,7 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     """
     from intercap_core.project import load_project
     from intercap_core.project_check import (
+        check_bodies,
         check_detector,
         check_device,
         faults_of_sequences,
@@ -99,6 +100,7 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 
     project = load_project(settings)
     check_device(project)
+    check_bodies(project)
     for note in [*check_detector(project), *notes_of_sequences(project)]:
         typer.echo(f"note: {note}")
     faults = faults_of_sequences(project)

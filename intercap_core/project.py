@@ -179,7 +179,24 @@ def _check_files(project: Project) -> None:
                 f"{project.path}: body_models.{field} is {file}, and there is no such file; "
                 "correct the path, or remove the line to use what is open"
             )
+    _check_bodies(project)
     _check_detectors(project)
+
+
+def _check_bodies(project: Project) -> None:
+    """Who names body files must name one for everybody: two meshes in a dataset mix badly."""
+    models = project.config.body_models
+    named = [gender for gender in ("female", "male") if getattr(models, gender) is not None]
+    if not named or models.neutral is not None:
+        return
+    for name in sorted({row.subject for row in project.sequences.values()}):
+        gender = project.subjects[name].gender
+        if models.of(gender) is None:
+            raise UserError(
+                f"{project.path}: subject {name!r} is {gender}, and body_models names only a file "
+                f"for {' and '.join(named)}; add body_models.{gender} or body_models.neutral, or "
+                "remove the lines to use the open body for all"
+            )
 
 
 def _check_detectors(project: Project) -> None:

@@ -40,6 +40,26 @@ def check_device(project: Project) -> None:
         )
 
 
+def check_bodies(project: Project) -> None:
+    """Open the body files and the pose prior that the settings name.
+
+    Raises UserError where one cannot be used: every sequence would fail by it, hours later.
+    """
+    models = project.config.body_models
+    genders = {project.subjects[row.subject].gender for row in project.sequences.values()}
+    files = sorted({path for gender in genders if (path := models.of(gender)) is not None})
+    if not files and models.vposer is None:
+        return  # without importing what opens them
+    from intercap_core.body.artefact import load_pose_prior
+    from intercap_core.body.model import BodyModel
+    from intercap_core.body.plausible import check_body
+
+    for path in files:
+        check_body(BodyModel.load(path))
+    if models.vposer is not None:
+        load_pose_prior(models, BodyModel.load())
+
+
 def check_detector(project: Project) -> list[Fault]:
     """Open the models that the settings name; notes of objects that segmentation does not know.
 

@@ -20,6 +20,7 @@ from rich.table import Table
 from intercap_core.errors import UserError
 from intercap_core.job import read_state
 from intercap_core.project import Project, load_project
+from intercap_core.project_check import check_bodies
 from intercap_core.step import SEQUENCE_STAGES
 
 POLL_SECONDS = 0.5
@@ -44,6 +45,7 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
     Raises UserError where settings or tables are wrong.
     """
     project = load_project(settings)
+    check_bodies(project)
     console = Console(stderr=True)
     command = snakemake_command(settings, cores=cores, arguments=arguments)
     if DRY_RUN & set(arguments):

@@ -329,6 +329,20 @@ def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path, model: 
     assert f"{model} is model.onnx, and there is no such file" in done.stderr
 
 
+@pytest.mark.parametrize("model", ["neutral", "vposer"])
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_body_file_that_cannot_be_used_stops_before_any_job(
+    small_project: Path, command: str, model: str
+) -> None:
+    (small_project / "body.npz").write_text("not a body")
+    config = small_project / "config.yaml"
+    config.write_text(config.read_text() + f"body_models: {{{model}: body.npz}}\n")
+    done = intercap(command, "config.yaml", folder=small_project)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert " file body.npz " in done.stderr
+
+
 def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_project)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

@@ -107,6 +107,10 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         ["config.yaml", "body_models.female", "SMPLX_FEMALE.npz", "no such file"],
     ),
     (
+        settings("dataset: x\nbody_models: {male: cup.ply}\n"),
+        ["config.yaml", "subject 's01' is female", "only a file for male", "body_models.neutral"],
+    ),
+    (
         settings(
             "dataset: x\nstudio:\n  captures:\n"
             "    other: {interaction: cup_drink, subject: s01, seed: 1}\n"

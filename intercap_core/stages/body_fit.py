@@ -17,6 +17,7 @@ from intercap_core.body.artefact import file_digest, load_pose_prior
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.body.plausible import check_body
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.fitting import quality
@@ -55,6 +56,7 @@ def run(
     """
     path = body_models.of(subject.gender) or OPEN_BODY
     model = BodyModel.load(path, num_betas=NUM_BETAS, num_expression=NUM_EXPRESSION, device=device)
+    check_body(model)
     pose_prior = load_pose_prior(body_models, model)
     seen = read_observations(scene, person)
     if not seen.usable.any():
