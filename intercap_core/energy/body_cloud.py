@@ -22,7 +22,7 @@ same fold of cloth, so a sample counts as one measurement however many points it
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -33,10 +33,14 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.solve.levenberg_marquardt import NormalEquations
 
+if TYPE_CHECKING:
+    from intercap_core.energy.body_surface import Surface
+
 _BODY_SPACING = 0.045
 _HAND_SPACING = 0.015
 _PATCH = 20  # vertices around a sample among which a point looks for its nearest
-_NORMAL_LENGTH = 0.06  # metres that a turn of one radian between normals counts as
+NORMAL_LENGTH = 0.06  # metres that a turn of one radian between normals counts as
+_ASIDE = 0.03  # metres beside the normal's line beyond which a point meets nothing
 _TURNED_AWAY = 0.3  # cosine between the normals of point and vertex below which they do not match
 
 
@@ -198,9 +202,9 @@ def match(
     """
     v, n = vertices[samples], vertex_normals[samples]
     centre = v.mean(0)
-    ours = torch.cat([v - centre, _NORMAL_LENGTH * n], 1)
-    theirs = torch.cat([points - centre, _NORMAL_LENGTH * normals], 1)
-    sample = _smallest(torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2))
+    ours = torch.cat([v - centre, NORMAL_LENGTH * n], 1)
+    theirs = torch.cat([points - centre, NORMAL_LENGTH * normals], 1)
+    sample = torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2).argmin(1)
     near = patch[sample]
     gap = points[:, None] - vertices[near]
     best = (gap * gap).sum(2).argmin(1, keepdim=True)
@@ -210,14 +214,27 @@ def match(
     distance = (normal * gap).sum(1)
     sideways = (gap - distance[:, None] * normal).norm(dim=1)
     valid = ((normal * normals).sum(1) > _TURNED_AWAY) & (distance.abs() < reach)
-    return Matches(sample, distance, valid & (sideways < 0.03))
+    return Matches(sample, distance, valid & (sideways < _ASIDE))
 
 
-def _smallest(score: Tensor) -> Tensor:
-    """Column (M,) of each row's smallest; on the CPU by numpy, which vectorises it."""
-    if score.device.type != "cpu":
-        return score.argmin(1)
-    return torch.from_numpy(score.numpy().argmin(1))
+def match_compiled(
+    points: Tensor,
+    normals: Tensor,
+    vertices: Tensor,
+    vertex_normals: Tensor,
+    surface: Surface,
+    reach: float,
+) -> Matches:
+    """The same by the compiled kernel, on the CPU; vertices and normals (R,3) of the surface."""
+    from intercap_core.energy import body_match_kernel
+
+    kind = vertices.dtype
+    found = body_match_kernel.match(
+        points.to(kind).numpy(), normals.to(kind).numpy(), vertices.numpy(),
+        vertex_normals.numpy(), surface.sample, surface.patch, surface.order, surface.groups,
+        vertices.numpy().dtype.type(NORMAL_LENGTH), reach, _ASIDE, _TURNED_AWAY,
+    )  # fmt: skip
+    return Matches(*map(torch.from_numpy, found))
 
 
 def gather(

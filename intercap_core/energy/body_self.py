@@ -18,7 +18,7 @@ never count as touching.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -182,6 +182,29 @@ def find(contact: SelfContact, vertices: Tensor, normals: Tensor) -> tuple[Tenso
     vertices (V,3) metres, unit normals (V,3). Samples up to ``_MARGIN`` outside are found too. The
     fingers of a hand are looked at apart: the next finger is nearer than what a hand is inside of.
     """
+    if vertices.device.type == "cpu":
+        return find_compiled(contact, vertices, normals)
+    return find_plain(contact, vertices, normals)
+
+
+def find_compiled(
+    contact: SelfContact, vertices: Tensor, normals: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`find` by the compiled kernel, on the CPU."""
+    from intercap_core.energy import body_match_kernel
+
+    given = (getattr(contact, field.name).numpy() for field in fields(contact))
+    found = body_match_kernel.find(
+        len(_PART_NAMES), _MARGIN, vertices.numpy(), normals.numpy(), *given
+    )
+    inner, outer = map(torch.from_numpy, found)
+    return inner, outer, normals[outer]
+
+
+def find_plain(
+    contact: SelfContact, vertices: Tensor, normals: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`find` on any device."""
     where = vertices[contact.vertex]
     near = _near_other_parts(contact, where)
     distance = torch.cdist(where[near], where)

@@ -5,6 +5,7 @@ Set up anew between rounds of the solver, together with how far each kind of obs
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from intercap_core.energy import body_cloud, body_keypoints, body_self
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows, Matches
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.body_self import SelfContact
+from intercap_core.energy.body_surface import Surface
 from intercap_core.fitting.free_space import seen_through
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import BodyProblem, Views
@@ -73,8 +75,13 @@ class Evidence:
         self.clouds = [clouds[t] for t in self.frames]
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
         self.samples = body_cloud.choose_samples(model)
-        self.self_contact = SelfContact.of(model, self.samples)
-        self.patch = torch.as_tensor(self.samples.patch, device=model.device)
+        self.surface = Surface.around_samples(model, self.samples)
+        sample, patch = (
+            torch.as_tensor(places, device=model.device)
+            for places in (self.surface.sample, self.surface.patch)
+        )
+        contact = SelfContact.of(model, self.samples)
+        self.self_contact = replace(contact, vertex=sample, patch=patch)  # places in the surface
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
         self.group = torch.as_tensor(self.samples.group, device=model.device)
         carrier = model.skinning_weights.argmax(1).cpu().numpy()
@@ -202,6 +209,19 @@ class Evidence:
                 low, high = (covering.noise * factor for factor in _NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
+    def _matches(
+        self, cloud: PersonCloud, vertices: Tensor, normals: Tensor, reach: float
+    ) -> Matches:
+        """One frame's, of vertices and normals (R,3) of the surface."""
+        if vertices.device.type == "cpu":
+            return body_cloud.match_compiled(
+                cloud.points, cloud.normals, vertices, normals, self.surface, reach
+            )
+        sample, patch = self.self_contact.vertex, self.self_contact.patch
+        return body_cloud.match(
+            cloud.points, cloud.normals, vertices, normals, sample, patch, reach
+        )
+
     def _with_seen_through(
         self,
         found: Matches,
@@ -221,7 +241,7 @@ class Evidence:
             late = where if shift is None else where + shift[frame, view]
             out, away = seen_through(
                 window, self.seen.rig[view], float(self.seen.depth_bias[view]),
-                late.double().cpu().numpy(), normal.double().cpu().numpy(),
+                late.cpu().numpy(), normal.cpu().numpy(),
             )  # fmt: skip
             sample.append(torch.as_tensor(view * size + out, device=where.device))
             distance.append(-self._tensor(away))
@@ -236,16 +256,13 @@ class Evidence:
         if not problem.self_weight:
             return None
         params = self.model.parameters(problem.base)
+        ids = torch.as_tensor(self.surface.ids, device=self.model.device)
         found = []
         for start in range(0, len(self.frames), _VERTEX_CHUNK):
-            vertices = self.model.forward(
-                params.frames(slice(start, start + _VERTEX_CHUNK))
-            ).vertices
-            normals = body_cloud.vertex_normals(vertices, self.model.faces)
-            found += [
-                body_self.find(self.self_contact, *one)
-                for one in zip(vertices, normals, strict=True)
-            ]
+            posed = self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK)))
+            for vertices, normals in zip(*posed, strict=True):
+                inner, outer, normal = body_self.find(self.self_contact, vertices, normals)
+                found.append((ids[inner], ids[outer], normal))
         return body_self.join(found)
 
     def match(self, problem: BodyProblem, reach: float) -> CloudRows:
@@ -253,7 +270,6 @@ class Evidence:
         count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
         expected = problem.thickness()
         params = self.model.parameters(problem.base)
-        faces = self.model.faces
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
         shift = self._shift(where)
         of_views = where.new_zeros(count, views, size)
@@ -262,18 +278,14 @@ class Evidence:
         normal = where.new_zeros(count, size, 3)
         for start in range(0, count, _VERTEX_CHUNK):
             at = slice(start, start + _VERTEX_CHUNK)
-            vertices = self.model.forward(params.frames(at)).vertices
-            normals = body_cloud.vertex_normals(vertices, faces)
-            normal[at] = normals[:, self.sample_ids]
+            vertices, normals = self.surface.posed(params.frames(at))
+            normal[at] = normals[:, self.self_contact.vertex]
             for row in range(len(vertices)):
                 t = start + row
                 cloud = self.clouds[t]
                 if cloud is None:
                     continue
-                found = body_cloud.match(
-                    cloud.points, cloud.normals, vertices[row], normals[row],
-                    self.sample_ids, self.patch, reach,
-                )  # fmt: skip
+                found = self._matches(cloud, vertices[row], normals[row], reach)
                 if shift is not None:
                     late = shift[t, cloud.view, found.sample]
                     moved = (late * normal[t, found.sample]).sum(1)

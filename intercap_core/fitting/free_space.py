@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply
+from intercap_core.fitting import free_space_kernel
 
 _BEHIND_M = 0.06  # farther behind the vertex is not the person's surface there
 _FACING = 0.1  # cosine between normal and line of sight; larger ones look away
+_NEAREST_M = 0.3  # points nearer to the camera are not looked at
 _REACH_M = 0.05
 _WAY_M = 0.01  # steps along the way in
 
@@ -32,16 +33,6 @@ class DepthWindow:
     view: int
     first: tuple[int, int]
     depth: np.ndarray
-
-    def at(self, pixels: np.ndarray) -> np.ndarray:
-        """Depth (...,) in metres at pixels (...,2) x, y of the whole image; 0 = unknown."""
-        known = np.isfinite(pixels).all(-1)
-        place = np.where(known[..., None], pixels, -1e6) - np.array(self.first[::-1])
-        column, row = np.rint(np.moveaxis(place, -1, 0)).astype(np.int64)
-        height, width = self.depth.shape
-        known &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        found = self.depth[np.where(known, row, 0), np.where(known, column, 0)]
-        return np.where(known, found, 0) * 1e-3
 
 
 def seen_through(
@@ -57,26 +48,8 @@ def seen_through(
     much. Those for which no person begins within reach are left out.
     """
     assert camera.depth is not None
-    pose = camera.depth_from_master
-    local = apply(pose, points)
-    outward = normals @ pose[:3, :3].T
-    sight = local / np.linalg.norm(local, axis=1, keepdims=True)
-    index = np.flatnonzero(((outward * sight).sum(1) < _FACING) & (local[:, 2] > 0.3))
-    index = index[_past(window, camera, depth_bias, local[index])]
-    if not len(index):
-        return index, np.zeros(0)
-    way = np.arange(_WAY_M, _REACH_M + _WAY_M / 2, _WAY_M)
-    inward = local[index, None] - way[:, None] * outward[index, None]
-    through = _past(window, camera, depth_bias, inward)
-    # the nearest step is within the image's own error: counting only those that err outward would
-    # make everybody thinner
-    ends = ~through.all(1) & through[:, 0]
-    # half a step back: the edge is between the last that is seen through and the first that is not
-    return index[ends], way[through[ends].argmin(1)] - _WAY_M / 2
-
-
-def _past(window: DepthWindow, camera: Camera, depth_bias: float, local: np.ndarray) -> np.ndarray:
-    """Where (...,) the camera measured clearly behind points (...,3), depth camera's frame."""
-    assert camera.depth is not None
-    measured = window.at(camera.depth.project(local))
-    return measured - depth_bias > local[..., 2] + _BEHIND_M
+    return free_space_kernel.seen_through(
+        window.depth, *window.first, tuple(camera.depth.parameters.tolist()),
+        camera.depth_from_master, depth_bias, points, normals,
+        _BEHIND_M, _FACING, _NEAREST_M, _REACH_M, _WAY_M,
+    )  # fmt: skip

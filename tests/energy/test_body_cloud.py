@@ -10,6 +10,7 @@ from torch import Tensor
 from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_cloud as term
 from intercap_core.energy.body_cloud import vertex_normals
+from intercap_core.energy.body_surface import Surface
 from intercap_core.solve.levenberg_marquardt import NormalEquations
 
 
@@ -159,3 +160,46 @@ def test_compiled_equations_are_the_plain_ones(model: BodyModel, samples: term.S
     torch.testing.assert_close(found.hessian[:, :n, :n], plain.hessian)
     torch.testing.assert_close(found.hessian[:, :n, n:], plain.cross)
     torch.testing.assert_close(found.hessian[:, n:, n:], plain.hessian_u)
+
+
+def _posed_bodies() -> tuple[BodyModel, term.Samples, Tensor]:
+    """Four bodies (4,P) in single precision, bent anyhow, two metres before the camera."""
+    model = BodyModel.load()
+    x = model.zeros(4).vector().clone()
+    x[:, :165] += 0.3 * _random(4, 165).float()
+    x[:, 167] = 2.0
+    return model, term.choose_samples(model), x
+
+
+def test_surface_poses_what_samples_need() -> None:
+    model, samples, x = _posed_bodies()
+    surface = Surface.around_samples(model, samples)
+    found, normals = surface.posed(model.parameters(x))
+    vertices = model.forward(model.parameters(x)).vertices
+    needed = np.union1d(surface.sample, surface.patch)
+    assert (surface.ids[surface.sample] == samples.vertex).all()
+    assert (surface.ids[surface.patch] == samples.patch).all()
+    torch.testing.assert_close(found, vertices[:, surface.ids])
+    true = vertex_normals(vertices, model.faces)[:, surface.ids]
+    torch.testing.assert_close(normals[:, needed], true[:, needed], rtol=0, atol=2e-6)
+
+
+def test_compiled_matches_are_the_plain_ones() -> None:
+    """Points within a hand's breadth of the skin, their normals astray."""
+    model, samples, x = _posed_bodies()
+    surface = Surface.around_samples(model, samples)
+    posed = surface.posed(model.parameters(x))
+    sample, patch = torch.as_tensor(surface.sample), torch.as_tensor(surface.patch)
+    generator = torch.Generator().manual_seed(1)
+    for vertices, normals in zip(*posed, strict=True):
+        at = torch.randint(0, len(vertices), (600,), generator=generator)
+        points = vertices[at] + 0.02 * torch.randn(600, 3, generator=generator)
+        looks = normals[at] + 0.3 * torch.randn(600, 3, generator=generator)
+        looks = torch.nn.functional.normalize(looks, dim=1)
+        plain = term.match(points, looks, vertices, normals, sample, patch, 0.05)
+        found = term.match_compiled(points, looks, vertices, normals, surface, 0.05)
+        assert 0.4 < plain.valid.float().mean() < 0.95
+        same = plain.sample == found.sample  # but for two that are equally near
+        assert same.float().mean() > 0.995
+        assert torch.equal(plain.valid[same], found.valid[same])
+        torch.testing.assert_close(plain.distance[same], found.distance[same], rtol=0, atol=1e-6)

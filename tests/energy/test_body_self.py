@@ -103,6 +103,19 @@ def test_samples_that_are_found_are_inside_by_winding_number(
     assert float((wound > 0.5).double().mean()) > 0.9
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_compiled_search_finds_what_the_plain_one_does(
+    name: str, model: BodyModel, contact: term.SelfContact
+) -> None:
+    vertices = model.forward(_pose(model, **CASES[name])).vertices
+    normals = vertex_normals(vertices, model.faces)
+    plain = term.find_plain(contact, vertices[0], normals[0])
+    compiled = term.find_compiled(contact, vertices[0], normals[0])
+    assert len(plain[0])
+    for one, other in zip(plain, compiled, strict=True):
+        assert torch.equal(one, other)
+
+
 def test_gradient_is_that_of_the_cost(model: BodyModel, contact: term.SelfContact) -> None:
     cases = [_pose(model, **CASES[name]).vector() for name in ("hand in thigh", "arm at trunk")]
     x = torch.cat([cases[0], _pose(model).vector(), cases[1]])
