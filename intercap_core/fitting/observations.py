@@ -12,12 +12,13 @@ from torch import Tensor
 
 from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
-from intercap_core.camera.clouds import colour_lookup
+from intercap_core.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.detection.masks import Runs
 from intercap_core.errors import UserError
+from intercap_core.fitting import person_pixels_kernel
 from intercap_core.fitting.free_space import DepthWindow
 from intercap_core.schemas import PERSON, SCENE
 
@@ -129,7 +130,8 @@ def person_clouds(
 def _fused(
     reader: Frames, seen: Observations, t: int, count: int, device: torch.device
 ) -> PersonCloud | None:
-    parts, windows = [], []
+    seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
+    windows = []
     for c, camera in enumerate(seen.rig):
         rle = seen.masks[t * len(seen.rig) + c]
         if not rle or camera.depth is None:
@@ -137,70 +139,75 @@ def _fused(
         depth = reader.depth(t, c)
         if depth is None:
             continue
-        runs = Runs(rle, camera.colour.height, camera.colour.width)
-        part = view_points(depth, camera, runs, seen.background[c], seen.depth_bias[c])
-        if part is not None:
-            parts.append((*part, np.full(len(part[0]), c)))
-            windows.append(_depth_window(depth, camera, runs, c))
-    if not parts:
+        mask = Runs(rle, camera.colour.height, camera.colour.width)
+        window = _window(camera, mask, depth)
+        if window is None:
+            continue
+        index = person_pixels(depth, camera, mask, seen.background[c], window)
+        if len(index):
+            seen_by.append((c, depth, index))
+            rows, columns = window
+            corner = (rows.start, columns.start)
+            windows.append(DepthWindow(c, corner, depth[rows, columns].copy()))
+    if not seen_by:
         return None
-    points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
     # every n-th point: pixels are in scan order, so this spreads over the surface
-    pick = np.unique(np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.int64))
+    first = np.cumsum([0, *(len(index) for _, _, index in seen_by)])
+    pick = np.unique(np.linspace(0, first[-1] - 1, min(count, first[-1])).astype(np.int64))
+    parts: list[tuple[np.ndarray, ...]] = []
+    for (c, depth, index), start in zip(seen_by, first[:-1], strict=True):
+        chosen = index[pick[(pick >= start) & (pick < start + len(index))] - start]
+        placed = _placed(depth, seen.rig[c], chosen, seen.depth_bias[c])
+        parts.append((*placed, np.full(len(chosen), c)))
+    points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
     return PersonCloud(
-        torch.as_tensor(points[pick], dtype=torch.float32, device=device),
-        torch.as_tensor(normals[pick], dtype=torch.float32, device=device),
-        torch.as_tensor(trust[pick], dtype=torch.float32, device=device),
-        torch.as_tensor(view[pick], device=device),
+        torch.as_tensor(points, dtype=torch.float32, device=device),
+        torch.as_tensor(normals, dtype=torch.float32, device=device),
+        torch.as_tensor(trust, dtype=torch.float32, device=device),
+        torch.as_tensor(view, device=device),
         tuple(windows),
     )
 
 
-def _depth_window(depth: np.ndarray, camera: Camera, mask: Runs, view: int) -> DepthWindow:
-    """What camera ``view`` measured around the person: the part of ``depth`` (H,W) uint16 mm that
-    can fall on ``mask``, which is not empty."""
-    box = _window(camera, mask, depth)
-    assert box is not None
-    rows, columns = box
-    return DepthWindow(view, (rows.start, columns.start), depth[rows, columns].copy())
-
-
-def view_points(
+def person_pixels(
     depth: np.ndarray,
     camera: Camera,
     mask: Runs,
     background: np.ndarray | None,
-    depth_bias: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Person points of one depth image: points, normals (M,3), master frame, and trust (M,).
+    window: tuple[slice, slice],
+) -> np.ndarray:
+    """Flat pixels (M,) of one depth image (H,W), within ``window``, that show the person.
 
     A depth pixel counts when the colour pixel that shows the same surface lies in the person's
-    mask and the depth is clearly nearer than the background. Every second pixel of every second
-    row is used. None where no pixel counts.
+    mask, which is not empty, and the depth is clearly nearer than the background. What stands
+    before the background is all that can cover the person. Every second pixel of every second row
+    is used.
     """
-    window = _window(camera, mask, depth)
-    if window is None:
-        return None
-    rows, columns = window
-    near = depth[rows, columns].astype(np.int32)
-    counts = near > 0
-    if background is not None:
-        behind = background[rows, columns].astype(np.int32)
-        counts &= (behind == 0) | (near < behind - int(1000 * _BEFORE_BACKGROUND_M))
-    # what stands before the background is all that can cover the person
-    before = np.zeros_like(depth)
-    before[rows, columns] = np.where(counts, near, 0)
-    counts[1::2] = False
-    counts[:, 1::2] = False
-    row, column = np.nonzero(counts)
-    index = (row + rows.start) * depth.shape[1] + column + columns.start
-    if not len(index):
-        return None
-    lookup = colour_lookup(before, camera, index)
-    inside = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
-    index = lookup.depth_index[inside]
-    if not len(index):
-        return None
+    assert camera.depth is not None and camera.colour_from_depth is not None
+    colour, (rows, columns) = camera.colour, window
+    spacing = max(colour.fx / camera.depth.fx, colour.fy / camera.depth.fy, 1.0)
+    return person_pixels_kernel.person_pixels(
+        depth,
+        np.zeros((0, 0), np.uint16) if background is None else background,
+        int(1000 * _BEFORE_BACKGROUND_M),
+        (rows.start, rows.stop),
+        (columns.start, columns.stop),
+        camera.depth.rays,
+        camera.colour_from_depth.astype(np.float32),
+        tuple(colour.parameters.astype(np.float32)),
+        (colour.height, colour.width),
+        mask.ends,
+        mask.box,
+        np.float32(CELL_SPACINGS * spacing),
+        # on the colour grid nothing hides: the pixels are the colour image's
+        np.float32(np.inf if camera.aligned else HIDDEN_BEHIND_M),
+    )
+
+
+def _placed(
+    depth: np.ndarray, camera: Camera, index: np.ndarray, depth_bias: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals (M,3), master frame, and trust (M,) of flat depth pixels (M,)."""
     points, normals, edge = _points_and_normals(depth, camera, index)
     if depth_bias:
         points = points - depth_bias * points / points[:, 2:]
