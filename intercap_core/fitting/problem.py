@@ -285,16 +285,26 @@ class BodyProblem:
             cost = cost + 0.5 * (self._shared_precision() * shared**2).sum()
         return cost
 
-    def _shared_precision(self) -> Tensor:
-        """Precision (m,) of the shared parameters' Gaussian about zero, in each frame."""
+    def shared_counts(self) -> Tensor:
+        """How often the Gaussian of each shared parameter (m,) counts: once for so many frames,
+        whose data are then worth one over it independent measurements."""
         parts = []
         if self.one_shape:
             parts.append(self.base.new_full((self.model.num_betas,), _SHAPE_PRIOR_PER_FRAME))
         if self.fit_shared:
-            offset = _OFFSET_PRIOR_PER_FRAME / OFFSET_SIGMA**2
-            parts.append(self.base.new_full((3 * NUM_OFFSETS,), offset))
-            parts.append(_COVERING_PRIOR_PER_FRAME / self._spread**2)
-        return torch.cat(parts)
+            parts.append(self.base.new_full((3 * NUM_OFFSETS,), _OFFSET_PRIOR_PER_FRAME))
+            parts.append(torch.full_like(self.u, _COVERING_PRIOR_PER_FRAME))
+        return torch.cat(parts) if parts else self.base.new_zeros(0)
+
+    def _shared_precision(self) -> Tensor:
+        """Precision (m,) of the shared parameters' Gaussian about zero, in each frame."""
+        spread = []
+        if self.one_shape:
+            spread.append(self.base.new_ones(self.model.num_betas))
+        if self.fit_shared:
+            spread.append(self.base.new_full((3 * NUM_OFFSETS,), OFFSET_SIGMA))
+            spread.append(self._spread)
+        return self.shared_counts() / torch.cat(spread) ** 2
 
 
 def _chunks(count: int) -> list[slice]:

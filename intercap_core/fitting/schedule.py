@@ -48,8 +48,10 @@ class Settled:
 class Fit:
     """The fitted frames (N,), ids among the sequence's T.
 
-    vectors (N,P) parameters; hessian (N,n,n) of the energy by the parameters ``columns`` (n,);
-    excess (N,) >= 1: mean square of the keypoints' residuals over their variance.
+    vectors (N,P) parameters; hessian (N,n+m,n+m) of the energy by the parameters ``columns`` (n,)
+    and by the m that all frames share, betas first where there is ``one_shape``; shared_counts (m,)
+    how often the prior of each of those counts in a frame. excess (N,) >= 1: mean square of the
+    keypoints' residuals over their variance.
     pixel_residual (N,C) px, cloud_residual (N,) m: medians, NaN = nothing seen. settled: what all
     frames share beside the shape. parts: how the observations bear out each part of the body.
     """
@@ -58,6 +60,8 @@ class Fit:
     vectors: Tensor
     columns: Tensor
     hessian: Tensor
+    one_shape: bool
+    shared_counts: Tensor
     excess: Tensor
     pixel_residual: Tensor
     cloud_residual: Tensor
@@ -138,8 +142,7 @@ class Fitter:
             evidence.look(problem, hands=hands, face=face)
             solution = self._minimise(problem, 5, keep_normal=last)
         assert solution.normal is not None
-        own = len(problem.columns)
-        return self._report(problem, solution.normal.hessian[:, :own, :own])
+        return self._report(problem, solution.normal.hessian)
 
     def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
         """The last round's problem at other bodies (N,P), with what a fit found to be constant."""
@@ -188,6 +191,8 @@ class Fitter:
             vectors=problem.base,
             columns=problem.columns,
             hessian=hessian,
+            one_shape=problem.one_shape,
+            shared_counts=problem.shared_counts(),
             # the median of a chi-squared variable with two degrees of freedom is 2 ln 2
             excess=((whitened**2 / 2).flatten(1).nanmedian(1).values / np.log(2)).clamp_min(1.0),
             pixel_residual=pixels.nanmedian(2).values,

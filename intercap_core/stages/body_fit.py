@@ -89,7 +89,7 @@ def run(
     params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
     sigma = np.zeros((seen.num_frames, 55))
-    stated = joint_sigma(model, fit.vectors, fit.columns, fit.hessian, fit.excess).cpu().numpy()
+    stated = joint_sigma(model, fit).cpu().numpy()
     # what has left the motion of its neighbours may well belong among them
     jumped = np.zeros_like(sigma)
     jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted])

@@ -1,0 +1,71 @@
+"""The stated deviation of joints against the covariance of the whole problem."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from intercap_core.body.model import BodyModel
+from intercap_core.fitting.quality import PartEvidence
+from intercap_core.fitting.schedule import Fit, Settled, columns_of
+from intercap_core.fitting.uncertainty import joint_sigma
+
+SHARED = 10 + 75 + 8
+MODEL_M = 0.001
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return BodyModel.load()
+
+
+def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> Fit:
+    """Equal frames of a random energy."""
+    columns = columns_of(model, hands=True, face=True, betas=False)
+    size = len(columns) + SHARED
+    rows = torch.randn(1, 2 * size, size, generator=torch.Generator().manual_seed(0))
+    hessian = 50 * (rows.transpose(1, 2) @ rows).double().expand(frames, -1, -1)
+    vectors = model.zeros(frames).vector()
+    nothing = torch.zeros(frames)
+    return Fit(
+        np.arange(frames), vectors, columns, hessian, True, torch.full((SHARED,), counts),
+        torch.full((frames,), excess), nothing, nothing,
+        Settled(nothing, nothing, nothing, nothing), PartEvidence(*[nothing] * 5),
+    )  # fmt: skip
+
+
+def _whole(model: BodyModel, fit: Fit) -> np.ndarray:
+    """(55,) deviations from the inverse of one frame's whole Hessian."""
+    lin = model.linearise(
+        model.parameters(fit.vectors[:1]), vertex_ids=np.array([0]), joints=True
+    )  # fmt: skip
+    full = lin.full()[0, 1:].double().reshape(165, -1)
+    by = torch.zeros(165, fit.hessian.shape[1], dtype=torch.float64)
+    by[:, : len(fit.columns)] = full[:, fit.columns]
+    by[:, len(fit.columns) : len(fit.columns) + 10] = full[:, 168:178]
+    variance = (by @ torch.linalg.inv(fit.hessian[0]) * by).sum(1)
+    return np.asarray((variance.reshape(55, 3).mean(1) + MODEL_M**2).sqrt())
+
+
+@pytest.mark.parametrize("frames", [1, 20])
+def test_priors_that_count_once_a_frame_leave_what_one_frame_says(model, frames):
+    """However many frames: what is wrong of what they share is wrong in all of them."""
+    fit = _fit(model, frames, 1.0)
+    stated = joint_sigma(model, fit).numpy()
+    assert stated.shape == (frames, 55) and stated.min() > 2 * MODEL_M
+    np.testing.assert_allclose(stated, _whole(model, fit)[None].repeat(frames, 0), rtol=1e-4)
+
+
+def test_priors_that_count_more_seldom_make_it_more_independent_frames(model):
+    once, seldom, never = (
+        joint_sigma(model, _fit(model, 3, counts)).numpy() for counts in (1.0, 0.25, 1e-9)
+    )
+    np.testing.assert_allclose(
+        seldom**2 - never**2, (once**2 - never**2) / 4, rtol=1e-3, atol=1e-10
+    )
+
+
+def test_residuals_above_their_noise_widen_what_a_frame_says_alone(model):
+    one, four = (joint_sigma(model, _fit(model, 2, 1e-9, e)).numpy() for e in (1.0, 4.0))
+    np.testing.assert_allclose(four**2 - MODEL_M**2, 4 * (one**2 - MODEL_M**2), rtol=1e-4)
