@@ -115,8 +115,6 @@ def evaluate(
         return Keypoints(points + arms, None, rotations)
     if columns is None:
         columns = torch.arange(model.num_parameters, device=model.device)
-    if model.has_kernels:
-        return _evaluate_compiled(model, params, chosen, arms, rotations, columns)
     linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
     full = linear.full()
     batch, _, _, size = full.shape
@@ -129,28 +127,6 @@ def evaluate(
         batch, len(moved), 3, 3 * NUM_JOINTS
     )
     return Keypoints(chosen.matrix @ linear.points + arms, by[..., columns], rotations)
-
-
-def _evaluate_compiled(
-    model: BodyModel,
-    params: BodyParameters,
-    chosen: KeypointSet,
-    arms: Tensor,
-    rotations: Tensor,
-    columns: Tensor,
-) -> Keypoints:
-    from intercap_core.body.jacobian_kernel import mixed_rows
-
-    chain, _ = model.chain(params, vertex_ids=chosen.vertices, joints=True)
-    place = np.full(model.num_parameters, -1)
-    place[columns.numpy()] = np.arange(len(columns))
-    row, ids = np.nonzero(chosen.matrix.numpy())
-    starts = np.searchsorted(row, np.arange(len(chosen.index) + 1))
-    shares = chosen.matrix.numpy()[row, ids]
-    by = torch.zeros(*arms.shape, len(columns), dtype=arms.dtype)
-    turned_by = chosen.turned_by.numpy()
-    points = mixed_rows(chain, place, starts, ids, shares, arms.numpy(), turned_by, by.numpy())
-    return Keypoints(torch.from_numpy(points), by, rotations)
 
 
 def reprojection(

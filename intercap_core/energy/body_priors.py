@@ -48,7 +48,7 @@ def cost(
 ) -> Tensor:
     """(B,) at (B,P); ``shape``: betas included (else they are the caller's), expression always;
     ``pose`` instead of the open prior of the body's pose."""
-    total = 0.5 * (vector[:, _quadratic(model, shape)] ** 2).sum(1)
+    total = 0.5 * (vector[:, quadratic(model, shape)] ** 2).sum(1)
     if pose is not None:
         total = total + pose.cost(vector[:, _BODY_POSE])
     for rows, weight in terms(model, vector, body_pose=pose is None):
@@ -68,11 +68,11 @@ def assemble(
         hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
     for rows, weight in terms(model, vector, body_pose=pose is None):
         rows.add_to(hessian, gradient, weight)
-    at = _quadratic(model, shape)
+    at = quadratic(model, shape)
     gradient[:, at] += vector[:, at]
     hessian.diagonal(dim1=1, dim2=2)[:, at] += 1
     return cost(model, vector, shape=shape, pose=pose), gradient, hessian
 
 
-def _quadratic(model: BodyModel, shape: bool) -> slice:
+def quadratic(model: BodyModel, shape: bool) -> slice:
     return slice(TRANSL.stop + (0 if shape else model.num_betas), None)

@@ -37,7 +37,7 @@ TOLERANCE = 0.003
 SIGMA = 0.008
 REACH = 0.015  # depth beyond which the push fades
 # Neighbouring samples are inside together: about four of them make one measurement.
-_WEIGHT = 0.25 / SIGMA**2
+WEIGHT = 0.25 / SIGMA**2
 # Samples nearer over the surface than this times the mean thickness of what they lie on are joined;
 # flesh meets flesh where a joint closes, so parts on both sides of one are joined farther.
 _JOINED = 1.6
@@ -263,7 +263,7 @@ def cost(model: BodyModel, params: BodyParameters, pairs: Pairs, index: Tensor) 
     chosen, present = here
     points = model.forward(params.frames(present), vertex_ids=pairs.vertices).vertices
     robust = geman_mcclure(_residuals(points, chosen) ** 2, REACH)
-    return total.index_add(0, present[chosen.frame], 0.5 * _WEIGHT * robust.rho)
+    return total.index_add(0, present[chosen.frame], 0.5 * WEIGHT * robust.rho)
 
 
 class SelfTerm(NamedTuple):
@@ -295,9 +295,9 @@ def assemble(
     apart = by_point[frame, chosen.inner[active]] - by_point[frame, chosen.outer[active]]
     rows = -(chosen.normal[active][:, None] @ apart)[:, 0]
     robust = geman_mcclure(residual**2, REACH)
-    weight = _WEIGHT * robust.weight
+    weight = WEIGHT * robust.weight
     count, size = len(present), len(columns)
-    total = rows.new_zeros(count).index_add(0, frame, 0.5 * _WEIGHT * robust.rho)
+    total = rows.new_zeros(count).index_add(0, frame, 0.5 * WEIGHT * robust.rho)
     pull = (weight * residual)[:, None] * rows
     gradient = rows.new_zeros(count, size).index_add(0, frame, pull)
     hessian = rows.new_zeros(count, size, size)

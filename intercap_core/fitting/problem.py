@@ -8,6 +8,8 @@ logarithm u of the coverings' thickness.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,6 +22,9 @@ from intercap_core.energy import body_cloud, body_keypoints, body_priors, body_s
 from intercap_core.energy.body_cloud import COVERINGS, CloudRows, Samples
 from intercap_core.energy.body_keypoints import Keypoints, KeypointSet, PointTerm
 from intercap_core.solve.levenberg_marquardt import NormalEquations
+
+if TYPE_CHECKING:
+    from intercap_core.fitting.compiled import Terms
 
 NUM_OFFSETS = 25  # OpenPose's body keypoints
 KEYPOINT_SCALE = 4.0  # sigmas at which a keypoint starts to count as an outlier
@@ -95,6 +100,12 @@ class BodyProblem:
         self._rest = torch.tensor([c.thickness for c in COVERINGS]).to(self.base)
         self._spread = torch.tensor([c.spread for c in COVERINGS]).to(self.base)
 
+    @cached_property
+    def _terms(self) -> Terms:
+        from intercap_core.fitting.compiled import Terms
+
+        return Terms(self.model, self.samples)
+
     # --- layout of the shared parameters -----------------------------------------------------
 
     @property
@@ -151,6 +162,11 @@ class BodyProblem:
 
     def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
         """(b,)"""
+        if self.model.has_kernels:
+            betas, offsets, u = self._split(shared)
+            x = self._vector(own, betas, index)
+            total = self._terms.cost(self, x, offsets, self._rest * u.exp(), index)
+            return total + self._shared_prior(shared)
         return torch.cat([self._cost(own[at], shared, index[at]) for at in _chunks(len(index))])
 
     def _cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
@@ -172,6 +188,8 @@ class BodyProblem:
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
         """Normal equations by own and shared parameters, own first."""
+        if self.model.has_kernels:
+            return self._linearise_compiled(own, shared, index)
         parts = [self._linearise(own[at], shared, index[at]) for at in _chunks(len(index))]
         return NormalEquations(*(torch.cat(p) for p in zip(*parts, strict=True)))
 
@@ -201,18 +219,7 @@ class BodyProblem:
             hessian[:, :n, offset_at] += cross
             hessian[:, offset_at, :n] += cross.transpose(1, 2)
         total = term.cost
-        if self.rows is not None and self.model.has_kernels:
-            place = np.full(x.shape[1], -1)
-            place[columns.numpy()] = np.arange(n)
-            first_u = u_at.start if self.fit_shared else -1
-            place_u = np.where(self.fit_shared, first_u + np.arange(len(u)), -1)
-            rows = CloudRows(*(part[index] for part in self.rows))
-            total = total.contiguous()
-            body_cloud.add_compiled(
-                self.model, params, self._sample_ids, rows, self._rest * u.exp(), self._group,
-                place, place_u, NormalEquations(total, gradient, hessian),
-            )  # fmt: skip
-        elif self.rows is not None:
+        if self.rows is not None:
             linear = self.model.linearise(params, vertex_ids=self._sample_ids)
             rows = CloudRows(*(part[index] for part in self.rows))
             by = linear.along(rows.normal[:, :, None])[:, :, 0][..., columns]
@@ -239,12 +246,33 @@ class BodyProblem:
         own_at = slice(0, own.shape[1])
         gradient[:, own_at] += prior_gradient[:, self.columns]
         hessian[:, own_at, own_at] += prior_hessian[:, self.columns][:, :, self.columns]
-        if len(shared):
-            precision = self._shared_precision()
-            gradient[:, own.shape[1] :] += precision * shared
-            hessian[:, own.shape[1] :, own.shape[1] :] += torch.diag(precision)
-            cost = cost + 0.5 * (precision * shared**2).sum()
-        return NormalEquations(total + cost, gradient, hessian)
+        normal = NormalEquations(total + cost, gradient, hessian)
+        self._add_shared_prior(shared, normal)
+        return normal
+
+    def _linearise_compiled(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
+        from intercap_core.fitting.compiled import Columns
+
+        betas, offsets, u = self._split(shared)
+        x = self._vector(own, betas, index)
+        count, n = own.shape
+        size = n + len(shared)
+        place = np.full(x.shape[1], -1)
+        place[self.columns.numpy()] = np.arange(n)
+        if self.one_shape:
+            place[self.shape_columns] = n + np.arange(self.model.num_betas)
+            n += self.model.num_betas
+        covering = np.full(len(u), -1)
+        if self.fit_shared:
+            covering = np.arange(size - len(u), size)
+        columns = Columns(place, covering, n, NUM_OFFSETS if self.fit_shared else 0)
+        normal = NormalEquations(
+            x.new_zeros(count), x.new_zeros(count, size), x.new_zeros(count, size, size)
+        )
+        thickness = self._rest * u.exp()
+        self._terms.add_equations(self, x, offsets, thickness, index, columns, normal)
+        self._add_shared_prior(shared, normal)
+        return normal
 
     def _points(self, keypoints: Keypoints, index: Tensor) -> PointTerm:
         """What views and targets say about the points, together."""
@@ -281,9 +309,20 @@ class BodyProblem:
 
     def _prior_cost(self, x: Tensor, shared: Tensor, index: Tensor) -> Tensor:
         cost = body_priors.cost(self.model, x, shape=not self.one_shape, pose=self._pose(index))
+        return cost + self._shared_prior(shared)
+
+    def _shared_prior(self, shared: Tensor) -> Tensor:
+        """Each frame's cost of the shared parameters."""
+        if not len(shared):
+            return shared.new_zeros(())
+        return 0.5 * (self._shared_precision() * shared**2).sum()
+
+    def _add_shared_prior(self, shared: Tensor, normal: NormalEquations) -> None:
         if len(shared):
-            cost = cost + 0.5 * (self._shared_precision() * shared**2).sum()
-        return cost
+            precision, first = self._shared_precision(), normal.gradient.shape[1] - len(shared)
+            normal.cost.add_(self._shared_prior(shared))
+            normal.gradient[:, first:] += precision * shared
+            normal.hessian.diagonal(dim1=1, dim2=2)[:, first:] += precision
 
     def shared_counts(self) -> Tensor:
         """How often the Gaussian of each shared parameter (m,) counts: once for so many frames,

@@ -1,0 +1,376 @@
+"""The keypoint term of :mod:`.body_keypoints`, compiled: one pass over each body's keypoints.
+
+A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
+the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.
+Without pose blend shapes only. Equal to the plain term to rounding.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
+from intercap_core.camera.projection import MIN_DEPTH_M
+from intercap_core.energy.body_keypoints import KeypointSet
+from intercap_core.energy.skeleton_kernel import rest_points
+
+_SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
+_PARENTS = np.array(PARENTS)
+
+
+class Pieces(NamedTuple):
+    """What K keypoints are made of: E pieces, keypoint k of those from starts[k] to starts[k+1].
+
+    A piece lies at R x + share t, with R and t of its bone and x, at rest, from template (E,3) and
+    directions (E,3,S). carrier (K,): the piece on the bone that carries the keypoint's offset.
+    limb_starts (L+1,) and order (K,): the keypoints of each limb; moved_by (L,55) bool: the joints
+    that turn a limb.
+    """
+
+    starts: np.ndarray
+    bone: np.ndarray
+    share: np.ndarray
+    template: np.ndarray
+    directions: np.ndarray
+    carrier: np.ndarray
+    limb_starts: np.ndarray
+    order: np.ndarray
+    moved_by: np.ndarray
+
+    @classmethod
+    def of(cls, model: BodyModel, chosen: KeypointSet) -> Pieces:
+        """Those of a set of keypoints."""
+        rest = model.linearise(model.zeros(), vertex_ids=chosen.vertices, joints=True)
+        points = rest.selection
+        weights = points.weights.double().numpy()
+        template, directions = points.template.double().numpy(), points.directions.double().numpy()
+        starts, carrier = [0], []
+        bones: list[int] = []
+        shares, places, moves = [], [], []
+        carried = zip(chosen.matrix.double().numpy(), chosen.carrier.tolist(), strict=True)
+        for row, carried_by in carried:
+            ids = np.flatnonzero(row)
+            share = row[ids, None] * weights[ids]
+            own = np.flatnonzero(share.any(0))
+            share = share[:, own]
+            carrier.append(len(bones) + own.tolist().index(carried_by))
+            bones += own.tolist()
+            shares.append(share.sum(0))
+            places.append(share.T @ template[ids])
+            moves.append(np.tensordot(share.T, directions[ids], 1))
+            starts.append(len(bones))
+        chains = [
+            frozenset().union(*(ancestors(bone) for bone in bones[first:end]))
+            for first, end in pairwise(starts)
+        ]
+        limbs = _limbs(chains)
+        moved_by = np.zeros((len(limbs), NUM_JOINTS), bool)
+        for flags, limb in zip(moved_by, limbs, strict=True):
+            flags[sorted(chains[limb[0]])] = True
+        dtype = points.template.numpy().dtype
+        return cls(
+            np.array(starts), np.array(bones), np.concatenate(shares).astype(dtype),
+            np.concatenate(places).astype(dtype), np.concatenate(moves).astype(dtype),
+            np.array(carrier), np.cumsum([0, *map(len, limbs)]), np.concatenate(limbs), moved_by,
+        )  # fmt: skip
+
+    def at_rest(self, shape: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """Pieces (B,E,3) of bodies of shape (B,S), with the keypoints' offsets (K,3)."""
+        rest = rest_points(self.template, self.directions, shape)
+        rest[:, self.carrier] += offsets
+        return rest
+
+
+def _limbs(chains: list[frozenset[int]]) -> list[list[int]]:
+    """Keypoints by limb: each goes with the first of those of longest chain that holds its own."""
+    limbs: list[list[int]] = []
+    for k in sorted(range(len(chains)), key=lambda k: (-len(chains[k]), k)):
+        home = next((limb for limb in limbs if chains[k] <= chains[limb[0]]), None)
+        if home is None:
+            limbs.append([k])
+        else:
+            home.append(k)
+    return limbs
+
+
+class Seen(NamedTuple):
+    """What T frames' keypoints are compared with, in the model's floating type.
+
+    observed (T,C,K,2), confidence, sigma (T,C,K), lenses (C,13), colour_from_master (C,4,4), shift
+    (T,C,K,3): see :func:`.body_keypoints.reprojection`; targets (T,K,3), trust (T,K): see
+    :func:`.body_keypoints.triangulated`. What there is none of is of no frame.
+    """
+
+    observed: np.ndarray
+    confidence: np.ndarray
+    sigma: np.ndarray
+    lenses: np.ndarray
+    colour_from_master: np.ndarray
+    shift: np.ndarray
+    targets: np.ndarray
+    trust: np.ndarray
+    targets_sigma: float
+    scale: float
+
+
+@numba.njit(cache=True, nogil=True)
+def _point(skeleton, pieces, rest, b, k):
+    """Keypoint k (3,) of body b, metres."""
+    p0, p1, p2 = 0.0, 0.0, 0.0
+    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+        m, w = pieces.bone[e], pieces.share[e]
+        r, t, x = skeleton.rotations[b, m], skeleton.offsets[b, m], rest[b, e]
+        p0 += r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + w * t[0]
+        p1 += r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + w * t[1]
+        p2 += r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + w * t[2]
+    return p0, p1, p2
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(px, py, pz, q):
+    """Pixel (u, v) and its derivatives du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ of a point in the
+    camera's frame: :func:`.projection.project_with_jacobian`, beyond the metric radius too."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = q
+    free = pz > MIN_DEPTH_M
+    inverse = 1 / pz if free else 1 / MIN_DEPTH_M
+    x, y = px * inverse, py * inverse
+    radius = np.sqrt(x * x + y * y)
+    outside = radius > limit
+    stretch = radius / limit if outside else 1.0
+    x, y = x / stretch, y / stretch
+    s = x * x + y * y
+    below = 1 + s * (k4 + s * (k5 + s * k6))
+    d = (1 + s * (k1 + s * (k2 + s * k3))) / below
+    slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
+    dd = 2 * slope / below
+    xd = x * d + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+    yd = y * d + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+    xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y
+    yx = xy
+    yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
+    if outside:
+        along_x, along_y = (xd - xx * x - xy * y) / s, (yd - xy * x - yy * y) / s
+        xx, xy = xx + along_x * x, xy + along_x * y
+        yx, yy = yx + along_y * x, yy + along_y * y
+        xd, yd, x, y = xd * stretch, yd * stretch, x * stretch, y * stretch
+    by_z = -inverse if free else 0.0
+    return (
+        fx * xd + cx, fy * yd + cy,
+        fx * xx * inverse, fx * xy * inverse, fx * (xx * x + xy * y) * by_z,
+        fy * yx * inverse, fy * yy * inverse, fy * (yx * x + yy * y) * by_z,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _ask(seen, t, k, p, slopes, gradient, matrix):
+    """What frame t says of keypoint k at p: returns its cost and, if ``slopes`` are wanted, writes
+    gradient (3,) and matrix (3,3) by the point."""
+    cost = 0.0
+    gradient[:] = 0
+    matrix[:] = 0
+    square = seen.scale * seen.scale
+    j = np.empty((2, 3))
+    views = seen.confidence.shape[1] if len(seen.confidence) else 0
+    for c in range(views):
+        trust = seen.confidence[t, c, k]
+        if not trust > 0:
+            continue
+        x, y, z = p
+        if len(seen.shift):
+            x += seen.shift[t, c, k, 0]
+            y += seen.shift[t, c, k, 1]
+            z += seen.shift[t, c, k, 2]
+        m = seen.colour_from_master[c]
+        u, v, ux, uy, uz, vx, vy, vz = _project(
+            m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+            m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+            m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+            seen.lenses[c],
+        )
+        sharp = 1.0 / seen.sigma[t, c, k]
+        ru = (u - seen.observed[t, c, k, 0]) * sharp
+        rv = (v - seen.observed[t, c, k, 1]) * sharp
+        squared = ru * ru + rv * rv
+        share = square / (squared + square)
+        cost += 0.5 * trust * share * squared
+        if not slopes:
+            continue
+        weight = trust * share * share
+        for i in range(3):
+            j[0, i] = (ux * m[0, i] + uy * m[1, i] + uz * m[2, i]) * sharp
+            j[1, i] = (vx * m[0, i] + vy * m[1, i] + vz * m[2, i]) * sharp
+        for i in range(3):
+            gradient[i] += weight * (j[0, i] * ru + j[1, i] * rv)
+            for o in range(3):
+                matrix[i, o] += weight * (j[0, i] * j[0, o] + j[1, i] * j[1, o])
+    if len(seen.targets) and seen.trust[t, k] > 0:
+        sharp = 1.0 / seen.targets_sigma
+        r0 = (p[0] - seen.targets[t, k, 0]) * sharp
+        r1 = (p[1] - seen.targets[t, k, 1]) * sharp
+        r2 = (p[2] - seen.targets[t, k, 2]) * sharp
+        squared = r0 * r0 + r1 * r1 + r2 * r2
+        share = square / (squared + square)
+        cost += 0.5 * seen.trust[t, k] * share * squared
+        weight = seen.trust[t, k] * share * share * sharp
+        gradient[0] += weight * r0
+        gradient[1] += weight * r1
+        gradient[2] += weight * r2
+        for i in range(3):
+            matrix[i, i] += weight * sharp
+    return cost
+
+
+@numba.njit(cache=True, nogil=True)
+def add_cost(skeleton, pieces, rest, seen, frames, cost):
+    """Add E_J to cost (B,) of the frames (B,), whose pieces at rest are (B,E,3)."""
+    gradient, matrix = np.empty(3), np.empty((3, 3))
+    for b in range(len(frames)):
+        total = 0.0
+        for k in range(len(pieces.carrier)):
+            p = _point(skeleton, pieces, rest, b, k)
+            total += _ask(seen, frames[b], k, p, False, gradient, matrix)
+        cost[b] += total
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
+    """Write the derivatives (3,m) of keypoint k by the columns that ``local`` (P,) places, those of
+    the shape from ``shape`` on. ``moved`` (3,S) is scratch."""
+    rows[:] = 0
+    moved[:] = 0
+    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+        m, w = pieces.bone[e], pieces.share[e]
+        r, t, x = skeleton.rotations[b, m], skeleton.offsets[b, m], rest[b, e]
+        q0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + w * t[0]
+        q1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + w * t[1]
+        q2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + w * t[2]
+        up = m
+        while up >= 0:
+            at, frame = skeleton.joints[b, up], skeleton.frames[b, up]
+            a0, a1, a2 = q0 - w * at[0], q1 - w * at[1], q2 - w * at[2]
+            for d in range(3):
+                place = local[3 * up + d]
+                if place >= 0:  # a turn f of the joint moves the piece by f x a
+                    f0, f1, f2 = frame[0, d], frame[1, d], frame[2, d]
+                    rows[0, place] += f1 * a2 - f2 * a1
+                    rows[1, place] += f2 * a0 - f0 * a2
+                    rows[2, place] += f0 * a1 - f1 * a0
+            up = _PARENTS[up]
+        for d in range(3):
+            if local[_TRANSL + d] >= 0:
+                rows[d, local[_TRANSL + d]] += w
+        if len(shape):
+            by, of_bone = pieces.directions[e], skeleton.moved[b, m]
+            for i in range(3):
+                r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
+                for s in range(by.shape[1]):
+                    moved[i, s] += r0 * by[0, s] + r1 * by[1, s] + r2 * by[2, s] + w * of_bone[i, s]
+    for s in shape:
+        for i in range(3):
+            rows[i, local[_SHAPE + s]] = moved[i, s]
+
+
+@numba.njit(cache=True, nogil=True)
+def _columns(pieces, limb, place):
+    """Where a limb's columns are: ``local`` (P,) in its rows, -1 = not there, and ``to`` (m,)."""
+    local = np.full(len(place), -1)
+    to = np.empty(len(place), np.int64)
+    m = 0
+    for p in range(len(place)):
+        if place[p] >= 0 and (p >= _TRANSL or pieces.moved_by[limb, p // 3]):
+            local[p], to[m] = m, place[p]
+            m += 1
+    return local, to[:m]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _pull(matrix, rows, pulled):
+    """pulled = matrix rows, (3,m)."""
+    for i in range(3):
+        m0, m1, m2 = matrix[i, 0], matrix[i, 1], matrix[i, 2]
+        for q in range(rows.shape[1]):
+            pulled[i, q] = m0 * rows[0, q] + m1 * rows[1, q] + m2 * rows[2, q]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _add_product(rows, pulled, block):
+    """Add the lower triangle of rows^T pulled, (m,m), to block; rows and pulled (3,m)."""
+    for p in range(block.shape[0]):
+        a0, a1, a2 = rows[0, p], rows[1, p], rows[2, p]
+        for q in range(p + 1):
+            block[p, q] += a0 * pulled[0, q] + a1 * pulled[1, q] + a2 * pulled[2, q]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_offset(turn, slope, matrix, pulled, to, first, gradient, hessian):
+    """Add the part of a keypoint's offset, whose three columns start at ``first``; turn (3,3) of
+    the bone that carries it."""
+    for d in range(3):
+        r0, r1, r2 = turn[0, d], turn[1, d], turn[2, d]
+        gradient[first + d] += r0 * slope[0] + r1 * slope[1] + r2 * slope[2]
+        for e in range(3):
+            for i in range(3):
+                hessian[first + d, first + e] += turn[i, e] * (
+                    r0 * matrix[0, i] + r1 * matrix[1, i] + r2 * matrix[2, i]
+                )
+        for q in range(len(to)):
+            part = r0 * pulled[0, q] + r1 * pulled[1, q] + r2 * pulled[2, q]
+            hessian[to[q], first + d] += part
+            hessian[first + d, to[q]] += part
+
+
+@numba.njit(cache=True, nogil=True)
+def add_equations(
+    skeleton, pieces, rest, seen, frames, place, first_offset, offsets, cost, gradient, hessian
+):  # fmt: skip
+    """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
+    (B,E,3).
+
+    ``place`` (P,) says where a parameter's column is, -1 = fixed; the offsets of the first
+    ``offsets`` keypoints, three columns each, start at ``first_offset``. cost (B,), gradient (B,n),
+    hessian (B,n,n).
+    """
+    dtype = hessian.dtype
+    shape = np.flatnonzero(place[_SHAPE:] >= 0)
+    moved = np.empty((3, len(place) - _SHAPE), dtype)
+    slope, matrix = np.empty(3), np.empty((3, 3))
+    narrow = np.empty((3, 3), dtype)
+    for limb in range(len(pieces.limb_starts) - 1):
+        local, to = _columns(pieces, limb, place)
+        m = len(to)
+        rows, pulled = np.empty((3, m), dtype), np.empty((3, m), dtype)
+        block = np.empty((m, m), dtype)
+        for b in range(len(frames)):
+            block[:] = 0
+            for k in pieces.order[pieces.limb_starts[limb] : pieces.limb_starts[limb + 1]]:
+                p = _point(skeleton, pieces, rest, b, k)
+                cost[b] += _ask(seen, frames[b], k, p, True, slope, matrix)
+                if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
+                    continue
+                _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)
+                for i in range(3):
+                    for o in range(3):
+                        narrow[i, o] = matrix[i, o]
+                _pull(narrow, rows, pulled)
+                _add_product(rows, pulled, block)
+                for q in range(m):
+                    gradient[b, to[q]] += (
+                        rows[0, q] * slope[0] + rows[1, q] * slope[1] + rows[2, q] * slope[2]
+                    )
+                if k < offsets:
+                    turn = skeleton.rotations[b, pieces.bone[pieces.carrier[k]]]
+                    first = first_offset + 3 * k
+                    _add_offset(turn, slope, matrix, pulled, to, first, gradient[b], hessian[b])
+            for p in range(m):
+                for q in range(p):
+                    block[q, p] = block[p, q]
+            for p in range(m):
+                for q in range(m):
+                    hessian[b, to[p], to[q]] += block[p, q]

@@ -1,0 +1,134 @@
+"""Terms of points on the skin, compiled: what :mod:`.body_cloud` and :mod:`.body_self` say.
+
+Equal to the plain terms to rounding, for bodies without pose blend shapes. The normal equations of
+the cloud's term are :func:`.jacobian_kernel.plane_equations`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from intercap_core.body.jacobian_kernel import _add_point
+from intercap_core.body.parameters import TRANSL
+
+_SHAPE = TRANSL.stop
+
+
+class Touching(NamedTuple):
+    """Pairs of :class:`.body_self.Pairs` by frame: those of frame t from starts[t] to starts[t+1].
+
+    inner, outer (M,) points of a chain, normal (M,3). tolerance, reach (m) and weight (1/m^2) as
+    in :mod:`.body_self`.
+    """
+
+    starts: np.ndarray
+    inner: np.ndarray
+    outer: np.ndarray
+    normal: np.ndarray
+    tolerance: float
+    reach: float
+    weight: float
+
+
+@numba.njit(cache=True, nogil=True)
+def _along(c, b, i, n):
+    """n . point i of body b."""
+    x, along = c.rest[b, i], 0.0
+    for k in range(c.bones.shape[1]):
+        w = c.shares[i, k]
+        if w == 0:
+            continue
+        r, o = c.rotations[b, c.bones[i, k]], c.offsets[b, c.bones[i, k]]
+        for d in range(3):
+            along += w * n[d] * (r[d, 0] * x[0] + r[d, 1] * x[1] + r[d, 2] * x[2] + o[d])
+    return along
+
+
+@numba.njit(cache=True, nogil=True)
+def add_plane_cost(chain, normal, weight, target, thickness, group, frames, cost):
+    """Add sum w e^2 / 2, e = target - n . v - thickness, to cost (B,) of the frames (B,).
+
+    normal (T,N,3), weight (T,N), 0 = no row, target (T,N); thickness (G,) of each group's points,
+    (N,).
+    """
+    for b in range(len(frames)):
+        t, total = frames[b], 0.0
+        for i in range(len(group)):
+            if weight[t, i] > 0:
+                along = _along(chain, b, i, normal[t, i])
+                e = target[t, i] - along - thickness[group[i]]
+                total += weight[t, i] * e * e / 2
+        cost[b] += total
+
+
+@numba.njit(cache=True, nogil=True)
+def _depth(chain, touching, b, at):
+    """How much deeper than the tolerance pair ``at`` is, metres; not above zero = apart."""
+    n = touching.normal[at]
+    outer = _along(chain, b, touching.outer[at], n)
+    return outer - _along(chain, b, touching.inner[at], n) - touching.tolerance
+
+
+@numba.njit(cache=True, nogil=True)
+def add_self_cost(chain, touching, frames, cost):
+    """Add E_P_self to cost (B,) of the frames (B,)."""
+    square = touching.reach * touching.reach
+    for b in range(len(frames)):
+        total = 0.0
+        for at in range(touching.starts[frames[b]], touching.starts[frames[b] + 1]):
+            depth = _depth(chain, touching, b, at)
+            if depth > 0:
+                total += depth * depth * square / (depth * depth + square)
+        cost[b] += 0.5 * touching.weight * total
+
+
+@numba.njit(cache=True, nogil=True)
+def add_self_equations(chain, touching, frames, place, cost, gradient, hessian):
+    """Add the normal equations of E_P_self to those of the frames (B,).
+
+    ``place`` (P,): each parameter's column, -1 = fixed. cost (B,), gradient (B,n), hessian (B,n,n).
+    """
+    shape = np.flatnonzero(place[_SHAPE:] >= 0)
+    columns = place[place >= 0]
+    scratch = np.empty((chain.chain.shape[1], 3), hessian.dtype)
+    one = np.ones(1, hessian.dtype)[0]
+    square = touching.reach * touching.reach
+    for b in range(len(frames)):
+        first, end = touching.starts[frames[b]], touching.starts[frames[b] + 1]
+        rows = np.zeros((end - first, gradient.shape[1]), hessian.dtype)
+        root = np.zeros(end - first, hessian.dtype)
+        count = 0
+        for at in range(first, end):
+            depth = _depth(chain, touching, b, at)
+            if depth <= 0:
+                continue
+            row, n = rows[count], touching.normal[at]
+            # d depth / d parameters = -n . (dp - dq)
+            _add_point(row, place, shape, chain, b, touching.outer[at], one, n, scratch)
+            _add_point(row, place, shape, chain, b, touching.inner[at], -one, n, scratch)
+            share = square / (depth * depth + square)
+            cost[b] += 0.5 * touching.weight * share * depth * depth
+            weight = touching.weight * share * share
+            for q in columns:
+                gradient[b, q] += weight * depth * row[q]
+            root[count] = np.sqrt(weight)
+            count += 1
+        if count == 0:
+            continue
+        used = np.empty(len(columns), np.int64)
+        m = 0
+        for q in columns:
+            if np.any(rows[:count, q]):
+                used[m] = q
+                m += 1
+        dense = np.empty((count, m), hessian.dtype)
+        for r in range(count):
+            for q in range(m):
+                dense[r, q] = root[r] * rows[r, used[q]]
+        part = np.dot(dense.T, dense)
+        for p in range(m):
+            for q in range(m):
+                hessian[b, used[p], used[q]] += part[p, q]

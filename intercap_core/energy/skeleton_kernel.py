@@ -1,0 +1,169 @@
+"""The 55 joints of many bodies posed, with their derivatives, compiled: once for all terms.
+
+The same as :mod:`intercap_core.body.kinematics`, joint by joint instead of level by level.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from intercap_core.body.jacobian_kernel import Chain
+from intercap_core.body.joints import NUM_JOINTS, PARENTS
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
+from intercap_core.body.selection import Selection
+
+_SMALL_ANGLE_SQUARED = 1e-4
+_SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
+_PARENTS = np.array(PARENTS)
+
+
+class RestJoints(NamedTuple):
+    """joints (55,3) of the mean shape, metres, and their directions (55,3,S) by the shape."""
+
+    joints: np.ndarray
+    directions: np.ndarray
+
+    @classmethod
+    def of(cls, model: BodyModel) -> RestJoints:
+        """Those of a body model."""
+        selection = model.linearise(model.zeros(), vertex_ids=np.array([0]), joints=True).selection
+        return cls(selection.template[1:].numpy(), selection.directions[1:].numpy())
+
+
+class Skeleton(NamedTuple):
+    """B posed skeletons: rotations (B,55,3,3), offsets (B,55,3), joints (B,55,3), frames
+    (B,55,3,3) and moved (B,55,3,S) as in :class:`.jacobian_kernel.Chain`.
+
+    Posed without derivatives, frames and moved are of no body.
+    """
+
+    rotations: np.ndarray
+    offsets: np.ndarray
+    joints: np.ndarray
+    frames: np.ndarray
+    moved: np.ndarray
+
+    def chain(self, selection: Selection, rest: np.ndarray) -> Chain:
+        """What kernels of :mod:`.jacobian_kernel` take, for points of a selection; rest (B,N,3)."""
+        return Chain(
+            rest, *self, selection.directions.numpy(), selection.bones.numpy(),
+            selection.bone_weights.numpy(), selection.chain.numpy(), selection.below.numpy(),
+        )  # fmt: skip
+
+
+def rest_points(template: np.ndarray, directions: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Points (B,N,3) of bodies of shape (B,S); template (N,3), directions (N,3,S)."""
+    moved = shape @ directions.reshape(-1, directions.shape[-1]).T
+    return moved.reshape(len(shape), *template.shape) + template
+
+
+def pose(rest: RestJoints, vectors: np.ndarray, *, derivatives: bool) -> Skeleton:
+    """Skeletons of the parameter vectors (B,P)."""
+    count, size = len(vectors), rest.directions.shape[2]
+    also = count if derivatives else 0
+    skeleton = Skeleton(
+        np.empty((count, NUM_JOINTS, 3, 3), vectors.dtype),
+        np.empty((count, NUM_JOINTS, 3), vectors.dtype),
+        np.empty((count, NUM_JOINTS, 3), vectors.dtype),
+        np.empty((also, NUM_JOINTS, 3, 3), vectors.dtype),
+        np.empty((also, NUM_JOINTS, 3, size), vectors.dtype),
+    )
+    _pose(rest.joints, rest.directions, _PARENTS, vectors, *skeleton)
+    return skeleton
+
+
+@numba.njit(cache=True, nogil=True)
+def _rodrigues(x, y, z, local, jacobian):
+    """Rotation and left Jacobian (3,3) of the axis-angle x, y, z; see :mod:`.kinematics`."""
+    t2 = x * x + y * y + z * z
+    if t2 < _SMALL_ANGLE_SQUARED:
+        a = 1 - t2 / 6 + t2 * t2 / 120
+        b = 0.5 - t2 / 24 + t2 * t2 / 720
+        c = 1 / 6 - t2 / 120 + t2 * t2 / 5040
+    else:
+        t = np.sqrt(t2)
+        half = np.sin(t / 2)
+        a, b = np.sin(t) / t, 2 * half * half / t2
+        c = (1 - a) / t2
+    for matrix, first, second in ((local, a, b), (jacobian, b, c)):
+        matrix[0, 0] = 1 - second * (y * y + z * z)
+        matrix[1, 1] = 1 - second * (x * x + z * z)
+        matrix[2, 2] = 1 - second * (x * x + y * y)
+        matrix[0, 1], matrix[1, 0] = second * x * y - first * z, second * x * y + first * z
+        matrix[0, 2], matrix[2, 0] = second * x * z + first * y, second * x * z - first * y
+        matrix[1, 2], matrix[2, 1] = second * y * z - first * x, second * y * z + first * x
+
+
+@numba.njit(cache=True, nogil=True)
+def _product(a, b, i, c):
+    """Element (i, c) of a b, both (3,3)."""
+    return a[i, 0] * b[0, c] + a[i, 1] * b[1, c] + a[i, 2] * b[2, c]
+
+
+@numba.njit(cache=True, nogil=True)
+def _pose(rest, directions, parents, vectors, rotations, offsets, joints, frames, moved):
+    """Fill in what :class:`Skeleton` holds; sums along the tree are in float64."""
+    size = directions.shape[2]
+    local, jacobian = np.empty((3, 3)), np.empty((3, 3))
+    world = np.empty((len(parents), 3, 3))
+    placed, at_rest = np.empty((len(parents), 3)), np.empty((len(parents), 3))
+    ahead = np.empty((len(parents), 3, size), vectors.dtype)  # derivatives of the joints
+    for b in range(len(vectors)):
+        x = vectors[b]
+        for j in range(len(parents)):
+            up = parents[j]
+            for i in range(3):
+                at_rest[j, i] = rest[j, i]
+                for s in range(size):
+                    at_rest[j, i] += directions[j, i, s] * x[_SHAPE + s]
+            _rodrigues(
+                np.float64(x[3 * j]), np.float64(x[3 * j + 1]), np.float64(x[3 * j + 2]),
+                local, jacobian,
+            )  # fmt: skip
+            for i in range(3):
+                if up < 0:
+                    placed[j, i] = at_rest[j, i] + x[_TRANSL + i]
+                else:
+                    placed[j, i] = placed[up, i]
+                for c in range(3):
+                    if up < 0:
+                        world[j, i, c] = local[i, c]
+                    else:
+                        bone = at_rest[j, c] - at_rest[up, c]
+                        placed[j, i] += world[up, i, c] * bone
+                        world[j, i, c] = _product(world[up], local, i, c)
+            for i in range(3):
+                joints[b, j, i] = placed[j, i]
+                turned = 0.0
+                for c in range(3):
+                    rotations[b, j, i, c] = world[j, i, c]
+                    turned += world[j, i, c] * at_rest[j, c]
+                offsets[b, j, i] = placed[j, i] - turned
+            if len(frames) == 0:
+                continue
+            for i in range(3):
+                for c in range(3):
+                    frames[b, j, i, c] = (
+                        jacobian[i, c] if up < 0 else _product(world[up], jacobian, i, c)
+                    )
+                r = rotations[b, j, i]
+                for s in range(size):
+                    ahead[j, i, s] = directions[j, i, s]
+                if up >= 0:
+                    q = rotations[b, up, i]
+                    for s in range(size):
+                        ahead[j, i, s] = ahead[up, i, s] + (
+                            q[0] * (directions[j, 0, s] - directions[up, 0, s])
+                            + q[1] * (directions[j, 1, s] - directions[up, 1, s])
+                            + q[2] * (directions[j, 2, s] - directions[up, 2, s])
+                        )
+                for s in range(size):
+                    moved[b, j, i, s] = ahead[j, i, s] - (
+                        r[0] * directions[j, 0, s]
+                        + r[1] * directions[j, 1, s]
+                        + r[2] * directions[j, 2, s]
+                    )
