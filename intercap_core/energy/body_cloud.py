@@ -30,8 +30,6 @@ from torch import Tensor
 
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
 from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import BodyParameters
-from intercap_core.solve.levenberg_marquardt import NormalEquations
 
 if TYPE_CHECKING:
     from intercap_core.energy.body_surface import Surface
@@ -307,32 +305,6 @@ def assemble(
         weighted.transpose(1, 2) @ pick,
         hessian_u,
     )
-
-
-def add_compiled(
-    model: BodyModel,
-    params: BodyParameters,
-    samples: Tensor,
-    rows: CloudRows,
-    thickness: Tensor,
-    group: Tensor,
-    place: np.ndarray,
-    place_u: np.ndarray,
-    normal: NormalEquations,
-) -> None:
-    """Add the term to the normal equations in place, compiled; for models with kernels.
-
-    samples (N,) vertex ids; ``place`` (P,) and ``place_u`` (G,): columns there of the body's
-    parameters and of u, -1 = fixed.
-    """
-    from intercap_core.body.jacobian_kernel import plane_equations
-
-    chain, selection = model.chain(params, vertex_ids=samples)
-    given = (rows.normal, rows.weight, rows.target, thickness, group)
-    plane_equations(
-        chain, place, place_u, *selection.limbs,
-        *(part.contiguous().numpy() for part in given), *(part.numpy() for part in normal),
-    )  # fmt: skip
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_cloud as term
 from intercap_core.energy.body_cloud import vertex_normals
 from intercap_core.energy.body_surface import Surface
-from intercap_core.solve.levenberg_marquardt import NormalEquations
 
 
 @pytest.fixture(scope="module")
@@ -125,41 +124,6 @@ def test_samples_cover_the_outer_skin(model: BodyModel, samples: term.Samples) -
     assert (samples.patch[:, 0] == samples.vertex).all()
     tongue_and_eyes = np.isin(model.skinning_weights.argmax(1).numpy(), (23, 24))
     assert not tongue_and_eyes[samples.vertex].any()
-
-
-def test_compiled_equations_are_the_plain_ones(model: BodyModel, samples: term.Samples) -> None:
-    """Of chosen parameters and u alone, with rows of no weight."""
-    group, ids = torch.as_tensor(samples.group), torch.as_tensor(samples.vertex)
-    count, groups = len(group), len(term.COVERINGS)
-    thickness = torch.linspace(0.001, 0.01, groups, dtype=torch.float64)
-    x = 0.15 * _random(2, model.num_parameters)
-    weight = _random(2, count, seed=4).clamp_min(0)
-    rows = term.CloudRows(
-        target=_random(2, count, seed=2),
-        normal=torch.nn.functional.normalize(_random(2, count, 3, seed=3), dim=2),
-        weight=weight,
-        distance=torch.zeros_like(weight),
-    )
-    columns = torch.tensor([0, 1, 2, 9, 10, 11, 60, 61, 62, 78, 79, 165, 166, 167, 169, 180])
-    linear = model.linearise(model.parameters(x), vertex_ids=ids)
-    by = linear.along(rows.normal[:, :, None])[:, :, 0][..., columns]
-    plain = term.assemble(linear.vertices, by, rows, thickness, group)
-    n = len(columns)
-    size = n + groups
-    place = np.full(model.num_parameters, -1)
-    place[columns.numpy()] = np.arange(n)
-    found = NormalEquations(
-        torch.zeros(2).double(), torch.zeros(2, size).double(), torch.zeros(2, size, size).double()
-    )
-    term.add_compiled(
-        model, model.parameters(x), ids, rows, thickness, group, place, n + np.arange(groups), found
-    )
-    torch.testing.assert_close(found.cost, plain.cost)
-    gradient = torch.cat([plain.gradient, plain.gradient_u], 1)
-    torch.testing.assert_close(found.gradient, gradient)
-    torch.testing.assert_close(found.hessian[:, :n, :n], plain.hessian)
-    torch.testing.assert_close(found.hessian[:, :n, n:], plain.cross)
-    torch.testing.assert_close(found.hessian[:, n:, n:], plain.hessian_u)
 
 
 def _posed_bodies() -> tuple[BodyModel, term.Samples, Tensor]:
