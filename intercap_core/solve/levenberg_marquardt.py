@@ -90,36 +90,34 @@ def minimise(
     own = own.clone()
     y = own.new_zeros(0) if shared is None else shared.clone()
     everyone = torch.arange(count, device=device)
-    size = own.shape[1] + len(y)
-    normal = NormalEquations(
-        own.new_zeros(count), own.new_zeros(count, size), own.new_zeros(count, size, size)
-    )
+    normal = problem.linearise(own, y, everyone)
+    cost = normal.cost.clone()
     lam = torch.full((count,), damping, dtype=torch.float64, device=device)
-    stale = torch.ones(count, dtype=torch.bool, device=device)
+    stale = torch.zeros(count, dtype=torch.bool, device=device)
     done = torch.zeros_like(stale)
     converged = torch.zeros_like(stale)
     trials = 0
     while trials < max_trials and not bool(done.all()):
-        _refresh(problem, normal, own, y, torch.nonzero(stale & ~done)[:, 0])
+        normal = _refresh(problem, normal, own, y, torch.nonzero(stale & ~done)[:, 0])
         stale[:] = False
         index = torch.nonzero(~done)[:, 0]
         at = normal if len(index) == count else NormalEquations(*(part[index] for part in normal))
         step, shared_step, solved = _damped_step(at, lam[index], len(y))
         trials += 1
         trial, trial_y = own[index] + step.to(own.dtype), y + shared_step.to(y.dtype)
-        new = problem.cost(trial, trial_y, index)
-        good = solved & (new <= at.cost)
+        new, before = problem.cost(trial, trial_y, index), cost[index]
+        good = solved & (new <= before)
         if len(y):
             trial, new, good = _keep_the_better(problem, own, trial, trial_y, new, good)
-            good &= new.double().sum() <= at.cost.double().sum()
+            good &= new.double().sum() <= before.double().sum()
         small = (step.abs() < step_tolerance).all(1)
-        small |= at.cost - new <= cost_tolerance * at.cost.abs()
+        small |= before - new <= cost_tolerance * before.abs()
         lam[index] *= torch.where(good, _DAMPING_DOWN, _DAMPING_UP)
         lam.clamp_(*_DAMPING_RANGE)
         stuck = lam[index] >= _DAMPING_RANGE[1]
         if len(y):
             if bool(good.any()):
-                own, y = trial, trial_y
+                own, y, cost = trial, trial_y, new
                 stale[:] = True
                 settled = bool((small | ~good).all()) and bool(
                     (shared_step.abs() < _SHARED_SLACK * step_tolerance).all()
@@ -128,11 +126,10 @@ def minimise(
             done |= stuck.all()
         else:
             accepted = index[good]
-            own[accepted] = trial[good]
+            own[accepted], cost[accepted] = trial[good], new[good]
             stale[accepted] = True
             converged[index[good & small]] = True
             done[index] = (good & small) | stuck
-    cost = problem.cost(own, y, everyone)
     result = Solution(own, y, cost, converged, trials)
     if keep_normal:
         result.normal = problem.linearise(own, y, everyone)
@@ -141,11 +138,14 @@ def minimise(
 
 def _refresh(
     problem: Problem, normal: NormalEquations, own: Tensor, y: Tensor, index: Tensor
-) -> None:
+) -> NormalEquations:
     """Linearise the frames of ``index`` where they stand now."""
+    if len(index) == len(own):
+        return problem.linearise(own, y, index)
     if len(index):
         for kept, fresh in zip(normal, problem.linearise(own[index], y, index), strict=True):
-            kept[index] = fresh.to(kept.dtype)
+            kept[index] = fresh
+    return normal
 
 
 def _keep_the_better(
@@ -167,26 +167,30 @@ def _damped_step(
     normal: NormalEquations, lam: Tensor, num_shared: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Steps (b, n) and (m,) of the damped arrow, and which frames could be factorised (b,)."""
-    hessian, gradient = normal.hessian.double(), normal.gradient.double()
-    n = gradient.shape[1] - num_shared
-    a, g = hessian[:, :n, :n].clone(), gradient[:, :n]
+    gradient, n = normal.gradient, normal.gradient.shape[1] - num_shared
+    a = normal.hessian[:, :n, :n].double()
+    if a.dtype == normal.hessian.dtype:
+        a = a.clone()
     diagonal = a.diagonal(dim1=1, dim2=2)
     diagonal += lam[:, None] * diagonal + 1e-9
     factor, info = torch.linalg.cholesky_ex(a)
+    right = torch.cat([gradient[:, :n, None], normal.hessian[:, :n, n:]], 2).double()
     solved = info == 0
     if not bool(solved.all()):  # leaves such a frame where it is; its damping grows
-        factor = torch.where(
-            solved[:, None, None], factor, torch.eye(n, dtype=a.dtype, device=a.device)
+        eye = torch.eye(n, dtype=a.dtype, device=a.device)
+        factor = torch.where(solved[:, None, None], factor, eye)
+        right = torch.where(solved[:, None, None], right, torch.zeros_like(right))
+    # H = L L^T; the frames are eliminated by L^-1 [g B]
+    half = torch.linalg.solve_triangular(factor, right, upper=False)
+    shared_step = right.new_zeros(num_shared)
+    if num_shared:
+        flat = half.flatten(0, 1)
+        taken = flat[:, 1:].T @ flat
+        schur = normal.hessian[:, n:, n:].sum(0, dtype=a.dtype) - taken[:, 1:]
+        schur.diagonal().add_(lam.mean() * schur.diagonal().abs() + 1e-9)
+        shared_step = -torch.linalg.solve(
+            schur, gradient[:, n:].sum(0, dtype=a.dtype) - taken[:, 0]
         )
-        g = torch.where(solved[:, None], g, torch.zeros_like(g))
-    if num_shared == 0:
-        step = -torch.cholesky_solve(g[..., None], factor)[..., 0]
-        return step, gradient.new_zeros(0), solved
-    border = torch.where(solved[:, None, None], hessian[:, :n, n:], torch.zeros(1).to(hessian))
-    back = torch.cholesky_solve(torch.cat([g[..., None], border], 2), factor)
-    schur = hessian[:, n:, n:].sum(0) - (border.transpose(1, 2) @ back[..., 1:]).sum(0)
-    schur.diagonal().add_(lam.mean() * schur.diagonal().abs() + 1e-9)
-    right = gradient[:, n:].sum(0) - (border.transpose(1, 2) @ back[..., :1])[..., 0].sum(0)
-    shared_step = -torch.linalg.solve(schur, right)
-    step = -back[..., 0] - (back[..., 1:] @ shared_step)
+    remains = half[..., :1] + half[..., 1:] @ shared_step[:, None]
+    step = -torch.linalg.solve_triangular(factor.mT, remains, upper=True)[..., 0]
     return step, shared_step, solved
