@@ -143,8 +143,8 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
     """
     import scipy.sparse.csgraph
 
+    from intercap_core.energy.first_hit import first_hits
     from intercap_core.rigid.normals import vertex_normals
-    from intercap_core.rigid.open3d_core import o3d
 
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     graph = scipy.sparse.coo_matrix(
@@ -155,13 +155,8 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
     head = [JOINT_INDEX[n] for n in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf")]
     ids = np.flatnonzero(outer & np.isin(joint, head))
     normals = vertex_normals(points, faces)[ids]
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(points.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(faces.astype(np.uint32)),
-    )
-    rays = np.concatenate([points[ids] + 1e-3 * normals, normals], 1).astype(np.float32)
-    outer[ids[scene.test_occlusions(o3d.core.Tensor.from_numpy(rays)).numpy()]] = False
+    hits = first_hits(points, faces, points[ids] + 1e-3 * normals, normals)
+    outer[ids[np.isfinite(hits)]] = False
     return outer
 
 

@@ -47,6 +47,7 @@ _DEEPEST_M = 0.06
 _MARGIN = 0.004  # metres outside at which a sample is watched: it may go in before the next look
 _SPACING_RANK = 6  # the so many nearest vertices surround a vertex
 _FAR = 1e6
+_ROUNDS = 12  # in which ways over the surface are looked for, each as far as its vertices need
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 _HAND_PARTS = ("wrist", "thumb", "index", "middle", "ring", "pinky")
@@ -117,7 +118,8 @@ class SelfContact:
         own = part[samples.vertex]
         factor = np.where(_HINGED[own[:, None], own], _JOINED_AT_JOINT, _JOINED)
         joined = factor * (thickness[:, None] + thickness) / 2
-        apart = _over_the_surface(template, faces, part, samples.vertex, joined.max()) > joined
+        joined[own[:, None] == own] = 0  # never asked
+        apart = _over_the_surface(template, faces, part, samples.vertex, joined) > joined
         apart &= own[:, None] != own
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
         spacing = np.sort(around, 1)[:, _SPACING_RANK]
@@ -315,29 +317,24 @@ def _residuals(points: Tensor, pairs: Pairs) -> Tensor:
 
 def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
     """How far (N,) it is through the body from each vertex, along its normal, metres."""
+    from intercap_core.energy.first_hit import first_hits
     from intercap_core.rigid.normals import vertex_normals
-    from intercap_core.rigid.open3d_core import o3d
 
     normals = vertex_normals(points, faces)[vertex]
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(points.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(faces.astype(np.uint32)),
-    )
-    rays = np.concatenate([points[vertex] - 1e-3 * normals, -normals], 1).astype(np.float32)
-    return scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy().astype(np.float64)
+    return first_hits(points, faces, points[vertex] - 1e-3 * normals, -normals)
 
 
 def _over_the_surface(
-    points: np.ndarray, faces: np.ndarray, part: np.ndarray, vertex: np.ndarray, limit: float
+    points: np.ndarray, faces: np.ndarray, part: np.ndarray, vertex: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
-    """Distances (N,N) between vertices over the surface, metres, infinite beyond ``limit``.
+    """Distances (N,N) between vertices over the surface, metres, right up to ``limit`` (N,N) and
+    else larger than it.
 
     Along a graph of the N vertices: two are neighbours where an edge of the mesh leads from what is
     nearest to one, on its part (V,) of the body, to what is nearest to the other.
     """
     import scipy.sparse.csgraph
-    import scipy.spatial
+    import scipy.spatial.distance
 
     nearest = np.full(len(points), -1)
     for p in np.unique(part[vertex]):
@@ -348,4 +345,12 @@ def _over_the_surface(
     length = np.linalg.norm(points[vertex[edges[:, 0]]] - points[vertex[edges[:, 1]]], axis=1)
     count = len(vertex)
     graph = scipy.sparse.csr_matrix((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return scipy.sparse.csgraph.dijkstra(graph, directed=False, limit=limit)
+    # who is farther straight on than asked is farther over the surface too
+    straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
+    farthest = np.where(straight <= limit, limit, 0).max(1)
+    found = np.full((count, count), np.inf)
+    for some in np.array_split(np.argsort(farthest, kind="stable"), _ROUNDS):
+        found[some] = scipy.sparse.csgraph.dijkstra(
+            graph, directed=False, indices=some, limit=farthest[some].max()
+        )
+    return found

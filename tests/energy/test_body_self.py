@@ -116,6 +116,21 @@ def test_compiled_search_finds_what_the_plain_one_does(
         assert torch.equal(one, other)
 
 
+def test_ways_over_the_surface_are_right_as_far_as_asked(model: BodyModel) -> None:
+    template, faces = model.template.numpy(), model.faces.numpy()
+    part = model.skinning_weights.argmax(1).numpy()
+    vertex = choose_samples(model).vertex[::9]
+    count = len(vertex)
+    every = term._over_the_surface(template, faces, part, vertex, np.full((count, count), 10.0))
+    limit = np.random.default_rng(0).uniform(0, 0.4, (count, count))
+    limit = limit + limit.T
+    found = term._over_the_surface(template, faces, part, vertex, limit)
+    within = every <= limit
+    assert 0.05 < within.mean() < 0.95
+    np.testing.assert_array_equal(found[within], every[within])
+    assert (found[~within] > limit[~within]).all()
+
+
 def test_gradient_is_that_of_the_cost(model: BodyModel, contact: term.SelfContact) -> None:
     cases = [_pose(model, **CASES[name]).vector() for name in ("hand in thigh", "arm at trunk")]
     x = torch.cat([cases[0], _pose(model).vector(), cases[1]])
