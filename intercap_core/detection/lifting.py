@@ -39,6 +39,7 @@ _SURFACE_M = 0.05  # samples this far behind the nearest are another surface
 _BREADTH_M = (0.18, 0.09)
 _AT_BACKGROUND_MM = 40  # of the room's depth: the room
 _ENOUGH_BODY = 6  # points before the room; with fewer, the person is taken for part of it
+_BODY_DEPTH_M = 0.25  # of the room's points from the middle of the others: the body, standing still
 _ENOUGH_POINTS = 8  # of the body: a set with so many triangulated needs no lifting
 
 
@@ -94,7 +95,8 @@ class Relief:
         """Points (K, 3), master frame, of keypoints at ``pixels`` (K, 2) where ``seen`` (K,).
 
         ``inset_m`` (K,): how deep each lies. NaN where nothing is measured, or only the room; but
-        who stands still for long is part of the room: then that counts.
+        who stands still for long is part of the room: that counts where it is as far away as the
+        rest of the body, or where there is hardly any rest.
         """
         result, of_room = np.full((len(pixels), 3), np.nan), np.zeros(len(pixels), bool)
         rays = self.camera.colour.unproject(pixels)
@@ -115,8 +117,11 @@ class Relief:
             nearest = np.quantile(found, _NEAREST_SHARE)
             surface = np.median(found[found < nearest + _SURFACE_M])
             result[k] = rays[k] * (surface + inset_m[k])
-        if (np.isfinite(result[:, 0]) & ~of_room).sum() >= _ENOUGH_BODY:
-            result[of_room] = np.nan
+        away = np.linalg.norm(result, axis=1)
+        body = np.isfinite(away) & ~of_room
+        if body.sum() >= _ENOUGH_BODY:
+            apart = np.abs(away - np.median(away[body]))
+            result[of_room & ~(apart < _BODY_DEPTH_M)] = np.nan
         return apply(self.camera.master_from_colour, result)
 
     @cached_property

@@ -47,6 +47,17 @@ def test_who_stands_still_for_long_is_part_of_the_room_and_still_lifted():
     assert np.isfinite(z).sum() >= 8 and np.nanmax(np.abs(z - 2.4)) < 0.2
 
 
+def test_a_trunk_that_stands_still_behind_a_table_is_lifted_beside_moving_arms():
+    """The upper quarter never moved and is the room's; the table is nearer by a metre."""
+    seen, room = _wall(2400), _wall(4000)
+    table, still = slice(room.shape[0] * 13 // 20, None), slice(0, room.shape[0] * 7 // 20)
+    room[still] = 2400
+    room[table] = seen[table] = 1300
+    z = _depths(Relief.of(seen, CAMERA, 0.0, room))
+    assert np.isnan(z[-1]) and np.nanmin(z) > 2.2
+    assert np.isfinite(z[:7]).all(), "the trunk that never moved too"
+
+
 def test_keypoints_where_nothing_at_all_is_measured_are_not_lifted():
     half = _wall(2400)
     half[half.shape[0] // 2 - 20 :] = 0
