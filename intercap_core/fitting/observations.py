@@ -12,6 +12,7 @@ from torch import Tensor
 
 from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
+from intercap_core.body.keypoints import BODY
 from intercap_core.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
@@ -26,6 +27,10 @@ _OUTLIER_TRUST = 0.2  # of a view that disagrees with the triangulated point
 _BEFORE_BACKGROUND_M = 0.04  # nearer than the background by less is background
 _NORMAL_BASE_PX = 3  # half the base over which a normal is measured
 _EDGE_M = 0.04  # a larger step between those pixels is an edge of the person
+# A body without a trunk's three points starts where those of frames so near put it, when so many of
+# the 25 body keypoints pull it to where it has gone.
+_NEAR_S = 1.0
+_ENOUGH_JOINTS = 6
 _EDGE_TRUST = 0.3  # such points may float between the person and what is behind
 
 
@@ -57,10 +62,21 @@ class Observations:
         return len(self.times)
 
     @property
-    def usable(self) -> np.ndarray:
+    def placed(self) -> np.ndarray:
         """(T,) bool: enough of the trunk is triangulated to place a body."""
         trunk = self.joints[:, list(TRUNK_KEYPOINTS)]
         return np.isfinite(trunk).all(2).sum(1) >= 3
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(T,) bool: a body can be placed, or enough of it is known near a frame in which one can:
+        one view from the side, or over a table, may see no more than one shoulder."""
+        placed = self.placed
+        if not placed.any():
+            return placed
+        away = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
+        known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
+        return placed | ((away <= _NEAR_S) & (known >= _ENOUGH_JOINTS))
 
 
 # neck, shoulders, mid hip, hips, knees: keypoints that a pose can be started from

@@ -20,7 +20,7 @@ from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import KEYPOINT_SCALE, BodyProblem, Targets
 from intercap_core.fitting.quality import PartEvidence, compare
 from intercap_core.fitting.recover import recover
-from intercap_core.fitting.start import place_trunk, turned_around
+from intercap_core.fitting.start import between, place_trunk, turned_around
 from intercap_core.solve.levenberg_marquardt import Solution, minimise
 
 _START_SIGMA = 0.04
@@ -239,7 +239,9 @@ class Fitter:
             self.model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().cpu().numpy()
         )
         joints = self.evidence.seen.joints[self.frames]
-        placed = place_trunk(keypoints, joints, pelvis)
+        placed = between(
+            place_trunk(keypoints, joints, pelvis), self.evidence.seen.times[self.frames]
+        )
         straight = self._fit_triangulated(placed, joints)
         poor = np.flatnonzero((straight.cost > _TURN_WORSE * straight.cost.median()).cpu().numpy())
         if len(poor):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.body.parameters import NUM_POSE
+from intercap_core.fitting.bridge import bridge
 from intercap_core.fitting.observations import TRUNK_KEYPOINTS
 
 
@@ -29,6 +31,16 @@ def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.
         result[t, :3] = Rotation.from_matrix(rotation).as_rotvec()
         result[t, 3:] = centre_t - rotation @ centre_s - pelvis
     return result
+
+
+def between(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The same placements (N,6), at times (N,) s, with the unknown ones (NaN) filled in from those
+    around. At least one is known."""
+    known = np.isfinite(placement).all(1)
+    vectors = np.zeros((len(placement), NUM_POSE + 3))
+    vectors[:, :3], vectors[:, NUM_POSE:] = placement[:, :3], placement[:, 3:]
+    filled = bridge(np.nan_to_num(vectors), known, times)
+    return np.hstack([filled[:, :3], filled[:, NUM_POSE:]])
 
 
 def turned_around(placement: np.ndarray) -> np.ndarray:
