@@ -18,6 +18,7 @@ _VELOCITY_S = (0.045, 0.15)
 # How much of it is believed over the mean velocity of the bridge, which noise does not disturb. On
 # hidden stretches of 1 to 15 frames at 15 a second anything from 0.7 to 1 is best.
 _BELIEVED = 0.85
+_BELIEVED_FOR_S = 1.0  # over longer bridges, of which this is not known, it fades
 
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -83,7 +84,8 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
         slopes[0] = np.array([1.0, 0.0, -1.0, 0.0]) / (knots[0] - knots[2])
     if knots[3] > knots[1]:
         slopes[1] = np.array([0.0, -1.0, 0.0, 1.0]) / (knots[3] - knots[1])
-    first, last = (mean + _BELIEVED * (slope - mean) for slope in slopes)
+    believed = _BELIEVED * min(1.0, _BELIEVED_FOR_S / length)
+    first, last = (mean + believed * (slope - mean) for slope in slopes)
     rise = s**2 * (3 - 2 * s)
     ends = np.concatenate([1 - rise, rise, np.zeros_like(s), np.zeros_like(s)], 1)
     bends = s * (1 - s) ** 2 * first - s**2 * (1 - s) * last
