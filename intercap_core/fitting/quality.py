@@ -27,10 +27,10 @@ _LARGEST_HAND_SIGMA_M = 0.013
 _DISAGREE = 0.5
 _FACE_SEEN = 0.5  # of the face's landmarks, by some view
 _MEASURED = 0.15  # of a part's samples: half of what a view sees of a limb, which is a third
-# A forearm or shin seen by one view leans towards it or away, the ends up to twice its length
-# (0.25 m and more) apart, of a finger (0.08 m) likewise: by this in the mean square, along one
-# coordinate.
-_MIRRORED_M = {"arm": 0.10, "leg": 0.10, "hand": 0.03}
+# A forearm seen by one view leans towards it or away, the ends up to twice its length (0.25 m)
+# apart, a leg's two segments (0.4 m each) farther, of a finger (0.08 m) less: by this in the mean
+# square, along one coordinate, where no point says which; the nearer to ``_MEASURED``, the less.
+_MIRRORED_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
 MEDIAN_CHI_3 = 1.5382  # median length of a three-dimensional normal error, in deviations
 _MEDIAN_CHI_2 = 1.1774  # median length of a two-dimensional normal error, in deviations
 _MEAN_CHI_3 = 1.5958  # mean length of a three-dimensional normal error, in deviations
@@ -152,17 +152,33 @@ def unmeasured(evidence: PartEvidence) -> np.ndarray:
     return result
 
 
+def unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
+    """Joints (N,55) bool of those limbs and hands."""
+    found = unmeasured(evidence)
+    result = np.zeros((len(found), len(JOINT_NAMES)), bool)
+    for column, part in enumerate(BODY_PARTS):
+        result[:, _joints_of(part)] |= found[:, column, None]
+    return result
+
+
+def _leaning(evidence: PartEvidence) -> np.ndarray:
+    """How far (N,8), metres, the parts that one view alone bears out may lean the wrong way."""
+    known = np.clip(evidence.measured.cpu().numpy() / _MEASURED, 0, 1)
+    usual = np.array([_MIRRORED_M.get(part.partition("_")[2], 0.0) for part in BODY_PARTS])
+    return np.where(unmeasured(evidence), usual * (1 - known) ** 2, 0.0)
+
+
 def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     """Deviations (N,55), metres, with those of parts widened of which the fit is one of several.
 
     Where most observations contradict a part, the truth may be where they are: the deviation that
     their distance, seen in two dimensions, amounts to is added, in squares. A limb that one view
-    alone sees may lean towards it or away. What is wrong of an arm is wrong of its hand.
+    alone sees may lean towards it or away, the more the fewer points it has. What is wrong of an
+    arm is wrong of its hand.
     """
     disputed = evidence.against.cpu().numpy() > _DISAGREE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
-    mirrored = [_MIRRORED_M.get(part.partition("_")[2], 0.0) for part in BODY_PARTS]
-    distance = np.hypot(distance, np.where(unmeasured(evidence), mirrored, 0))
+    distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
         arm, hand = BODY_PARTS.index(f"{side}_arm"), BODY_PARTS.index(f"{side}_hand")
         distance[:, hand] = np.maximum(distance[:, hand], distance[:, arm])

@@ -19,18 +19,18 @@ from intercap_core.solve.levenberg_marquardt import minimise
 # Around a moment hands swing off the straight by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m; fits
 # scatter by less than a tenth of a metre.
 _AROUND_S = 0.21
-_JUMP_M = 0.25
+JUMP_M = 0.25
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 _TRIALS = 10
 # What seems to be seen is no worse explained from between the neighbours: then that is the motion.
 _AS_GOOD, _SLACK = 1.2, 5.0
 
 
-def jumps(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
+def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M) -> np.ndarray:
     """Distance (N,J) of joints (N,J,3), metres, from their median over the frames around.
 
     ``times`` (N,) seconds. Frames count up to 0.2 s away, as many before as after; 0 where there
-    are none, and where the distance is no more than people move.
+    are none, and where the distance is no more than ``least`` (N,J), by default what people move.
     """
     result = np.zeros(joints.shape[:2])
     for t, time in enumerate(times):
@@ -39,7 +39,7 @@ def jumps(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
         if half:
             window = joints[t - half : t + half + 1]
             result[t] = np.linalg.norm(joints[t] - np.median(window, axis=0), axis=1)
-    return np.where(result > _JUMP_M, result, 0.0)
+    return np.where(result > least, result, 0.0)
 
 
 def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from intercap_core.errors import UserError
 from intercap_core.fitting import quality
 from intercap_core.fitting.bridge import bridge, bridged_sigma, continuous
 from intercap_core.fitting.observations import person_clouds, read_observations
-from intercap_core.fitting.recover import jumps
+from intercap_core.fitting.recover import JUMP_M, jumps
 from intercap_core.fitting.schedule import Fitter
 from intercap_core.fitting.uncertainty import joint_sigma
 from intercap_core.project import digest
@@ -90,9 +90,12 @@ def run(
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
     sigma = np.zeros((seen.num_frames, 55))
     stated = joint_sigma(model, fit).cpu().numpy()
-    # what has left the motion of its neighbours may well belong among them
+    # what has left the motion of its neighbours may well belong among them; where nothing but one
+    # view's pixels holds a limb, any step does
+    least = np.full_like(sigma, JUMP_M)
+    least[fit.frames] *= ~quality.unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)
-    jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted])
+    jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
         quality.widened_sigma(stated, fit.parts), jumped[fit.frames] / quality.MEDIAN_CHI_3
     )

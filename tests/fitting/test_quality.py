@@ -86,6 +86,23 @@ def test_a_limb_that_one_view_sees_needs_points_of_its_own(fine):
     assert widened[0, JOINT_INDEX["right_wrist"]] == 0.008
 
 
+def test_every_point_on_a_limb_tells_a_little_of_how_it_leans(fine):
+    """From none to as many as decide it, the arm's and its hand's deviation falls to its own."""
+    whitened, confidence, sigma = fine
+    confidence[:, 1:] = 0
+    joints = np.array([JOINT_INDEX["left_elbow"]] * 100)
+    stated = []
+    for points in (0, 2, 5, 10, 16):
+        weight = torch.zeros(1, 100)
+        weight[0, :points] = 5
+        evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, weight))
+        stated.append(quality.widened_sigma(sigma, evidence)[0, JOINT_INDEX["left_wrist"]])
+        named = quality.unmeasured_joints(evidence)[0]
+        assert named[JOINT_INDEX["left_wrist"]] == (points < 15)
+    assert stated[0] > 0.09 and stated[-1] == 0.008
+    assert (np.diff(stated) < 0).all()
+
+
 def test_the_expected_error_is_the_mean_of_a_normal_one():
     random = np.random.default_rng(0)
     errors = np.linalg.norm(random.normal(0, 0.03, (200_000, 3)), axis=1)
