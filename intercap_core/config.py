@@ -148,9 +148,9 @@ class BodyFitSettings(Model):
     """One shape for the sequence, or a free shape in every frame as in the paper's first stage."""
     points_per_frame: Annotated[int, Field(ge=200, le=20000)] = 1500
     """Person points kept of each frame's fused cloud."""
-    cloud_weight: Positive = 1.0
+    cloud_weight: Annotated[float, Field(gt=0, le=1000)] = 1.0
     """Weight of the cloud against the keypoints (lambda_D)."""
-    self_penetration_weight: Annotated[float, Field(ge=0)] = 1.0
+    self_penetration_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Weight of the body's parts not entering each other (lambda_P of equation 2)."""
 
 

@@ -115,7 +115,8 @@ def faults_of_sequences(project: Project) -> list[Fault]:
         if project.recordings_made(name) is not None:
             faults += [Fault(name, message) for message in _faults_of_capture(project, name)]
             continue
-        faults += [Fault(name, message) for message in _faults_of_files(row)]
+        cameras = project.config.frames.cameras
+        faults += [Fault(name, message) for message in _faults_of_files(row, cameras)]
     return faults
 
 
@@ -269,7 +270,7 @@ def _faults_of_capture(project: Project, name: str) -> list[str]:
     return []
 
 
-def _faults_of_files(row: SequenceEntry) -> list[str]:
+def _faults_of_files(row: SequenceEntry, cameras: tuple[str, ...]) -> list[str]:
     faults = []
     for column in ("calibration", "keypoints", "candidates", "truth"):
         path = getattr(row, column)
@@ -277,10 +278,10 @@ def _faults_of_files(row: SequenceEntry) -> list[str]:
             faults.append(f"column {column} says {path}, which is not there")
     if not row.recordings.is_dir():
         return [f"there is no folder {row.recordings} of recordings", *faults]
-    return faults + (_faults_of_recordings(row) if row.calibration.exists() else [])
+    return faults + (_faults_of_recordings(row, cameras) if row.calibration.exists() else [])
 
 
-def _faults_of_recordings(row: SequenceEntry) -> list[str]:
+def _faults_of_recordings(row: SequenceEntry, cameras: tuple[str, ...]) -> list[str]:
     from intercap_core.capture.layouts import open_layout
 
     try:
@@ -289,9 +290,16 @@ def _faults_of_recordings(row: SequenceEntry) -> list[str]:
         return [str(error)]
     if not layout.names:
         return [f"{row.recordings} holds no camera's recording in the layout {row.layout}"]
-    faults = []
+    known = list(layout.extrinsics.master_from_colour)
+    faults = [
+        f"the setting frames.cameras names {name!r}, {row.recordings} has {', '.join(layout.names)}"
+        for name in cameras
+        if name not in known and name not in layout.names
+    ]
     for name in layout.names:
-        if name not in layout.extrinsics.master_from_colour:
+        if cameras and name not in cameras:
+            continue
+        if name not in known:
             faults.append(
                 f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add "
                 "the camera"

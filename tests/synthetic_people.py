@@ -63,13 +63,15 @@ def write_detections(
     rig: Rig,
     people: list[list[list[np.ndarray]]],
     candidates: dict[tuple[int, int], list[tuple[str, bytes]]] | None = None,
+    note: str = "",
 ) -> Path:
-    """Write a detections artefact; ``people[t][c]`` lists (135, 3) arrays."""
+    """Write a detections artefact; ``people[t][c]`` lists (135, 3) arrays, ``note`` is of the
+    second camera."""
     sets, views = len(people), len(rig)
     with artefacts.write(path, DETECTIONS, sequence="test") as writer:
         writer.put("camera_names", list(rig.names))
         writer.put("colour_size", np.array([(c.colour.width, c.colour.height) for c in rig]))
-        writer.put("note", [""] * views)
+        writer.put("note", [note if c == 1 else "" for c in range(views)])
         writer.put("keypoints_found", np.ones((sets, views), bool))
         writer.put("candidates_found", np.ones((sets, views), bool))
         for c, name in enumerate(rig.names):

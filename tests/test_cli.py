@@ -198,6 +198,17 @@ def test_ready_means_that_the_files_can_be_used(
         Path(file).write_text(content)
     (fault,) = faults_of_sequences(project)
     assert says in f"problem: {fault}"
+
+
+def test_cameras_that_no_recording_is_of(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    settings = {"exclude": ["bad", "empty"], "frames": {"cameras": ["k9"]}}
+    (fault,) = faults_of_sequences(load_project(Path("config.yaml"), settings))
+    assert "the setting frames.cameras names 'k9', rec has k1" in str(fault)
+    settings = settings | {"frames": {"cameras": ["k1"]}}
+    assert faults_of_sequences(load_project(Path("config.yaml"), settings)) == []
     assert "\n" not in str(fault)
 
 

@@ -88,6 +88,14 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         settings("dataset: x\njoint: {contact_weight: -1}\n"),
         ["config.yaml", "joint.contact_weight", "greater than or equal to 0", "-1"],
     ),
+    (
+        settings("dataset: x\nbody_fit: {cloud_weight: 1.0e+30}\n"),
+        ["config.yaml", "body_fit.cloud_weight", "less than or equal to 1000"],
+    ),
+    (
+        settings("dataset: x\nbody_fit: {points_per_frame: 0}\n"),
+        ["config.yaml", "body_fit.points_per_frame", "greater than or equal to 200", "found 0"],
+    ),
     (settings("dataset: -x\n"), ["config.yaml", "dataset", "'-x'"]),
     (
         settings("dataset: x\njoint: {contact_weight: .inf}\n"),

@@ -88,7 +88,9 @@ def _why(found: Detections) -> str:
         if any(len(found.people(t, c)) for t in range(found.num_sets))
     ]
     if not seeing:
-        return f"no image has keypoints of anybody ({found.path}); check the keypoint files"
+        noted = zip(found.camera_names, found.notes, strict=True)
+        told = next((f"{name}: {note}" for name, note in noted if note), found.path)
+        return f"no image has keypoints of anybody ({told}); check the keypoint files"
     if len(seeing) == 1:
         return (
             f"camera {seeing[0]} alone sees anybody, without depth beside its keypoints, so that "

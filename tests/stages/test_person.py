@@ -73,10 +73,10 @@ def detected() -> np.ndarray:
     return keypoints
 
 
-def run(tmp_path, people, candidates=None, slip=None) -> Path:
+def run(tmp_path, people, candidates=None, slip=None, note="") -> Path:
     person.run(
         frames=write_frames(tmp_path / "frames.h5", RIG, num_sets=T),
-        detections=write_detections(tmp_path / "detections.h5", RIG, people, candidates),
+        detections=write_detections(tmp_path / "detections.h5", RIG, people, candidates, note),
         scene=write_scene(tmp_path / "scene.h5", RIG, T, slip),
         output=tmp_path / "person.h5",
         settings=PersonSettings(segmentation="detector"),
@@ -169,6 +169,8 @@ def test_same_input_same_bytes(tmp_path, detected):
 def test_nobody_and_other_captures_are_named(tmp_path, detected):
     with pytest.raises(UserError, match=r"sequence test: .* no image has keypoints of anybody"):
         run(tmp_path, [[[] for _ in range(6)] for _ in range(T)])
+    with pytest.raises(UserError, match=r"keypoints of anybody \(k2: all points lie outside\)"):
+        run(tmp_path, [[[] for _ in range(6)] for _ in range(T)], note="all points lie outside")
     with pytest.raises(UserError, match="frame sets differ"):
         run(tmp_path, [[[detected[0, c]] for c in range(6)] for _ in range(T - 1)])
     people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
