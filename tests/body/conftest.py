@@ -37,7 +37,8 @@ def full_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arrays = open_arrays()
     table = arrays["shapedirs"].astype(np.float32)
     wide = np.zeros((*table.shape[:2], 400), np.float32)
-    wide[:, :, :10], wide[:, :, 300:310] = table[:, :, :10], table[:, :, 10:]
+    half = table.shape[2] // 2
+    wide[:, :, :half], wide[:, :, 300 : 300 + half] = table[:, :, :half], table[:, :, half:]
     rng = np.random.default_rng(3)
     posedirs = rng.normal(0, 2e-3, (len(table), 3, 486)).astype(np.float32)
     arrays |= {"shapedirs": wide, "posedirs": posedirs, "joint2num": _JOINT_NUMBERS}
