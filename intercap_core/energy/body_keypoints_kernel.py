@@ -120,15 +120,24 @@ class Seen(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
+def _piece(skeleton, pieces, rest, b, e):
+    """Where piece e (3,) of body b is, times its share, metres."""
+    m, w = pieces.bone[e], pieces.share[e]
+    x, y, z = rest[b, e, 0], rest[b, e, 1], rest[b, e, 2]
+    turn, offset = skeleton.rotations, skeleton.offsets
+    p0 = turn[b, m, 0, 0] * x + turn[b, m, 0, 1] * y + turn[b, m, 0, 2] * z + w * offset[b, m, 0]
+    p1 = turn[b, m, 1, 0] * x + turn[b, m, 1, 1] * y + turn[b, m, 1, 2] * z + w * offset[b, m, 1]
+    p2 = turn[b, m, 2, 0] * x + turn[b, m, 2, 1] * y + turn[b, m, 2, 2] * z + w * offset[b, m, 2]
+    return p0, p1, p2
+
+
+@numba.njit(cache=True, nogil=True)
 def _point(skeleton, pieces, rest, b, k):
     """Keypoint k (3,) of body b, metres."""
     p0, p1, p2 = 0.0, 0.0, 0.0
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
-        m, w = pieces.bone[e], pieces.share[e]
-        r, t, x = skeleton.rotations[b, m], skeleton.offsets[b, m], rest[b, e]
-        p0 += r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + w * t[0]
-        p1 += r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + w * t[1]
-        p2 += r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + w * t[2]
+        q0, q1, q2 = _piece(skeleton, pieces, rest, b, e)
+        p0, p1, p2 = p0 + q0, p1 + q1, p2 + q2
     return p0, p1, p2
 
 
@@ -247,18 +256,18 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
     moved[:] = 0
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
         m, w = pieces.bone[e], pieces.share[e]
-        r, t, x = skeleton.rotations[b, m], skeleton.offsets[b, m], rest[b, e]
-        q0 = r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + w * t[0]
-        q1 = r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + w * t[1]
-        q2 = r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + w * t[2]
+        q0, q1, q2 = _piece(skeleton, pieces, rest, b, e)
         up = m
         while up >= 0:
-            at, frame = skeleton.joints[b, up], skeleton.frames[b, up]
-            a0, a1, a2 = q0 - w * at[0], q1 - w * at[1], q2 - w * at[2]
+            a0 = q0 - w * skeleton.joints[b, up, 0]
+            a1 = q1 - w * skeleton.joints[b, up, 1]
+            a2 = q2 - w * skeleton.joints[b, up, 2]
             for d in range(3):
                 place = local[3 * up + d]
                 if place >= 0:  # a turn f of the joint moves the piece by f x a
-                    f0, f1, f2 = frame[0, d], frame[1, d], frame[2, d]
+                    f0 = skeleton.frames[b, up, 0, d]
+                    f1 = skeleton.frames[b, up, 1, d]
+                    f2 = skeleton.frames[b, up, 2, d]
                     rows[0, place] += f1 * a2 - f2 * a1
                     rows[1, place] += f2 * a0 - f0 * a2
                     rows[2, place] += f0 * a1 - f1 * a0
@@ -267,27 +276,33 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
             if local[_TRANSL + d] >= 0:
                 rows[d, local[_TRANSL + d]] += w
         if len(shape):
-            by, of_bone = pieces.directions[e], skeleton.moved[b, m]
             for i in range(3):
-                r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
-                for s in range(by.shape[1]):
-                    moved[i, s] += r0 * by[0, s] + r1 * by[1, s] + r2 * by[2, s] + w * of_bone[i, s]
+                r0 = skeleton.rotations[b, m, i, 0]
+                r1 = skeleton.rotations[b, m, i, 1]
+                r2 = skeleton.rotations[b, m, i, 2]
+                for s in range(moved.shape[1]):
+                    moved[i, s] += (
+                        r0 * pieces.directions[e, 0, s]
+                        + r1 * pieces.directions[e, 1, s]
+                        + r2 * pieces.directions[e, 2, s]
+                        + w * skeleton.moved[b, m, i, s]
+                    )
     for s in shape:
         for i in range(3):
             rows[i, local[_SHAPE + s]] = moved[i, s]
 
 
 @numba.njit(cache=True, nogil=True)
-def _columns(pieces, limb, place):
-    """Where a limb's columns are: ``local`` (P,) in its rows, -1 = not there, and ``to`` (m,)."""
-    local = np.full(len(place), -1)
-    to = np.empty(len(place), np.int64)
+def _find_columns(moved_by, place, local, to):
+    """A limb's columns: writes where each parameter's is in its rows, ``local`` (P,), -1 = not
+    there, and where it stands in the normal equations, ``to``; how many there are."""
+    local[:] = -1
     m = 0
     for p in range(len(place)):
-        if place[p] >= 0 and (p >= _TRANSL or pieces.moved_by[limb, p // 3]):
+        if place[p] >= 0 and (p >= _TRANSL or moved_by[p // 3]):
             local[p], to[m] = m, place[p]
             m += 1
-    return local, to[:m]
+    return m
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
@@ -320,7 +335,7 @@ def _add_offset(turn, slope, matrix, pulled, to, first, gradient, hessian):
                 hessian[first + d, first + e] += turn[i, e] * (
                     r0 * matrix[0, i] + r1 * matrix[1, i] + r2 * matrix[2, i]
                 )
-        for q in range(len(to)):
+        for q in range(pulled.shape[1]):
             part = r0 * pulled[0, q] + r1 * pulled[1, q] + r2 * pulled[2, q]
             hessian[to[q], first + d] += part
             hessian[first + d, to[q]] += part
@@ -342,14 +357,19 @@ def add_equations(
     moved = np.empty((3, len(place) - _SHAPE), dtype)
     slope, matrix = np.empty(3), np.empty((3, 3))
     narrow = np.empty((3, 3), dtype)
-    for limb in range(len(pieces.limb_starts) - 1):
-        local, to = _columns(pieces, limb, place)
-        m = len(to)
-        rows, pulled = np.empty((3, m), dtype), np.empty((3, m), dtype)
-        block = np.empty((m, m), dtype)
-        for b in range(len(frames)):
-            block[:] = 0
-            for k in pieces.order[pieces.limb_starts[limb] : pieces.limb_starts[limb + 1]]:
+    limbs = len(pieces.limb_starts) - 1
+    all_local = np.empty((limbs, len(place)), np.int64)
+    all_to, width = np.empty((limbs, len(place)), np.int64), np.empty(limbs, np.int64)
+    for limb in range(limbs):
+        moved_by = pieces.moved_by[limb]
+        width[limb] = _find_columns(moved_by, place, all_local[limb], all_to[limb])
+    for b in range(len(frames)):
+        for limb in range(limbs):
+            m, local, to = width[limb], all_local[limb], all_to[limb]
+            rows, pulled = np.empty((3, m), dtype), np.empty((3, m), dtype)
+            block = np.zeros((m, m), dtype)
+            for at in range(pieces.limb_starts[limb], pieces.limb_starts[limb + 1]):
+                k = pieces.order[at]
                 p = _point(skeleton, pieces, rest, b, k)
                 cost[b] += _ask(seen, frames[b], k, p, True, slope, matrix)
                 if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:

@@ -16,11 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.jacobian_kernel import plane_equations
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.selection import Selection
-from intercap_core.energy import body_keypoints_kernel, body_self
+from intercap_core.energy import body_cloud_kernel, body_keypoints_kernel, body_self
 from intercap_core.energy.body_cloud import Samples
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.body_keypoints_kernel import Pieces, Seen
@@ -130,12 +129,11 @@ class Terms:
                 place, columns.first_offset, columns.offsets, *out,
             )  # fmt: skip
             if now.rows is not None:
-                order, starts, moved_by = self._samples.limbs
-                normal, weight, target = (part[ids] for part in now.rows)
-                plane_equations(
-                    skeleton.chain(self._samples, now.samples[at]), place, columns.covering,
-                    order, starts, moved_by, normal, weight, target, now.thickness, self._group,
-                    *out,
+                normal, weight, target = now.rows
+                body_cloud_kernel.add_equations(
+                    skeleton.chain(self._samples, now.samples[at]), self._samples.limbs,
+                    normal, weight, target, now.thickness, self._group, ids, place,
+                    columns.covering, *out,
                 )  # fmt: skip
             if now.touching is not None:
                 touching, selection = now.touching
