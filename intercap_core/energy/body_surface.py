@@ -12,7 +12,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.energy.body_cloud import NORMAL_LENGTH, Samples, vertex_normals
 
-_GROUP = 16  # samples that are looked at together
+_GROUP = 24  # samples that are looked at together
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from intercap_core.energy.body_surface import Surface
 from intercap_core.fitting.free_space import seen_through
 from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.fitting.problem import BodyProblem, Views
+from intercap_core.solve.crew import Crew
 from intercap_core.solve.velocity import limited_velocity
 
 # What is left of a keypoint's error in metres once its fixed part is taken out: the start, refined
@@ -86,6 +87,8 @@ class Evidence:
         self.group = torch.as_tensor(self.samples.group, device=model.device)
         carrier = model.skinning_weights.argmax(1).cpu().numpy()
         self.sample_joints = carrier[self.samples.vertex]
+        # frame by frame in compiled code, which threads can share
+        self._crew = Crew(torch.get_num_threads() if model.device.type == "cpu" else 1)
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
         self.by_view: ViewDistances | None = None
@@ -209,18 +212,44 @@ class Evidence:
                 low, high = (covering.noise * factor for factor in _NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
-    def _matches(
-        self, cloud: PersonCloud, vertices: Tensor, normals: Tensor, reach: float
-    ) -> Matches:
-        """One frame's, of vertices and normals (R,3) of the surface."""
+    def _matched(
+        self,
+        t: int,
+        vertices: Tensor,
+        normals: Tensor,
+        where: Tensor,
+        shift: Tensor | None,
+        expected: Tensor,
+        reach: float,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the cloud of the t-th frame says of its samples: their mean distance and effective
+        number of points by camera (C,S), and the median distance, metres.
+
+        vertices and normals (R,3) of the surface; ``where`` (S,3) its samples are, and how far they
+        move until each camera exposes, shift (C,S,3); ``expected`` (C*S,) thickness.
+        """
+        cloud = self.clouds[t]
+        assert cloud is not None
+        size, views = len(where), len(self.seen.rig)
+        sample, patch = self.self_contact.vertex, self.self_contact.patch
+        normal = normals[sample]
         if vertices.device.type == "cpu":
-            return body_cloud.match_compiled(
+            found = body_cloud.match_compiled(
                 cloud.points, cloud.normals, vertices, normals, self.surface, reach
             )
-        sample, patch = self.self_contact.vertex, self.self_contact.patch
-        return body_cloud.match(
-            cloud.points, cloud.normals, vertices, normals, sample, patch, reach
-        )
+        else:
+            found = body_cloud.match(
+                cloud.points, cloud.normals, vertices, normals, sample, patch, reach
+            )
+        if shift is not None:
+            moved = (shift[cloud.view, found.sample] * normal[found.sample]).sum(1)
+            found = found._replace(distance=found.distance - moved)
+        residual = found.distance[found.valid].abs().nanmedian()
+        # gathered by camera and sample: those that several cameras see tell their offsets
+        found = found._replace(sample=cloud.view * size + found.sample)
+        found, trust = self._with_seen_through(found, cloud, where, normal, shift)
+        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=_HUBER_M)
+        return apart.reshape(views, -1), number.reshape(views, -1), residual
 
     def _with_seen_through(
         self,
@@ -229,19 +258,19 @@ class Evidence:
         where: Tensor,
         normal: Tensor,
         shift: Tensor | None,
-        frame: int,
     ) -> tuple[Matches, Tensor]:
         """One frame's matches and their trust, with those of samples that stick out of the person.
 
-        where, normal (S,3) of the samples; matches count samples by camera.
+        where, normal (S,3) of the samples, shift (C,S,3); matches count samples by camera.
         """
         size, sample, distance = len(where), [found.sample], [found.distance]
+        outward = normal.cpu().numpy()
         for window in cloud.windows:
             view = window.view
-            late = where if shift is None else where + shift[frame, view]
+            late = where if shift is None else where + shift[view]
             out, away = seen_through(
                 window, self.seen.rig[view], float(self.seen.depth_bias[view]),
-                late.cpu().numpy(), normal.cpu().numpy(),
+                late.cpu().numpy(), outward,
             )  # fmt: skip
             sample.append(torch.as_tensor(view * size + out, device=where.device))
             distance.append(-self._tensor(away))
@@ -260,44 +289,40 @@ class Evidence:
         found = []
         for start in range(0, len(self.frames), _VERTEX_CHUNK):
             posed = self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK)))
-            for vertices, normals in zip(*posed, strict=True):
-                inner, outer, normal = body_self.find(self.self_contact, vertices, normals)
-                found.append((ids[inner], ids[outer], normal))
-        return body_self.join(found)
+            found += self._crew.map(
+                lambda one: body_self.find(self.self_contact, *one),
+                list(zip(*posed, strict=True)),
+            )
+        return body_self.join([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
 
     def match(self, problem: BodyProblem, reach: float) -> CloudRows:
         """Correspondences of all frames at the problem's bodies, within ``reach`` metres."""
         count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
-        expected = problem.thickness()
         params = self.model.parameters(problem.base)
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
         shift = self._shift(where)
         of_views = where.new_zeros(count, views, size)
         points = where.new_zeros(count, views, size)
-        expected = expected.repeat(views)
+        expected = problem.thickness().repeat(views)
         normal = where.new_zeros(count, size, 3)
         for start in range(0, count, _VERTEX_CHUNK):
             at = slice(start, start + _VERTEX_CHUNK)
             vertices, normals = self.surface.posed(params.frames(at))
             normal[at] = normals[:, self.self_contact.vertex]
-            for row in range(len(vertices)):
-                t = start + row
-                cloud = self.clouds[t]
-                if cloud is None:
-                    continue
-                found = self._matches(cloud, vertices[row], normals[row], reach)
-                if shift is not None:
-                    late = shift[t, cloud.view, found.sample]
-                    moved = (late * normal[t, found.sample]).sum(1)
-                    found = found._replace(distance=found.distance - moved)
-                self.cloud_residual[t] = found.distance[found.valid].abs().nanmedian()
-                # gathered by camera and sample: those that several cameras see tell their offsets
-                found = found._replace(sample=cloud.view * size + found.sample)
-                found, trust = self._with_seen_through(found, cloud, where[t], normal[t], shift, t)
-                apart, number = body_cloud.gather(
-                    found, trust, expected, views * size, huber=_HUBER_M
+            seen = [
+                (start + row, *posed)
+                for row, posed in enumerate(zip(vertices, normals, strict=True))
+                if self.clouds[start + row] is not None
+            ]
+
+            def matched(one: tuple[int, Tensor, Tensor]) -> None:
+                t, vertices, normals = one
+                late = None if shift is None else shift[t]
+                of_views[t], points[t], self.cloud_residual[t] = self._matched(
+                    t, vertices, normals, where[t], late, expected, reach
                 )
-                of_views[t], points[t] = apart.reshape(views, -1), number.reshape(views, -1)
+
+            self._crew.map(matched, seen)
         self.by_view = ViewDistances(of_views, points, normal)
         total = points.sum(1)
         mean = (of_views * points).sum(1) / total.clamp_min(1e-6)
