@@ -5,6 +5,7 @@ Set up anew between rounds of the solver, together with how far each kind of obs
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -43,6 +44,7 @@ _FULL_SAMPLE = 2.0  # points with which a sample counts half
 _HUBER_M = 0.012
 _SEEN_THROUGH_TRUST = 1.0  # of a sample that sticks out of the person, beside a point's
 _VERTEX_CHUNK = 16
+_MOST_KEPT = 256  # frames whose bodies are kept, a quarter of a megabyte each
 # Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
 _MAX_SPEED = 6.0
 
@@ -87,6 +89,7 @@ class Evidence:
         self.group = torch.as_tensor(self.samples.group, device=model.device)
         carrier = model.skinning_weights.argmax(1).cpu().numpy()
         self.sample_joints = carrier[self.samples.vertex]
+        self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
         # frame by frame in compiled code, which threads can share
         self._crew = Crew(torch.get_num_threads() if model.device.type == "cpu" else 1)
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
@@ -279,19 +282,33 @@ class Evidence:
         valid = torch.cat([found.valid, found.valid.new_ones(extra)])
         return Matches(torch.cat(sample), torch.cat(distance), valid), trust
 
+    def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Some frames of the bodies ``base`` (N,P) at a time: the first one's place, vertices and
+        normals (b,R,3) of the surface. Those of short sequences are kept for the next look."""
+        if self._posed is not None and torch.equal(self._posed[0], base):
+            yield from self._posed[1]
+            return
+        self._posed, parts = None, []
+        params = self.model.parameters(base)
+        for start in range(0, len(base), _VERTEX_CHUNK):
+            part = (start, *self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK))))
+            if len(base) <= _MOST_KEPT:
+                parts.append(part)
+            yield part
+        if parts:
+            self._posed = (base.clone(), parts)
+
     def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
         """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
         not asked for."""
         if not problem.self_weight:
             return None
-        params = self.model.parameters(problem.base)
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)
         found = []
-        for start in range(0, len(self.frames), _VERTEX_CHUNK):
-            posed = self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK)))
+        for _, vertices, normals in self._bodies(problem.base):
             found += self._crew.map(
                 lambda one: body_self.find(self.self_contact, *one),
-                list(zip(*posed, strict=True)),
+                list(zip(vertices, normals, strict=True)),
             )
         return body_self.join([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
 
@@ -305,10 +322,8 @@ class Evidence:
         points = where.new_zeros(count, views, size)
         expected = problem.thickness().repeat(views)
         normal = where.new_zeros(count, size, 3)
-        for start in range(0, count, _VERTEX_CHUNK):
-            at = slice(start, start + _VERTEX_CHUNK)
-            vertices, normals = self.surface.posed(params.frames(at))
-            normal[at] = normals[:, self.self_contact.vertex]
+        for start, vertices, normals in self._bodies(problem.base):
+            normal[start : start + len(normals)] = normals[:, self.self_contact.vertex]
             seen = [
                 (start + row, *posed)
                 for row, posed in enumerate(zip(vertices, normals, strict=True))
