@@ -253,7 +253,12 @@ BODY_FIT = Schema(
             "m",
             "bone",
         ),
-        "keypoint_sigma": Field(("135",), "float32", "what is left of a keypoint's error", "m"),
+        "keypoint_sigma": Field(
+            ("135",), "float32", "what is left of a keypoint's error at usual confidence", "m"
+        ),
+        "keypoint_doubt": Field(
+            ("135",), "float32", "power with which that error grows as confidence falls"
+        ),
         "covering": Field(
             ("G",), "float32", "logarithm of each covering's thickness over its usual one"
         ),

@@ -36,6 +36,10 @@ _KEYPOINT_SIGMA = (
 )
 _SMALLEST_SIGMA_PX = 1.0
 _PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit do not show
+# Detectors' errors grow as a power of falling confidence, which residuals measure.
+_CONFIDENCE_BINS, _FEWEST_IN_BIN = 6, 30
+_LARGEST_DOUBT = 2.0
+_LEAST_CONFIDENCE = 0.1
 _SIGMA_RANGE = (0.1, 2.0)  # how far the refined sigma may go from the start
 _NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
 # Neighbouring samples stand on the same fold: about four of them make one measurement.
@@ -47,6 +51,18 @@ _VERTEX_CHUNK = 16
 _MOST_KEPT = 256  # frames whose bodies are kept, a quarter of a megabyte each
 # Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
 _MAX_SPEED = 6.0
+
+
+def measured_doubt(confidence: Tensor, error: Tensor) -> float:
+    """The power a >= 0 with which errors (M,) grow as confidence (M,) falls: confidence^-a."""
+    bins = torch.tensor_split(confidence.argsort(), _CONFIDENCE_BINS)
+    if len(bins[0]) < _FEWEST_IN_BIN:
+        return 0.0
+    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(_LEAST_CONFIDENCE).log()
+    y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
+    x, y = x - x.mean(), y - y.mean()
+    slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
+    return min(max(slope, 0.0), _LARGEST_DOUBT)
 
 
 class ViewDistances(NamedTuple):
@@ -62,8 +78,9 @@ class Evidence:
     """Observations of the N usable frames.
 
     frames (N,) their ids. keypoint_sigma (135,) m and cloud_noise (G,) m start from what is usual
-    and are refined from residuals. cloud_residual (N,): median distance of points at the last
-    matching, metres, NaN = none. by_view: what each camera's points said then, or None.
+    and are refined from residuals; the first is of keypoints of usual confidence, others have
+    (confidence / usual)^-keypoint_doubt of it. cloud_residual (N,): median distance of points at
+    the last matching, metres, NaN = none. by_view: what each camera's points said then, or None.
     """
 
     def __init__(
@@ -96,8 +113,13 @@ class Evidence:
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
         self.by_view: ViewDistances | None = None
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
+        self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
+        self.usual_confidence = torch.ones_like(self.keypoint_sigma)
         for part, value in _KEYPOINT_SIGMA:
             self.keypoint_sigma[part] = value
+            seen_at = seen.confidence[self.frames, :, part]
+            usual = np.median(seen_at[seen_at > 0]) if (seen_at > 0).any() else 1.0
+            self.usual_confidence[part] = float(usual)
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
@@ -123,10 +145,12 @@ class Evidence:
         lenses = self._tensor(seen.rig.colour_parameters)
         z = points[:, None] @ pose[:, 2, :3, None]
         z = z[..., 0] + pose[:, 2, 3][:, None]
+        confidence = self._tensor(seen.confidence[at])
         sigma = widened * self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
+        sigma = sigma * self._doubted(confidence, chosen)
         problem.views = Views(
             self._tensor(seen.keypoints[at]),
-            self._tensor(seen.confidence[at]),
+            confidence,
             sigma.clamp_min(_SMALLEST_SIGMA_PX),
             lenses,
             pose,
@@ -184,18 +208,27 @@ class Evidence:
         )
         return self._tensor(found)
 
+    def _doubted(self, confidence: Tensor, index: Tensor) -> Tensor:
+        """Factor (N,C,K) of the sigma of keypoints ``index`` (K,) by their confidence (N,C,K)."""
+        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.usual_confidence[index]
+        return share ** -self.keypoint_doubt[index]
+
     def refine_sigma(self, problem: BodyProblem) -> None:
         """Noise of each group of keypoints from its residuals: 1.48 median absolute deviation."""
         views = problem.views
         assert views is not None
+        index = problem.keypoints.index
         scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
-        scaled = scaled * self.keypoint_sigma[problem.keypoints.index, None]
+        scaled = scaled * self.keypoint_sigma[index, None]
+        scaled = scaled * self._doubted(views.confidence, index)[..., None]
         for part, start in _KEYPOINT_SIGMA:
-            index = problem.keypoints.index
             here = (index >= part.start) & (index < part.stop)
             known = views.confidence[:, :, here] > 0
             if bool(known.any()):
-                found = 1.4826 * _PERSISTENCE * float(scaled[:, :, here][known].median())
+                sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
+                self.keypoint_doubt[part] = measured_doubt(sure, off.mean(1))
+                usual = off / self._doubted(views.confidence, index)[:, :, here][known][:, None]
+                found = 1.4826 * _PERSISTENCE * float(usual.median())
                 low, high = (start * factor for factor in _SIGMA_RANGE)
                 self.keypoint_sigma[part] = min(max(found, low), high)
 

@@ -35,13 +35,15 @@ class Settled:
     """What a fit found to be the same in all frames, beside the shape.
 
     offsets (25,3) m of the body keypoints in the frames of their bones; covering (G,) logarithm of
-    each covering's thickness over the usual one; keypoint_sigma (K,) m; cloud_noise (G,) m.
+    each covering's thickness over the usual one; keypoint_sigma (K,) m; cloud_noise (G,) m;
+    keypoint_doubt (K,): the power with which sigma grows as confidence falls.
     """
 
     offsets: Tensor
     covering: Tensor
     keypoint_sigma: Tensor
     cloud_noise: Tensor
+    keypoint_doubt: Tensor
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,7 @@ class Fitter:
         """The last round's problem at other bodies (N,P), with what a fit found to be constant."""
         self.evidence.keypoint_sigma = settled.keypoint_sigma.to(base)
         self.evidence.cloud_noise = settled.cloud_noise.to(base)
+        self.evidence.keypoint_doubt = settled.keypoint_doubt.to(base)
         return BodyProblem(
             self.model, self.evidence.keypoints(), self.evidence.samples, base,
             columns_of(
@@ -198,7 +201,11 @@ class Fitter:
             pixel_residual=pixels.nanmedian(2).values,
             cloud_residual=evidence.cloud_residual,
             settled=Settled(
-                problem.offsets, problem.u, evidence.keypoint_sigma, evidence.cloud_noise
+                problem.offsets,
+                problem.u,
+                evidence.keypoint_sigma,
+                evidence.cloud_noise,
+                evidence.keypoint_doubt,
             ),
             parts=compare(
                 every,

@@ -66,7 +66,13 @@ class BodyData:
         settled = Settled(
             *(
                 torch.from_numpy(body_fit[name])
-                for name in ("keypoint_offsets", "covering", "keypoint_sigma", "covering_noise")
+                for name in (
+                    "keypoint_offsets",
+                    "covering",
+                    "keypoint_sigma",
+                    "covering_noise",
+                    "keypoint_doubt",
+                )
             )
         )
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)

@@ -125,6 +125,7 @@ def run(
         writer.put("joint_sigma", sigma)
         writer.put("keypoint_offsets", fit.settled.offsets.cpu().numpy())
         writer.put("keypoint_sigma", fit.settled.keypoint_sigma.cpu().numpy())
+        writer.put("keypoint_doubt", fit.settled.keypoint_doubt.cpu().numpy())
         writer.put("covering", fit.settled.covering.cpu().numpy())
         writer.put("covering_noise", fit.settled.cloud_noise.cpu().numpy())
         writer.put("failed", ~fitted)

@@ -31,7 +31,7 @@ def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> F
     return Fit(
         np.arange(frames), vectors, columns, hessian, True, torch.full((SHARED,), counts),
         torch.full((frames,), excess), nothing, nothing,
-        Settled(nothing, nothing, nothing, nothing), PartEvidence(*[nothing] * 5),
+        Settled(*[nothing] * 5), PartEvidence(*[nothing] * 5),
     )  # fmt: skip
 
 

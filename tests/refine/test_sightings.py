@@ -59,6 +59,7 @@ def fitted(tmp_path_factory):
         torch.full((len(COVERINGS),), -3.0),
         fitter.evidence.keypoint_sigma,
         torch.tensor([covering.noise for covering in COVERINGS]),
+        fitter.evidence.keypoint_doubt,
     )
     problem = fitter.resume(_moving(model, times), settled)
     fitter.observe(problem)
