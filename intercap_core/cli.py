@@ -17,7 +17,7 @@ from intercap_core.errors import UserError
 
 STAGES = {
     "frames": "Recordings to synchronised frame sets.",
-    "detections": "Keypoints and segmentation candidates, from files.",
+    "detections": "Keypoints and segmentation candidates, from files or models.",
     "scene": "Refined extrinsics, ground plane and background.",
     "person": "The subject over views, and the triangulated keypoints.",
     "object_track": "The object's pose in every frame.",
@@ -292,7 +292,8 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         typer.echo(written)
 
     command.__doc__ = (
-        f"{purpose}\n\nReads what the earlier stages wrote for this sequence.\n\n"
+        f"{purpose}\n\nReads what the earlier stages wrote for this sequence; what can be set is "
+        f"`{stage}` in SETTINGS (config/README.md).\n\n"
         f"Example: intercap {stage.replace('_', '-')} config/demo/config.yaml cup_drink_s02"
     )
     return command
