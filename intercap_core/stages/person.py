@@ -89,8 +89,12 @@ def _why(found: Detections) -> str:
     ]
     if not seeing:
         noted = zip(found.camera_names, found.notes, strict=True)
-        told = next((f"{name}: {note}" for name, note in noted if note), found.path)
-        return f"no image has keypoints of anybody ({told}); check the keypoint files"
+        looked = f"{found.path} knows {int(found.keypoints_found.sum())} images that were looked at"
+        told = next((f"{name}: {note}" for name, note in noted if note), looked)
+        return (
+            f"no image has keypoints of anybody ({told}); expected people with points in the image "
+            "and confidences above 0: check the keypoint files"
+        )
     if len(seeing) == 1:
         return (
             f"camera {seeing[0]} alone sees anybody, without depth beside its keypoints, so that "
