@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from intercap_core.capture_evaluation import CaptureEvaluation, evaluate_capture
 from intercap_core.cli import BODY_SETTINGS, OBJECT_SETTINGS
 from intercap_core.errors import UserError
 from intercap_core.metrics import capture
+from intercap_core.metrics.body_clouds import CLOUD_KEYS
 from intercap_core.metrics.body_errors import BodyErrors
 from intercap_core.metrics.capture import CaptureErrors, SlipCounts
 from intercap_core.metrics.object_errors import ObjectErrors
@@ -141,6 +143,19 @@ def _bodies() -> list[BodyEvaluation]:
         BodyEvaluation("object_noise2", "all views", [_body("c", 50, flagged=True)], [], 0),
         BodyEvaluation("body_two_view", "2 views", [_body("b", 90)], ["a"], 1),
     ]
+
+
+def test_figures_that_versions_are_compared_by_keep_their_names() -> None:
+    clouds = {key: np.ones(1) for key in CLOUD_KEYS}
+    error = replace(_body("a", 50, flagged=True), clouds=clouds)
+    kinds = ("object", "object_noise2", "body_per_frame_shape", "body_rgb_only", "body_two_view")
+    flat = body_evaluation.flat([BodyEvaluation(kind, "", [error], [], 0) for kind in kinds])
+    names = (
+        "pve_mm", "mpjpe_mm", "hand_mpjpe_mm", "hand_grasp_mpjpe_mm", "face_mm", "noise2_pve_mm",
+        "per_frame_shape_pve_mm", "cloud_to_mesh_mm", "mesh_to_cloud_visible_mm",
+        "rgb_only_mpjpe_mm", "two_view_mpjpe_mm", "bad_frames_recall", "bad_frames_precision",
+    )  # fmt: skip
+    assert {f"body.{name}" for name in names} <= flat.keys()
 
 
 def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
