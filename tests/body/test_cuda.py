@@ -1,0 +1,47 @@
+"""The body on a GPU: the same numbers as on the CPU. Skipped where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from intercap_core.body.model import BodyModel
+
+from .conftest import random_vector
+
+DEVICE = "cuda"
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+@pytest.mark.parametrize("file", ["open", "full"])
+def test_values_and_derivatives_are_those_of_the_cpu(file: str, full_file: Path) -> None:
+    path = None if file == "open" else full_file
+    here = BodyModel.load(path, dtype=torch.float64)
+    there = BodyModel.load(path, device=DEVICE, dtype=torch.float64)
+    vector = random_vector(3, here.num_parameters, 1, torch.float64)
+    params, far = here.parameters(vector), there.parameters(vector.to(DEVICE))
+    cameras = torch.eye(4, dtype=torch.float64)[None].repeat(2, 1, 1)
+    ids = torch.arange(0, here.num_vertices, 97)
+    pairs = [
+        (here.forward(params), there.forward(far)),
+        (
+            here.jacobian(params, vertex_ids=ids, joints=True),
+            there.jacobian(far, vertex_ids=ids, joints=True),
+        ),
+    ]
+    values = [(getattr(a, name), getattr(b, name)) for a, b in pairs for name in vars(a)] + [
+        (here.keypoints_of(params), there.keypoints_of(far)),
+        (
+            here.keypoints_by_view(params, cameras),
+            there.keypoints_by_view(far, cameras.to(DEVICE)),
+        ),
+        (
+            here.contour_jacobian(params, cameras)[1],
+            there.contour_jacobian(far, cameras.to(DEVICE))[1],
+        ),
+    ]
+    for expected, found in values:
+        assert found.device.type == DEVICE
+        assert (found.cpu() - expected).abs().max() < 1e-10
