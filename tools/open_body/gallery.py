@@ -66,6 +66,13 @@ SIT = {
     "right_shoulder": (0.0, 0.3, 1.1), "left_elbow": (0.0, -0.9, 0.0),
     "right_elbow": (0.0, 0.9, 0.0), "spine1": (0.1, 0.0, 0.0),
 }  # fmt: skip
+# Arms folded, a leg over the other one
+FOLDED = {
+    "left_shoulder": (0.3, -1.1, -0.75), "right_shoulder": (0.3, 1.1, 0.75),
+    "left_elbow": (0.0, -1.9, 0.0), "right_elbow": (0.0, 1.9, 0.0),
+    "left_hip": (-1.5, 0.0, -0.15), "right_hip": (-1.75, -0.2, 0.35),
+    "left_knee": (1.5, 0.0, 0.0), "right_knee": (1.5, 0.0, 0.0),
+}  # fmt: skip
 
 
 def render(folder: Path) -> None:
@@ -87,14 +94,14 @@ def render(folder: Path) -> None:
     ])  # fmt: skip
     save(folder / "body_poses.png", [
         shade(skin(posed(model, **pose)), faces, yaw_deg=yaw, centre=middle, width_m=1.7,
-              size=(340, 400))
-        for pose, yaw in ((REACH, 0), (REACH, 50), (SIT, 35), (SIT, 90))
+              size=(260, 306))
+        for pose, yaw in ((REACH, 0), (REACH, 50), (SIT, 35), (SIT, 90), (FOLDED, 0), (FOLDED, 60))
     ])  # fmt: skip
-    hand = {"width_m": 0.26, "size": (300, 260), "centre": np.array([0.82, 0.06, 0.0])}
+    hand = {"width_m": 0.24, "size": (300, 240), "centre": np.array([0.77, 0.04, 0.02])}
     save(folder / "body_grasps.png", [
         np.concatenate([
             shade(skin(grasping(model, name)), faces, pitch_deg=-60, **hand),
-            shade(skin(grasping(model, name)), faces, yaw_deg=20, pitch_deg=10, **hand),
+            shade(skin(grasping(model, name)), faces, yaw_deg=30, pitch_deg=-20, **hand),
         ])
         for name in ("relaxed", "fist", "medium_wrap", "pinch", "point")
     ])  # fmt: skip
@@ -119,7 +126,7 @@ def render(folder: Path) -> None:
     colours = np.full((len(v), 3), 0.82)
     for ids, colour in zip(model.regions.values(), _COLOURS, strict=True):
         colours[ids] = colour
-    low = {"centre": np.array([0.85, 0.05, 0.0]), "width_m": 0.3, "size": (300, 400)}
+    low = {"centre": np.array([0.78, 0.05, 0.0]), "width_m": 0.3, "size": (300, 400)}
     save(folder / "body_regions.png", [
         shade(v, faces, colours=colours, **view),
         shade(v, faces, colours=colours, yaw_deg=180, **view),
