@@ -9,7 +9,7 @@ import numpy as np
 from intercap_core.detection import openpose
 from intercap_core.detection.coco import UnreadableCandidates, read_head
 from intercap_core.detection.keypoint_files import camera_file, image_files
-from intercap_core.detection.keypoint_values import Values
+from intercap_core.detection.keypoint_values import NOBODY, Values
 from intercap_core.detection.wholebody import people_of
 from intercap_core.errors import UserError
 
@@ -31,7 +31,7 @@ def look_at_keypoints(
         if content is None:
             return []
         if whole is None and openpose.is_openpose(content):
-            values.clean(openpose.people_of(content, str(path)))
+            people = openpose.people_of(content, str(path))
         else:
             found = people_of(content, one_image=whole is None)
             if found.faults:
@@ -39,10 +39,17 @@ def look_at_keypoints(
                     f"{path}: {len(found.faults)} of its first {found.entries} people cannot be "
                     f"used (first: {found.faults[0]})"
                 )
-            if found.results:
-                values.clean(np.stack([person for _, person in found.results]))
+            people = np.array([person for _, person in found.results]).reshape(
+                -1, *NOBODY.shape[1:]
+            )
     except UnreadableCandidates as error:
         return [f"{path} {error}"]
     except UserError as error:
         return [str(error)]
+    values.clean(people)
+    if len(people) and not values.seen:
+        notes.append(
+            f"{path}: none of its first {len(people)} people has a point with numbers and a "
+            "confidence above 0; write the keypoints again"
+        )
     return notes + [f"{path}: {note}" for note in values.notes()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.detection.image_numbers import CameraImages
+from intercap_core.detection.keypoint_check import look_at_keypoints
 from intercap_core.detection.keypoint_files import has_keypoints, read_camera
 from intercap_core.detection.keypoint_layouts import WHOLE_BODY
 from intercap_core.detection.keypoint_values import Values
@@ -190,6 +192,19 @@ def test_confidence_is_cut_and_scaled():
     (scaled,) = values.clean(person)
     np.testing.assert_allclose(scaled[[0, 1, 2], 2], [0.325, 1, 0.125])
     assert values.notes() == []
+
+
+@pytest.mark.parametrize("value", [0.0, None])
+def test_a_look_before_a_run_tells_of_people_without_points(tmp_path, value):
+    empty = whole(image_id=0) | {"keypoints": [value] * 399}
+    look = partial(look_at_keypoints, tmp_path, "k1", size=SIZE, full_confidence=1.0)
+    write(tmp_path / "k1.json", [empty, empty])
+    (note,) = look()
+    assert "k1.json: none of its first 2 people has a point" in note
+    write(tmp_path / "k1.json", [empty, whole(image_id=1)])
+    assert look() == []
+    write(tmp_path / "k1.json", [])
+    assert look() == []
 
 
 def test_people_of_zeros_or_of_shares_are_nobody():
