@@ -5,7 +5,7 @@ Reads the artefacts of the stages before ``body_fit``; what is decoded here is n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from intercap_core.project import Project
 from intercap_core.schemas import FRAMES
 
 _BY_FRAME = ("keypoints", "confidence", "joints", "joint_views", "image_of", "times")
+_TENSORS = ("points", "normals", "trust", "view")  # of a cloud
 _CHUNK = 32  # bodies posed at once
 
 
@@ -89,7 +90,7 @@ class BodyClip:
         """The same with model and clouds on another device."""
         model = BodyModel.load(self.model.path, device=device)
         clouds = [
-            cloud and PersonCloud(*(getattr(cloud, f.name).to(device) for f in fields(cloud)))
+            cloud and replace(cloud, **{name: getattr(cloud, name).to(device) for name in _TENSORS})
             for cloud in self.clouds
         ]
         return replace(self, model=model, clouds=clouds)
