@@ -156,8 +156,7 @@ def find(
     metres outside counts as inside.
     """
     count, kind = len(samples), vertices.dtype
-    order = np.argsort(part, kind="mergesort")
-    starts = np.searchsorted(part[order], np.arange(parts + 1))
+    order, starts = _by_part(part, parts)
     where = np.empty((count, 3), kind)  # in that order
     low, high = np.full((parts, 3), np.inf, kind), np.full((parts, 3), -np.inf, kind)
     for at in range(count):
@@ -220,6 +219,21 @@ def find(
             inner[found], outer[found] = v, at
             found += 1
     return inner[:found].copy(), outer[:found].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_part(part, parts):
+    """Samples part by part, in their order, and where each part starts and the last ends."""
+    order, starts = np.empty(len(part), np.int64), np.zeros(parts + 1, np.int64)
+    for p in part:
+        starts[p + 1] += 1
+    for p in range(parts):
+        starts[p + 1] += starts[p]
+    place = starts.copy()
+    for i in range(len(part)):
+        order[place[part[i]]] = i
+        place[part[i]] += 1
+    return order, starts
 
 
 @numba.njit(cache=True, nogil=True)
