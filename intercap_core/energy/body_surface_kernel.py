@@ -1,7 +1,7 @@
-"""Terms of points on the skin, compiled: what :mod:`.body_cloud` and :mod:`.body_self` say.
+"""Terms of points on the skin, compiled: E_P_self of :mod:`.body_self`, and what E_D costs.
 
 Equal to the plain terms to rounding, for bodies without pose blend shapes. The normal equations of
-the cloud's term are :func:`.jacobian_kernel.plane_equations`.
+E_D are in :mod:`.body_cloud_kernel`.
 """
 
 from __future__ import annotations
