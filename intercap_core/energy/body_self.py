@@ -1,4 +1,4 @@
-"""Self-penetration of the body, E_P_self of equation 3.
+"""Self-penetration of the body, E_P_self of equation 2.
 
     E_P_self = sum over samples p inside another part of the body of w rho(d - tolerance) / 2
 

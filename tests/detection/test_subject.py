@@ -138,5 +138,5 @@ def test_two_who_pass_each_other_are_not_exchanged(tmp_path, apart_m):
     found = find_subject(Detections.load(path), RIG, np.arange(sets) / 15, min_confidence=0.3)
     seen = expected >= 0
     np.testing.assert_array_equal(found[seen], expected[seen])
-    # where a view misses the subject, the other one who stands at the same place may be taken for it
+    # where a view misses the subject, the one who stands at the same place may be taken for it
     assert (found[~seen] >= 0).mean() < 0.5
