@@ -40,7 +40,7 @@ _PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit
 _CONFIDENCE_BINS, _FEWEST_IN_BIN = 6, 30
 _LARGEST_DOUBT = 2.0
 _LEAST_CONFIDENCE = 0.1
-_SIGMA_RANGE = (0.1, 2.0)  # how far the refined sigma may go from the start
+_SIGMA_RANGE = (0.1, 4.0)  # how far the refined sigma may go from the start
 _NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
 # Neighbouring samples stand on the same fold: about four of them make one measurement.
 _SAMPLE_SHARE = 0.25
