@@ -235,6 +235,13 @@ BODY_FIT = Schema(
         "joint_sigma": Field(
             ("T", "55"), "float32", "stated standard deviation of each joint", "m"
         ),
+        "joint_covariance": Field(
+            ("T", "55", "3", "3"),
+            "float32",
+            "stated covariance of each joint; a third of its trace is the square of joint_sigma",
+            "m^2",
+            "master",
+        ),
         "failed": Field(("T",), "bool", "no believable fit in this frame"),
         "bridged": Field(("T",), "bool", "filled in from its neighbours"),
         "uncertain": Field(

@@ -31,6 +31,10 @@ _MEASURED = 0.15  # of a part's samples: half of what a view sees of a limb, whi
 # apart, a leg's two segments (0.4 m each) farther, of a finger (0.08 m) less: by this in the mean
 # square, along one coordinate, where no point says which; the nearer to ``_MEASURED``, the less.
 _MIRRORED_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
+# A limb that no view bears out may be anywhere in its reach, a wrist 0.55 m from the shoulder, an
+# ankle 0.85 m from the hip; points then may as well be those of another limb. Prior and fit, which
+# are linear about one pose, would state less.
+_UNSEEN_M = {"arm": 0.20, "leg": 0.25}
 MEDIAN_CHI_3 = 1.5382  # median length of a three-dimensional normal error, in deviations
 _MEDIAN_CHI_2 = 1.1774  # median length of a two-dimensional normal error, in deviations
 _MEAN_CHI_3 = 1.5958  # mean length of a three-dimensional normal error, in deviations
@@ -162,10 +166,13 @@ def unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
 
 
 def _leaning(evidence: PartEvidence) -> np.ndarray:
-    """How far (N,8), metres, the parts that one view alone bears out may lean the wrong way."""
+    """How far (N,8), metres, parts may lean the wrong way that one view bears out, or none."""
     known = np.clip(evidence.measured.cpu().numpy() / _MEASURED, 0, 1)
-    usual = np.array([_MIRRORED_M.get(part.partition("_")[2], 0.0) for part in BODY_PARTS])
-    return np.where(unmeasured(evidence), usual * (1 - known) ** 2, 0.0)
+    limbs = [part.partition("_")[2] for part in BODY_PARTS]
+    mirrored = np.array([_MIRRORED_M.get(limb, 0.0) for limb in limbs])
+    unseen = np.array([_UNSEEN_M.get(limb, 0.0) for limb in limbs])
+    leaning = np.where(unmeasured(evidence), mirrored * (1 - known) ** 2, 0.0)
+    return np.where(evidence.seen.cpu().numpy() == 0, unseen, leaning)
 
 
 def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:

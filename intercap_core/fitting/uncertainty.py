@@ -17,11 +17,11 @@ _CHUNK = 16
 _NUM_JOINTS = 55
 
 
-def joint_sigma(model: BodyModel, fit: Fit) -> Tensor:
-    """Standard deviation (N,55) of each joint's coordinates, metres.
+def joint_covariance(model: BodyModel, fit: Fit) -> Tensor:
+    """Covariance (N,55,3,3) of each joint's position, master frame, square metres.
 
-    With own parameters o and shared ones s of blocks H of the whitened energy's Hessian, a joint
-    J(o, s) has the covariance
+    With own parameters o and shared ones s of blocks H of the whitened energy's Hessian, that of a
+    joint J(o, s) is
 
         J_o H_oo^-1 J_o' e  +  G S^-1 G',   G = J_s - J_o H_oo^-1 H_os
 
@@ -37,7 +37,8 @@ def joint_sigma(model: BodyModel, fit: Fit) -> Tensor:
     counts = fit.shared_counts.double()
     information = information / (counts[:, None] * counts[None]).sqrt()
     shared_factor = torch.linalg.cholesky(information)
-    sigma = fit.vectors.new_zeros(len(fit.vectors), _NUM_JOINTS)
+    model_error = _MODEL_M**2 * torch.eye(3).to(information)
+    result = information.new_zeros(len(fit.vectors), _NUM_JOINTS, 3, 3)
     for at, (factor, answer, _) in zip(_chunks(len(fit.vectors)), at_rest, strict=True):
         lin = model.linearise(
             model.parameters(fit.vectors[at]), vertex_ids=np.array([0]), joints=True
@@ -47,10 +48,25 @@ def joint_sigma(model: BodyModel, fit: Fit) -> Tensor:
         by_shared = -by_own @ answer
         if fit.one_shape:
             by_shared[..., : len(betas)] += full[..., betas]
-        excess = fit.excess[at, None].double()
-        variance = _mean_square(factor, by_own) * excess + _mean_square(shared_factor, by_shared)
-        sigma[at] = (variance + _MODEL_M**2).sqrt().to(sigma.dtype)
-    return sigma
+        excess = fit.excess[at, None, None, None].double()
+        found = _covariance(factor, by_own) * excess + _covariance(shared_factor, by_shared)
+        result[at] = found + model_error
+    return result
+
+
+def deviation(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviation (...) along one coordinate, in the mean square, of covariances
+    (...,3,3)."""
+    return np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 3)
+
+
+def widened(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Covariances (...,3,3) grown alike in all directions until their deviation is ``sigma`` (...).
+
+    What widens it, flags and bridges, has no direction.
+    """
+    more = sigma**2 - deviation(covariance) ** 2
+    return covariance + more[..., None, None] * np.eye(3)
 
 
 def _eliminated(hessian: Tensor, own: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -62,11 +78,12 @@ def _eliminated(hessian: Tensor, own: int) -> tuple[Tensor, Tensor, Tensor]:
     return factor, answer, hessian[:, own:, own:] - mixed.transpose(1, 2) @ answer
 
 
-def _mean_square(factor: Tensor, by: Tensor) -> Tensor:
-    """Variance (B,55), the mean of three coordinates', of rows ``by`` (B,165,n) under the
-    information whose Cholesky factor (B,n,n) or (n,n) is given."""
+def _covariance(factor: Tensor, by: Tensor) -> Tensor:
+    """Covariance (B,55,3,3) of rows ``by`` (B,165,n), three a joint, under the information whose
+    Cholesky factor (B,n,n) or (n,n) is given."""
     half = torch.linalg.solve_triangular(factor, by.transpose(1, 2), upper=False)
-    return (half**2).sum(1).reshape(len(by), _NUM_JOINTS, 3).mean(2)
+    half = half.reshape(len(by), -1, _NUM_JOINTS, 3).transpose(1, 2)
+    return half.transpose(2, 3) @ half
 
 
 def _chunks(count: int) -> list[slice]:

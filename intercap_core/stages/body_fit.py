@@ -25,7 +25,7 @@ from intercap_core.fitting.bridge import bridge, bridged_sigma, continuous
 from intercap_core.fitting.observations import person_clouds, read_observations
 from intercap_core.fitting.recover import JUMP_M, jumps
 from intercap_core.fitting.schedule import Fitter
-from intercap_core.fitting.uncertainty import joint_sigma
+from intercap_core.fitting.uncertainty import deviation, joint_covariance, widened
 from intercap_core.project import digest
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
@@ -89,7 +89,7 @@ def run(
     params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
     sigma = np.zeros((seen.num_frames, 55))
-    stated = joint_sigma(model, fit).cpu().numpy()
+    stated = joint_covariance(model, fit).cpu().numpy()
     # what has left the motion of its neighbours may well belong among them; where nothing but one
     # view's pixels holds a limb, any step does
     least = np.full_like(sigma, JUMP_M)
@@ -97,12 +97,16 @@ def run(
     jumped = np.zeros_like(sigma)
     jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
-        quality.widened_sigma(stated, fit.parts), jumped[fit.frames] / quality.MEDIAN_CHI_3
+        quality.widened_sigma(deviation(stated), fit.parts),
+        jumped[fit.frames] / quality.MEDIAN_CHI_3,
     )
     undetermined = np.ones((seen.num_frames, len(BODY_PARTS)), bool)
     undetermined[fit.frames] = quality.undetermined(sigma[fit.frames], fit.parts)
     undetermined[~fitted] = True
     sigma = bridged_sigma(joints.astype(float), fitted, sigma, seen.times)
+    covariance = np.zeros((*sigma.shape, 3, 3))
+    covariance[fit.frames] = stated
+    covariance[~fitted] = 0
     share = model.skinning_weights.double().mean(0).cpu().numpy()
     uncertain = fitted & (quality.expected_error(sigma, share) > _BAD_BODY_M)
 
@@ -123,6 +127,7 @@ def run(
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", sigma)
+        writer.put("joint_covariance", widened(covariance, sigma))
         writer.put("keypoint_offsets", fit.settled.offsets.cpu().numpy())
         writer.put("keypoint_sigma", fit.settled.keypoint_sigma.cpu().numpy())
         writer.put("keypoint_doubt", fit.settled.keypoint_doubt.cpu().numpy())

@@ -12,6 +12,7 @@ from intercap_core.fitting import quality
 from intercap_core.schemas import BODY_PARTS
 
 ALL = torch.arange(135)
+LEG = ("knee", "ankle", "toe", "heel")
 SIGMA = torch.full((135,), 0.02)
 
 
@@ -70,6 +71,25 @@ def test_what_nobody_sees_is_open_by_its_deviation(fine):
     assert torch.isnan(evidence.against).all() and np.isnan(quality.trunk_distance(evidence)).all()
     sigma[0, [JOINT_INDEX["right_knee"], JOINT_INDEX["right_ankle"]]] = 0.09
     assert _open(evidence, sigma) == ["right_leg", "left_hand", "right_hand", "face"]
+
+
+def test_limbs_that_nobody_sees_may_be_anywhere_in_their_reach(fine):
+    """Whatever points lie on them; an arm and two legs make a bad body likely."""
+    whitened, confidence, sigma = fine
+    share = np.ones(55) / 55
+    forearm = [KEYPOINT_NAMES.index(f"left_{name}") for name in ("elbow", "wrist")]
+    confidence[:, :, forearm] = 0
+    widened = quality.widened_sigma(sigma, _evidence(whitened, confidence))
+    assert widened[0, JOINT_INDEX["left_wrist"]] > 0.2
+    assert widened[0, JOINT_INDEX["right_wrist"]] == 0.008
+    joints = np.arange(55)
+    legs = [k for k, name in enumerate(KEYPOINT_NAMES[:25]) if name.split("_")[-1] in LEG]
+    confidence[:, :, legs] = 0
+    points = (joints, torch.ones(1, 55))
+    evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, points)
+    widened = quality.widened_sigma(sigma, evidence)
+    assert set(_open(evidence, widened)) >= {"left_arm", "left_leg", "right_leg"}
+    assert quality.expected_error(widened, share)[0] > 0.04
 
 
 def test_a_limb_that_one_view_sees_needs_points_of_its_own(fine):
