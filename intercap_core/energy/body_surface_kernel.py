@@ -128,7 +128,14 @@ def add_self_equations(chain, touching, frames, place, cost, gradient, hessian):
         for r in range(count):
             for q in range(m):
                 dense[r, q] = root[r] * rows[r, used[q]]
-        part = np.dot(dense.T, dense)
+        # by hand: a library's product would wake its threads for each frame
+        block = np.zeros((m, m), hessian.dtype)
+        for r in range(count):
+            for p in range(m):
+                for q in range(p + 1):
+                    block[p, q] += dense[r, p] * dense[r, q]
         for p in range(m):
-            for q in range(m):
-                hessian[b, used[p], used[q]] += part[p, q]
+            for q in range(p):
+                hessian[b, used[p], used[q]] += block[p, q]
+                hessian[b, used[q], used[p]] += block[p, q]
+            hessian[b, used[p], used[p]] += block[p, p]
