@@ -55,10 +55,21 @@ class Skeleton(NamedTuple):
         )  # fmt: skip
 
 
-def rest_points(template: np.ndarray, directions: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Points (B,N,3) of bodies of shape (B,S); template (N,3), directions (N,3,S)."""
-    moved = shape @ directions.reshape(-1, directions.shape[-1]).T
-    return moved.reshape(len(shape), *template.shape) + template
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def rest_points(template, directions, shape):
+    """Points (B,N,3) of bodies of shape (B,S); template (N,3), directions (N,3,S).
+
+    By hand: a library's product would wake its threads, and round by the number of bodies.
+    """
+    points = np.empty((len(shape), *template.shape), template.dtype)
+    for b in range(len(shape)):
+        for i in range(len(template)):
+            for d in range(3):
+                moved = template[i, d]
+                for s in range(shape.shape[1]):
+                    moved += directions[i, d, s] * shape[b, s]
+                points[b, i, d] = moved
+    return points
 
 
 def pose(rest: RestJoints, vectors: np.ndarray, *, derivatives: bool) -> Skeleton:

@@ -147,7 +147,7 @@ class Terms:
         self, problem: BodyProblem, vectors: Tensor, offsets: Tensor, thickness: Tensor
     ) -> _Now:
         model, rows, pairs = self._model, problem.rows, problem.touching
-        shape = vectors.numpy()[:, _SHAPE:]
+        shape = _array(vectors[:, _SHAPE:])
         if self._pieces is None or self._pieces[0] is not problem.keypoints:
             self._pieces = problem.keypoints, Pieces.of(model, problem.keypoints)
         touching, touched, samples = None, _NOTHING, _NOTHING
@@ -216,7 +216,7 @@ def _selection(model: BodyModel, vertices: np.ndarray) -> Selection:
 
 
 def _at_rest(selection: Selection, shape: np.ndarray) -> np.ndarray:
-    """Points (b,N,3) of all frames at once: a product's rounding may vary with its size."""
+    """Points (b,N,3)."""
     return rest_points(selection.template.numpy(), selection.directions.numpy(), shape)
 
 
