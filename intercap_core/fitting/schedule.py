@@ -125,7 +125,7 @@ class Fitter:
         for reach in _REACH_M[:2] if evidence.has_cloud else ():
             problem.rows = evidence.match(problem, reach)
             evidence.look(problem)
-            self._minimise(problem, 5)
+            self._minimise(problem, 3)
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
             problem.targets = None
@@ -142,7 +142,7 @@ class Fitter:
             problem.touching = evidence.touch(problem)
             evidence.refine_sigma(problem)
             evidence.look(problem, hands=hands, face=face)
-            solution = self._minimise(problem, 5, keep_normal=last)
+            solution = self._minimise(problem, 4, keep_normal=last)
         assert solution.normal is not None
         return self._report(problem, solution.normal.hessian)
 
