@@ -83,22 +83,27 @@ def bake(source: Source, folder: Path, held_out: Path) -> None:
 
 
 def report(source: Source, space: shape_space.ShapeSpace, regressor: np.ndarray) -> None:
-    """Print how well ten components meet 300 other adults: skin and joints, millimetres."""
+    """Print how well ten and all components meet 300 other adults: skin and joints, mm."""
     others = shape_space.sample_adults(300, np.random.default_rng(SEED + 1))
     vertices, joints, _ = shape_space.t_posed(source, source.coefficients(others))
     area = np.repeat(shape_space.vertex_areas(space.template, source.faces), 3)
-    basis = space.directions[:, :, :10].reshape(-1, 10)
-    offset = (vertices - space.template).reshape(len(vertices), -1)
-    betas = np.linalg.solve((basis * area[:, None]).T @ basis, (basis * area[:, None]).T @ offset.T)
-    fitted = space.template + (basis @ betas).T.reshape(vertices.shape)
-    skin = 1e3 * np.linalg.norm(fitted - vertices, axis=2)
-    print(f"skin of held-out adults: mean {skin.mean():.2f} mm, p99 {np.percentile(skin, 99):.2f}")
-    landed = np.einsum("jv,bvc->bjc", regressor, fitted)
-    exact = space.joints + np.einsum("jck,kb->bjc", space.joint_directions[:, :, :10], betas)
-    gap = 1e3 * np.linalg.norm(landed - exact, axis=2).max()
-    print(f"regressor against the rig over the shape space: worst {gap:.4f} mm")
-    error = 1e3 * np.linalg.norm(landed - joints, axis=2)
-    print("joints of held-out adults, mm: name, mean, p95, worst")
-    for name, column in zip(JOINT_NAMES, error.T, strict=True):
-        print(f"  {name:18s} {column.mean():5.2f} {np.percentile(column, 95):5.2f} "
-              f"{column.max():5.2f}")  # fmt: skip
+    errors = []
+    for count in (10, shape_space.NUM_SHAPE):
+        basis = space.directions[:, :, :count].reshape(-1, count)
+        weighted = (basis * area[:, None]).T
+        offset = (vertices - space.template).reshape(len(vertices), -1)
+        betas = np.linalg.solve(weighted @ basis, weighted @ offset.T)
+        fitted = space.template + (basis @ betas).T.reshape(vertices.shape)
+        skin = 1e3 * np.linalg.norm(fitted - vertices, axis=2)
+        landed = np.einsum("jv,bvc->bjc", regressor, fitted)
+        moved = np.einsum("jck,kb->bjc", space.joint_directions[:, :, :count], betas)
+        gap = 1e3 * np.linalg.norm(landed - space.joints - moved, axis=2).max()
+        errors.append(1e3 * np.linalg.norm(landed - joints, axis=2))
+        print(f"{count} components: skin of held-out adults {skin.mean():.2f} mm, p99 "
+              f"{np.percentile(skin, 99):.2f}; regressor against the rig over the shape space, "
+              f"worst {gap:.4f} mm")  # fmt: skip
+    print("joints of held-out adults, mm: name; mean, p95, worst of ten components; of all")
+    for joint, name in enumerate(JOINT_NAMES):
+        told = (f"{e.mean():6.2f} {np.percentile(e, 95):5.2f} {e.max():5.2f}"
+                for e in (found[:, joint] for found in errors))  # fmt: skip
+        print(f"  {name:18s} {' '.join(told)}")

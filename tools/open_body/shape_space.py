@@ -1,4 +1,4 @@
-"""Ten shape and ten expression directions, and the joint regressor that is exact over them."""
+"""Shape and expression directions, and the joint regressor that is exact over them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from intercap_core.body.joints import PARENTS
 from .source import Source
 from .t_pose import to_t_pose
 
-NUM_SHAPE = 10
-NUM_EXPRESSION = 10
+# As many of each, since a file of less than 301 columns is read as two halves. The first ten are
+# those of a file of ten; with thirty every joint of an unseen adult is within 3 mm.
+NUM_SHAPE = 30
+NUM_EXPRESSION = 30
 _RACES = ("african", "asian", "caucasian")
 
 
@@ -48,7 +50,9 @@ def t_posed(source: Source, coefficients: np.ndarray, chunk: int = 64) -> tuple[
 
 @dataclass(frozen=True)
 class ShapeSpace:
-    """template (V,3), directions (V,3,20), joints (55,3), joint_directions (55,3,20)."""
+    """template (V,3), directions (V,3,S), shape then expression, joints (55,3), joint_directions
+    (55,3,S).
+    """
 
     template: np.ndarray
     directions: np.ndarray
@@ -95,7 +99,7 @@ def build(source: Source, count: int, seed: int) -> ShapeSpace:
 
 
 def _expression(source: Source) -> np.ndarray:
-    """(V,3,10): components of the facial actions, each taken at random with its usual strength.
+    """(V,3,E): components of the facial actions, each taken at random with its usual strength.
 
     Jaw opening and gaze are left out: they are joints.
     """
@@ -117,7 +121,7 @@ def _expression(source: Source) -> np.ndarray:
 def joint_regressor(space: ShapeSpace, weights: np.ndarray, neighbours: int = 600) -> np.ndarray:
     """(55,V) rows that sum to one and give the joints exactly for every shape and expression.
 
-    Each joint asks for 1 + 3 + 3x20 linear conditions on the weights of the `neighbours` closest
+    Each joint asks for 1 + 3 + 3xS linear conditions on the weights of the `neighbours` closest
     vertices that its bone or the parent's moves; the least-norm solution has small weights, some
     negative.
     """
