@@ -22,7 +22,7 @@ _COLOURS = np.array([
 ])  # fmt: skip
 
 
-def _tips(model: BodyModel) -> tuple[np.ndarray, np.ndarray]:
+def rest_points(model: BodyModel) -> tuple[np.ndarray, np.ndarray]:
     """Rest joints (55,3) and finger tips (10,3), left then right, of the mean body."""
     out = model.forward(model.zeros())
     points = model.keypoints(out)[0].numpy()
@@ -33,7 +33,7 @@ def _tips(model: BodyModel) -> tuple[np.ndarray, np.ndarray]:
 
 def grasping(model: BodyModel, grasp: str) -> BodyParameters:
     """Both hands in a named grasp, T-posed otherwise."""
-    joints, tips = _tips(model)
+    joints, tips = rest_points(model)
     left = named_grasp(grasp, joints.astype(float), tips.astype(float))
     params = model.zeros()
     params.left_hand_pose[0] = torch.as_tensor(left)
