@@ -9,19 +9,17 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from intercap_core.body.contour import FaceContour, contour_rows
-from intercap_core.body.jacobian import Linearisation, linearise, shaped_points, turn_frames
+from intercap_core.body.jacobian import Linearisation, linearise, shaped_points
 from intercap_core.body.joints import JOINT_INDEX, PARENTS
 from intercap_core.body.keypoints import CONTOUR, KeypointMap, keypoint_map
 from intercap_core.body.kinematics import (
     PosedJoints,
-    joint_shape_derivatives,
     pose_joints,
     rotation_from_axis_angle,
 )
@@ -31,9 +29,6 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.regions import find_regions
 from intercap_core.body.selection import Selection, select
 from intercap_core.body.skinning import skin
-
-if TYPE_CHECKING:
-    from intercap_core.body.jacobian_kernel import Chain
 
 _KEPT_SELECTIONS = 8
 _MOUTH_OUTLINE = slice(31, 43)  # landmarks 48 to 59 of dlib's 68
@@ -210,32 +205,6 @@ class BodyModel:
             selection = self._select(vertex_ids, joints=joints)
             points, posed, axis_angle = self._rest(selection, params)
             return linearise(selection, points, posed, axis_angle, self._joint_directions)
-
-    @property
-    def has_kernels(self) -> bool:
-        """Whether :meth:`chain` is there: on the CPU, without pose blend shapes."""
-        return self.device.type == "cpu" and self._posedirs is None
-
-    def chain(
-        self,
-        params: BodyParameters,
-        *,
-        vertex_ids: Tensor | np.ndarray | None = None,
-        joints: bool = False,
-    ) -> tuple[Chain, Selection]:
-        """What the compiled derivatives of the same points as `linearise`'s are made of."""
-        from intercap_core.body.jacobian_kernel import Chain
-
-        selection = self._select(vertex_ids, joints=joints)
-        points, posed, axis_angle = self._rest(selection, params)
-        frames, _ = turn_frames(posed, axis_angle)
-        _, moved = joint_shape_derivatives(posed, self._joint_directions)
-        parts = (
-            points, posed.rotations, posed.offsets, posed.joints, frames, moved,
-            selection.directions, selection.bones, selection.bone_weights, selection.chain,
-            selection.below,
-        )  # fmt: skip
-        return Chain(*(part.contiguous().numpy() for part in parts)), selection
 
     def jacobian(
         self,

@@ -100,6 +100,11 @@ class BodyProblem:
         self._rest = torch.tensor([c.thickness for c in COVERINGS]).to(self.base)
         self._spread = torch.tensor([c.spread for c in COVERINGS]).to(self.base)
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the terms are summed by compiled kernels: on the CPU."""
+        return self.base.device.type == "cpu" and self.model._posedirs is None
+
     @cached_property
     def _terms(self) -> Terms:
         from intercap_core.fitting.compiled import Terms
@@ -162,7 +167,7 @@ class BodyProblem:
 
     def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
         """(b,)"""
-        if self.model.has_kernels:
+        if self.is_compiled:
             betas, offsets, u = self._split(shared)
             x = self._vector(own, betas, index)
             total = self._terms.cost(self, x, offsets, self._rest * u.exp(), index)
@@ -188,7 +193,7 @@ class BodyProblem:
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
         """Normal equations by own and shared parameters, own first."""
-        if self.model.has_kernels:
+        if self.is_compiled:
             return self._linearise_compiled(own, shared, index)
         parts = [self._linearise(own[at], shared, index[at]) for at in _chunks(len(index))]
         return NormalEquations(*(torch.cat(p) for p in zip(*parts, strict=True)))
