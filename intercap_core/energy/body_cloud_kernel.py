@@ -1,6 +1,7 @@
 """The normal equations of :mod:`.body_cloud`, compiled: a limb's samples touch few columns.
 
-Equal to :func:`.body_cloud.assemble` to rounding, for bodies without pose blend shapes.
+Equal to :func:`.body_cloud.assemble` to rounding; what pose blend shapes add is left to
+:mod:`.correctives_kernel`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import numba
 import numpy as np
 
 from intercap_core.body.parameters import TRANSL
+from intercap_core.energy.skeleton_kernel import turned_back
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _TOGETHER = 4  # rows that are added to a block at once
@@ -112,14 +114,14 @@ def _add_squares(rows, weights, block):
 @numba.njit(cache=True, nogil=True)
 def add_equations(
     chain, limbs, normal, weight, target, thickness, group, frames, place, place_u,
-    cost, gradient, hessian,
+    cost, gradient, hessian, pull,
 ):  # fmt: skip
     """Add the normal equations of E_D to those of the frames (B,).
 
     ``limbs``: as :attr:`.Selection.limbs`; normal (T,N,3), weight (T,N), 0 = no row, target (T,N);
     thickness (G,) of each group's points, (N,), whose derivative by its column in ``place_u`` (G,)
     is itself; ``place`` (P,): the parameters' columns; -1 = fixed. cost (B,), gradient (B,n),
-    hessian (B,n,n).
+    hessian (B,n,n). pull (B,N,3): the gradient by the points at rest; of no body if not wanted.
     """
     order, starts, moved_by = limbs
     dtype = hessian.dtype
@@ -158,6 +160,11 @@ def add_equations(
                 pulls[0] = w * e
                 for q in range(m):
                     slope[q] -= pulls[0] * row[q]
+                if len(pull):
+                    t0, t1, t2 = turned_back(chain, b, i, n)
+                    pull[b, i, 0] -= pulls[0] * t0
+                    pull[b, i, 1] -= pulls[0] * t1
+                    pull[b, i, 2] -= pulls[0] * t2
                 weights[filled] = w
                 filled += 1
                 if filled == _TOGETHER:

@@ -2,7 +2,8 @@
 
 A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
 the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.
-Without pose blend shapes only. Equal to the plain term to rounding.
+Equal to the plain term to rounding; what pose blend shapes add to the gradient is left to
+:mod:`.correctives_kernel`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from torch import Tensor
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 from intercap_core.body.model import BodyModel
@@ -30,7 +32,7 @@ class Pieces(NamedTuple):
     A piece lies at R x + share t, with R and t of its bone and x, at rest, from template (E,3) and
     directions (E,3,S). carrier (K,): the piece on the bone that carries the keypoint's offset.
     limb_starts (L+1,) and order (K,): the keypoints of each limb; moved_by (L,55) bool: the joints
-    that turn a limb.
+    that turn a limb. posedirs (E,3,486), or (E,3,0) where there are no pose blend shapes.
     """
 
     starts: np.ndarray
@@ -42,6 +44,7 @@ class Pieces(NamedTuple):
     limb_starts: np.ndarray
     order: np.ndarray
     moved_by: np.ndarray
+    posedirs: np.ndarray
 
     @classmethod
     def of(cls, model: BodyModel, chosen: KeypointSet) -> Pieces:
@@ -49,22 +52,16 @@ class Pieces(NamedTuple):
         rest = model.linearise(model.zeros(), vertex_ids=chosen.vertices, joints=True)
         points = rest.selection
         weights = points.weights.double().numpy()
-        template, directions = points.template.double().numpy(), points.directions.double().numpy()
-        starts, carrier = [0], []
-        bones: list[int] = []
-        shares, places, moves = [], [], []
-        carried = zip(chosen.matrix.double().numpy(), chosen.carrier.tolist(), strict=True)
-        for row, carried_by in carried:
-            ids = np.flatnonzero(row)
-            share = row[ids, None] * weights[ids]
-            own = np.flatnonzero(share.any(0))
-            share = share[:, own]
-            carrier.append(len(bones) + own.tolist().index(carried_by))
-            bones += own.tolist()
-            shares.append(share.sum(0))
-            places.append(share.T @ template[ids])
-            moves.append(np.tensordot(share.T, directions[ids], 1))
-            starts.append(len(bones))
+        dtype = points.template.numpy().dtype
+        matrix = chosen.matrix.double().numpy()
+        made_of, bone = np.nonzero((matrix != 0) @ (weights != 0))
+        share = matrix[made_of] * weights[:, bone].T  # (E,N), of each point in each piece
+        carrier = np.flatnonzero(bone == chosen.carrier.numpy()[made_of])
+        bones, starts = bone.tolist(), np.searchsorted(made_of, np.arange(len(matrix) + 1))
+
+        def mixed(values: Tensor) -> np.ndarray:
+            return np.tensordot(share, values.double().numpy(), 1).astype(dtype)
+
         chains = [
             frozenset().union(*(ancestors(bone) for bone in bones[first:end]))
             for first, end in pairwise(starts)
@@ -73,11 +70,11 @@ class Pieces(NamedTuple):
         moved_by = np.zeros((len(limbs), NUM_JOINTS), bool)
         for flags, limb in zip(moved_by, limbs, strict=True):
             flags[sorted(chains[limb[0]])] = True
-        dtype = points.template.numpy().dtype
+        posedirs = points.directions[..., :0] if points.posedirs is None else points.posedirs
         return cls(
-            np.array(starts), np.array(bones), np.concatenate(shares).astype(dtype),
-            np.concatenate(places).astype(dtype), np.concatenate(moves).astype(dtype),
-            np.array(carrier), np.cumsum([0, *map(len, limbs)]), np.concatenate(limbs), moved_by,
+            starts, bone, share.sum(1).astype(dtype), mixed(points.template),
+            mixed(points.directions), carrier, np.cumsum([0, *map(len, limbs)]),
+            np.concatenate(limbs), moved_by, mixed(posedirs),
         )  # fmt: skip
 
     def at_rest(self, shape: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -343,14 +340,15 @@ def _add_offset(turn, slope, matrix, pulled, to, first, gradient, hessian):
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    skeleton, pieces, rest, seen, frames, place, first_offset, offsets, cost, gradient, hessian
+    skeleton, pieces, rest, seen, frames, place, first_offset, offsets,
+    cost, gradient, hessian, pull,
 ):  # fmt: skip
     """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
     (B,E,3).
 
     ``place`` (P,) says where a parameter's column is, -1 = fixed; the offsets of the first
     ``offsets`` keypoints, three columns each, start at ``first_offset``. cost (B,), gradient (B,n),
-    hessian (B,n,n).
+    hessian (B,n,n). pull (B,E,3): the gradient by the pieces at rest; of no body if not wanted.
     """
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
@@ -374,6 +372,12 @@ def add_equations(
                 cost[b] += _ask(seen, frames[b], k, p, True, slope, matrix)
                 if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
                     continue
+                if len(pull):
+                    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+                        turn = skeleton.rotations[b, pieces.bone[e]]
+                        for i in range(3):
+                            for d in range(3):
+                                pull[b, e, d] += turn[i, d] * slope[i]
                 _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)
                 for i in range(3):
                     for o in range(3):

@@ -1,7 +1,7 @@
 """Terms of points on the skin, compiled: E_P_self of :mod:`.body_self`, and what E_D costs.
 
-Equal to the plain terms to rounding, for bodies without pose blend shapes. The normal equations of
-E_D are in :mod:`.body_cloud_kernel`.
+Equal to the plain terms to rounding; what pose blend shapes add to a gradient is left to
+:mod:`.correctives_kernel`. The normal equations of E_D are in :mod:`.body_cloud_kernel`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 
 from intercap_core.body.jacobian_kernel import _add_point
 from intercap_core.body.parameters import TRANSL
+from intercap_core.energy.skeleton_kernel import turned_back
 
 _SHAPE = TRANSL.stop
 
@@ -31,6 +32,15 @@ class Touching(NamedTuple):
     tolerance: float
     reach: float
     weight: float
+
+    def asked(self, frames: np.ndarray, count: int) -> np.ndarray:
+        """Which of so many points pairs of the frames (B,) ask for, (B,N) bool."""
+        asked = np.zeros((len(frames), count), bool)
+        for row, first, end in zip(
+            asked, self.starts[frames], self.starts[frames + 1], strict=True
+        ):
+            row[self.inner[first:end]] = row[self.outer[first:end]] = True
+        return asked
 
 
 @numba.njit(cache=True, nogil=True)
@@ -86,10 +96,11 @@ def add_self_cost(chain, touching, frames, cost):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_self_equations(chain, touching, frames, place, cost, gradient, hessian):
+def add_self_equations(chain, touching, frames, place, cost, gradient, hessian, pull):
     """Add the normal equations of E_P_self to those of the frames (B,).
 
     ``place`` (P,): each parameter's column, -1 = fixed. cost (B,), gradient (B,n), hessian (B,n,n).
+    pull (B,N,3): the gradient by the points at rest; of no body if not wanted.
     """
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     columns = place[place >= 0]
@@ -114,6 +125,12 @@ def add_self_equations(chain, touching, frames, place, cost, gradient, hessian):
             weight = touching.weight * share * share
             for q in columns:
                 gradient[b, q] += weight * depth * row[q]
+            if len(pull):
+                outer, inner = touching.outer[at], touching.inner[at]
+                o, p = turned_back(chain, b, outer, n), turned_back(chain, b, inner, n)
+                for d in range(3):
+                    pull[b, outer, d] += weight * depth * o[d]
+                    pull[b, inner, d] -= weight * depth * p[d]
             root[count] = np.sqrt(weight)
             count += 1
         if count == 0:

@@ -72,6 +72,21 @@ def rest_points(template, directions, shape):
     return points
 
 
+@numba.njit(cache=True, nogil=True)
+def turned_back(chain, b, i, n):
+    """A vector n on point i of body b as it acts on the point at rest: the blended R^T n."""
+    t0, t1, t2 = n[0] * 0, n[0] * 0, n[0] * 0
+    for k in range(chain.bones.shape[1]):
+        w = chain.shares[i, k]
+        if w == 0:
+            continue
+        r = chain.rotations[b, chain.bones[i, k]]
+        t0 += w * (r[0, 0] * n[0] + r[1, 0] * n[1] + r[2, 0] * n[2])
+        t1 += w * (r[0, 1] * n[0] + r[1, 1] * n[1] + r[2, 1] * n[2])
+        t2 += w * (r[0, 2] * n[0] + r[1, 2] * n[1] + r[2, 2] * n[2])
+    return t0, t1, t2
+
+
 def pose(rest: RestJoints, vectors: np.ndarray, *, derivatives: bool) -> Skeleton:
     """Skeletons of the parameter vectors (B,P)."""
     count, size = len(vectors), rest.directions.shape[2]

@@ -1,8 +1,10 @@
-"""The terms of :class:`.problem.BodyProblem` by compiled kernels, for bodies that have them.
+"""The terms of :class:`.problem.BodyProblem` by compiled kernels, on the CPU.
 
 A frame's skeleton is posed once for all terms; frames are shared out among as many threads as torch
 uses, and each term adds itself to its own frame's normal equations, so that nothing depends on who
-did what. The plain form of every term stays: for a GPU, and for bodies with pose blend shapes.
+did what. Pose blend shapes move the points at rest before the terms see them, and the gradient
+knows it; Gauss-Newton's matrices do not: see :mod:`.correctives_kernel`. The plain form of every
+term stays for a GPU.
 """
 
 from __future__ import annotations
@@ -30,6 +32,14 @@ from intercap_core.energy.body_surface_kernel import (
     add_self_cost,
     add_self_equations,
 )
+from intercap_core.energy.correctives_kernel import (
+    NUM_FEATURES,
+    Correctives,
+    add_gradient,
+    features,
+    gather,
+    move,
+)
 from intercap_core.energy.skeleton_kernel import RestJoints, pose, rest_points
 from intercap_core.solve.crew import Crew
 from intercap_core.solve.levenberg_marquardt import NormalEquations
@@ -38,7 +48,6 @@ if TYPE_CHECKING:
     from intercap_core.fitting.problem import BodyProblem
 
 _SHAPE = TRANSL.stop
-_NOTHING = np.zeros((0, 0, 3))
 
 
 @dataclass(frozen=True)
@@ -52,21 +61,65 @@ class Columns:
     offsets: int
 
 
+class _Rest(NamedTuple):
+    """Points (b,N,3) of a term at rest, which pose blend shapes, where there are any, are to move;
+    the gradient by them, (b,N,3), or of no body where it is not wanted."""
+
+    points: np.ndarray
+    correctives: Correctives | None
+    pull: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, correctives: Correctives | None, derivatives: bool) -> _Rest:
+        wanted = derivatives and correctives is not None
+        pull = np.zeros(points.shape if wanted else (0, 0, 3), points.dtype)
+        return cls(points, correctives, pull)
+
+    def move(self, feature: np.ndarray, at: slice, asked: np.ndarray) -> None:
+        """Move the points of the bodies ``at`` that are asked for, (B,N), by feature (B,486)."""
+        points = self.points[at]
+        move(self.correctives, feature, asked, points)
+
+
 class _Now(NamedTuple):
     """What a problem compares with at the moment, as arrays; rows and touching None if not.
 
-    places, samples and touched (b,N,3): the keypoints' pieces and the points of the two, at rest.
+    places, and the last of rows and of touching: the points of each.
     """
 
     pieces: Pieces
-    places: np.ndarray
+    places: _Rest
     seen: Seen
     priors: Priors
-    rows: tuple[np.ndarray, np.ndarray, np.ndarray] | None
-    samples: np.ndarray
-    touching: tuple[Touching, Selection] | None
-    touched: np.ndarray
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray, _Rest] | None
+    touching: tuple[Touching, Selection, _Rest] | None
     thickness: np.ndarray
+
+    def move(self, vectors: np.ndarray, frames: np.ndarray, at: slice) -> None:
+        """Move the points of the bodies ``at``, of parameters (B,P), by the pose blend shapes."""
+        if self.places.correctives is None:
+            return
+        feature = features(vectors)
+        self.places.move(feature, at, np.ones((len(frames), self.places.points.shape[1]), bool))
+        if self.rows is not None:
+            _, weight, _, samples = self.rows
+            samples.move(feature, at, weight[frames] > 0)
+        if self.touching is not None:
+            touching, _, touched = self.touching
+            touched.move(feature, at, touching.asked(frames, touched.points.shape[1]))
+
+    def add_pull(
+        self, vectors: np.ndarray, at: slice, place: np.ndarray, gradient: np.ndarray
+    ) -> None:
+        """Add the pull on those points to their bodies' gradient (B,n)."""
+        if self.places.correctives is None:
+            return
+        by_feature = np.zeros((len(vectors), NUM_FEATURES), vectors.dtype)
+        gather(self.places.correctives, self.places.pull[at], by_feature)
+        for term in (self.rows, self.touching):
+            if term is not None:
+                gather(term[-1].correctives, term[-1].pull[at], by_feature)
+        add_gradient(vectors, by_feature, place, gradient)
 
 
 class Terms:
@@ -77,8 +130,9 @@ class Terms:
         self._rest = RestJoints.of(model)
         self._samples = _selection(model, samples.vertex)
         self._group = samples.group
-        self._pieces: tuple[KeypointSet, Pieces] | None = None
-        self._touching: tuple[body_self.Pairs, Selection] | None = None
+        self._correctives = _correctives(self._samples)
+        self._pieces: tuple[KeypointSet, Pieces, Correctives | None] | None = None
+        self._touching: tuple[body_self.Pairs, Selection, Correctives | None] | None = None
         self._priors: dict[tuple[bool, bool], Priors] = {}
 
     def cost(
@@ -87,7 +141,7 @@ class Terms:
     ) -> Tensor:  # fmt: skip
         """(b,) of the frames ``index`` (b,) at vectors (b,P); offsets (K,3) of the keypoints and
         thickness (G,) of the coverings, metres."""
-        now = self._now(problem, vectors, offsets, thickness)
+        now = self._now(problem, vectors, offsets, thickness, derivatives=False)
         x, frames, total = vectors.numpy(), index.numpy(), vectors.new_zeros(len(index))
         nothing = np.zeros((1, 0, 0), x.dtype)
         fixed = np.full(x.shape[1], -1)
@@ -95,17 +149,19 @@ class Terms:
         def some(at: slice) -> None:
             own, ids, cost = x[at], frames[at], total.numpy()[at]
             skeleton = pose(self._rest, own, derivatives=False)
+            now.move(own, ids, at)
             add_priors(now.priors, own, ids, fixed, False, cost, nothing[0], nothing)
             body_keypoints_kernel.add_cost(
-                skeleton, now.pieces, now.places[at], now.seen, ids, cost
+                skeleton, now.pieces, now.places.points[at], now.seen, ids, cost
             )
             if now.rows is not None:
-                chain = skeleton.chain(self._samples, now.samples[at])
-                normal, weight, target = now.rows
+                normal, weight, target, samples = now.rows
+                chain = skeleton.chain(self._samples, samples.points[at])
                 add_plane_cost(chain, normal, weight, target, now.thickness, self._group, ids, cost)
             if now.touching is not None:
-                touching, selection = now.touching
-                add_self_cost(skeleton.chain(selection, now.touched[at]), touching, ids, cost)
+                touching, selection, touched = now.touching
+                chain = skeleton.chain(selection, touched.points[at])
+                add_self_cost(chain, touching, ids, cost)
 
         _share_out(some, len(index))
         return total
@@ -115,47 +171,57 @@ class Terms:
         index: Tensor, columns: Columns, equations: NormalEquations,
     ) -> None:  # fmt: skip
         """Add the terms to the normal equations of the same frames, in place."""
-        now = self._now(problem, vectors, offsets, thickness)
+        now = self._now(problem, vectors, offsets, thickness, derivatives=True)
         x, frames, place = vectors.numpy(), index.numpy(), columns.body
         costs, gradients, hessians = (part.numpy() for part in equations)
 
         def some(at: slice) -> None:
             own, ids = x[at], frames[at]
-            out: tuple[Any, ...] = costs[at], gradients[at], hessians[at]
+            cost, gradient, hessian = costs[at], gradients[at], hessians[at]
             skeleton = pose(self._rest, own, derivatives=True)
-            add_priors(now.priors, own, ids, place, True, *out)
+            now.move(own, ids, at)
+            add_priors(now.priors, own, ids, place, True, cost, gradient, hessian)
             body_keypoints_kernel.add_equations(
-                skeleton, now.pieces, now.places[at], now.seen, ids,
-                place, columns.first_offset, columns.offsets, *out,
+                skeleton, now.pieces, now.places.points[at], now.seen, ids,
+                place, columns.first_offset, columns.offsets,
+                cost, gradient, hessian, now.places.pull[at],
             )  # fmt: skip
             if now.rows is not None:
-                normal, weight, target = now.rows
+                normal, weight, target, samples = now.rows
                 body_cloud_kernel.add_equations(
-                    skeleton.chain(self._samples, now.samples[at]), self._samples.limbs,
+                    skeleton.chain(self._samples, samples.points[at]), self._samples.limbs,
                     normal, weight, target, now.thickness, self._group, ids, place,
-                    columns.covering, *out,
+                    columns.covering, cost, gradient, hessian, samples.pull[at],
                 )  # fmt: skip
             if now.touching is not None:
-                touching, selection = now.touching
-                add_self_equations(
-                    skeleton.chain(selection, now.touched[at]), touching, ids, place, *out
-                )
+                touching, selection, touched = now.touching
+                chain = skeleton.chain(selection, touched.points[at])
+                pull = touched.pull[at]
+                add_self_equations(chain, touching, ids, place, cost, gradient, hessian, pull)
+            now.add_pull(own, at, place, gradient)
 
         _share_out(some, len(index))
 
     def _now(
-        self, problem: BodyProblem, vectors: Tensor, offsets: Tensor, thickness: Tensor
-    ) -> _Now:
+        self, problem: BodyProblem, vectors: Tensor, offsets: Tensor, thickness: Tensor,
+        *, derivatives: bool,
+    ) -> _Now:  # fmt: skip
         model, rows, pairs = self._model, problem.rows, problem.touching
         shape = _array(vectors[:, _SHAPE:])
         if self._pieces is None or self._pieces[0] is not problem.keypoints:
-            self._pieces = problem.keypoints, Pieces.of(model, problem.keypoints)
-        touching, touched, samples = None, _NOTHING, _NOTHING
+            pieces = Pieces.of(model, problem.keypoints)
+            tables = pieces.posedirs
+            moved = Correctives.of(tables) if tables.shape[2] else None
+            self._pieces = problem.keypoints, pieces, moved
+        compared, touching = None, None
         if rows is not None:
-            samples = _at_rest(self._samples, shape)
+            samples = _Rest.of(_at_rest(self._samples, shape), self._correctives, derivatives)
+            compared = _array(rows.normal), _array(rows.weight), _array(rows.target), samples
         if pairs is not None:
             if self._touching is None or self._touching[0] is not pairs:
-                self._touching = pairs, _selection(model, pairs.vertices.numpy())
+                selection = _selection(model, pairs.vertices.numpy())
+                self._touching = pairs, selection, _correctives(selection)
+            _, selection, moved = self._touching
             starts = np.searchsorted(pairs.frame.numpy(), np.arange(len(problem.base) + 1))
             touching = (
                 Touching(
@@ -163,9 +229,9 @@ class Terms:
                     body_self.TOLERANCE, body_self.REACH,
                     float(problem.self_weight * body_self.WEIGHT),
                 ),
-                self._touching[1],
+                selection,
+                _Rest.of(_at_rest(selection, shape), moved, derivatives),
             )  # fmt: skip
-            touched = _at_rest(self._touching[1], shape)
         which = not problem.one_shape, problem.pose is not None
         if which not in self._priors:
             self._priors[which] = Priors.of(model, shape=which[0], body_pose=not which[1])
@@ -173,16 +239,14 @@ class Terms:
         if problem.pose is not None:
             mean, precision = _array(problem.pose.mean), _array(problem.pose.precision)
             priors = priors._replace(pose=mean, pose_precision=precision)
-        pieces = self._pieces[1]
+        _, pieces, moved = self._pieces
         return _Now(
             pieces,
-            pieces.at_rest(shape, offsets.numpy()),
+            _Rest.of(pieces.at_rest(shape, offsets.numpy()), moved, derivatives),
             _seen(problem),
             priors,
-            rows and (_array(rows.normal), _array(rows.weight), _array(rows.target)),
-            samples,
+            compared,
             touching,
-            touched,
             _array(thickness),
         )
 
@@ -213,6 +277,11 @@ def _array(values: Tensor) -> np.ndarray:
 
 def _selection(model: BodyModel, vertices: np.ndarray) -> Selection:
     return model.linearise(model.zeros(), vertex_ids=vertices).selection
+
+
+def _correctives(selection: Selection) -> Correctives | None:
+    posedirs = selection.posedirs
+    return None if posedirs is None else Correctives.of(posedirs.numpy())
 
 
 def _at_rest(selection: Selection, shape: np.ndarray) -> np.ndarray:

@@ -103,7 +103,7 @@ class BodyProblem:
     @property
     def is_compiled(self) -> bool:
         """Whether the terms are summed by compiled kernels: on the CPU."""
-        return self.base.device.type == "cpu" and self.model._posedirs is None
+        return self.base.device.type == "cpu"
 
     @cached_property
     def _terms(self) -> Terms:
