@@ -1,7 +1,7 @@
 """The normal equations of :mod:`.body_cloud`, compiled: a limb's samples touch few columns.
 
-Equal to :func:`.body_cloud.assemble` to rounding; what pose blend shapes add is left to
-:mod:`.correctives_kernel`.
+Equal to :func:`.body_cloud.assemble` to rounding, but for what :mod:`.correctives_kernel` says
+about pose blend shapes.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from intercap_core.body.parameters import TRANSL
+from intercap_core.energy.correctives_kernel import add_to_row
 from intercap_core.energy.skeleton_kernel import turned_back
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
@@ -114,14 +115,15 @@ def _add_squares(rows, weights, block):
 @numba.njit(cache=True, nogil=True)
 def add_equations(
     chain, limbs, normal, weight, target, thickness, group, frames, place, place_u,
-    cost, gradient, hessian, pull,
+    cost, gradient, hessian, pull, tables, change,
 ):  # fmt: skip
     """Add the normal equations of E_D to those of the frames (B,).
 
     ``limbs``: as :attr:`.Selection.limbs`; normal (T,N,3), weight (T,N), 0 = no row, target (T,N);
     thickness (G,) of each group's points, (N,), whose derivative by its column in ``place_u`` (G,)
     is itself; ``place`` (P,): the parameters' columns; -1 = fixed. cost (B,), gradient (B,n),
-    hessian (B,n,n). pull (B,N,3): the gradient by the points at rest; of no body if not wanted.
+    hessian (B,n,n). pull (B,N,3): the gradient by the points at rest, tables (N,3,486) and change
+    (B,54,3,9): see :mod:`.correctives_kernel`; of no body without pose blend shapes.
     """
     order, starts, moved_by = limbs
     dtype = hessian.dtype
@@ -145,6 +147,7 @@ def add_equations(
             local, local_u, to = all_local[limb], all_local_u[limb], all_to[limb]
             rows, block = np.empty((_TOGETHER, m), dtype), np.zeros((m, m), dtype)
             slope = np.zeros(m, dtype)
+            bent_by = np.flatnonzero(moved_by[limb, 1:]) + 1
             for at in range(starts[limb], starts[limb + 1]):
                 i = order[at]
                 w, g = weight[t, i], group[i]
@@ -161,10 +164,10 @@ def add_equations(
                 for q in range(m):
                     slope[q] -= pulls[0] * row[q]
                 if len(pull):
-                    t0, t1, t2 = turned_back(chain, b, i, n)
-                    pull[b, i, 0] -= pulls[0] * t0
-                    pull[b, i, 1] -= pulls[0] * t1
-                    pull[b, i, 2] -= pulls[0] * t2
+                    back = turned_back(chain, b, i, n)
+                    for d in range(3):
+                        pull[b, i, d] -= pulls[0] * back[d]
+                    add_to_row(row, local, bent_by, back, tables[i], change[b])
                 weights[filled] = w
                 filled += 1
                 if filled == _TOGETHER:

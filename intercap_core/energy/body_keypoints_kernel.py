@@ -2,8 +2,8 @@
 
 A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
 the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.
-Equal to the plain term to rounding; what pose blend shapes add to the gradient is left to
-:mod:`.correctives_kernel`.
+Equal to the plain term to rounding, but for what :mod:`.correctives_kernel` says about pose blend
+shapes.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from torch import Tensor
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.camera.projection import MIN_DEPTH_M
 from intercap_core.energy.body_keypoints import KeypointSet
+from intercap_core.energy.correctives_kernel import add_to_row
+from intercap_core.energy.sightings_kernel import ask
 from intercap_core.energy.skeleton_kernel import rest_points
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
@@ -96,26 +97,6 @@ def _limbs(chains: list[frozenset[int]]) -> list[list[int]]:
     return limbs
 
 
-class Seen(NamedTuple):
-    """What T frames' keypoints are compared with, in the model's floating type.
-
-    observed (T,C,K,2), confidence, sigma (T,C,K), lenses (C,13), colour_from_master (C,4,4), shift
-    (T,C,K,3): see :func:`.body_keypoints.reprojection`; targets (T,K,3), trust (T,K): see
-    :func:`.body_keypoints.triangulated`. What there is none of is of no frame.
-    """
-
-    observed: np.ndarray
-    confidence: np.ndarray
-    sigma: np.ndarray
-    lenses: np.ndarray
-    colour_from_master: np.ndarray
-    shift: np.ndarray
-    targets: np.ndarray
-    trust: np.ndarray
-    targets_sigma: float
-    scale: float
-
-
 @numba.njit(cache=True, nogil=True)
 def _piece(skeleton, pieces, rest, b, e):
     """Where piece e (3,) of body b is, times its share, metres."""
@@ -139,101 +120,6 @@ def _point(skeleton, pieces, rest, b, k):
 
 
 @numba.njit(cache=True, nogil=True)
-def _project(px, py, pz, q):
-    """Pixel (u, v) and its derivatives du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ of a point in the
-    camera's frame: :func:`.projection.project_with_jacobian`, beyond the metric radius too."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = q
-    free = pz > MIN_DEPTH_M
-    inverse = 1 / pz if free else 1 / MIN_DEPTH_M
-    x, y = px * inverse, py * inverse
-    radius = np.sqrt(x * x + y * y)
-    outside = radius > limit
-    stretch = radius / limit if outside else 1.0
-    x, y = x / stretch, y / stretch
-    s = x * x + y * y
-    below = 1 + s * (k4 + s * (k5 + s * k6))
-    d = (1 + s * (k1 + s * (k2 + s * k3))) / below
-    slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
-    dd = 2 * slope / below
-    xd = x * d + 2 * p1 * x * y + p2 * (s + 2 * x * x)
-    yd = y * d + p1 * (s + 2 * y * y) + 2 * p2 * x * y
-    xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
-    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y
-    yx = xy
-    yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
-    if outside:
-        along_x, along_y = (xd - xx * x - xy * y) / s, (yd - xy * x - yy * y) / s
-        xx, xy = xx + along_x * x, xy + along_x * y
-        yx, yy = yx + along_y * x, yy + along_y * y
-        xd, yd, x, y = xd * stretch, yd * stretch, x * stretch, y * stretch
-    by_z = -inverse if free else 0.0
-    return (
-        fx * xd + cx, fy * yd + cy,
-        fx * xx * inverse, fx * xy * inverse, fx * (xx * x + xy * y) * by_z,
-        fy * yx * inverse, fy * yy * inverse, fy * (yx * x + yy * y) * by_z,
-    )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def _ask(seen, t, k, p, slopes, gradient, matrix):
-    """What frame t says of keypoint k at p: returns its cost and, if ``slopes`` are wanted, writes
-    gradient (3,) and matrix (3,3) by the point."""
-    cost = 0.0
-    gradient[:] = 0
-    matrix[:] = 0
-    square = seen.scale * seen.scale
-    j = np.empty((2, 3))
-    views = seen.confidence.shape[1] if len(seen.confidence) else 0
-    for c in range(views):
-        trust = seen.confidence[t, c, k]
-        if not trust > 0:
-            continue
-        x, y, z = p
-        if len(seen.shift):
-            x += seen.shift[t, c, k, 0]
-            y += seen.shift[t, c, k, 1]
-            z += seen.shift[t, c, k, 2]
-        m = seen.colour_from_master[c]
-        u, v, ux, uy, uz, vx, vy, vz = _project(
-            m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
-            m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
-            m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
-            seen.lenses[c],
-        )
-        sharp = 1.0 / seen.sigma[t, c, k]
-        ru = (u - seen.observed[t, c, k, 0]) * sharp
-        rv = (v - seen.observed[t, c, k, 1]) * sharp
-        squared = ru * ru + rv * rv
-        share = square / (squared + square)
-        cost += 0.5 * trust * share * squared
-        if not slopes:
-            continue
-        weight = trust * share * share
-        for i in range(3):
-            j[0, i] = (ux * m[0, i] + uy * m[1, i] + uz * m[2, i]) * sharp
-            j[1, i] = (vx * m[0, i] + vy * m[1, i] + vz * m[2, i]) * sharp
-        for i in range(3):
-            gradient[i] += weight * (j[0, i] * ru + j[1, i] * rv)
-            for o in range(3):
-                matrix[i, o] += weight * (j[0, i] * j[0, o] + j[1, i] * j[1, o])
-    if len(seen.targets) and seen.trust[t, k] > 0:
-        sharp = 1.0 / seen.targets_sigma
-        r0 = (p[0] - seen.targets[t, k, 0]) * sharp
-        r1 = (p[1] - seen.targets[t, k, 1]) * sharp
-        r2 = (p[2] - seen.targets[t, k, 2]) * sharp
-        squared = r0 * r0 + r1 * r1 + r2 * r2
-        share = square / (squared + square)
-        cost += 0.5 * seen.trust[t, k] * share * squared
-        weight = seen.trust[t, k] * share * share * sharp
-        gradient[0] += weight * r0
-        gradient[1] += weight * r1
-        gradient[2] += weight * r2
-        for i in range(3):
-            matrix[i, i] += weight * sharp
-    return cost
-
-
-@numba.njit(cache=True, nogil=True)
 def add_cost(skeleton, pieces, rest, seen, frames, cost):
     """Add E_J to cost (B,) of the frames (B,), whose pieces at rest are (B,E,3)."""
     gradient, matrix = np.empty(3), np.empty((3, 3))
@@ -241,7 +127,7 @@ def add_cost(skeleton, pieces, rest, seen, frames, cost):
         total = 0.0
         for k in range(len(pieces.carrier)):
             p = _point(skeleton, pieces, rest, b, k)
-            total += _ask(seen, frames[b], k, p, False, gradient, matrix)
+            total += ask(seen, frames[b], k, p, False, gradient, matrix)
         cost[b] += total
 
 
@@ -287,6 +173,18 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
     for s in shape:
         for i in range(3):
             rows[i, local[_SHAPE + s]] = moved[i, s]
+
+
+@numba.njit(cache=True, nogil=True)
+def _bend(skeleton, pieces, b, k, slope, pull, rows, local, joints, change):
+    """Write the pull on the pieces of keypoint k, and add to its rows (3,m) what ``joints`` change
+    by pose blend shapes; slope (3,) of the cost by the keypoint."""
+    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+        turn = skeleton.rotations[b, pieces.bone[e]]
+        for i in range(3):
+            for d in range(3):
+                pull[b, e, d] += turn[i, d] * slope[i]
+            add_to_row(rows[i], local, joints, turn[i], pieces.posedirs[e], change)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -341,14 +239,15 @@ def _add_offset(turn, slope, matrix, pulled, to, first, gradient, hessian):
 @numba.njit(cache=True, nogil=True)
 def add_equations(
     skeleton, pieces, rest, seen, frames, place, first_offset, offsets,
-    cost, gradient, hessian, pull,
+    cost, gradient, hessian, pull, change,
 ):  # fmt: skip
     """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
     (B,E,3).
 
     ``place`` (P,) says where a parameter's column is, -1 = fixed; the offsets of the first
     ``offsets`` keypoints, three columns each, start at ``first_offset``. cost (B,), gradient (B,n),
-    hessian (B,n,n). pull (B,E,3): the gradient by the pieces at rest; of no body if not wanted.
+    hessian (B,n,n). pull (B,E,3): the gradient by the pieces at rest, change (B,54,3,9): see
+    :mod:`.correctives_kernel`; of no body without pose blend shapes.
     """
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
@@ -366,28 +265,25 @@ def add_equations(
             m, local, to = width[limb], all_local[limb], all_to[limb]
             rows, pulled = np.empty((3, m), dtype), np.empty((3, m), dtype)
             block = np.zeros((m, m), dtype)
+            bent_by = np.flatnonzero(pieces.moved_by[limb, 1:]) + 1
             for at in range(pieces.limb_starts[limb], pieces.limb_starts[limb + 1]):
                 k = pieces.order[at]
                 p = _point(skeleton, pieces, rest, b, k)
-                cost[b] += _ask(seen, frames[b], k, p, True, slope, matrix)
+                cost[b] += ask(seen, frames[b], k, p, True, slope, matrix)
                 if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
                     continue
-                if len(pull):
-                    for e in range(pieces.starts[k], pieces.starts[k + 1]):
-                        turn = skeleton.rotations[b, pieces.bone[e]]
-                        for i in range(3):
-                            for d in range(3):
-                                pull[b, e, d] += turn[i, d] * slope[i]
                 _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)
+                for q in range(m):
+                    gradient[b, to[q]] += (
+                        rows[0, q] * slope[0] + rows[1, q] * slope[1] + rows[2, q] * slope[2]
+                    )
+                if len(pull):
+                    _bend(skeleton, pieces, b, k, slope, pull, rows, local, bent_by, change[b])
                 for i in range(3):
                     for o in range(3):
                         narrow[i, o] = matrix[i, o]
                 _pull(narrow, rows, pulled)
                 _add_product(rows, pulled, block)
-                for q in range(m):
-                    gradient[b, to[q]] += (
-                        rows[0, q] * slope[0] + rows[1, q] * slope[1] + rows[2, q] * slope[2]
-                    )
                 if k < offsets:
                     turn = skeleton.rotations[b, pieces.bone[pieces.carrier[k]]]
                     first = first_offset + 3 * k

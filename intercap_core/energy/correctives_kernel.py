@@ -1,14 +1,12 @@
 """Pose blend shapes of chosen points, compiled: the points at rest, and the exact gradient.
 
 A point at rest moves by P vec(R - I), R the 54 local rotations below the root. Terms take the moved
-points, and leave the pull p = dE / dx on each point at rest; then dE/dR = P^T p, and as a change of
-an axis-angle theta turns its rotation by the left Jacobian's J_l d theta,
+points, and leave the pull p = dE / dx on each point at rest; then dE/dR = P^T p, and the gradient
+by the parameters follows with dR / d theta_c = skew(J_l e_c) R, J_l the left Jacobian.
 
-    dE / d theta = J_l^T sum over columns c of R_c x (dE/dR)_c.
-
-Gauss-Newton's matrices leave these derivatives out: they are millimetres a radian beside the
-decimetres by which a turn moves a limb, and would tie every point to every joint. A minimum is
-where the gradient is zero, so it stays where it is.
+Gauss-Newton's matrices of keypoints and cloud know these derivatives by the joints of a point's own
+limb. Others are left out: they would tie every point to every joint, for the sake of millimetres a
+radian. A minimum is where the gradient is zero, so it stays where it is.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ _TOGETHER = 16  # points whose table stays in a core's own cache for all bodies
 
 
 class Correctives(NamedTuple):
-    """Of the points ``ids`` (n,) of a term, those that are moved: tables (n,3,486), metres."""
+    """tables (N,3,486) of a term's points, metres, and ``ids`` (n,) of those that they move."""
 
     ids: np.ndarray
     tables: np.ndarray
@@ -35,8 +33,7 @@ class Correctives(NamedTuple):
     @classmethod
     def of(cls, tables: np.ndarray) -> Correctives:
         """Those of a term's points (N,3,486)."""
-        ids = np.flatnonzero(tables.any((1, 2)))
-        return cls(ids, np.ascontiguousarray(tables[ids]))
+        return cls(np.flatnonzero(tables.any((1, 2))), np.ascontiguousarray(tables))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -69,8 +66,8 @@ def move(correctives, feature, asked, rest):
             for i in range(first, min(first + _TOGETHER, len(ids))):
                 if not asked[b, ids[i]]:
                     continue
-                t0, t1, t2 = tables[i, 0], tables[i, 1], tables[i, 2]
-                x = y = z = rest[b, 0, 0] * 0
+                t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
+                x = y = z = by[0] * np.float32(0)  # of the same type
                 for k in range(NUM_FEATURES):
                     x += t0[k] * by[k]
                     y += t1[k] * by[k]
@@ -91,32 +88,68 @@ def gather(correctives, pull, by_feature):
                 x, y, z = pull[b, ids[i], 0], pull[b, ids[i], 1], pull[b, ids[i], 2]
                 if x == 0 and y == 0 and z == 0:
                     continue
-                t0, t1, t2 = tables[i, 0], tables[i, 1], tables[i, 2]
+                t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
                 for k in range(NUM_FEATURES):
                     by[k] += x * t0[k] + y * t1[k] + z * t2[k]
 
 
 @numba.njit(cache=True, nogil=True)
-def add_gradient(vectors, by_feature, place, gradient):
-    """Add a gradient by the features (B,486) to that by the parameters (B,n).
-
-    vectors (B,P); ``place`` (P,): each parameter's column, -1 = fixed.
-    """
+def changes(vectors):
+    """d R / d axis-angle, (B,54,3,9) by axis and number of the rotation, at (B,P) parameters."""
+    out = np.empty((len(vectors), NUM_FEATURES // 9, 3, 9), vectors.dtype)
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
     for b in range(len(vectors)):
         x = vectors[b]
-        for p in range(_FIRST, NUM_POSE, 3):
+        for joint in range(out.shape[1]):
+            p = _FIRST + 3 * joint
             _rodrigues(
                 np.float64(x[p]), np.float64(x[p + 1]), np.float64(x[p + 2]), local, jacobian
             )
-            f = by_feature[b, 3 * (p - _FIRST) : 3 * (p - _FIRST) + 9].copy().reshape(3, 3)
-            u0, u1, u2 = 0.0, 0.0, 0.0
-            for c in range(3):
-                u0 += local[1, c] * f[2, c] - local[2, c] * f[1, c]
-                u1 += local[2, c] * f[0, c] - local[0, c] * f[2, c]
-                u2 += local[0, c] * f[1, c] - local[1, c] * f[0, c]
             for d in range(3):
-                if place[p + d] >= 0:
-                    gradient[b, place[p + d]] += (
-                        jacobian[0, d] * u0 + jacobian[1, d] * u1 + jacobian[2, d] * u2
-                    )
+                w0, w1, w2 = jacobian[0, d], jacobian[1, d], jacobian[2, d]
+                for c in range(3):
+                    out[b, joint, d, c] = w1 * local[2, c] - w2 * local[1, c]
+                    out[b, joint, d, 3 + c] = w2 * local[0, c] - w0 * local[2, c]
+                    out[b, joint, d, 6 + c] = w0 * local[1, c] - w1 * local[0, c]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def add_gradient(change, by_feature, place, gradient):
+    """Add a gradient by the features (B,486) to that by the parameters (B,n).
+
+    change (B,54,3,9) of :func:`changes`; ``place`` (P,): each parameter's column, -1 = fixed.
+    """
+    for b in range(len(change)):
+        for joint in range(change.shape[1]):
+            for d in range(3):
+                q = place[_FIRST + 3 * joint + d]
+                if q >= 0:
+                    for k in range(9):
+                        gradient[b, q] += change[b, joint, d, k] * by_feature[b, 9 * joint + k]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def add_to_row(row, local, joints, t, table, change):
+    """Add what the correctives of one point change by ``joints`` to its row of derivatives.
+
+    t (3,): the row's direction turned back to the point at rest; table (3,486); change (54,3,9);
+    ``local`` (P,): each parameter's place in the row, -1 = not there.
+    """
+    for joint in joints:
+        first, by = 9 * (joint - 1), change[joint - 1]
+        s0 = s1 = s2 = t[0] * np.float32(0)  # of the same type
+        for k in range(9):
+            along = (
+                t[0] * table[0, first + k] + t[1] * table[1, first + k] + t[2] * table[2, first + k]
+            )
+            s0 += along * by[0, k]
+            s1 += along * by[1, k]
+            s2 += along * by[2, k]
+        p = 3 * joint
+        if local[p] >= 0:
+            row[local[p]] += s0
+        if local[p + 1] >= 0:
+            row[local[p + 1]] += s1
+        if local[p + 2] >= 0:
+            row[local[p + 2]] += s2

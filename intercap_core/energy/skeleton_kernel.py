@@ -75,7 +75,7 @@ def rest_points(template, directions, shape):
 @numba.njit(cache=True, nogil=True)
 def turned_back(chain, b, i, n):
     """A vector n on point i of body b as it acts on the point at rest: the blended R^T n."""
-    t0, t1, t2 = n[0] * 0, n[0] * 0, n[0] * 0
+    t0 = t1 = t2 = n[0] * np.float32(0)  # of the same type
     for k in range(chain.bones.shape[1]):
         w = chain.shares[i, k]
         if w == 0:

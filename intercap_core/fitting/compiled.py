@@ -3,8 +3,8 @@
 A frame's skeleton is posed once for all terms; frames are shared out among as many threads as torch
 uses, and each term adds itself to its own frame's normal equations, so that nothing depends on who
 did what. Pose blend shapes move the points at rest before the terms see them, and the gradient
-knows it; Gauss-Newton's matrices do not: see :mod:`.correctives_kernel`. The plain form of every
-term stays for a GPU.
+knows it; Gauss-Newton's matrices do in part: see :mod:`.correctives_kernel`. The plain form of
+every term stays for a GPU.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from intercap_core.body.selection import Selection
 from intercap_core.energy import body_cloud_kernel, body_keypoints_kernel, body_self
 from intercap_core.energy.body_cloud import Samples
 from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.body_keypoints_kernel import Pieces, Seen
+from intercap_core.energy.body_keypoints_kernel import Pieces
 from intercap_core.energy.body_priors_kernel import Priors, add_priors
 from intercap_core.energy.body_surface_kernel import (
     Touching,
@@ -36,10 +36,12 @@ from intercap_core.energy.correctives_kernel import (
     NUM_FEATURES,
     Correctives,
     add_gradient,
+    changes,
     features,
     gather,
     move,
 )
+from intercap_core.energy.sightings_kernel import Seen
 from intercap_core.energy.skeleton_kernel import RestJoints, pose, rest_points
 from intercap_core.solve.crew import Crew
 from intercap_core.solve.levenberg_marquardt import NormalEquations
@@ -75,6 +77,12 @@ class _Rest(NamedTuple):
         pull = np.zeros(points.shape if wanted else (0, 0, 3), points.dtype)
         return cls(points, correctives, pull)
 
+    @property
+    def tables(self) -> np.ndarray:
+        """(N,3,486), or of no point."""
+        nothing = np.empty((0, 3, NUM_FEATURES), self.points.dtype)
+        return nothing if self.correctives is None else self.correctives.tables
+
     def move(self, feature: np.ndarray, at: slice, asked: np.ndarray) -> None:
         """Move the points of the bodies ``at`` that are asked for, (B,N), by feature (B,486)."""
         points = self.points[at]
@@ -109,17 +117,17 @@ class _Now(NamedTuple):
             touched.move(feature, at, touching.asked(frames, touched.points.shape[1]))
 
     def add_pull(
-        self, vectors: np.ndarray, at: slice, place: np.ndarray, gradient: np.ndarray
+        self, at: slice, change: np.ndarray, place: np.ndarray, gradient: np.ndarray
     ) -> None:
-        """Add the pull on those points to their bodies' gradient (B,n)."""
+        """Add the pull on those points to their bodies' gradient (B,n); change: of `changes`."""
         if self.places.correctives is None:
             return
-        by_feature = np.zeros((len(vectors), NUM_FEATURES), vectors.dtype)
+        by_feature = np.zeros((len(change), NUM_FEATURES), change.dtype)
         gather(self.places.correctives, self.places.pull[at], by_feature)
         for term in (self.rows, self.touching):
             if term is not None:
                 gather(term[-1].correctives, term[-1].pull[at], by_feature)
-        add_gradient(vectors, by_feature, place, gradient)
+        add_gradient(change, by_feature, place, gradient)
 
 
 class Terms:
@@ -179,12 +187,13 @@ class Terms:
             own, ids = x[at], frames[at]
             cost, gradient, hessian = costs[at], gradients[at], hessians[at]
             skeleton = pose(self._rest, own, derivatives=True)
+            change = changes(own if now.places.correctives else own[:0])
             now.move(own, ids, at)
             add_priors(now.priors, own, ids, place, True, cost, gradient, hessian)
             body_keypoints_kernel.add_equations(
                 skeleton, now.pieces, now.places.points[at], now.seen, ids,
                 place, columns.first_offset, columns.offsets,
-                cost, gradient, hessian, now.places.pull[at],
+                cost, gradient, hessian, now.places.pull[at], change,
             )  # fmt: skip
             if now.rows is not None:
                 normal, weight, target, samples = now.rows
@@ -192,13 +201,14 @@ class Terms:
                     skeleton.chain(self._samples, samples.points[at]), self._samples.limbs,
                     normal, weight, target, now.thickness, self._group, ids, place,
                     columns.covering, cost, gradient, hessian, samples.pull[at],
+                    samples.tables, change,
                 )  # fmt: skip
             if now.touching is not None:
                 touching, selection, touched = now.touching
                 chain = skeleton.chain(selection, touched.points[at])
                 pull = touched.pull[at]
                 add_self_equations(chain, touching, ids, place, cost, gradient, hessian, pull)
-            now.add_pull(own, at, place, gradient)
+            now.add_pull(at, change, place, gradient)
 
         _share_out(some, len(index))
 

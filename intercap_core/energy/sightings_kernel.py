@@ -1,0 +1,125 @@
+"""What views and triangulated points say of a keypoint, compiled: :mod:`.body_keypoints`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from intercap_core.camera.projection import MIN_DEPTH_M
+
+
+class Seen(NamedTuple):
+    """What T frames' keypoints are compared with, in the model's floating type.
+
+    observed (T,C,K,2), confidence, sigma (T,C,K), lenses (C,13), colour_from_master (C,4,4), shift
+    (T,C,K,3): see :func:`.body_keypoints.reprojection`; targets (T,K,3), trust (T,K): see
+    :func:`.body_keypoints.triangulated`. What there is none of is of no frame.
+    """
+
+    observed: np.ndarray
+    confidence: np.ndarray
+    sigma: np.ndarray
+    lenses: np.ndarray
+    colour_from_master: np.ndarray
+    shift: np.ndarray
+    targets: np.ndarray
+    trust: np.ndarray
+    targets_sigma: float
+    scale: float
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(px, py, pz, q):
+    """Pixel (u, v) and its derivatives du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ of a point in the
+    camera's frame: :func:`.projection.project_with_jacobian`, beyond the metric radius too."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = q
+    free = pz > MIN_DEPTH_M
+    inverse = 1 / pz if free else 1 / MIN_DEPTH_M
+    x, y = px * inverse, py * inverse
+    radius = np.sqrt(x * x + y * y)
+    outside = radius > limit
+    stretch = radius / limit if outside else 1.0
+    x, y = x / stretch, y / stretch
+    s = x * x + y * y
+    below = 1 + s * (k4 + s * (k5 + s * k6))
+    d = (1 + s * (k1 + s * (k2 + s * k3))) / below
+    slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
+    dd = 2 * slope / below
+    xd = x * d + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+    yd = y * d + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+    xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y
+    yx = xy
+    yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
+    if outside:
+        along_x, along_y = (xd - xx * x - xy * y) / s, (yd - xy * x - yy * y) / s
+        xx, xy = xx + along_x * x, xy + along_x * y
+        yx, yy = yx + along_y * x, yy + along_y * y
+        xd, yd, x, y = xd * stretch, yd * stretch, x * stretch, y * stretch
+    by_z = -inverse if free else 0.0
+    return (
+        fx * xd + cx, fy * yd + cy,
+        fx * xx * inverse, fx * xy * inverse, fx * (xx * x + xy * y) * by_z,
+        fy * yx * inverse, fy * yy * inverse, fy * (yx * x + yy * y) * by_z,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def ask(seen, t, k, p, slopes, gradient, matrix):
+    """What frame t says of keypoint k at p: returns its cost and, if ``slopes`` are wanted, writes
+    gradient (3,) and matrix (3,3) by the point."""
+    cost = 0.0
+    gradient[:] = 0
+    matrix[:] = 0
+    square = seen.scale * seen.scale
+    j = np.empty((2, 3))
+    views = seen.confidence.shape[1] if len(seen.confidence) else 0
+    for c in range(views):
+        trust = seen.confidence[t, c, k]
+        if not trust > 0:
+            continue
+        x, y, z = p
+        if len(seen.shift):
+            x += seen.shift[t, c, k, 0]
+            y += seen.shift[t, c, k, 1]
+            z += seen.shift[t, c, k, 2]
+        m = seen.colour_from_master[c]
+        u, v, ux, uy, uz, vx, vy, vz = _project(
+            m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+            m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+            m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+            seen.lenses[c],
+        )
+        sharp = 1.0 / seen.sigma[t, c, k]
+        ru = (u - seen.observed[t, c, k, 0]) * sharp
+        rv = (v - seen.observed[t, c, k, 1]) * sharp
+        squared = ru * ru + rv * rv
+        share = square / (squared + square)
+        cost += 0.5 * trust * share * squared
+        if not slopes:
+            continue
+        weight = trust * share * share
+        for i in range(3):
+            j[0, i] = (ux * m[0, i] + uy * m[1, i] + uz * m[2, i]) * sharp
+            j[1, i] = (vx * m[0, i] + vy * m[1, i] + vz * m[2, i]) * sharp
+        for i in range(3):
+            gradient[i] += weight * (j[0, i] * ru + j[1, i] * rv)
+            for o in range(3):
+                matrix[i, o] += weight * (j[0, i] * j[0, o] + j[1, i] * j[1, o])
+    if len(seen.targets) and seen.trust[t, k] > 0:
+        sharp = 1.0 / seen.targets_sigma
+        r0 = (p[0] - seen.targets[t, k, 0]) * sharp
+        r1 = (p[1] - seen.targets[t, k, 1]) * sharp
+        r2 = (p[2] - seen.targets[t, k, 2]) * sharp
+        squared = r0 * r0 + r1 * r1 + r2 * r2
+        share = square / (squared + square)
+        cost += 0.5 * seen.trust[t, k] * share * squared
+        weight = seen.trust[t, k] * share * share * sharp
+        gradient[0] += weight * r0
+        gradient[1] += weight * r1
+        gradient[2] += weight * r2
+        for i in range(3):
+            matrix[i, i] += weight * sharp
+    return cost
