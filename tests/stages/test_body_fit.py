@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,16 @@ from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle
+from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
 from intercap_core.energy import body_cloud, body_keypoints
 from intercap_core.energy.body_cloud import COVERINGS
 from intercap_core.errors import UserError
+from intercap_core.fitting.observations import person_clouds, read_observations
 from intercap_core.fitting.problem import BodyProblem, Views
-from intercap_core.fitting.schedule import columns_of
+from intercap_core.fitting.schedule import Fitter, columns_of
 from intercap_core.schemas import BODY_FIT, BODY_PARTS, PERSON
 from intercap_core.solve.levenberg_marquardt import minimise
 from intercap_core.stages import body_fit
@@ -385,3 +388,26 @@ def test_artefacts_of_another_recording_are_refused(model, clothed, tmp_path: Pa
             output=tmp_path / "out.h5", subject=SUBJECT, body_models=BodyModels(),
             settings=SETTINGS,
         )  # fmt: skip
+
+
+def test_blend_shapes_compiled_or_plain_end_in_the_same_bodies(tmp_path, monkeypatch):
+    """A bend moves the skin around its joint by a centimetre and more."""
+    file = load_body_file(None, 10, 10)
+    joints = (file.joint_regressor @ file.template)[1:]
+    size = np.where(np.arange(1, 55) < 22, 0.012, 0.002)
+    away = np.linalg.norm(file.template[:, None] - joints, axis=2) / np.where(
+        size > 0.01, 0.08, 0.02
+    )
+    near = (size * np.exp(-(away**2) / 2)).repeat(9, 1)
+    moves = near[:, None] * np.random.default_rng(5).standard_normal((3, 486))
+    model = BodyModel(replace(file, posedirs=moves), torch.device("cpu"), torch.float32)
+    capture = Capture(model, tmp_path, 3, cameras=4, pixel_noise=1.0, depth_noise_mm=3.0)
+    seen = read_observations(capture.inputs.scene, capture.inputs.person)
+    found = []
+    for compiled in (True, False):
+        monkeypatch.setattr(BodyProblem, "is_compiled", compiled)
+        clouds = list(person_clouds(capture.inputs.frames, seen, 800, model.device))
+        vectors = Fitter(model, seen, clouds, SETTINGS).run().vectors
+        found.append(model.forward(model.parameters(vectors)).joints.numpy())
+    assert 1000 * np.linalg.norm(found[0] - found[1], axis=2).max() < 0.3
+    assert 1000 * np.linalg.norm(found[0] - capture.joints, axis=2)[:, :22].mean() < 4
