@@ -410,4 +410,4 @@ def test_blend_shapes_compiled_or_plain_end_in_the_same_bodies(tmp_path, monkeyp
         vectors = Fitter(model, seen, clouds, SETTINGS).run().vectors
         found.append(model.forward(model.parameters(vectors)).joints.numpy())
     assert 1000 * np.linalg.norm(found[0] - found[1], axis=2).max() < 0.3
-    assert 1000 * np.linalg.norm(found[0] - capture.joints, axis=2)[:, :22].mean() < 4
+    assert 1000 * np.linalg.norm(found[0] - capture.joints, axis=2)[:, :22].mean() < 6
