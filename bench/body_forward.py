@@ -60,7 +60,8 @@ def write_files(folder: Path) -> tuple[Path, Path]:
     """The open body with pose blend shapes, with 400 shape directions and with 20."""
     with np.load(OPEN_BODY) as file:
         arrays = {name: file[name] for name in file.files}
-    table = arrays["shapedirs"].astype(np.float32)
+    shape, expression = np.split(arrays["shapedirs"].astype(np.float32), 2, axis=2)
+    table = np.concatenate([shape[:, :, :10], expression[:, :, :10]], 2)
     wide = np.zeros((*table.shape[:2], 400), np.float32)
     wide[:, :, :10], wide[:, :, 300:310] = table[:, :, :10], table[:, :, 10:]
     posedirs = np.random.default_rng(3).normal(0, 2e-3, (len(table), 3, 486)).astype(np.float32)
