@@ -11,7 +11,7 @@ import numpy as np
 
 from intercap_core.body.parameters import TRANSL
 from intercap_core.energy.correctives_kernel import add_to_row
-from intercap_core.energy.skeleton_kernel import turned_back
+from intercap_core.energy.skeleton_kernel import columns_of_limb, turned_back
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _TOGETHER = 4  # rows that are added to a block at once
@@ -21,13 +21,8 @@ _TOGETHER = 4  # rows that are added to a block at once
 def _find_columns(moved_by, place, group, place_u, local, local_u, to):
     """A limb's columns: writes where each parameter's (P,) and each covering's (G,) is in its rows,
     -1 = not there, and ``to``, where they stand in the normal equations; how many there are."""
-    local[:] = -1
+    m = columns_of_limb(moved_by, place, local, to)
     local_u[:] = -1
-    m = 0
-    for p in range(len(place)):
-        if place[p] >= 0 and (p >= _TRANSL or moved_by[p // 3]):
-            local[p], to[m] = m, place[p]
-            m += 1
     for g in group:
         if place_u[g] >= 0 and local_u[g] < 0:
             local_u[g], to[m] = m, place_u[g]

@@ -21,7 +21,7 @@ from intercap_core.body.parameters import TRANSL
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.correctives_kernel import add_to_row
 from intercap_core.energy.sightings_kernel import ask
-from intercap_core.energy.skeleton_kernel import rest_points
+from intercap_core.energy.skeleton_kernel import columns_of_limb, rest_points
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _PARENTS = np.array(PARENTS)
@@ -187,19 +187,6 @@ def _bend(skeleton, pieces, b, k, slope, pull, rows, local, joints, change):
             add_to_row(rows[i], local, joints, turn[i], pieces.posedirs[e], change)
 
 
-@numba.njit(cache=True, nogil=True)
-def _find_columns(moved_by, place, local, to):
-    """A limb's columns: writes where each parameter's is in its rows, ``local`` (P,), -1 = not
-    there, and where it stands in the normal equations, ``to``; how many there are."""
-    local[:] = -1
-    m = 0
-    for p in range(len(place)):
-        if place[p] >= 0 and (p >= _TRANSL or moved_by[p // 3]):
-            local[p], to[m] = m, place[p]
-            m += 1
-    return m
-
-
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def _pull(matrix, rows, pulled):
     """pulled = matrix rows, (3,m)."""
@@ -259,7 +246,7 @@ def add_equations(
     all_to, width = np.empty((limbs, len(place)), np.int64), np.empty(limbs, np.int64)
     for limb in range(limbs):
         moved_by = pieces.moved_by[limb]
-        width[limb] = _find_columns(moved_by, place, all_local[limb], all_to[limb])
+        width[limb] = columns_of_limb(moved_by, place, all_local[limb], all_to[limb])
     for b in range(len(frames)):
         for limb in range(limbs):
             m, local, to = width[limb], all_local[limb], all_to[limb]

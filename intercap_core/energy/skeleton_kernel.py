@@ -73,6 +73,23 @@ def rest_points(template, directions, shape):
 
 
 @numba.njit(cache=True, nogil=True)
+def columns_of_limb(moved_by, place, local, to):
+    """A limb's columns: writes where each parameter's is in its rows, ``local`` (P,), -1 = not
+    there, and where it stands in the normal equations, ``to``; how many there are.
+
+    ``moved_by`` (55,) bool: the joints that turn the limb; ``place`` (P,): each parameter's column
+    in the normal equations, -1 = fixed.
+    """
+    local[:] = -1
+    m = 0
+    for p in range(len(place)):
+        if place[p] >= 0 and (p >= _TRANSL or moved_by[p // 3]):
+            local[p], to[m] = m, place[p]
+            m += 1
+    return m
+
+
+@numba.njit(cache=True, nogil=True)
 def turned_back(chain, b, i, n):
     """A vector n on point i of body b as it acts on the point at rest: the blended R^T n."""
     t0 = t1 = t2 = n[0] * np.float32(0)  # of the same type
