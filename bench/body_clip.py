@@ -14,14 +14,14 @@ from torch import Tensor
 from intercap_core.artefacts import read
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
-from intercap_core.config import BodyFitSettings
-from intercap_core.errors import UserError
-from intercap_core.fitting.observations import (
+from intercap_core.body_fit.observations import (
     Observations,
     PersonCloud,
     person_clouds,
     read_observations,
 )
+from intercap_core.config import BodyFitSettings
+from intercap_core.errors import UserError
 from intercap_core.metrics.body import vertex_error
 from intercap_core.metrics.truth import Truth
 from intercap_core.project import Project

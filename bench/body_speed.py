@@ -31,9 +31,9 @@ from bench.body_clip import BodyClip
 from bench.body_forward import BATCH, forward_times
 from bench.command import add_figures, from_command_line
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body_fit.schedule import Fitter
+from intercap_core.body_fit.start import place_trunk
 from intercap_core.errors import UserError
-from intercap_core.fitting.schedule import Fitter
-from intercap_core.fitting.start import place_trunk
 from intercap_core.project import load_project
 
 THREADS = int(os.environ["OMP_NUM_THREADS"])

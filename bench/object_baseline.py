@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation
 from bench.soft_rasteriser import OverdrawRasteriser, Pixels, Rasteriser, SoftRasteriser
 from intercap_core.camera.projection import project_with_jacobian
 from intercap_core.camera.transforms import apply
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import Rendering, render
-from intercap_core.tracking.evidence import View
-from intercap_core.tracking.reduced_mask import ReducedMask
+from intercap_core.rigid.render import render
+from intercap_core.rigid.shots import Rendering
 
 MARGIN_PX = 12  # of a tile around mask and prediction: how far a pose may stray
 COVERED = 0.5  # depth counts where the object is drawn at all

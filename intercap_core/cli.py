@@ -14,18 +14,8 @@ from typing import Annotated
 import typer
 
 from intercap_core.errors import UserError
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
-STAGES = {
-    "frames": "Recordings to synchronised frame sets.",
-    "detections": "Keypoints and segmentation candidates, from files or models.",
-    "scene": "Refined extrinsics, ground plane and background.",
-    "person": "The subject over views, and the triangulated keypoints.",
-    "object_track": "The object's pose in every frame.",
-    "body_fit": "SMPL-X parameters in every frame.",
-    "joint": "Body and object together, over all frames, with contact.",
-    "metrics": "Distances, penetration, and errors against truth where it is known.",
-    "export": "Files for other tools: InterCap, AMASS, BOP, glb.",
-}
 WHOLE, SINGLE, LOOK = "A whole dataset", "One step of one sequence", "Look and maintain"
 
 app = typer.Typer(
@@ -89,14 +79,14 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 
     Example: intercap check config/demo/config.yaml
     """
-    from intercap_core.project import load_project
-    from intercap_core.project_check import (
+    from intercap_core.commands.check import (
         check_bodies,
         check_detector,
-        check_device,
         faults_of_sequences,
         notes_of_sequences,
     )
+    from intercap_core.pipeline.step import check_device
+    from intercap_core.project import load_project
 
     project = load_project(settings)
     check_device(project)
@@ -152,7 +142,7 @@ def tables(
     Examples: intercap tables intercap ~/InterCap --output config/intercap;
     intercap tables behave ~/BEHAVE --output config/behave
     """
-    from intercap_core.tables.command import write_tables
+    from intercap_core.commands.tables import write_tables
     from intercap_core.tables.intercap import Sources
 
     sources = Sources(calibrations, annotations, meshes, keypoints, candidates)
@@ -179,7 +169,7 @@ def run(context: typer.Context, settings: Settings = DEFAULT_SETTINGS, cores: Co
     Examples: intercap run config/demo/config.yaml;
     intercap run config/demo/config.yaml --cores 2 -- --until joint
     """
-    from intercap_core.run import run_workflow
+    from intercap_core.commands.run import run_workflow
 
     raise typer.Exit(run_workflow(settings, cores=cores, arguments=context.args))
 
@@ -191,8 +181,8 @@ def report(settings: Settings = DEFAULT_SETTINGS) -> None:
     Example: intercap report config/demo/config.yaml
     """
     _prepare()
+    from intercap_core.pipeline.step import run_dataset
     from intercap_core.project import load_project
-    from intercap_core.step import run_dataset
 
     typer.echo(run_dataset(load_project(settings)))
 
@@ -225,7 +215,7 @@ def evaluate(
 
     Examples: intercap evaluate; intercap evaluate --only bodies --output body.json
     """
-    from intercap_core.evaluation import evaluate as run_evaluation
+    from intercap_core.evaluation.evaluate import evaluate as run_evaluation
 
     _check_output(output, replace_any=True)
     whole = settings if only in (None, Part.sequences) else None
@@ -247,7 +237,7 @@ def bench(
 
     Example: intercap bench
     """
-    from intercap_core.benchmark import measure
+    from intercap_core.commands.bench import measure
 
     _check_output(output, replace_any=True)
     measure(settings, output, cores=cores)
@@ -260,8 +250,8 @@ def studio(settings: Settings, sequence: SequenceName) -> None:
     Example: intercap studio config/demo/config.yaml cup_drink_s02
     """
     _prepare()
+    from intercap_core.pipeline.step import run_studio
     from intercap_core.project import load_project
-    from intercap_core.step import run_studio
 
     project = load_project(settings)
     typer.echo(run_studio(project, _known(project.sequences, sequence)))
@@ -279,8 +269,8 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         ] = 1,
     ) -> None:
         _prepare(threads)
+        from intercap_core.pipeline.step import run_step
         from intercap_core.project import load_project
-        from intercap_core.step import SEQUENCE_STAGES, run_step
 
         project = load_project(settings)
         name = _known(project.sequences, sequence)
@@ -299,8 +289,10 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
     return command
 
 
-for _stage, _purpose in STAGES.items():
-    app.command(_stage.replace("_", "-"), rich_help_panel=SINGLE)(_stage_command(_stage, _purpose))
+for _stage in STAGES.values():
+    app.command(_stage.name.replace("_", "-"), rich_help_panel=SINGLE)(
+        _stage_command(_stage.name, _stage.purpose)
+    )
 
 
 @app.command(rich_help_panel=LOOK)
@@ -312,7 +304,7 @@ def inspect(
 
     Example: intercap inspect results/demo/cup_drink_s02/joint.h5
     """
-    from intercap_core.artefact_summary import print_summary
+    from intercap_core.commands.inspect import print_summary
 
     print_summary(artefact, verify=verify)
 
@@ -323,7 +315,7 @@ def docs(
     check_only: Annotated[bool, typer.Option("--check", help="Only say what is stale.")] = False,
 ) -> None:
     """Write what is generated from the code: config/README.md, JSON schemas, docs/artefacts.md."""
-    from intercap_core.generated_docs import generate
+    from intercap_core.commands.docs import generate
 
     stale = generate(root, write=not check_only)
     for path in stale:
@@ -336,7 +328,7 @@ def _prepare(threads: int = 1) -> None:
     """Threads before any numerical library is imported; progress to standard error."""
     import logging
 
-    from intercap_core.job import set_threads
+    from intercap_core.pipeline.job import set_threads
 
     set_threads(threads)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")

@@ -7,9 +7,11 @@ JSON schemas in ``config/schemas/`` are generated from these models.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -493,3 +495,11 @@ class Annotation(Model):
         if beyond:
             return f"drop_frames holds {beyond[0]}, the recording has {count} frames"
         return None
+
+
+def digest(value: BaseModel | Any) -> str:
+    """A short digest of settings or of any JSON-like value: equal content, equal digest."""
+    if isinstance(value, BaseModel):
+        value = value.model_dump(mode="json")
+    text = json.dumps(value, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import hashlib
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
-from intercap_core.detection.label_maps import read_label_map
+from intercap_core.detections.label_maps import read_label_map
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
 
@@ -282,14 +280,6 @@ def read_yaml(path: Path) -> Any:
 def _or_empty(values: Any) -> Any:
     """What a YAML file holds, where an empty file holds no entries."""
     return {} if values is None else values
-
-
-def digest(value: BaseModel | Any) -> str:
-    """A short digest of settings or of any JSON-like value: equal content, equal digest."""
-    if isinstance(value, BaseModel):
-        value = value.model_dump(mode="json")
-    text = json.dumps(value, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _parse(model: type[M], values: Any, where: str, what: str) -> M:

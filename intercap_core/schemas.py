@@ -441,5 +441,3 @@ HEATMAPS = Schema(
         "object_likelihood": Field(("N",), "float32", "share of frames in which the point touches the body"),
     },
 )  # fmt: skip
-
-STAGES = (FRAMES, DETECTIONS, SCENE, PERSON, OBJECT_TRACK, BODY_FIT, JOINT, METRICS)

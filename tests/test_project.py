@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from intercap_core.config import Annotation, Config
+from intercap_core.commands.docs import contents
+from intercap_core.config import Annotation, Config, digest
 from intercap_core.errors import UserError
-from intercap_core.generated_docs import contents
-from intercap_core.project import Project, digest, load_project
+from intercap_core.project import Project, load_project
 
 ROOT = Path(__file__).resolve().parents[1]
 HEADER = "sequence\tsubject\tobject\trecordings\tcalibration\n"

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from intercap_core.body.correctives_kernel import add_to_row
 from intercap_core.body.parameters import TRANSL
-from intercap_core.energy.correctives_kernel import add_to_row
-from intercap_core.energy.skeleton_kernel import columns_of_limb, turned_back
+from intercap_core.body.skeleton_kernel import columns_of_limb, turned_back
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _TOGETHER = 4  # rows that are added to a block at once

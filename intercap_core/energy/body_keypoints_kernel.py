@@ -15,13 +15,13 @@ import numba
 import numpy as np
 from torch import Tensor
 
+from intercap_core.body.correctives_kernel import add_to_row
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body.skeleton_kernel import columns_of_limb, rest_points
 from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.correctives_kernel import add_to_row
 from intercap_core.energy.sightings_kernel import ask
-from intercap_core.energy.skeleton_kernel import columns_of_limb, rest_points
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _PARENTS = np.array(PARENTS)

@@ -28,7 +28,7 @@ from torch import Tensor
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.energy.body_cloud import Samples
+from intercap_core.energy.body_samples import Samples
 from intercap_core.solve.robust import geman_mcclure
 
 # Skin yields by some millimetres where parts press on each other.

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.model import BodyModel
+from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.energy.body_cloud import NORMAL_LENGTH, Samples, vertex_normals
+from intercap_core.energy.body_samples import NORMAL_LENGTH, Samples
 
 _GROUP = 24  # samples that are looked at together
 

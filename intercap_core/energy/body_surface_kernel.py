@@ -13,7 +13,7 @@ import numpy as np
 
 from intercap_core.body.jacobian_kernel import _add_point
 from intercap_core.body.parameters import TRANSL
-from intercap_core.energy.skeleton_kernel import turned_back
+from intercap_core.body.skeleton_kernel import turned_back
 
 _SHAPE = TRANSL.stop
 

@@ -13,8 +13,8 @@ from intercap_core import artefacts
 from intercap_core.metrics import contact, object_errors, penetration
 from intercap_core.metrics.object_errors import ObjectErrors
 from intercap_core.schemas import METRICS
+from intercap_core.stage_list import ESTIMATES
 
-STAGES = ("object_track", "body_fit", "joint")
 SUMMARY_TRUTH = (
     "body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "object_translation_mm",
     "object_rotation_deg", "contact_region_f1", "contact_f1", "contact_recall",
@@ -254,7 +254,7 @@ def summary(dataset: str, sequences: Sequence[SequenceMetrics]) -> dict[str, Any
     """The content of summary.json; a figure that cannot be known is None."""
     truth = {}
     if any(s.has_truth for s in sequences):
-        for stage in STAGES:
+        for stage in ESTIMATES:
             figures = truth_figures(sequences, stage)
             truth[stage] = {k: figures[k] for k in SUMMARY_TRUTH if k in figures}
     depth = penetration_figures(sequences)

@@ -9,10 +9,10 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.camera.clouds import colour_lookup, depth_points
+from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
-from intercap_core.detection.masks import Runs
 from intercap_core.schemas import PERSON
 
 # Depth pixels are looked at only this far around the projected meshes: a fit that is further off

@@ -10,6 +10,7 @@ import numpy as np
 from intercap_core.metrics import figures
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.report import charts
+from intercap_core.stage_list import ESTIMATES
 
 _MAX_CAMERA_ROWS = 40
 _HISTOGRAM_MM = 30.0
@@ -50,10 +51,10 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
     known = [s for s in sequences if s.has_truth]
     if not known:
         return None
-    by_stage = {stage: figures.truth_figures(known, stage) for stage in figures.STAGES}
+    by_stage = {stage: figures.truth_figures(known, stage) for stage in ESTIMATES}
     rows = []
     for key, name, digits, more in _TRUTH_ROWS:
-        values = [by_stage[stage].get(key) for stage in figures.STAGES]
+        values = [by_stage[stage].get(key) for stage in ESTIMATES]
         found = [v for v in values if v is not None]
         if not found:
             continue
@@ -79,7 +80,7 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
     return {
         "sequences": len(known),
         "frames": sum(len(s) for s in known),
-        "stages": [_NAMES[stage] for stage in figures.STAGES],
+        "stages": [_NAMES[stage] for stage in ESTIMATES],
         "rows": rows,
         "flags": figures.flag_figures(known),
         "own_penetration": own_mm,

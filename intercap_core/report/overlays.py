@@ -16,7 +16,8 @@ from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
 from intercap_core.report.shading import Painted, draw
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import Drawable, render_scene
+from intercap_core.rigid.render import render_scene
+from intercap_core.rigid.shots import Drawable
 
 BODY_COLOUR = (0.42, 0.66, 0.92)
 OBJECT_COLOUR = (1.0, 0.62, 0.18)

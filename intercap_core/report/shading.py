@@ -10,7 +10,8 @@ import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.rigid.normals import vertex_normals
-from intercap_core.rigid.render import Drawable, Rendering, render_scene
+from intercap_core.rigid.render import render_scene
+from intercap_core.rigid.shots import Drawable, Rendering
 
 _AMBIENT = 0.38
 _LIGHT = np.array([-0.35, -0.55, -0.76])  # towards the light, camera frame: above, left, in front

@@ -10,6 +10,7 @@ import pandas as pd
 
 from intercap_core.metrics import figures
 from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.stage_list import ESTIMATES
 
 _MILLIMETRES = {
     "penetration_mean", "penetration_median", "penetration_max", "penetration_object",
@@ -51,7 +52,7 @@ def sequence_table(
         row["extrinsics_residual_before_mm"] = 1e3 * before
         row["extrinsics_residual_after_mm"] = 1e3 * after
         if s.has_truth:
-            for stage in figures.STAGES:
+            for stage in ESTIMATES:
                 for name, value in figures.truth_figures([s], stage).items():
                     row[f"{stage}.{name}"] = value
             for name, value in figures.extrinsics_figures([s]).items():
@@ -97,7 +98,7 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
         }
         for name in sorted(_MILLIMETRES | _ACCELERATIONS):
             columns[f"{name}_mm"] = 1e3 * s.values[name].astype(np.float64)
-        for stage in figures.STAGES:
+        for stage in ESTIMATES:
             for name in ("body_pve", "body_mpjpe", "object_translation"):
                 if f"truth/{stage}/{name}" in s.values:
                     values = s.values[f"truth/{stage}/{name}"].astype(np.float64)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.capture.frames import Frames
-from intercap_core.detection.masks import Runs
 from intercap_core.report.sheets import Crop, Sheet, make_sheet
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import render

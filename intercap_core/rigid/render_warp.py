@@ -18,7 +18,7 @@ from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.rigid import raster
 from intercap_core.rigid import warp_kernels as kernels
 from intercap_core.rigid.normals import vertex_normals
-from intercap_core.rigid.render import Rendering, Shot, Surface
+from intercap_core.rigid.shots import Rendering, Shot, Surface
 from intercap_core.solve.crew import Crew
 
 VISIBLE_OFFSET_M = 0.001  # a vertex is lifted off its own surface before the ray is cast

@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.camera import projection
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert
-from intercap_core.detection.sides import BODY_POINTS
+from intercap_core.person.sides import BODY_POINTS
 from intercap_core.scene.subject_views import SubjectViews
 
 MIN_BODY_POINTS = 50  # fewer do not constrain a rig

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.detection.subject import ring_centre
 from intercap_core.errors import UserError
+from intercap_core.person.subject import ring_centre
 
 GRAVITY_CONE_DEG = 10.0  # an accelerometer and its calibration, on a tripod
 CAMERA_CONE_DEG = 40.0  # the mean of the cameras' own up directions, without an accelerometer

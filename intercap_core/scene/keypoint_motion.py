@@ -15,7 +15,7 @@ from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
 from intercap_core.camera import projection
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
-from intercap_core.detection.triangulation import pixel_scale, triangulate
+from intercap_core.camera.triangulation import pixel_scale, triangulate
 from intercap_core.scene.smooth_paths import Paths, smooth_paths
 
 MIN_CONFIDENCE = 0.3

@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.detection.sides import BODY_POINTS, swapped
-from intercap_core.detection.subject import MIN_COMMON_POINTS, NOBODY
-from intercap_core.detection.triangulation import pixel_scale, reproject
+from intercap_core.camera.triangulation import pixel_scale, reproject
+from intercap_core.person.sides import BODY_POINTS, swapped
+from intercap_core.person.subject import MIN_COMMON_POINTS, NOBODY
 
 # Of the body's points the median: biases of joints, poses not yet refined, half a frame of motion.
 SAME_PERSON_PX_AT_1080P = 45.0

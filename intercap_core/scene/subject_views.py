@@ -8,11 +8,11 @@ import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
-from intercap_core.detection.middles import fill_middles
-from intercap_core.detection.read import Detections
-from intercap_core.detection.sides import BODY_POINTS
-from intercap_core.detection.subject import NOBODY, find_subject
-from intercap_core.detection.swaps import triangulate_people
+from intercap_core.detections.read import Detections
+from intercap_core.person.middles import fill_middles
+from intercap_core.person.sides import BODY_POINTS
+from intercap_core.person.subject import NOBODY, find_subject
+from intercap_core.person.swaps import triangulate_people
 from intercap_core.scene.late_views import with_late_views
 
 MIN_CONFIDENCE = 0.3

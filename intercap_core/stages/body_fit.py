@@ -18,15 +18,14 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.plausible import check_body
-from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
+from intercap_core.body_fit import quality
+from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
+from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.recover import JUMP_M, jumps
+from intercap_core.body_fit.schedule import Fitter
+from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widened
+from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, digest
 from intercap_core.errors import UserError
-from intercap_core.fitting import quality
-from intercap_core.fitting.bridge import bridge, bridged_sigma, continuous
-from intercap_core.fitting.observations import person_clouds, read_observations
-from intercap_core.fitting.recover import JUMP_M, jumps
-from intercap_core.fitting.schedule import Fitter
-from intercap_core.fitting.uncertainty import deviation, joint_covariance, widened
-from intercap_core.project import digest
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
 NUM_BETAS, NUM_EXPRESSION = 10, 10

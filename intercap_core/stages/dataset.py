@@ -6,7 +6,6 @@ import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, ObjectEntry, ReportSettings, SubjectEntry
-from intercap_core.detection.read import Detections
+from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
 from intercap_core.metrics.contact import CONTACT_M
@@ -38,18 +37,7 @@ log = logging.getLogger(__name__)
 _MAX_OBJECTS = 12  # objects whose heatmaps are drawn; all are in heatmaps.h5
 
 
-@dataclass(frozen=True)
-class SequenceArtefacts:
-    """Artefacts of one sequence that the dataset is made from."""
-
-    frames: Path
-    scene: Path
-    detections: Path
-    person: Path
-    object_track: Path
-    body_fit: Path
-    joint: Path
-    metrics: Path
+SequenceArtefacts = Mapping[str, Path]  # of one sequence, by the stage that wrote each
 
 
 def run(
@@ -76,11 +64,11 @@ def run(
             f"dataset {dataset!r}: no sequence has a result to report; look into the logs of the "
             "sequences that failed"
         )
-    measured = [SequenceMetrics.read(s.metrics) for s in sequences.values()]
-    residuals = {name: _residuals(s.scene) for name, s in sequences.items()}
+    measured = [SequenceMetrics.read(s["metrics"]) for s in sequences.values()]
+    residuals = {name: _residuals(s["scene"]) for name, s in sequences.items()}
     by_sequence = tables.sequence_table(measured, {n: _medians(p) for n, p in residuals.items()})
     tables.write(tables_folder, by_sequence, tables.frame_table(measured))
-    heat = collect([s.metrics for s in sequences.values()])
+    heat = collect([s["metrics"] for s in sequences.values()])
     _write_heatmaps(heatmaps, dataset, heat)
     text = json.dumps(figures.summary(dataset, measured), indent=2) + "\n"
     _replace(summary, text)
@@ -92,19 +80,28 @@ def run(
         for name, s in zip(sequences, measured, strict=True)
         if name in shown
     ]
-    captures = [read_capture(s.frames, s.scene) for name, s in sequences.items() if name in shown]
+    captures = [
+        read_capture(s["frames"], s["scene"]) for name, s in sequences.items() if name in shown
+    ]
     tracks = [
         _track(sequences[name], s.object_, objects)
         for name, s in zip(sequences, measured, strict=True)
         if name in shown
     ]
     bodies = [
-        read_fit(p.frames, p.scene, p.person, p.body_fit, body_models, subjects[s.subject].gender)
+        read_fit(
+            p["frames"],
+            p["scene"],
+            p["person"],
+            p["body_fit"],
+            body_models,
+            subjects[s.subject].gender,
+        )
         for p, s in zip(sequences.values(), measured, strict=True)
         if s.name in shown
     ]
     first = next(iter(sequences.values()))
-    with artefacts.read(first.joint, JOINT) as artefact:
+    with artefacts.read(first["joint"], JOINT) as artefact:
         model = load_model(body_models, str(artefact.attributes["gender"]), artefact)
     body_top = _top(heat.body)
     drawn = sorted(heat.objects, key=lambda name: (-heat.objects[name].frames, name))[:_MAX_OBJECTS]
@@ -139,16 +136,16 @@ def _detail(
     settings: ReportSettings,
 ) -> Detail:
     mesh = ObjectMesh.load(objects[measured.object_])
-    with artefacts.read(paths.joint, JOINT) as joint:
+    with artefacts.read(paths["joint"], JOINT) as joint:
         parameters = read_parameters(joint)
         model = load_model(body_models, subjects[measured.subject].gender, joint)
         fit = Fit(model, parameters, joint["rotation"], joint["translation"], mesh)
-    with artefacts.read(paths.scene, SCENE) as scene:
+    with artefacts.read(paths["scene"], SCENE) as scene:
         rig, image_of = Rig.from_artefact(scene), scene["image_of"]
     chosen = choose_frames(measured.values["object_visible_to_cloud"], settings.frames)
     cameras = choose_cameras(fit, rig, chosen, settings.cameras)
     try:
-        with Frames.open(paths.frames) as images:
+        with Frames.open(paths["frames"]) as images:
             return Detail(name, overlays(images.showing(image_of), rig, fit, cameras, chosen))
     except UserError as error:  # one image that does not decode must not cost the whole report
         log.warning("%s: no overlays: %s", name, error)
@@ -158,17 +155,17 @@ def _detail(
 def _track(
     paths: SequenceArtefacts, object_name: str, objects: Mapping[str, ObjectEntry]
 ) -> TrackFacts:
-    with artefacts.read(paths.scene, SCENE) as scene:
-        moments = Detections.load(paths.detections).showing(scene["image_of"])
-    found = moments.with_candidates_of(paths.person)
-    with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
+    with artefacts.read(paths["scene"], SCENE) as scene:
+        moments = Detections.load(paths["detections"]).showing(scene["image_of"])
+    found = moments.with_candidates_of(paths["person"])
+    with artefacts.read(paths["object_track"], OBJECT_TRACK) as track:
         candidate = track["candidate"]
 
     def kept(t: int, c: int) -> bytes:
         return found.candidates(t, c)[candidate[t, c]].rle if candidate[t, c] >= 0 else b""
 
     mesh = ObjectMesh.load(objects[object_name])
-    return read_track(paths.frames, paths.scene, paths.object_track, mesh, kept)
+    return read_track(paths["frames"], paths["scene"], paths["object_track"], mesh, kept)
 
 
 def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) -> ObjectHeat:
@@ -210,12 +207,12 @@ def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
 
 def _trace(paths: SequenceArtefacts) -> dict[str, str]:
     schemas: tuple[tuple[Path, Schema], ...] = (
-        (paths.frames, FRAMES),
-        (paths.scene, SCENE),
-        (paths.object_track, OBJECT_TRACK),
-        (paths.body_fit, BODY_FIT),
-        (paths.joint, JOINT),
-        (paths.metrics, METRICS),
+        (paths["frames"], FRAMES),
+        (paths["scene"], SCENE),
+        (paths["object_track"], OBJECT_TRACK),
+        (paths["body_fit"], BODY_FIT),
+        (paths["joint"], JOINT),
+        (paths["metrics"], METRICS),
     )
     found = {}
     for path, schema in schemas:

@@ -25,9 +25,8 @@ from intercap_core.capture.synchronise import (
     nearest_images,
     synchronise,
 )
-from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.config import FramesSettings, SequenceEntry, digest
 from intercap_core.errors import UserError
-from intercap_core.project import digest
 from intercap_core.schemas import FRAMES
 
 MIN_DRIFT_US = 1000.0  # less than the exposure of one image

@@ -26,20 +26,20 @@ from intercap_core.config import (
     JointSettings,
     ObjectEntry,
     SubjectEntry,
+    digest,
 )
 from intercap_core.contact.detect import annotation_evidence, contact_probability
 from intercap_core.contact.motion import region_motion
 from intercap_core.contact.patches import contact_patches
-from intercap_core.project import digest
-from intercap_core.refine.body_data import BodyData
-from intercap_core.refine.bridge import bridge_poses
-from intercap_core.refine.minimise import minimise
-from intercap_core.refine.object_data import TrackedPoses
-from intercap_core.refine.problem import Ground, Problem
-from intercap_core.refine.state import State
-from intercap_core.refine.time_offsets import OffsetPrior
+from intercap_core.joint.body_data import BodyData
+from intercap_core.joint.minimise import minimise
+from intercap_core.joint.object_data import TrackedPoses
+from intercap_core.joint.problem import Ground, Problem
+from intercap_core.joint.state import State
+from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.pose_interpolation import bridge_poses
 from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, SCENE
 
 log = logging.getLogger(__name__)

@@ -11,8 +11,8 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
-from intercap_core.config import BodyModels, MetricsSettings, ObjectEntry, SubjectEntry
-from intercap_core.detection.read import Detections
+from intercap_core.config import BodyModels, MetricsSettings, ObjectEntry, SubjectEntry, digest
+from intercap_core.detections.read import Detections
 from intercap_core.metrics import body, contact, motion, object_pose
 from intercap_core.metrics import truth as truths
 from intercap_core.metrics.extrinsics import displacement
@@ -21,7 +21,6 @@ from intercap_core.metrics.measurement import Measurement, Values
 from intercap_core.metrics.proximity import PosedObject
 from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack, read_body, read_object
-from intercap_core.project import digest
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import (
     BODY_FIT,

@@ -12,16 +12,15 @@ from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
-from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings
-from intercap_core.detection.read import Candidate, Detections
+from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings, digest
+from intercap_core.detections.read import Candidate, Detections
 from intercap_core.errors import UserError
-from intercap_core.project import digest
+from intercap_core.object_track.evidence import View, ViewGeometry, distances
+from intercap_core.object_track.object_size import label_doubt, size_doubt
+from intercap_core.object_track.passes import Track, Tracker
+from intercap_core.object_track.seed import NotFound
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
-from intercap_core.tracking.evidence import View, ViewGeometry, distances
-from intercap_core.tracking.object_size import label_doubt, size_doubt
-from intercap_core.tracking.passes import Track, Tracker
-from intercap_core.tracking.seed import NotFound
 
 log = logging.getLogger(__name__)
 

@@ -9,26 +9,25 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
+from intercap_core.camera.triangulation import Triangulation, reproject
 from intercap_core.capture.frames import Frames
-from intercap_core.config import PersonSettings
-from intercap_core.detection.exposure import at_set_times
-from intercap_core.detection.image_segments import ImageCandidate, ViewSegments
-from intercap_core.detection.lifting import Lifter
-from intercap_core.detection.middles import fill_middles
-from intercap_core.detection.person_masks import choose_mask
-from intercap_core.detection.read import (
+from intercap_core.config import PersonSettings, digest
+from intercap_core.detections.read import (
     FROM_DETECTOR,
     FROM_IMAGES,
     NOBODY_LOOKED,
     Detections,
 )
-from intercap_core.detection.sides import BODY_POINTS
-from intercap_core.detection.subject import NOBODY, find_subject
-from intercap_core.detection.swaps import steady_sides, triangulate_people
-from intercap_core.detection.triangulation import Triangulation, reproject
 from intercap_core.errors import UserError
-from intercap_core.project import digest
+from intercap_core.person.exposure import at_set_times
+from intercap_core.person.lifting import Lifter
+from intercap_core.person.masks import choose_mask
+from intercap_core.person.middles import fill_middles
+from intercap_core.person.sides import BODY_POINTS
+from intercap_core.person.subject import NOBODY, find_subject
+from intercap_core.person.swaps import steady_sides, triangulate_people
 from intercap_core.schemas import PERSON, SCENE
+from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
 
 
 def run(
@@ -152,7 +151,7 @@ def _from_images(
         wanted = wanted & ~found.candidates_found
     if settings.segmentation == "detector" or not wanted.any():
         return {}
-    from intercap_core.detection.image_segmentation import segment_images
+    from intercap_core.segmentation.image_segmentation import segment_images
 
     joints = points.points.reshape(*wanted.shape[:1], NUM_KEYPOINTS, 3)
     return segment_images(images, scene, joints, wanted)

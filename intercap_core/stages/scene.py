@@ -12,10 +12,9 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.capture.synchronise import images_of_moments
-from intercap_core.config import SceneSettings
-from intercap_core.detection.read import Detections
+from intercap_core.config import SceneSettings, digest
+from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
-from intercap_core.project import digest
 from intercap_core.scene.background import Background, background_of
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.floor_constraint import FloorConstraint

@@ -16,7 +16,8 @@ import numpy as np
 import open3d as o3d
 
 from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.rigid.render import Drawable, render_scene
+from intercap_core.rigid.render import render_scene
+from intercap_core.rigid.shots import Drawable
 from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 

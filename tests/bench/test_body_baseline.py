@@ -10,15 +10,15 @@ from torch import Tensor
 from bench.body_baseline import STAGES, Energy, FrameFit, Free, fit_by_lbfgs
 from bench.body_clip import BodyClip
 from intercap_core.body.model import BodyModel
+from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.camera import projection
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import BodyFitSettings
-from intercap_core.energy.body_cloud import vertex_normals
-from intercap_core.fitting.observations import Observations, PersonCloud
 from intercap_core.metrics.proximity import Sight
-from tests.synthetic_capture import ring
+from tests.helpers.synthetic_capture import ring
 
 FRAMES, POINTS = 2, 300
 

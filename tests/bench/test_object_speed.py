@@ -9,10 +9,10 @@ from bench.object_baseline import Recipe
 from bench.object_clip import ObjectClip
 from bench.object_speed import Run, one_pass, paper, until, whole_track
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.evidence import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.tracking.evidence import View, ViewGeometry
+from tests.helpers.object_capture import ObjectCapture
 from tests.rigid.conftest import catalogue
-from tests.tracking.object_capture import ObjectCapture
 
 FRAMES = 3
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_capture import FURNITURE, ring, room_depth
 
 from intercap_core.camera.clouds import (
     colour_lookup,
@@ -17,6 +16,7 @@ from intercap_core.camera.clouds import (
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply, invert, rigid
+from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 
 DEPTH = Intrinsics(
     640, 576, 504.6, 504.7, 332.8, 348.8,

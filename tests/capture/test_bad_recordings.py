@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinect_files import PERIOD_US, depth_at, entry_of, jpeg_at, notes_of, record, run
 
 from intercap_core.capture.clocks import WRONG, best_epoch, drift_us, epochs
 from intercap_core.capture.frames import Frames
 from intercap_core.config import SequenceEntry
+from tests.helpers.kinect_files import PERIOD_US, depth_at, entry_of, jpeg_at, notes_of, record, run
 
 TICKS = 12
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fitted_capture import Capture, make_capture
 
 from intercap_core.capture.frames import Frames
 from intercap_core.capture.synchronise import images_of_moments
-from intercap_core.detection.read import Detections
+from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from tests.helpers.fitted_capture import Capture, make_capture
 
 SETS, LATE = 5, 2
 

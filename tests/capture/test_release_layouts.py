@@ -10,9 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from release_folders import convert_frames, write_behave, write_intercap
 from scipy.spatial import cKDTree
-from synthetic_capture import COLOUR, FURNITURE, ring, room_depth, to_millimetres
 
 from intercap_core import artefacts
 from intercap_core.camera.clouds import master_points
@@ -28,6 +26,8 @@ from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
+from tests.helpers.release_folders import convert_frames, write_behave, write_intercap
+from tests.helpers.synthetic_capture import COLOUR, FURNITURE, ring, room_depth, to_millimetres
 
 LENS = COLOUR.scaled(0.1)
 NUMBERS = (0, 1, 2, 4, 5)  # 3 was lost by all cameras

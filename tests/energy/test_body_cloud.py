@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.model import BodyModel
+from intercap_core.body.normals import vertex_normals
 from intercap_core.energy import body_cloud as term
-from intercap_core.energy.body_cloud import vertex_normals
+from intercap_core.energy.body_samples import COVERINGS, Samples, choose_samples
 from intercap_core.energy.body_surface import Surface
 
 
@@ -19,19 +20,19 @@ def model() -> BodyModel:
 
 
 @pytest.fixture(scope="module")
-def samples(model: BodyModel) -> term.Samples:
-    return term.choose_samples(model)
+def samples(model: BodyModel) -> Samples:
+    return choose_samples(model)
 
 
 def _random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: term.Samples) -> None:
+def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: Samples) -> None:
     ids, group = torch.as_tensor(samples.vertex), torch.as_tensor(samples.group)
     x = 0.1 * _random(2, model.num_parameters)
-    u = 0.3 * _random(len(term.COVERINGS), seed=1)
-    rest = torch.tensor([c.thickness for c in term.COVERINGS], dtype=torch.float64)
+    u = 0.3 * _random(len(COVERINGS), seed=1)
+    rest = torch.tensor([c.thickness for c in COVERINGS], dtype=torch.float64)
     count = len(samples.vertex)
     rows = term.CloudRows(
         target=_random(2, count, seed=2),
@@ -55,10 +56,10 @@ def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: term.Sam
     torch.testing.assert_close(found.gradient_u @ turn, slope, rtol=1e-6, atol=1e-5)
 
 
-def test_cross_block_is_the_gauss_newton_product(model: BodyModel, samples: term.Samples) -> None:
+def test_cross_block_is_the_gauss_newton_product(model: BodyModel, samples: Samples) -> None:
     group = torch.as_tensor(samples.group)
     count = len(group)
-    thickness = torch.linspace(0.001, 0.01, len(term.COVERINGS), dtype=torch.float64)
+    thickness = torch.linspace(0.001, 0.01, len(COVERINGS), dtype=torch.float64)
     by, points = _random(1, count, 4), _random(1, count, 3, seed=1)
     rows = term.CloudRows(
         _random(1, count, seed=2), _random(1, count, 3, seed=3),
@@ -74,7 +75,7 @@ def test_cross_block_is_the_gauss_newton_product(model: BodyModel, samples: term
     torch.testing.assert_close(found.hessian_u[0], dense[4:, 4:])
 
 
-def test_points_lifted_off_the_skin_are_measured(model: BodyModel, samples: term.Samples) -> None:
+def test_points_lifted_off_the_skin_are_measured(model: BodyModel, samples: Samples) -> None:
     """Points on normals of outer vertices come back with their height, from either side."""
     params = model.zeros()
     vertices = model.forward(params).vertices
@@ -91,9 +92,7 @@ def test_points_lifted_off_the_skin_are_measured(model: BodyModel, samples: term
         assert error[found.valid].quantile(0.95) < 0.002
 
 
-def test_a_surface_that_looks_the_other_way_is_not_met(
-    model: BodyModel, samples: term.Samples
-) -> None:
+def test_a_surface_that_looks_the_other_way_is_not_met(model: BodyModel, samples: Samples) -> None:
     vertices = model.forward(model.zeros()).vertices
     normals = vertex_normals(vertices, model.faces)[0]
     chest = torch.as_tensor(model.regions["chest"])[::20]
@@ -116,7 +115,7 @@ def test_gathering_resists_outliers() -> None:
     assert total[1] == 0 and total[2] == 0
 
 
-def test_samples_cover_the_outer_skin(model: BodyModel, samples: term.Samples) -> None:
+def test_samples_cover_the_outer_skin(model: BodyModel, samples: Samples) -> None:
     template = model.template.numpy()
     low = template[samples.vertex].min(0)
     assert np.allclose(low, template.min(0), atol=0.05)
@@ -126,13 +125,13 @@ def test_samples_cover_the_outer_skin(model: BodyModel, samples: term.Samples) -
     assert not tongue_and_eyes[samples.vertex].any()
 
 
-def _posed_bodies() -> tuple[BodyModel, term.Samples, Tensor]:
+def _posed_bodies() -> tuple[BodyModel, Samples, Tensor]:
     """Four bodies (4,P) in single precision, bent anyhow, two metres before the camera."""
     model = BodyModel.load()
     x = model.zeros(4).vector().clone()
     x[:, :165] += 0.3 * _random(4, 165).float()
     x[:, 167] = 2.0
-    return model, term.choose_samples(model), x
+    return model, choose_samples(model), x
 
 
 def test_surface_poses_what_samples_need() -> None:

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import fitted_capture as fitted
 import numpy as np
 import pytest
 import torch
@@ -29,6 +28,7 @@ from intercap_core.export.motion import read_motion
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import SCENE
 from intercap_core.stages import export
+from tests.helpers import fitted_capture as fitted
 
 OFFSET = np.array([0, fitted.BODY_OFFSET_M, 0])
 OBJECT_OFFSET = np.array([0, fitted.OBJECT_OFFSET_M / 2, 0])

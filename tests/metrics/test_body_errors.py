@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import fitted_capture as fitted
 import h5py
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from intercap_core.metrics import body, body_errors
 from intercap_core.metrics.body_clouds import CLOUD_KEYS
 from intercap_core.metrics.body_errors import BodyErrors
 from intercap_core.schemas import FRAMES
+from tests.helpers import fitted_capture as fitted
 
 OFFSET = fitted.BODY_OFFSET_M
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import fitted_capture as fitted
 import h5py
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from intercap_core.errors import UserError
 from intercap_core.metrics import capture
 from intercap_core.metrics.capture import CaptureErrors, Slip, SlipCounts
 from intercap_core.metrics.times import match_times
+from tests.helpers import fitted_capture as fitted
 
 UP = np.array([0, 0, 1.0])
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
 
+from intercap_core.camera.masks import Runs, encode
 from intercap_core.camera.transforms import apply, invert
-from intercap_core.detection.masks import Runs, encode
 from intercap_core.metrics.segmented import ViewMasks, segmented_points
+from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
 
 RIG, UP = ring()
 NEAR = apply(invert(UP), np.array([[1.2, 1.35, 0.5], [0.9, 1.1, 1.1]]))

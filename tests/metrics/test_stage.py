@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import fitted_capture as fitted
 import h5py
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from intercap_core.config import MetricsSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import METRIC_REGIONS, METRICS
 from intercap_core.stages import metrics
+from tests.helpers import fitted_capture as fitted
 
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import fitted_capture as fitted
 import h5py
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from intercap_core.errors import UserError
 from intercap_core.report import body, charts
 from intercap_core.report.body_pictures import FIT_COLOUR, KEYPOINT_COLOUR
 from intercap_core.report.sheets import Crop
+from tests.helpers import fitted_capture as fitted
 
 SETS = 6
 

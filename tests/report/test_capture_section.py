@@ -7,17 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import fitted_capture as fitted
 import h5py
 import numpy as np
 import pytest
-from reduced_capture import Reduction
 
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.report import capture, charts
 from intercap_core.report.capture_pictures import CapturePicture, choose_set, floor_profiles
 from intercap_core.report.point_cloud import FusedCloud, View, fuse, splat
+from tests.helpers import fitted_capture as fitted
+from tests.helpers.reduced_capture import Reduction
 
 STAGES = ("frames", "scene")
 

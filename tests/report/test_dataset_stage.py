@@ -10,7 +10,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
-import fitted_capture as fitted
 import numpy as np
 import pandas as pd
 import pytest
@@ -19,8 +18,9 @@ from intercap_core import artefacts
 from intercap_core.config import MetricsSettings, ReportSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import HEATMAPS, METRICS
+from intercap_core.stage_list import SEQUENCE_STAGES
 from intercap_core.stages import dataset, metrics
-from intercap_core.step import READS
+from tests.helpers import fitted_capture as fitted
 
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
@@ -48,10 +48,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
 def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Path:
     dataset.run(
         dataset="demo",
-        sequences={
-            name: dataset.SequenceArtefacts(**capture.inputs(*READS["metrics"], "metrics"))
-            for name, capture in captures.items()
-        },
+        sequences={name: capture.inputs(*SEQUENCE_STAGES) for name, capture in captures.items()},
         objects={capture.object_.name: capture.object_ for capture in captures.values()},
         subjects={"p01": fitted.SUBJECT},
         body_models=fitted.BODY_MODELS,

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import fitted_capture as fitted
 import h5py
 import numpy as np
 import pytest
 
-from intercap_core.detection.masks import encode
+from intercap_core.camera.masks import encode
 from intercap_core.report import track
 from intercap_core.report.track_pictures import CANDIDATE_COLOUR, TRACK_COLOUR
 from intercap_core.rigid.mesh import ObjectMesh
+from tests.helpers import fitted_capture as fitted
 
 SETS = 6
 

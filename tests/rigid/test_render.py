@@ -7,7 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.rigid.render import Drawable, render, render_scene
+from intercap_core.rigid.render import render, render_scene
+from intercap_core.rigid.shots import Drawable
 from intercap_core.rigid.visibility import visible_vertices
 
 PINHOLE = Intrinsics(640, 576, 504.0, 505.0, 321.3, 287.6)

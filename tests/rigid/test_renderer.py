@@ -11,12 +11,11 @@ from intercap_core.errors import UserError
 from intercap_core.rigid.render import (
     CpuRenderer,
     Renderer,
-    Shot,
-    Surface,
     default_renderer,
     open_renderer,
     render,
 )
+from intercap_core.rigid.shots import Shot, Surface
 from intercap_core.rigid.visibility import visible_vertices
 from tests.rigid.test_render import LENS, PINHOLE
 

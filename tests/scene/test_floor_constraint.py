@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_capture import perturbed, ring, room_depth, to_millimetres
 
 from intercap_core.camera.transforms import apply
 from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
 from intercap_core.scene.surface import Surface, surface_of
+from tests.helpers.synthetic_capture import perturbed, ring, room_depth, to_millimetres
 
 TRUTH, UP = ring()
 NO_GRAVITY = np.full((6, 3), np.nan)

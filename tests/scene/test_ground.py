@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic_capture import ring
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
@@ -17,6 +16,7 @@ from intercap_core.scene.ground import (
     up_hint,
     zup_from_master,
 )
+from tests.helpers.synthetic_capture import ring
 
 RIG, UP = ring()
 NO_GRAVITY = np.full((6, 3), np.nan)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from synthetic_capture import ring
-from synthetic_people import seen_by, walking
 
 from intercap_core.camera.transforms import apply, invert
-from intercap_core.detection.subject import NOBODY
+from intercap_core.person.subject import NOBODY
 from intercap_core.scene.late_views import with_late_views
+from tests.helpers.synthetic_capture import ring
+from tests.helpers.synthetic_people import seen_by, walking
 
 RIG, UP = ring()
 T, FPS, LATE = 12, 15.0, 4

@@ -6,12 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_capture import DEPTH, FURNITURE, perturbed, ring, room_depth, to_millimetres
 
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.scene.background import steady_background
 from intercap_core.scene.lens_exchange import exchange_lenses, exchanged
 from intercap_core.scene.subject_views import triangulated
+from tests.helpers.synthetic_capture import (
+    DEPTH,
+    FURNITURE,
+    perturbed,
+    ring,
+    room_depth,
+    to_millimetres,
+)
 
 TIMES = np.zeros(1)
 RING, UP = ring()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from synthetic_capture import perturbed, ring
-from synthetic_people import seen_by, walking
 
 from intercap_core.camera.rig import Rig
 from intercap_core.scene.lenses import lens_gains, swapped_lenses
+from tests.helpers.synthetic_capture import perturbed, ring
+from tests.helpers.synthetic_people import seen_by, walking
 
 RIG, UP = ring()
 TIMES = np.arange(40) / 15

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic_capture import FURNITURE, ring, room_depth, to_millimetres, write_frames
 
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.scene.background import background_of
 from intercap_core.scene.moving import moving_surfaces
 from intercap_core.scene.registration import MOVING, Estimate, Layer, Registration
+from tests.helpers.synthetic_capture import (
+    FURNITURE,
+    ring,
+    room_depth,
+    to_millimetres,
+    write_frames,
+)
 
 TRUTH, UP = ring()
 FPS, T = 15.0, 10

@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_capture import (
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.camera.triangulation import triangulate
+from intercap_core.scene.body_constraints import BodyConstraint, BodyViews
+from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
+from intercap_core.scene.surface import surface_of
+from tests.helpers.synthetic_capture import (
     FURNITURE,
     extrinsics_error,
     perturbed,
@@ -15,13 +21,7 @@ from synthetic_capture import (
     room_depth,
     to_millimetres,
 )
-from synthetic_people import seen_by, walking
-
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.detection.triangulation import triangulate
-from intercap_core.scene.body_constraints import BodyConstraint, BodyViews
-from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
-from intercap_core.scene.surface import surface_of
+from tests.helpers.synthetic_people import seen_by, walking
 
 TRUTH, UP = ring()
 MIDDLE = apply(invert(UP), np.array([[0, 0, 0.8]]))[0]

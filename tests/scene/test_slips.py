@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
-from synthetic_capture import ring
-from synthetic_people import stick_person
 
 from intercap_core.camera.transforms import apply, invert
-from intercap_core.detection.triangulation import reproject
+from intercap_core.camera.triangulation import reproject
 from intercap_core.scene.keypoint_timing import WINDOW_SETS, keypoint_offsets
 from intercap_core.scene.slips import find_slips, interval_gains
+from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
+from tests.helpers.synthetic_capture import ring
+from tests.helpers.synthetic_people import stick_person
 
 FPS = 15.0
 RIG, UP = ring()

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from body_capture import Inputs, master_from_room, ring, write_capture
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
@@ -18,17 +17,18 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.problem import BodyProblem, Views
+from intercap_core.body_fit.schedule import Fitter, columns_of
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
-from intercap_core.energy import body_cloud, body_keypoints
-from intercap_core.energy.body_cloud import COVERINGS
+from intercap_core.energy import body_cloud, body_keypoints, body_samples
+from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.errors import UserError
-from intercap_core.fitting.observations import person_clouds, read_observations
-from intercap_core.fitting.problem import BodyProblem, Views
-from intercap_core.fitting.schedule import Fitter, columns_of
 from intercap_core.schemas import BODY_FIT, BODY_PARTS, PERSON
 from intercap_core.solve.levenberg_marquardt import minimise
 from intercap_core.stages import body_fit
+from tests.helpers.body_capture import Inputs, master_from_room, ring, write_capture
 
 SUBJECT = SubjectEntry(subject="s01", gender="neutral")
 SETTINGS = BodyFitSettings(points_per_frame=800)
@@ -150,7 +150,7 @@ def test_known_offsets_of_the_exposures_make_a_moving_body_better(model, tmp_pat
 
 
 def _normals(model: BodyModel, vertices: torch.Tensor) -> np.ndarray:
-    from intercap_core.energy.body_cloud import vertex_normals
+    from intercap_core.body.normals import vertex_normals
 
     return vertex_normals(vertices, model.faces).double().numpy()
 
@@ -173,7 +173,7 @@ def test_exact_keypoints_alone_give_the_parameters_back() -> None:
     start[:, 69:75] = truth[:, 69:75] = 0
     problem = BodyProblem(
         model, body_keypoints.keypoint_set(model, range(135)),
-        body_cloud.choose_samples(model), start,
+        body_samples.choose_samples(model), start,
         columns_of(model, hands=True, face=True, betas=False), True,
         offsets=start.new_zeros(25, 3), u=start.new_zeros(len(COVERINGS)),
         views=Views(observed, torch.ones(shape).double(), torch.full(shape, 0.003).double(),
@@ -196,7 +196,7 @@ def test_exact_keypoints_alone_give_the_parameters_back() -> None:
 def test_normal_equations_of_the_whole_energy_match_differences() -> None:
     """Own and shared parameters, all terms together."""
     model = BodyModel.load(dtype=torch.float64)
-    samples = body_cloud.choose_samples(model)
+    samples = body_samples.choose_samples(model)
     generator = torch.Generator().manual_seed(1)
 
     def random(*shape: int) -> torch.Tensor:

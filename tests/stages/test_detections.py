@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_capture import ring, write_frames
 
+from intercap_core.camera import masks
 from intercap_core.config import DetectionsSettings, SequenceEntry
-from intercap_core.detection import masks
-from intercap_core.detection.read import Detections
+from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.stages import detections
+from tests.helpers.synthetic_capture import ring, write_frames
 
 RIG, _ = ring(2)
 WIDTH, HEIGHT = 1920, 1080

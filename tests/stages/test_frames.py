@@ -7,17 +7,6 @@ import json
 import cv2
 import numpy as np
 import pytest
-from kinect_files import (
-    PERIOD_US,
-    depth_at,
-    entry_of,
-    jpeg_at,
-    make_camera,
-    notes_of,
-    pose_of,
-    record,
-    run,
-)
 
 from intercap_core import artefacts
 from intercap_core.camera.extrinsics_files import Extrinsics, read_extrinsics, write_rig_file
@@ -28,6 +17,17 @@ from intercap_core.config import FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
+from tests.helpers.kinect_files import (
+    PERIOD_US,
+    depth_at,
+    entry_of,
+    jpeg_at,
+    make_camera,
+    notes_of,
+    pose_of,
+    record,
+    run,
+)
 
 
 @pytest.fixture

@@ -11,17 +11,18 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from plain_capture import detect, plain_entry, write_rig
+
+from tests.helpers.plain_capture import detect, plain_entry, write_rig
 
 pytest.importorskip("onnxruntime")
 tiny_pose = pytest.importorskip("tiny_pose", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
+from intercap_core.camera import masks  # noqa: E402
 from intercap_core.config import (  # noqa: E402
     SequenceEntry,
 )
-from intercap_core.detection import masks  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402
 
@@ -101,7 +102,7 @@ def test_keypoints_of_another_length_name_file_and_camera(capture, tmp_path):
 
 
 def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
-    import tiny_onnx
+    from tests.helpers import tiny_onnx
 
     path = tiny_onnx.thresholder(tmp_path / "other.onnx")
     with pytest.raises(UserError, match=r"other.onnx: its outputs .* are not those of a pose"):
@@ -112,7 +113,7 @@ def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
 def test_without_a_model_nothing_is_loaded():
     words = (
         "import sys, intercap_core.stages.detections; "
-        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detection.onnx_pose' "
+        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.onnx_pose' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_capture import ring, write_frames
-from synthetic_people import seen_by, walking, write_detections
 
 from intercap_core import artefacts
+from intercap_core.camera import masks
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import PersonSettings
-from intercap_core.detection import masks
-from intercap_core.detection.sides import LEGS, swapped
-from intercap_core.detection.swaps import steady_sides
 from intercap_core.errors import UserError
+from intercap_core.person.sides import LEGS, swapped
+from intercap_core.person.swaps import steady_sides
 from intercap_core.schemas import PERSON, SCENE
 from intercap_core.stages import person
+from tests.helpers.synthetic_capture import ring, write_frames
+from tests.helpers.synthetic_people import seen_by, walking, write_detections
 
 RIG, UP = ring()
 T = 8

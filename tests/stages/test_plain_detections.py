@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from plain_capture import detect, plain_entry, write_rig
 
 from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
-from intercap_core.detection.read import Detections
+from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.stages import detections, frames
+from tests.helpers.plain_capture import detect, plain_entry, write_rig
 
 SIZE = (64, 48)
 CUT, ABSENT = 2, 4  # numbers of the right camera's damaged image and of the one that is not there

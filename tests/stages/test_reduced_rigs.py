@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import fitted_capture as fitted
 import numpy as np
 import pytest
-from body_capture import ring, write_capture
-from reduced_capture import Reduction
-from test_body_fit import motion
 
 from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
@@ -28,10 +24,14 @@ from intercap_core.config import (
 from intercap_core.errors import UserError
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
+from intercap_core.stage_list import STAGES
 from intercap_core.stages import body_fit, dataset, export, joint, metrics, object_track, person
-from intercap_core.step import READS
+from tests.helpers import fitted_capture as fitted
+from tests.helpers.body_capture import ring, write_capture
+from tests.helpers.object_capture import ObjectCapture
+from tests.helpers.reduced_capture import Reduction
 from tests.rigid.conftest import catalogue
-from tests.tracking.object_capture import ObjectCapture
+from tests.stages.test_body_fit import motion
 
 SUBJECT = SubjectEntry(subject="s01", gender="neutral")
 FAST = BodyFitSettings(points_per_frame=600, hands=False, face=False)
@@ -262,12 +262,7 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
     )  # fmt: skip
     dataset.run(
         dataset="small",
-        sequences={
-            "cap": dataset.SequenceArtefacts(
-                metrics=measured,
-                **{s: paths[s] for s in READS["metrics"]},
-            )
-        },
+        sequences={"cap": {"metrics": measured, **{s: paths[s] for s in STAGES["metrics"].reads}}},
         objects={capture.object_.name: capture.object_},
         subjects={"p01": fitted.SUBJECT},
         body_models=fitted.BODY_MODELS,

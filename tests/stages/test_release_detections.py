@@ -9,15 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from release_folders import write_behave, write_intercap
-from synthetic_capture import COLOUR, ring
 
 from intercap_core.camera.rig import Rig
 from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
-from intercap_core.detection.read import Detections
+from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.stages import detections
 from intercap_core.stages import frames as frames_stage
+from tests.helpers.release_folders import write_behave, write_intercap
+from tests.helpers.synthetic_capture import COLOUR, ring
 
 LENS = COLOUR.scaled(0.1)
 TIMES = ("0003.000", "0004.000", "0006.000")

@@ -6,16 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_capture import (
-    FURNITURE,
-    extrinsics_error,
-    perturbed,
-    ring,
-    room_depth,
-    to_millimetres,
-    write_frames,
-)
-from synthetic_people import seen_by, walking, write_detections
 
 from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
@@ -24,6 +14,16 @@ from intercap_core.config import SceneSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import SCENE
 from intercap_core.stages import scene
+from tests.helpers.synthetic_capture import (
+    FURNITURE,
+    extrinsics_error,
+    perturbed,
+    ring,
+    room_depth,
+    to_millimetres,
+    write_frames,
+)
+from tests.helpers.synthetic_people import seen_by, walking, write_detections
 
 TRUTH, UP = ring()
 MIDDLE = apply(invert(UP), np.array([[0, 0, 0.8]]))[0]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from body_capture import FPS, master_from_room, ring
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.observations import Observations
+from intercap_core.body_fit.schedule import Fitter
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings
-from intercap_core.fitting.observations import Observations
-from intercap_core.fitting.schedule import Fitter
+from tests.helpers.body_capture import FPS, master_from_room, ring
 
 FRAMES = 4
 DETECTOR_M = 0.02  # the body detector's wrist lies so far down the hand

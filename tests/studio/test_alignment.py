@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from aligned_depth import depth_on_colour as mean_of_samples
-from synthetic_capture import FURNITURE, ring, room_depth
 
 from intercap_core.camera.rig import Camera
 from intercap_core.studio.alignment import Aligner
+from tests.helpers.aligned_depth import depth_on_colour as mean_of_samples
+from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 
 
 def studio(depth: np.ndarray, camera: Camera) -> np.ndarray:

@@ -10,16 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from release_folders import write_behave
-from synthetic_capture import COLOUR, ring
 from typer.testing import CliRunner
 
 from intercap_core.camera.rig import Rig
 from intercap_core.cli import app
+from intercap_core.commands.check import faults_of_sequences
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
-from intercap_core.project_check import faults_of_sequences
 from intercap_core.stages import frames as frames_stage
+from tests.helpers.release_folders import write_behave
+from tests.helpers.synthetic_capture import COLOUR, ring
 
 ROOT = Path(__file__).resolve().parents[2]
 LENS = COLOUR.scaled(0.1)

@@ -10,19 +10,26 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from release_folders import write_intercap
-from synthetic_capture import COLOUR, FURNITURE, perturbed, ring, room_depth, to_millimetres
 from typer.testing import CliRunner
 
 from intercap_core.camera.rig import Rig
 from intercap_core.cli import app
+from intercap_core.commands.check import faults_of_sequences
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
-from intercap_core.project_check import faults_of_sequences
 from intercap_core.stages import frames as frames_stage
 from intercap_core.tables.calibration_choice import choose_calibration
 from intercap_core.tables.intercap import stated_calibration
+from tests.helpers.release_folders import write_intercap
+from tests.helpers.synthetic_capture import (
+    COLOUR,
+    FURNITURE,
+    perturbed,
+    ring,
+    room_depth,
+    to_millimetres,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 LENS = COLOUR.scaled(0.1)

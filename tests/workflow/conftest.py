@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 
 import pytest
-from flow import OTHER, Flow
+
+from tests.helpers.flow import OTHER, Flow
 
 
 @pytest.fixture(scope="session")

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from flow import ONE, OTHER, Flow
 
 from intercap_core import artefacts
 from intercap_core.schemas import FRAMES
+from tests.helpers.flow import ONE, OTHER, Flow
 
 STAGES = ("frames", "detections", "scene", "person", "object_track", "body_fit", "joint", "metrics")
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from flow import ONE, Flow
+
+from tests.helpers.flow import ONE, Flow
 
 BEFORE_METRICS = (
     "frames",

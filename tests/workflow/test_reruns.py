@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from flow import ONE, OTHER, Flow
+
+from tests.helpers.flow import ONE, OTHER, Flow
 
 AFTER_SCENE = {"scene", "person", "object_track", "body_fit", "joint", "metrics", "export"}
 DATASET = ("", "dataset")

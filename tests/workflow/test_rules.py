@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.step import SEQUENCE_STAGES
+from intercap_core.stage_list import SEQUENCE_STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = "\n".join(path.read_text() for path in sorted((ROOT / "workflow/rules").glob("*.smk")))

@@ -1,11 +1,9 @@
 rule body_fit:
     """The body in every frame."""
     input:
+        **artefacts_read("body_fit"),
         body=body_file,
         pose_prior=pose_prior_file,
-        frames=rules.frames.output.frames,
-        scene=rules.scene.output.scene,
-        person=rules.person.output.person,
     output:
         body_fit=f"{RESULTS}/{{sequence}}/body_fit.h5",
     log:

@@ -5,10 +5,11 @@ from pathlib import Path
 from snakemake.exceptions import WorkflowError
 
 from intercap_core.capture.layouts import input_files
-from intercap_core.code_digest import code_digest
-from intercap_core.config import Annotation
+from intercap_core.config import Annotation, digest
 from intercap_core.errors import UserError
-from intercap_core.project import digest, load_project
+from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.project import load_project
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 
 def _load():
@@ -107,6 +108,11 @@ def annotation_input(*sections):
         return [PROJECT.annotation_path(wildcards.sequence)]
 
     return files
+
+
+def artefacts_read(stage):
+    """Inputs: the artefacts that a stage reads, by the stage that wrote each."""
+    return {name: f"{RESULTS}/{{sequence}}/{name}.h5" for name in STAGES[stage].reads}
 
 
 def object_files(wildcards):

@@ -1,14 +1,10 @@
 rule dataset:
     """Heatmaps, histograms, tables and the report over all sequences."""
     input:
-        frames=expand(rules.frames.output.frames, sequence=SEQUENCES),
-        scene=expand(rules.scene.output.scene, sequence=SEQUENCES),
-        detections=expand(rules.detections.output.detections, sequence=SEQUENCES),
-        person=expand(rules.person.output.person, sequence=SEQUENCES),
-        object_track=expand(rules.object_track.output.object_track, sequence=SEQUENCES),
-        body_fit=expand(rules.body_fit.output.body_fit, sequence=SEQUENCES),
-        joint=expand(rules.joint.output.joint, sequence=SEQUENCES),
-        metrics=expand(rules.metrics.output.metrics, sequence=SEQUENCES),
+        **{
+            stage: expand(f"{RESULTS}/{{sequence}}/{stage}.h5", sequence=SEQUENCES)
+            for stage in SEQUENCE_STAGES
+        },
     output:
         report=f"{RESULTS}/report.html",
         summary=f"{RESULTS}/summary.json",

@@ -18,10 +18,10 @@ MODEL_THREADS = 8
 rule detections:
     """Keypoints and segmentation candidates, from files or from a model."""
     input:
+        **artefacts_read("detections"),
         keypoints=recorded("keypoints"),
         candidates=recorded("candidates"),
         detectors=existing(*DETECTORS),
-        frames=rules.frames.output.frames,
     output:
         detections=f"{RESULTS}/{{sequence}}/detections.h5",
     log:

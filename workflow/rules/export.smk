@@ -1,10 +1,9 @@
 rule export:
     """Files for other tools: InterCap, AMASS, BOP, glb."""
     input:
+        **artefacts_read("export"),
         object=object_files,
         body=body_file,
-        scene=rules.scene.output.scene,
-        joint=rules.joint.output.joint,
     output:
         folder=directory(f"{RESULTS}/{{sequence}}/export"),
     log:

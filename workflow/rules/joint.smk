@@ -1,14 +1,10 @@
 rule joint:
     """Body and object together, over all frames."""
     input:
+        **artefacts_read("joint"),
         object=object_files,
         body=body_file,
         pose_prior=pose_prior_file,
-        frames=rules.frames.output.frames,
-        scene=rules.scene.output.scene,
-        person=rules.person.output.person,
-        object_track=rules.object_track.output.object_track,
-        body_fit=rules.body_fit.output.body_fit,
         annotation=ancient(annotation_input("contact")),
     output:
         joint=f"{RESULTS}/{{sequence}}/joint.h5",

@@ -1,16 +1,10 @@
 rule metrics:
     """Distances, penetration, and errors against truth where it is known."""
     input:
+        **artefacts_read("metrics"),
         truth=recorded("truth"),
         object=object_files,
         body=body_file,
-        frames=rules.frames.output.frames,
-        scene=rules.scene.output.scene,
-        detections=rules.detections.output.detections,
-        person=rules.person.output.person,
-        object_track=rules.object_track.output.object_track,
-        body_fit=rules.body_fit.output.body_fit,
-        joint=rules.joint.output.joint,
     output:
         metrics=f"{RESULTS}/{{sequence}}/metrics.h5",
     log:

@@ -1,11 +1,8 @@
 rule object_track:
     """The object's pose in every frame."""
     input:
+        **artefacts_read("object_track"),
         object=object_files,
-        frames=rules.frames.output.frames,
-        scene=rules.scene.output.scene,
-        detections=rules.detections.output.detections,
-        person=rules.person.output.person,
         annotation=ancient(annotation_input("object_pose")),
     output:
         object_track=f"{RESULTS}/{{sequence}}/object_track.h5",

@@ -1,8 +1,7 @@
 rule scene:
     """Refined extrinsics, ground plane and background."""
     input:
-        frames=rules.frames.output.frames,
-        detections=rules.detections.output.detections,
+        **artefacts_read("scene"),
         annotation=ancient(annotation_input("floor")),
     output:
         scene=f"{RESULTS}/{{sequence}}/scene.h5",
@@ -29,9 +28,7 @@ rule scene:
 rule person:
     """The subject over views, and the triangulated keypoints."""
     input:
-        frames=rules.frames.output.frames,
-        detections=rules.detections.output.detections,
-        scene=rules.scene.output.scene,
+        **artefacts_read("person"),
     output:
         person=f"{RESULTS}/{{sequence}}/person.h5",
     log:

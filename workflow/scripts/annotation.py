@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from intercap_core.job import job
+from intercap_core.pipeline.job import job
 
 with job(f"{snakemake.wildcards.sequence}: annotation", snakemake.log[0]):
     from intercap_core.project import load_project

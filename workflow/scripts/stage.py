@@ -2,15 +2,16 @@
 
 from pathlib import Path
 
-from intercap_core.job import job
+from intercap_core.pipeline.job import job
 
 with job(
     f"{snakemake.wildcards.sequence}: {snakemake.rule}",
     snakemake.log[0],
     threads=snakemake.threads,
 ):
+    from intercap_core.pipeline.step import run_step
     from intercap_core.project import load_project
-    from intercap_core.step import SEQUENCE_STAGES, run_step
+    from intercap_core.stage_list import SEQUENCE_STAGES
 
     run_step(
         snakemake.rule,

@@ -1,0 +1,155 @@
+"""Pose blend shapes of chosen points, compiled: the points at rest, and the exact gradient.
+
+A point at rest moves by P vec(R - I), R the 54 local rotations below the root. Terms take the moved
+points, and leave the pull p = dE / dx on each point at rest; then dE/dR = P^T p, and the gradient
+by the parameters follows with dR / d theta_c = skew(J_l e_c) R, J_l the left Jacobian.
+
+Gauss-Newton's matrices of keypoints and cloud know these derivatives by the joints of a point's own
+limb. Others are left out: they would tie every point to every joint, for the sake of millimetres a
+radian. A minimum is where the gradient is zero, so it stays where it is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from intercap_core.body.parameters import NUM_POSE
+from intercap_core.body.skeleton_kernel import _rodrigues
+
+NUM_FEATURES = 486  # nine numbers of each rotation but the root's
+_FIRST = 3  # parameter of the first joint below the root
+_TOGETHER = 16  # points whose table stays in a core's own cache for all bodies
+
+
+class Correctives(NamedTuple):
+    """tables (N,3,486) of a term's points, metres, and ``ids`` (n,) of those that they move."""
+
+    ids: np.ndarray
+    tables: np.ndarray
+
+    @classmethod
+    def of(cls, tables: np.ndarray) -> Correctives:
+        """Those of a term's points (N,3,486)."""
+        return cls(np.flatnonzero(tables.any((1, 2))), np.ascontiguousarray(tables))
+
+
+@numba.njit(cache=True, nogil=True)
+def features(vectors):
+    """vec(R - I) (B,486) of the parameter vectors (B,P)."""
+    out = np.empty((len(vectors), NUM_FEATURES), vectors.dtype)
+    local, jacobian = np.empty((3, 3)), np.empty((3, 3))
+    for b in range(len(vectors)):
+        x = vectors[b]
+        for p in range(_FIRST, NUM_POSE, 3):
+            _rodrigues(
+                np.float64(x[p]), np.float64(x[p + 1]), np.float64(x[p + 2]), local, jacobian
+            )
+            for i in range(3):
+                for c in range(3):
+                    out[b, 3 * (p - _FIRST) + 3 * i + c] = local[i, c] - (1 if i == c else 0)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def move(correctives, feature, asked, rest):
+    """Move the points at rest (B,N,3), those that are ``asked`` (B,N) for, by feature (B,486).
+
+    By hand, as :func:`.skeleton_kernel.rest_points`.
+    """
+    ids, tables = correctives
+    for first in range(0, len(ids), _TOGETHER):
+        for b in range(len(rest)):
+            by = feature[b]
+            for i in range(first, min(first + _TOGETHER, len(ids))):
+                if not asked[b, ids[i]]:
+                    continue
+                t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
+                x = y = z = by[0] * np.float32(0)  # of the same type
+                for k in range(NUM_FEATURES):
+                    x += t0[k] * by[k]
+                    y += t1[k] * by[k]
+                    z += t2[k] * by[k]
+                rest[b, ids[i], 0] += x
+                rest[b, ids[i], 1] += y
+                rest[b, ids[i], 2] += z
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def gather(correctives, pull, by_feature):
+    """Add to by_feature (B,486) what the pull (B,N,3) on points at rest is by the features."""
+    ids, tables = correctives
+    for first in range(0, len(ids), _TOGETHER):
+        for b in range(len(pull)):
+            by = by_feature[b]
+            for i in range(first, min(first + _TOGETHER, len(ids))):
+                x, y, z = pull[b, ids[i], 0], pull[b, ids[i], 1], pull[b, ids[i], 2]
+                if x == 0 and y == 0 and z == 0:
+                    continue
+                t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
+                for k in range(NUM_FEATURES):
+                    by[k] += x * t0[k] + y * t1[k] + z * t2[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def changes(vectors):
+    """d R / d axis-angle, (B,54,3,9) by axis and number of the rotation, at (B,P) parameters."""
+    out = np.empty((len(vectors), NUM_FEATURES // 9, 3, 9), vectors.dtype)
+    local, jacobian = np.empty((3, 3)), np.empty((3, 3))
+    for b in range(len(vectors)):
+        x = vectors[b]
+        for joint in range(out.shape[1]):
+            p = _FIRST + 3 * joint
+            _rodrigues(
+                np.float64(x[p]), np.float64(x[p + 1]), np.float64(x[p + 2]), local, jacobian
+            )
+            for d in range(3):
+                w0, w1, w2 = jacobian[0, d], jacobian[1, d], jacobian[2, d]
+                for c in range(3):
+                    out[b, joint, d, c] = w1 * local[2, c] - w2 * local[1, c]
+                    out[b, joint, d, 3 + c] = w2 * local[0, c] - w0 * local[2, c]
+                    out[b, joint, d, 6 + c] = w0 * local[1, c] - w1 * local[0, c]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def add_gradient(change, by_feature, place, gradient):
+    """Add a gradient by the features (B,486) to that by the parameters (B,n).
+
+    change (B,54,3,9) of :func:`changes`; ``place`` (P,): each parameter's column, -1 = fixed.
+    """
+    for b in range(len(change)):
+        for joint in range(change.shape[1]):
+            for d in range(3):
+                q = place[_FIRST + 3 * joint + d]
+                if q >= 0:
+                    for k in range(9):
+                        gradient[b, q] += change[b, joint, d, k] * by_feature[b, 9 * joint + k]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def add_to_row(row, local, joints, t, table, change):
+    """Add what the correctives of one point change by ``joints`` to its row of derivatives.
+
+    t (3,): the row's direction turned back to the point at rest; table (3,486); change (54,3,9);
+    ``local`` (P,): each parameter's place in the row, -1 = not there.
+    """
+    for joint in joints:
+        first, by = 9 * (joint - 1), change[joint - 1]
+        s0 = s1 = s2 = t[0] * np.float32(0)  # of the same type
+        for k in range(9):
+            along = (
+                t[0] * table[0, first + k] + t[1] * table[1, first + k] + t[2] * table[2, first + k]
+            )
+            s0 += along * by[0, k]
+            s1 += along * by[1, k]
+            s2 += along * by[2, k]
+        p = 3 * joint
+        if local[p] >= 0:
+            row[local[p]] += s0
+        if local[p + 1] >= 0:
+            row[local[p + 1]] += s1
+        if local[p + 2] >= 0:
+            row[local[p + 2]] += s2

@@ -1,0 +1,382 @@
+"""What the observations ask of bodies as they stand: E_J's pixels and E_D's correspondences.
+
+Set up anew between rounds of the solver, together with how far each kind of observation is trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
+from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.free_space import seen_through
+from intercap_core.body_fit.observations import Observations, PersonCloud
+from intercap_core.body_fit.problem import BodyProblem, Views
+from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
+from intercap_core.energy.body_cloud import CloudRows, Matches
+from intercap_core.energy.body_keypoints import KeypointSet
+from intercap_core.energy.body_samples import COVERINGS
+from intercap_core.energy.body_self import SelfContact
+from intercap_core.energy.body_surface import Surface
+from intercap_core.solve.crew import Crew
+from intercap_core.solve.velocity import limited_velocity
+
+# What is left of a keypoint's error in metres once its fixed part is taken out: the start, refined
+# from the residuals themselves.
+_KEYPOINT_SIGMA = (
+    (BODY, 0.02),
+    (LEFT_HAND, 0.01),
+    (RIGHT_HAND, 0.01),
+    (slice(FACE.start, CONTOUR.stop), 0.008),
+)
+_SMALLEST_SIGMA_PX = 1.0
+_PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit do not show
+# Detectors' errors grow as a power of falling confidence, which residuals measure.
+_CONFIDENCE_BINS, _FEWEST_IN_BIN = 6, 30
+_LARGEST_DOUBT = 2.0
+_LEAST_CONFIDENCE = 0.1
+_SIGMA_RANGE = (0.1, 4.0)  # how far the refined sigma may go from the start
+_NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
+# Neighbouring samples stand on the same fold: about four of them make one measurement.
+_SAMPLE_SHARE = 0.25
+_FULL_SAMPLE = 2.0  # points with which a sample counts half
+_HUBER_M = 0.012
+_SEEN_THROUGH_TRUST = 1.0  # of a sample that sticks out of the person, beside a point's
+_VERTEX_CHUNK = 16
+_MOST_KEPT = 256  # frames whose bodies are kept, a quarter of a megabyte each
+# Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
+_MAX_SPEED = 6.0
+
+
+def measured_doubt(confidence: Tensor, error: Tensor) -> float:
+    """The power a >= 0 with which errors (M,) grow as confidence (M,) falls: confidence^-a."""
+    bins = torch.tensor_split(confidence.argsort(), _CONFIDENCE_BINS)
+    if len(bins[0]) < _FEWEST_IN_BIN:
+        return 0.0
+    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(_LEAST_CONFIDENCE).log()
+    y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
+    x, y = x - x.mean(), y - y.mean()
+    slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
+    return min(max(slope, 0.0), _LARGEST_DOUBT)
+
+
+class ViewDistances(NamedTuple):
+    """What the points of each camera say of the samples: their mean distance (N,C,S), metres, and
+    effective number (N,C,S), 0 = none; the samples' normals (N,S,3)."""
+
+    distance: Tensor
+    points: Tensor
+    normal: Tensor
+
+
+class Evidence:
+    """Observations of the N usable frames.
+
+    frames (N,) their ids. keypoint_sigma (135,) m and cloud_noise (G,) m start from what is usual
+    and are refined from residuals; the first is of keypoints of usual confidence, others have
+    (confidence / usual)^-keypoint_doubt of it. cloud_residual (N,): median distance of points at
+    the last matching, metres, NaN = none. by_view: what each camera's points said then, or None.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        seen: Observations,
+        clouds: list[PersonCloud | None],
+        cloud_weight: float,
+    ) -> None:
+        self.model, self.seen, self.cloud_weight = model, seen, cloud_weight
+        self.frames = np.flatnonzero(seen.usable)
+        self.clouds = [clouds[t] for t in self.frames]
+        self.has_cloud = any(cloud is not None for cloud in self.clouds)
+        self.samples = body_samples.choose_samples(model)
+        self.surface = Surface.around_samples(model, self.samples)
+        sample, patch = (
+            torch.as_tensor(places, device=model.device)
+            for places in (self.surface.sample, self.surface.patch)
+        )
+        contact = SelfContact.of(model, self.samples)
+        self.self_contact = replace(contact, vertex=sample, patch=patch)  # places in the surface
+        self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
+        self.group = torch.as_tensor(self.samples.group, device=model.device)
+        carrier = model.skinning_weights.argmax(1).cpu().numpy()
+        self.sample_joints = carrier[self.samples.vertex]
+        self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
+        # frame by frame in compiled code, which threads can share
+        self._crew = Crew(torch.get_num_threads() if model.device.type == "cpu" else 1)
+        self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
+        self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
+        self.by_view: ViewDistances | None = None
+        self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
+        self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
+        self.usual_confidence = torch.ones_like(self.keypoint_sigma)
+        for part, value in _KEYPOINT_SIGMA:
+            self.keypoint_sigma[part] = value
+            seen_at = seen.confidence[self.frames, :, part]
+            usual = np.median(seen_at[seen_at > 0]) if (seen_at > 0).any() else 1.0
+            self.usual_confidence[part] = float(usual)
+
+    def _tensor(self, values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
+
+    def look(
+        self,
+        problem: BodyProblem,
+        *,
+        hands: bool = False,
+        face: bool = False,
+        widened: float = 1.0,
+    ) -> None:
+        """Set E_J up at the problem's bodies: which keypoints, their sigma in pixels, shifts.
+
+        ``widened`` multiplies sigma, and with it the error from which a keypoint is an outlier.
+        """
+        seen, frames = self.seen, self.frames
+        problem.keypoints = self.keypoints(hands=hands, face=face)
+        chosen = problem.keypoints.index
+        at = np.ix_(frames, np.arange(len(seen.rig)), chosen.cpu().numpy())
+        points = self.points(problem)
+        pose = self._tensor(seen.rig.colour_from_master)
+        lenses = self._tensor(seen.rig.colour_parameters)
+        z = points[:, None] @ pose[:, 2, :3, None]
+        z = z[..., 0] + pose[:, 2, 3][:, None]
+        confidence = self._tensor(seen.confidence[at])
+        sigma = widened * self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
+        sigma = sigma * self._doubted(confidence, chosen)
+        problem.views = Views(
+            self._tensor(seen.keypoints[at]),
+            confidence,
+            sigma.clamp_min(_SMALLEST_SIGMA_PX),
+            lenses,
+            pose,
+            self._shift(points),
+        )
+
+    def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
+        """Those of the body, and of hands and face where asked for.
+
+        The jaw line is left out: its landmarks slide over the cheek with the view.
+        """
+        index = list(range(BODY.start, BODY.stop))
+        if hands:
+            index += range(LEFT_HAND.start, RIGHT_HAND.stop)
+        if face:
+            index += range(FACE.start, FACE.stop)
+        return body_keypoints.keypoint_set(self.model, index)
+
+    def points(self, problem: BodyProblem) -> Tensor:
+        """Current positions (N,K,3) of the problem's keypoints, with offsets."""
+        offsets = torch.zeros(len(problem.keypoints.index), 3).to(problem.base)
+        offsets[: BODY.stop] = problem.offsets
+        return body_keypoints.evaluate(
+            self.model,
+            self.model.parameters(problem.base),
+            problem.keypoints,
+            offsets,
+            derivatives=False,
+        ).points
+
+    def pixel_residuals(self, problem: BodyProblem) -> Tensor:
+        """Projections minus observations (N,C,K,2), px, of the problem's keypoints."""
+        views = problem.views
+        if views is None:
+            raise ValueError("the problem has no views to compare with")
+        return body_keypoints.pixel_residuals(
+            self.points(problem),
+            views.observed,
+            views.lenses,
+            views.colour_from_master,
+            shift=views.shift,
+        )
+
+    def _shift(self, points: Tensor) -> Tensor | None:
+        """How far points (N,...,3) move until each camera exposes: (N,C,...,3), or None."""
+        offset = self.seen.time_offset
+        if not np.any(offset):
+            return None
+        return self._tensor(offset)[:, None, None] * self.velocity(points)[:, None]
+
+    def velocity(self, points: Tensor) -> Tensor:
+        """(N,...,3) m/s of the usable frames' points (N,...,3)."""
+        found = limited_velocity(
+            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=_MAX_SPEED
+        )
+        return self._tensor(found)
+
+    def _doubted(self, confidence: Tensor, index: Tensor) -> Tensor:
+        """Factor (N,C,K) of the sigma of keypoints ``index`` (K,) by their confidence (N,C,K)."""
+        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.usual_confidence[index]
+        return share ** -self.keypoint_doubt[index]
+
+    def refine_sigma(self, problem: BodyProblem) -> None:
+        """Noise of each group of keypoints from its residuals: 1.48 median absolute deviation."""
+        views = problem.views
+        assert views is not None
+        index = problem.keypoints.index
+        scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
+        scaled = scaled * self.keypoint_sigma[index, None]
+        scaled = scaled * self._doubted(views.confidence, index)[..., None]
+        for part, start in _KEYPOINT_SIGMA:
+            here = (index >= part.start) & (index < part.stop)
+            known = views.confidence[:, :, here] > 0
+            if bool(known.any()):
+                sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
+                self.keypoint_doubt[part] = measured_doubt(sure, off.mean(1))
+                usual = off / self._doubted(views.confidence, index)[:, :, here][known][:, None]
+                found = 1.4826 * _PERSISTENCE * float(usual.median())
+                low, high = (start * factor for factor in _SIGMA_RANGE)
+                self.keypoint_sigma[part] = min(max(found, low), high)
+
+    def refine_cloud_noise(self, problem: BodyProblem) -> None:
+        """The same for each covering's samples, from what is left of their distances."""
+        rows = problem.rows
+        assert rows is not None
+        points = self.model.forward(
+            self.model.parameters(problem.base), vertex_ids=self.sample_ids
+        ).vertices
+        away = body_cloud.residuals(points, rows, problem.thickness_of_group(), self.group).abs()
+        for g, covering in enumerate(COVERINGS):
+            part = self.group == g
+            known = rows.weight[:, part] > 0
+            if bool(known.any()):
+                found = 1.4826 * float(away[:, part][known].median())
+                low, high = (covering.noise * factor for factor in _NOISE_RANGE)
+                self.cloud_noise[g] = min(max(found, low), high)
+
+    def _matched(
+        self,
+        t: int,
+        vertices: Tensor,
+        normals: Tensor,
+        where: Tensor,
+        shift: Tensor | None,
+        expected: Tensor,
+        reach: float,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the cloud of the t-th frame says of its samples: their mean distance and effective
+        number of points by camera (C,S), and the median distance, metres.
+
+        vertices and normals (R,3) of the surface; ``where`` (S,3) its samples are, and how far they
+        move until each camera exposes, shift (C,S,3); ``expected`` (C*S,) thickness.
+        """
+        cloud = self.clouds[t]
+        assert cloud is not None
+        size, views = len(where), len(self.seen.rig)
+        sample, patch = self.self_contact.vertex, self.self_contact.patch
+        normal = normals[sample]
+        if vertices.device.type == "cpu":
+            found = body_cloud.match_compiled(
+                cloud.points, cloud.normals, vertices, normals, self.surface, reach
+            )
+        else:
+            found = body_cloud.match(
+                cloud.points, cloud.normals, vertices, normals, sample, patch, reach
+            )
+        if shift is not None:
+            moved = (shift[cloud.view, found.sample] * normal[found.sample]).sum(1)
+            found = found._replace(distance=found.distance - moved)
+        residual = found.distance[found.valid].abs().nanmedian()
+        # gathered by camera and sample: those that several cameras see tell their offsets
+        found = found._replace(sample=cloud.view * size + found.sample)
+        found, trust = self._with_seen_through(found, cloud, where, normal, shift)
+        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=_HUBER_M)
+        return apart.reshape(views, -1), number.reshape(views, -1), residual
+
+    def _with_seen_through(
+        self,
+        found: Matches,
+        cloud: PersonCloud,
+        where: Tensor,
+        normal: Tensor,
+        shift: Tensor | None,
+    ) -> tuple[Matches, Tensor]:
+        """One frame's matches and their trust, with those of samples that stick out of the person.
+
+        where, normal (S,3) of the samples, shift (C,S,3); matches count samples by camera.
+        """
+        size, sample, distance = len(where), [found.sample], [found.distance]
+        outward = normal.cpu().numpy()
+        for window in cloud.windows:
+            view = window.view
+            late = where if shift is None else where + shift[view]
+            out, away = seen_through(
+                window, self.seen.rig[view], float(self.seen.depth_bias[view]),
+                late.cpu().numpy(), outward,
+            )  # fmt: skip
+            sample.append(torch.as_tensor(view * size + out, device=where.device))
+            distance.append(-self._tensor(away))
+        extra = sum(len(part) for part in sample[1:])
+        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), _SEEN_THROUGH_TRUST)])
+        valid = torch.cat([found.valid, found.valid.new_ones(extra)])
+        return Matches(torch.cat(sample), torch.cat(distance), valid), trust
+
+    def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Some frames of the bodies ``base`` (N,P) at a time: the first one's place, vertices and
+        normals (b,R,3) of the surface. Those of short sequences are kept for the next look."""
+        if self._posed is not None and torch.equal(self._posed[0], base):
+            yield from self._posed[1]
+            return
+        self._posed, parts = None, []
+        params = self.model.parameters(base)
+        for start in range(0, len(base), _VERTEX_CHUNK):
+            part = (start, *self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK))))
+            if len(base) <= _MOST_KEPT:
+                parts.append(part)
+            yield part
+        if parts:
+            self._posed = (base.clone(), parts)
+
+    def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
+        """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
+        not asked for."""
+        if not problem.self_weight:
+            return None
+        ids = torch.as_tensor(self.surface.ids, device=self.model.device)
+        found = []
+        for _, vertices, normals in self._bodies(problem.base):
+            found += self._crew.map(
+                lambda one: body_self.find(self.self_contact, *one),
+                list(zip(vertices, normals, strict=True)),
+            )
+        return body_self.join([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
+
+    def match(self, problem: BodyProblem, reach: float) -> CloudRows:
+        """Correspondences of all frames at the problem's bodies, within ``reach`` metres."""
+        count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
+        params = self.model.parameters(problem.base)
+        where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
+        shift = self._shift(where)
+        of_views = where.new_zeros(count, views, size)
+        points = where.new_zeros(count, views, size)
+        expected = problem.thickness().repeat(views)
+        normal = where.new_zeros(count, size, 3)
+        for start, vertices, normals in self._bodies(problem.base):
+            normal[start : start + len(normals)] = normals[:, self.self_contact.vertex]
+            seen = [
+                (start + row, *posed)
+                for row, posed in enumerate(zip(vertices, normals, strict=True))
+                if self.clouds[start + row] is not None
+            ]
+
+            def matched(one: tuple[int, Tensor, Tensor]) -> None:
+                t, vertices, normals = one
+                late = None if shift is None else shift[t]
+                of_views[t], points[t], self.cloud_residual[t] = self._matched(
+                    t, vertices, normals, where[t], late, expected, reach
+                )
+
+            self._crew.map(matched, seen)
+        self.by_view = ViewDistances(of_views, points, normal)
+        total = points.sum(1)
+        mean = (of_views * points).sum(1) / total.clamp_min(1e-6)
+        noise = self.cloud_noise[self.group]
+        share = self.cloud_weight * _SAMPLE_SHARE
+        weight = share * total / (total + _FULL_SAMPLE) / noise**2
+        target = mean + (normal * where).sum(2)
+        return CloudRows(target, normal, weight, mean)

@@ -1,0 +1,55 @@
+"""The other direction of E_D: vertices that a camera should see, against what it measured there.
+
+A vertex that faces a camera, and past which that camera measured something clearly farther away,
+sticks out of the person. It has to go in along its normal until the measured person begins:
+
+    e = -d - c,    d = the way along -n, in the image, to the first pixel not seen through,
+
+c the covering's thickness as in :mod:`intercap_core.energy.body_cloud`. The person's mask has no
+say, so one that is too small, or lacks a hand, draws nothing to it; what hides the vertex is nearer
+than it, and pixels without depth are unknown: neither pulls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.body_fit import free_space_kernel
+from intercap_core.camera.rig import Camera
+
+_BEHIND_M = 0.06  # farther behind the vertex is not the person's surface there
+_FACING = 0.1  # cosine between normal and line of sight; larger ones look away
+_NEAREST_M = 0.3  # points nearer to the camera are not looked at
+_REACH_M = 0.05
+_WAY_M = 0.01  # steps along the way in
+
+
+@dataclass(frozen=True, eq=False)
+class DepthWindow:
+    """Part of camera ``view``'s depth image: (h,w) uint16 mm, its first pixel's row, column."""
+
+    view: int
+    first: tuple[int, int]
+    depth: np.ndarray
+
+
+def seen_through(
+    window: DepthWindow,
+    camera: Camera,
+    depth_bias: float,
+    points: np.ndarray,
+    normals: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which points (M,) stick out in one view, and how far, metres, M values > 0.
+
+    points, unit normals (N,3), master frame; ``depth_bias`` metres that the camera measures too
+    much. Those for which no person begins within reach are left out.
+    """
+    assert camera.depth is not None
+    return free_space_kernel.seen_through(
+        window.depth, *window.first, tuple(camera.depth.parameters.tolist()),
+        camera.depth_from_master, depth_bias, points, normals,
+        _BEHIND_M, _FACING, _NEAREST_M, _REACH_M, _WAY_M,
+    )  # fmt: skip

@@ -1,0 +1,289 @@
+"""What the cameras say about the person: keypoints of all frames, and each frame's fused cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core import artefacts
+from intercap_core.artefacts import unpack_ragged
+from intercap_core.body.keypoints import BODY
+from intercap_core.body_fit import person_pixels_kernel
+from intercap_core.body_fit.free_space import DepthWindow
+from intercap_core.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
+from intercap_core.camera.masks import Runs
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply
+from intercap_core.capture.frames import Frames
+from intercap_core.errors import UserError
+from intercap_core.schemas import PERSON, SCENE
+
+_OUTLIER_TRUST = 0.2  # of a view that disagrees with the triangulated point
+_BEFORE_BACKGROUND_M = 0.04  # nearer than the background by less is background
+_NORMAL_BASE_PX = 3  # half the base over which a normal is measured
+_EDGE_M = 0.04  # a larger step between those pixels is an edge of the person
+# A body without a trunk's three points starts where those of frames so near put it, when so many of
+# the 25 body keypoints pull it to where it has gone.
+_NEAR_S = 1.0
+_ENOUGH_JOINTS = 6
+_EDGE_TRUST = 0.3  # such points may float between the person and what is behind
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """T frames, C cameras, K = 135 keypoints.
+
+    keypoints (T,C,K,2) px and confidence (T,C,K), 0 = not seen; joints (T,K,3) triangulated, master
+    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none;
+    image_of (T,C): the set whose image of each camera shows each frame, -1 = none; times (T,) s;
+    time_offset (C,) s: each camera exposes later than the frame's time by this much.
+    """
+
+    sequence: str
+    rig: Rig
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    joints: np.ndarray
+    joint_views: np.ndarray
+    masks: list[bytes]
+    background: list[np.ndarray | None]
+    depth_bias: np.ndarray
+    image_of: np.ndarray
+    time_offset: np.ndarray
+    times: np.ndarray
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.times)
+
+    @property
+    def placed(self) -> np.ndarray:
+        """(T,) bool: enough of the trunk is triangulated to place a body."""
+        trunk = self.joints[:, list(TRUNK_KEYPOINTS)]
+        return np.isfinite(trunk).all(2).sum(1) >= 3
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(T,) bool: a body can be placed, or enough of it is known near a frame in which one can:
+        one view from the side, or over a table, may see no more than one shoulder."""
+        placed = self.placed
+        if not placed.any():
+            return placed
+        away = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
+        known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
+        return placed | ((away <= _NEAR_S) & (known >= _ENOUGH_JOINTS))
+
+
+# neck, shoulders, mid hip, hips, knees: keypoints that a pose can be started from
+TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
+
+
+def read_observations(scene: Path, person: Path) -> Observations:
+    """Read scene and person; raises UserError for artefacts that do not belong together."""
+    with artefacts.read(scene, SCENE) as read:
+        rig = Rig.from_artefact(read)
+        sequence = str(read.attributes["sequence"])
+        times = read["times"]
+        image_of, time_offset = read["image_of"], read["time_offset"]
+        depth_bias = read["depth_bias"]
+        keys = set(read.keys("cameras/"))
+        background = [
+            read[f"cameras/{name}/background"] if f"cameras/{name}/background" in keys else None
+            for name in rig.names
+        ]
+    with artefacts.read(person, PERSON) as read:
+        names = tuple(read.text("camera_names"))
+        if names != rig.names or len(read["missing"]) != len(times):
+            raise UserError(
+                f"{person}: has {len(read['missing'])} frames of cameras {', '.join(names)}, "
+                f"expected {len(times)} of {', '.join(rig.names)} as in {scene}; re-run stage "
+                "'person' for this sequence"
+            )
+        keypoints = read["keypoints"].astype(np.float64)
+        joints, views = read["joints"].astype(np.float64), read["joint_views"]
+        inlier = read["inlier"]
+        masks = unpack_ragged(read["mask_offsets"], read["mask_rle"])
+    confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
+    disputed = (views >= 2)[:, None] & ~inlier
+    confidence = np.where(disputed, _OUTLIER_TRUST * confidence, confidence)
+    confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
+    return Observations(
+        sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks,
+        background, depth_bias, image_of, time_offset, times,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class PersonCloud:
+    """One frame's person points of all views, master frame.
+
+    points, normals (M,3) float32, metres, normals towards the camera; trust (M,) in (0,1]; view
+    (M,) index of the camera; windows: what each camera's depth shows around the person.
+    """
+
+    points: Tensor
+    normals: Tensor
+    trust: Tensor
+    view: Tensor
+    windows: tuple[DepthWindow, ...] = ()
+
+
+def person_clouds(
+    frames: Path, seen: Observations, count: int, device: torch.device
+) -> Iterator[PersonCloud | None]:
+    """The cloud of every frame in order, about ``count`` points each; None = no depth, no mask."""
+    with Frames.open(frames) as reader:
+        reader = reader.showing(seen.image_of)
+        for t in range(seen.num_frames):
+            yield _fused(reader, seen, t, count, device)
+
+
+def _fused(
+    reader: Frames, seen: Observations, t: int, count: int, device: torch.device
+) -> PersonCloud | None:
+    seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
+    windows = []
+    for c, camera in enumerate(seen.rig):
+        rle = seen.masks[t * len(seen.rig) + c]
+        if not rle or camera.depth is None:
+            continue
+        depth = reader.depth(t, c)
+        if depth is None:
+            continue
+        mask = Runs(rle, camera.colour.height, camera.colour.width)
+        window = _window(camera, mask, depth)
+        if window is None:
+            continue
+        index = person_pixels(depth, camera, mask, seen.background[c], window)
+        if len(index):
+            seen_by.append((c, depth, index))
+            rows, columns = window
+            corner = (rows.start, columns.start)
+            windows.append(DepthWindow(c, corner, depth[rows, columns].copy()))
+    if not seen_by:
+        return None
+    # every n-th point: pixels are in scan order, so this spreads over the surface
+    first = np.cumsum([0, *(len(index) for _, _, index in seen_by)])
+    pick = np.unique(np.linspace(0, first[-1] - 1, min(count, first[-1])).astype(np.int64))
+    parts: list[tuple[np.ndarray, ...]] = []
+    for (c, depth, index), start in zip(seen_by, first[:-1], strict=True):
+        chosen = index[pick[(pick >= start) & (pick < start + len(index))] - start]
+        placed = _placed(depth, seen.rig[c], chosen, seen.depth_bias[c])
+        parts.append((*placed, np.full(len(chosen), c)))
+    points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return PersonCloud(
+        torch.as_tensor(points, dtype=torch.float32, device=device),
+        torch.as_tensor(normals, dtype=torch.float32, device=device),
+        torch.as_tensor(trust, dtype=torch.float32, device=device),
+        torch.as_tensor(view, device=device),
+        tuple(windows),
+    )
+
+
+def person_pixels(
+    depth: np.ndarray,
+    camera: Camera,
+    mask: Runs,
+    background: np.ndarray | None,
+    window: tuple[slice, slice],
+) -> np.ndarray:
+    """Flat pixels (M,) of one depth image (H,W), within ``window``, that show the person.
+
+    A depth pixel counts when the colour pixel that shows the same surface lies in the person's
+    mask, which is not empty, and the depth is clearly nearer than the background. What stands
+    before the background is all that can cover the person. Every second pixel of every second row
+    is used.
+    """
+    assert camera.depth is not None and camera.colour_from_depth is not None
+    colour, (rows, columns) = camera.colour, window
+    spacing = max(colour.fx / camera.depth.fx, colour.fy / camera.depth.fy, 1.0)
+    return person_pixels_kernel.person_pixels(
+        depth,
+        np.zeros((0, 0), np.uint16) if background is None else background,
+        int(1000 * _BEFORE_BACKGROUND_M),
+        (rows.start, rows.stop),
+        (columns.start, columns.stop),
+        camera.depth.rays,
+        camera.colour_from_depth.astype(np.float32),
+        tuple(colour.parameters.astype(np.float32)),
+        (colour.height, colour.width),
+        mask.ends,
+        mask.box,
+        np.float32(CELL_SPACINGS * spacing),
+        # on the colour grid nothing hides: the pixels are the colour image's
+        np.float32(np.inf if camera.aligned else HIDDEN_BEHIND_M),
+    )
+
+
+def _placed(
+    depth: np.ndarray, camera: Camera, index: np.ndarray, depth_bias: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals (M,3), master frame, and trust (M,) of flat depth pixels (M,)."""
+    points, normals, edge = _points_and_normals(depth, camera, index)
+    if depth_bias:
+        points = points - depth_bias * points / points[:, 2:]
+    master = camera.master_from_depth
+    rotation = master[:3, :3].astype(np.float32)
+    return apply(master, points), normals @ rotation.T, np.where(edge, _EDGE_TRUST, 1.0)
+
+
+def _window(camera: Camera, mask: Runs, depth: np.ndarray) -> tuple[slice, slice] | None:
+    """The part of the depth image that can show the mask: its box, through both lenses."""
+    x, y, w, h = mask.box
+    if w == 0 or camera.depth is None or camera.colour_from_depth is None:
+        return None
+    corners = np.array([[x + i * w / 4, y + j * h / 4] for i in range(5) for j in range(5)])
+    rays = camera.colour.unproject(corners)
+    rays = rays[np.isfinite(rays).all(1)]
+    depth_from_colour = np.linalg.inv(camera.colour_from_depth)
+    placed = np.concatenate([apply(depth_from_colour, z * rays) for z in (0.7, 2.0, 6.0)])
+    pixels = camera.depth.project(placed)
+    height, width = depth.shape
+    margin = 6
+    x0, y0 = np.floor(pixels.min(0)).astype(int) - margin
+    x1, y1 = np.ceil(pixels.max(0)).astype(int) + margin
+    rows = slice(max(int(y0), 0), min(int(y1), height))
+    columns = slice(max(int(x0), 0), min(int(x1), width))
+    return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
+
+
+def _points_and_normals(
+    depth: np.ndarray, camera: Camera, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points and unit normals (M,3), depth camera's frame, and whether a pixel is at an edge."""
+    assert camera.depth is not None
+    height, width = depth.shape
+    rays = camera.depth.rays
+    row, column = np.divmod(index, width)
+    z = depth[row, column].astype(np.float32) * np.float32(1e-3)
+
+    def at(r: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
+        there = depth[r, c].astype(np.float32) * np.float32(1e-3)
+        ray = rays[r, c]
+        good = (there > 0) & (np.abs(there - z) < _EDGE_M) & np.isfinite(ray[:, 0])
+        ray = np.where(good[:, None], ray, 0)
+        return np.concatenate([ray * there[:, None], there[:, None]], 1), good
+
+    ray = np.nan_to_num(rays[row, column])
+    here = np.concatenate([ray * z[:, None], z[:, None]], 1)
+    spans, smooth = [], np.ones(len(index), bool)
+    for dr, dc in ((0, _NORMAL_BASE_PX), (_NORMAL_BASE_PX, 0)):
+        ahead, a = at(row + dr, column + dc)
+        back, b = at(row - dr, column - dc)
+        # one-sided where the other side is another surface
+        span = np.where(a[:, None], ahead, here) - np.where(b[:, None], back, here)
+        spans.append(span)
+        smooth &= a & b
+    normals = np.cross(spans[1], spans[0])
+    length = np.linalg.norm(normals, axis=1)
+    flat = length < 1e-9
+    facing = -here / np.maximum(np.linalg.norm(here, axis=1, keepdims=True), 1e-9)
+    normals = np.where(flat[:, None], facing, normals / np.maximum(length, 1e-9)[:, None])
+    normals *= np.where((normals * here).sum(1) > 0, -1.0, 1.0)[:, None]
+    return here, normals.astype(np.float32), ~smooth

@@ -1,0 +1,102 @@
+"""Frames whose body left the motion of its neighbours: found, and fitted again from between them.
+
+A fit that starts from a wrong triangulation, or an arm that one view cannot place in depth, ends in
+another minimum of the energy, alone among frames that agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body_fit.bridge import bridge
+from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.solve.levenberg_marquardt import minimise
+
+# Around a moment hands swing off the straight by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m; fits
+# scatter by less than a tenth of a metre.
+_AROUND_S = 0.21
+JUMP_M = 0.25
+_BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
+_TRIALS = 10
+# What seems to be seen is no worse explained from between the neighbours: then that is the motion.
+_AS_GOOD, _SLACK = 1.2, 5.0
+
+
+def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M) -> np.ndarray:
+    """Distance (N,J) of joints (N,J,3), metres, from their median over the frames around.
+
+    ``times`` (N,) seconds. Frames count up to 0.2 s away, as many before as after; 0 where there
+    are none, and where the distance is no more than ``least`` (N,J), by default what people move.
+    """
+    result = np.zeros(joints.shape[:2])
+    for t, time in enumerate(times):
+        near = np.abs(times - time) <= _AROUND_S
+        half = min(near[:t].sum(), near[t + 1 :].sum())
+        if half:
+            window = joints[t - half : t + half + 1]
+            result[t] = np.linalg.norm(joints[t] - np.median(window, axis=0), axis=1)
+    return np.where(result > least, result, 0.0)
+
+
+def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
+    """Fit the frames that jump again from between the others; which were changed, (N,) bool.
+
+    ``problem`` has views; its base is changed in place, ``times`` (N,) seconds are its frames'.
+    Shared parameters stay.
+    """
+    model = problem.model
+    changed = np.zeros(len(times), bool)
+    params = model.parameters(problem.base)
+    joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
+    odd = np.asarray((jumps(joints.double().cpu().numpy(), times) > 0).any(1))
+    if not odd.any() or odd.all():
+        return changed
+    between = bridge(problem.base.double().cpu().numpy(), ~odd, times)
+    at = torch.as_tensor(np.flatnonzero(odd), device=problem.base.device)
+    base = torch.as_tensor(between[odd]).to(problem.base)
+    again = _of_frames(problem, at, base)
+    everyone = torch.arange(len(at), device=base.device)
+    nothing = base.new_zeros(0)
+    before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
+    found = minimise(again, again.own_start(), max_trials=_TRIALS, cost_tolerance=1e-3)
+    kept = found.cost <= _AS_GOOD * before + _SLACK
+    rows = problem.base[at].clone()
+    again.accept(found.own, nothing)
+    rows[kept] = again.base[kept]
+    problem.base = problem.base.clone()
+    problem.base[at] = rows
+    changed[np.flatnonzero(odd)[kept.cpu().numpy()]] = True
+    return changed
+
+
+def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> BodyProblem:
+    """E_J and priors alone of the frames ``at`` (n,), at bodies ``base`` (n,P), shape fixed."""
+    views, targets = problem.views, problem.targets
+    if views is not None:
+        views = replace(
+            views,
+            observed=views.observed[at],
+            confidence=views.confidence[at],
+            sigma=views.sigma[at],
+            shift=None if views.shift is None else views.shift[at],
+        )
+    if targets is not None:
+        targets = replace(targets, points=targets.points[at], confidence=targets.confidence[at])
+    shape = torch.arange(base.shape[1], device=base.device)[problem.shape_columns]
+    own = problem.columns[~torch.isin(problem.columns, shape)]
+    return replace(
+        problem,
+        base=base,
+        columns=own,
+        one_shape=False,
+        fit_shared=False,
+        views=views,
+        targets=targets,
+        rows=None,
+        touching=None,
+        pose=None if problem.pose is None else problem.pose.of_frames(at),
+    )

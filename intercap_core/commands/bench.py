@@ -1,0 +1,144 @@
+"""`intercap bench`: seconds a frame and peak memory of one recording, by stage and end to end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core import artefacts
+from intercap_core.commands.run import snakemake_command
+from intercap_core.errors import UserError
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project, load_project
+from intercap_core.schemas import FRAMES
+from intercap_core.stage_list import SEQUENCE_STAGES
+
+SAMPLE_SECONDS = 0.1
+EXTRACTIONS = 3
+MEGABYTE = 1 << 20
+
+
+def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
+    """Measure the project's first sequence and write flat JSON, keys ``area.measure``.
+
+    The recording is made before, if it is a virtual one. Then every stage from the recordings to
+    the metrics is computed anew through the workflow: process starts count, the studio does not.
+    ``end_to_end.peak_memory_mb`` is the largest sum of resident memory over all processes of the
+    run; a stage's is its own process's. ``frames.fps`` is :func:`extraction`'s. Raises UserError
+    where a stage fails.
+    """
+    project = load_project(settings)
+    sequence = next(iter(project.sequences))
+    made = project.recordings_made(sequence)
+    if made is not None:
+        _run(settings, str(made / "capture.json"), cores)
+    shutil.rmtree(project.results / sequence, ignore_errors=True)
+    seconds, peak = _run(settings, str(project.artefact(sequence, "metrics")), cores)
+    with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as source:
+        frames, cameras = source["colour_index"].shape
+    figures = {
+        "end_to_end.seconds_per_frame": round(seconds / frames, 4),
+        "end_to_end.peak_memory_mb": round(peak / MEGABYTE, 1),
+        **_stages(project, sequence, frames),
+        **extraction(project, sequence, frames),
+    }
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    _print(figures, f"{sequence}: {frames} frame sets of {cameras} cameras")
+    print(output)
+
+
+def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
+    """Run the workflow up to ``target``: seconds, and peak resident bytes of all its processes."""
+    import psutil
+
+    start = time.monotonic()
+    process = subprocess.Popen(
+        [*snakemake_command(settings, cores=cores, arguments=[target]), "--quiet", "all"],
+        stdout=sys.stderr,
+    )
+    tree, peak = psutil.Process(process.pid), 0
+    while process.poll() is None:
+        total = 0
+        try:
+            for member in [tree, *tree.children(recursive=True)]:
+                total += member.memory_info().rss
+        except psutil.NoSuchProcess:
+            continue  # ended between listing and asking
+        peak = max(peak, total)
+        time.sleep(SAMPLE_SECONDS)
+    if process.returncode:
+        raise UserError(f"the run up to {target} failed; its messages are above")
+    return time.monotonic() - start, peak
+
+
+def _stages(project: Project, sequence: str, frames: int) -> dict[str, float]:
+    """Each stage's own figures, from the workflow's benchmark files."""
+    figures = {}
+    for stage in SEQUENCE_STAGES:
+        path = Path("benchmarks") / project.config.dataset / sequence / f"{stage}.tsv"
+        with open(path, encoding="utf-8") as file:
+            row = next(csv.DictReader(file, delimiter="\t"))
+        figures[f"{stage}.seconds_per_frame"] = round(float(row["s"]) / frames, 4)
+        # Too short a job is never sampled
+        if row["max_rss"] not in ("-", "NA"):
+            figures[f"{stage}.peak_memory_mb"] = float(row["max_rss"])
+    return figures
+
+
+def extraction(project: Project, sequence: str, frames: int) -> dict[str, float]:
+    """Speed of the frames stage alone, and its artefact's size beside the recordings' own.
+
+    ``frames.fps``: frame sets of all cameras a second, the median of ``EXTRACTIONS`` runs within
+    one process whose imports are done and whose input the system has read before.
+    ``frames.bytes_ratio``: bytes of frames.h5 over bytes of the recording files, whole: colour and
+    depth packets, and whatever else was recorded (infrared, inertial samples, attachments).
+    """
+    seconds = []
+    with tempfile.TemporaryDirectory(dir=project.results) as folder:
+        output = Path(folder) / "frames.h5"
+        for _ in range(1 + EXTRACTIONS):  # the first one imports and warms up
+            output.unlink(missing_ok=True)
+            start = time.perf_counter()
+            run_step("frames", project, sequence, inputs={}, output=output)
+            seconds.append(time.perf_counter() - start)
+        written = output.stat().st_size
+    row = project.sequences[sequence]
+    files = row.recordings.rglob("*.mkv" if row.layout == "k4a" else "*")
+    recorded = sum(path.stat().st_size for path in files if path.is_file())
+    return {
+        "frames.fps": round(frames / statistics.median(seconds[1:]), 2),
+        "frames.bytes_ratio": round(written / recorded, 4),
+        "frames.bytes_per_set": round(written / frames),
+        "frames.recorded_bytes_per_set": round(recorded / frames),
+    }
+
+
+def _print(figures: dict[str, float], title: str) -> None:
+    table = Table("stage", "seconds a frame", "peak memory, MB", title=title, box=None)
+    for area in ("end_to_end", *SEQUENCE_STAGES):
+        memory = figures.get(f"{area}.peak_memory_mb")
+        table.add_row(
+            area,
+            f"{figures[f'{area}.seconds_per_frame']:.3f}",
+            "" if memory is None else f"{memory:.0f}",
+        )
+    console = Console()
+    console.print(table)
+    console.print(
+        f"extraction alone: {figures['frames.fps']:.1f} frame sets a second; "
+        f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "
+        f"{figures['frames.recorded_bytes_per_set'] / 1e6:.2f} MB "
+        f"(ratio {figures['frames.bytes_ratio']:.3f})",
+        highlight=False,
+    )

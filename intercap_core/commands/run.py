@@ -1,0 +1,202 @@
+"""`intercap run`: Snakemake with a table of sequences and stages that a person can follow."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+
+from intercap_core.commands.check import check_bodies
+from intercap_core.errors import UserError
+from intercap_core.pipeline.job import read_state
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import STAGES
+
+POLL_SECONDS = 0.5
+COLUMNS = tuple(STAGES)
+DRY_RUN = {"-n", "--dry-run", "--dryrun"}
+LAST_LINES = 15
+AGGREGATES = ("report.html", "summary.json")
+
+
+@dataclass(frozen=True)
+class JobState:
+    """What the log of one job of this run says: running, finished or failed, and in which words."""
+
+    state: str
+    words: str
+
+
+def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = ()) -> int:
+    """Bring a project up to date; returns the exit status.
+
+    Where sequences fail, they are named with their reason and the report is made of the others.
+    Raises UserError where settings or tables are wrong.
+    """
+    project = load_project(settings)
+    check_bodies(project)
+    console = Console(stderr=True)
+    command = snakemake_command(settings, cores=cores, arguments=arguments)
+    if DRY_RUN & set(arguments):
+        return subprocess.call(command)
+    watcher = Watcher(project, console)
+    status = run_watched(command, watcher, console)
+    failures = watcher.failures()
+    for name, words in failures.items():
+        console.print(f"[red]{escape(name)}[/red] {escape(words)}", highlight=False, soft_wrap=True)
+    if status and not failures:
+        lines = watcher.transcript.read_text(encoding="utf-8").splitlines()
+        console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
+        raise UserError(f"the workflow stopped; its whole output is in {watcher.transcript}")
+    bad = sorted({name.split(":")[0] for name in failures} & set(project.sequences))
+    if bad and len(bad) < len(project.sequences) and not arguments:
+        console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
+        targets = [str(project.results / name) for name in AGGREGATES]
+        excluded = ",".join([*project.config.exclude, *bad])
+        command = snakemake_command(
+            settings, cores=cores, arguments=[*targets, "--config", f"exclude=[{excluded}]"]
+        )
+        run_watched(command, Watcher(project, console), console)
+    report = project.results / "report.html"
+    if report.is_file():
+        words = f"report: {report.resolve()}"
+        console.print(words, highlight=False, markup=False, soft_wrap=True)
+    return status
+
+
+def snakemake_command(
+    settings: Path, *, cores: int = 0, arguments: Sequence[str] = ()
+) -> list[str]:
+    """The command line that runs a project's workflow; ``cores`` 0 = all."""
+    return [
+        *(sys.executable, "-m", "snakemake"),
+        *("--snakefile", str(snakefile())),
+        *("--configfile", str(settings)),
+        *("--cores", str(cores) if cores else "all"),
+        *arguments,
+    ]
+
+
+def snakefile() -> Path:
+    """The workflow that comes with the package, or one in the working directory."""
+    for folder in (Path(__file__).resolve().parents[2], Path.cwd()):
+        if (folder / "Snakefile").is_file():
+            return folder / "Snakefile"
+    raise UserError(
+        "there is no Snakefile here; run from the project's root, where Snakefile and workflow/ are"
+    )
+
+
+class Watcher:
+    """Follows a run through the logs of its jobs."""
+
+    def __init__(self, project: Project, console: Console) -> None:
+        self._project = project
+        self._console = console
+        self._start = time.time() - 1.0  # file systems keep whole seconds at worst
+        self._told: set[str] = set()
+        self._logs = project.logs
+        self.transcript = self._logs / "snakemake.log"
+
+    def jobs(self) -> dict[str, JobState]:
+        """State of every job that this run has started, by "sequence: stage"."""
+        found = {}
+        for path in sorted(self._logs.glob("**/*.log")):
+            try:
+                if path == self.transcript or path.stat().st_mtime < self._start:
+                    continue
+                state = JobState(*read_state(path))
+            except FileNotFoundError:  # the workflow removes an old log before it runs a job anew
+                continue
+            sequence = path.parent.name if path.parent != self._logs else ""
+            found[f"{sequence}: {path.stem}" if sequence else path.stem] = state
+        return found
+
+    def failures(self) -> dict[str, str]:
+        """Jobs that did not finish, with the reason; only once the run has ended."""
+        ended = "ended without a word: killed, perhaps for its memory"
+        return {
+            name: job.words if job.state == "failed" else ended
+            for name, job in self.jobs().items()
+            if job.state != "finished"
+        }
+
+    def table(self) -> Table:
+        """One row a sequence, one column a stage."""
+        jobs = self.jobs()
+        table = Table("sequence", *COLUMNS, box=None, header_style="bold")
+        for sequence in self._project.sequences:
+            making = jobs.get(f"{sequence}: studio")
+            first = f"{sequence} (recording)" if making and making.state == "running" else sequence
+            cells = [self._cell(sequence, stage, jobs) for stage in COLUMNS]
+            table.add_row(first, *cells)
+        return table
+
+    def _cell(self, sequence: str, stage: str, jobs: dict[str, JobState]) -> str:
+        job = jobs.get(f"{sequence}: {stage}")
+        if job is None:
+            there = self._project.artefact(sequence, stage).exists()
+            return "[dim]kept[/dim]" if there else "[dim]-[/dim]"
+        if job.state == "running":
+            return "[yellow]runs[/yellow]"
+        return (
+            f"[green]{escape(job.words)}[/green]"
+            if job.state == "finished"
+            else "[red]failed[/red]"
+        )
+
+    def tell(self) -> None:
+        """Print each job once, when it has ended; for terminals that cannot redraw."""
+        for name, job in self.jobs().items():
+            if job.state != "running" and name not in self._told:
+                self._told.add(name)
+                words = f"{name}: {job.state} {job.words}"
+                self._console.print(words, highlight=False, markup=False)
+
+
+def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:
+    """Run a command, its output to the watcher's transcript; returns the exit status.
+
+    Where this process is interrupted or told to end, so is the command, and it is waited for.
+    """
+    watcher.transcript.parent.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "NO_COLOR": "1"}
+    with open(watcher.transcript, "w", encoding="utf-8") as transcript:
+        process = subprocess.Popen(
+            command, stdout=transcript, stderr=subprocess.STDOUT, env=environment
+        )
+        told_to_end = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        try:
+            with _display(watcher, console) as refresh:
+                while process.poll() is None:
+                    time.sleep(POLL_SECONDS)
+                    refresh()
+                refresh()
+        except KeyboardInterrupt:
+            raise SystemExit(130) from None  # Snakemake has got the same signal
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
+            signal.signal(signal.SIGTERM, told_to_end)
+    return process.returncode
+
+
+@contextmanager
+def _display(watcher: Watcher, console: Console) -> Iterator[Callable[[], None]]:
+    if not console.is_terminal:
+        yield watcher.tell
+        return
+    with Live(watcher.table(), console=console, refresh_per_second=4) as live:
+        yield lambda: live.update(watcher.table())

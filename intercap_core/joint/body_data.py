@@ -1,0 +1,149 @@
+"""E_B in the joint energy: equation 2 as the body fit left it, shape and coverings settled."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from intercap_core.artefacts import Artefact
+from intercap_core.body.model import BodyModel
+from intercap_core.body.vposer import VPoser
+from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.body_fit.schedule import Fitter, Settled
+from intercap_core.config import BodyFitSettings
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.sightings import cloud_sightings, keypoint_sightings
+from intercap_core.joint.state import BODY, State
+from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets, estimate_offsets
+
+# Frames without a believable fit stay near where they were bridged unless their neighbours pull.
+_BRIDGED_TURN, _BRIDGED_SHIFT = 0.3, 0.1  # rad, metres
+_OFFSET_SAME_S = 0.0003  # what a hand at 3 m/s moves meanwhile is a millimetre
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """``keypoint_px`` (T, C) median reprojection error and ``cloud_m`` (T,) median distance of the
+    cloud beyond the coverings; NaN = nothing seen."""
+
+    keypoint_px: np.ndarray
+    cloud_m: np.ndarray
+
+
+class BodyData:
+    """Keypoints, clouds and priors of all frames; frames that the body fit gave up have no say."""
+
+    def __init__(self, fitter: Fitter, problem: BodyProblem, trusted: np.ndarray) -> None:
+        self._fitter, self._problem = fitter, problem
+        self._trusted = trusted[fitter.frames]
+        self._index = torch.arange(len(fitter.frames), device=fitter.model.device)
+        self._bridged: np.ndarray | None = None
+
+    @classmethod
+    def load(
+        cls,
+        *,
+        frames: Path,
+        scene: Path,
+        person: Path,
+        body_fit: Artefact,
+        model: BodyModel,
+        state: State,
+        settings: BodyFitSettings,
+        pose_prior: VPoser | None = None,
+    ) -> BodyData:
+        """Read the images' evidence and what the body fit found to be constant."""
+        seen = read_observations(scene, person)
+        clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
+        fitter = Fitter(model, seen, clouds, settings, pose_prior)
+        settled = Settled(
+            *(
+                torch.from_numpy(body_fit[name])
+                for name in (
+                    "keypoint_offsets",
+                    "covering",
+                    "keypoint_sigma",
+                    "covering_noise",
+                    "keypoint_doubt",
+                )
+            )
+        )
+        problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
+        problem.columns = torch.arange(BODY, device=model.device)
+        return cls(fitter, problem, ~body_fit["failed"])
+
+    def refresh(self, state: State) -> None:
+        """Take correspondences and visibility anew at ``state``."""
+        self._place(state)
+        self._fitter.observe(self._problem)
+        if self._bridged is None:
+            self._bridged = state.body.copy()
+
+    def add(self, state: State, out: NormalEquations) -> None:
+        """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
+        assert self._bridged is not None, "refresh comes first"
+        own = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
+        none = own.new_zeros(0)
+        normal = self._problem.linearise(own, none, self._index)
+        frames = self._fitter.frames[self._trusted]
+        hessian = np.zeros((len(state), BODY, BODY))
+        gradient = np.zeros((len(state), BODY))
+        hessian[frames] = normal.hessian.double().cpu().numpy()[self._trusted]
+        gradient[frames] = normal.gradient.double().cpu().numpy()[self._trusted]
+        energy = float(normal.cost.double().cpu().numpy()[self._trusted].sum())
+        rest = np.setdiff1d(np.arange(len(state)), frames)
+        precision = np.full(BODY, _BRIDGED_TURN**-2)
+        precision[-3:] = _BRIDGED_SHIFT**-2
+        away = state.body[rest] - self._bridged[rest]
+        hessian[rest] = np.diag(precision)
+        gradient[rest] = precision * away
+        energy += 0.5 * float((precision * away**2).sum())
+        out.add_blocks("body_data", slice(0, BODY), hessian, gradient, energy)
+
+    def residuals(self, state: State) -> Residuals:
+        """How far the images are from ``state``."""
+        self.refresh(state)
+        pixels, metres = self._fitter.residuals(self._problem)
+        keypoint = np.full((len(state), pixels.shape[1]), np.nan)
+        cloud = np.full(len(state), np.nan)
+        keypoint[self._fitter.frames] = pixels.cpu().numpy()
+        cloud[self._fitter.frames] = metres.cpu().numpy()
+        return Residuals(keypoint, cloud)
+
+    @property
+    def time_offset(self) -> np.ndarray:
+        """(C,) seconds by which the predictions take the cameras to expose late."""
+        return self._fitter.evidence.seen.time_offset
+
+    def estimate_offsets(self, prior: OffsetPrior) -> TimeOffsets:
+        """Estimate the cameras' time offsets at the state of the last :meth:`refresh`."""
+        evidence, problem = self._fitter.evidence, self._problem
+        sightings = [
+            replace(found, weight=found.weight * self._trusted[:, None, None])
+            for found in (keypoint_sightings(evidence, problem), cloud_sightings(evidence, problem))
+            if found is not None
+        ]
+        times = evidence.seen.times[evidence.frames]
+        offsets = estimate_offsets(sightings, times, self.time_offset, prior)
+        log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
+        return offsets
+
+    def take_offsets(self, offset: np.ndarray) -> float:
+        """Predict with other offsets (C,) from now on; the largest change, seconds."""
+        evidence = self._fitter.evidence
+        change = float(np.abs(offset - self.time_offset).max())
+        if change > _OFFSET_SAME_S:
+            evidence.seen = replace(evidence.seen, time_offset=offset)
+            self._fitter.observe(self._problem)
+        return change
+
+    def _place(self, state: State) -> None:
+        vector = state.parameters(self._fitter.model).vector()
+        self._problem.base = vector[self._fitter.frames].to(self._problem.base)

@@ -1,0 +1,31 @@
+"""The body's vertices that the joint fit watches: contact patches dense, the rest thin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core.body.model import BodyModel
+from intercap_core.contact.patches import Patches
+from intercap_core.energy.body_samples import choose_samples
+
+
+@dataclass(frozen=True)
+class Skin:
+    """``vertices`` (N,) ids, ascending; ``share`` (N,) how many vertices of the mesh each stands
+    for; ``patch`` (M,) where in them the contact patches' vertices are."""
+
+    vertices: np.ndarray
+    share: np.ndarray
+    patch: np.ndarray
+
+    @classmethod
+    def watch(cls, model: BodyModel, patches: Patches) -> Skin:
+        """All contact patches and an even sample of the outer skin."""
+        vertices = np.union1d(patches.vertices, choose_samples(model).vertex)
+        template = model.template.double().cpu().numpy()
+        _, nearest = cKDTree(template[vertices]).query(template)
+        share = np.bincount(nearest, minlength=len(vertices)).astype(float)
+        return cls(vertices, share, np.searchsorted(vertices, patches.vertices))

@@ -1,0 +1,116 @@
+"""Hundreds of poses aligned at once to what a group of candidates shows of the object.
+
+Point-to-plane ICP to the measured points, and the reach of the silhouettes where views measure none
+or few views leave many poses that fit the points. Robust (Geman-McClure), with a scale that shrinks
+from the size of the search grid's error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track import outlines
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.groups import Group, centre_of
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
+
+CLOUD_POINTS = 150
+ICP_STEPS = 6
+ICP_SCALES_M = (0.08, 0.015)
+FEW_VIEWS = 2
+FARTHEST_M = 0.05  # residuals beyond count as this much
+_MAX_TURN, _MAX_SHIFT_M = np.radians(15), 0.05  # of a step
+
+
+def align(
+    mesh: ObjectMesh,
+    field: DistanceField,
+    group: Group,
+    views: list[View],
+    rotations: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Align every rotation (N, 3, 3): poses (N, 4, 4) and robust mean residual (N,) in metres."""
+    count = len(rotations)
+    cloud, eyes = _cloud(group, views)
+    few = len(group) <= FEW_VIEWS
+    shapes = [s.outline for s in group if s.outline and (few or s.centre is None)]
+    hull = outlines.hull_vertices(mesh) if shapes else np.zeros((0, 3))
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    middle = (area[:, None] * (a + b + c) / 3).sum(0) / area.sum()
+    rotation = rotations.copy()
+    translation = centre_of(group) - rotation @ middle
+    scales = np.geomspace(*ICP_SCALES_M, ICP_STEPS)
+    residual = np.zeros(count)
+    for scale in [*scales, scales[-1]]:
+        hessian, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        costs = []
+        if len(cloud):
+            cost, h, g = _to_points(field, cloud, eyes, rotation, translation, scale)
+            hessian, gradient = hessian + h, gradient + g
+            costs.append(cost)
+        for shape in shapes:
+            gap, jacobian = outlines.residuals(shape, hull, rotation, translation)
+            weight = (scale**2 / (scale**2 + gap**2)) ** 2
+            weighted = jacobian * weight[..., None]
+            hessian += np.einsum("ndi,ndj->nij", weighted, jacobian)
+            gradient -= np.einsum("ndi,nd->ni", weighted, gap)
+            costs.append(np.minimum(np.abs(gap[:, shape.known]), FARTHEST_M))
+        residual = np.concatenate(costs, 1).mean(1)
+        hessian += 1e-3 * np.einsum("nii,ij->nij", hessian, np.eye(6)) + 1e-6 * np.eye(6)
+        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        limit = np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1) / _MAX_TURN)
+        limit = np.maximum(limit, np.linalg.norm(step[:, 3:], axis=1) / _MAX_SHIFT_M)
+        step /= limit[:, None]
+        # the step moves the object in its own frame: pose <- pose * exp(step)
+        translation = translation + np.einsum("nij,nj->ni", rotation, step[:, 3:])
+        rotation = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotation
+    poses[:, :3, 3] = translation
+    return poses, residual
+
+
+def _cloud(group: Group, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P, 3), as many of each view that measures, and the camera centre of each (P, 3)."""
+    measured = [s for s in group if len(s.points)]
+    if not measured:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    share = CLOUD_POINTS // len(measured)
+    parts = [
+        s.points[np.linspace(0, len(s.points) - 1, min(share, len(s.points))).astype(int)]
+        for s in measured
+    ]
+    centres = [views[s.view].geometry.camera.master_from_depth[:3, 3] for s in measured]
+    eyes = [np.broadcast_to(e, part.shape) for e, part in zip(centres, parts, strict=True)]
+    return np.concatenate(parts), np.concatenate(eyes)
+
+
+def _to_points(
+    field: DistanceField,
+    cloud: np.ndarray,
+    eyes: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    scale: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cost (N, P) of each point, normal matrix (N, 6, 6) and what it takes a step to (N, 6)."""
+    count = len(rotation)
+    local = np.einsum("nji,npj->npi", rotation, cloud[None] - translation[:, None])
+    closest = field.closest(local.reshape(-1, 3))
+    points = closest.points.reshape(count, -1, 3)
+    normals = closest.normals.reshape(count, -1, 3)
+    gap = local - points
+    along = (gap * normals).sum(-1)
+    distance = np.linalg.norm(gap, axis=-1)
+    # a measured point cannot lie on a face that looks away from the camera
+    to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
+    facing = (to_eye * normals).sum(-1) > 0
+    weight = (scale**2 / (scale**2 + distance**2)) ** 2 * np.where(facing, 1.0, 0.1)
+    cost = np.minimum(np.where(facing, distance, np.maximum(distance, 0.01)), FARTHEST_M)
+    jacobian = np.concatenate([np.cross(local, normals), normals], -1)
+    weighted = jacobian * weight[..., None]
+    hessian = np.einsum("npi,npj->nij", weighted, jacobian)
+    return cost, hessian, np.einsum("npi,np->ni", weighted, along)

@@ -1,0 +1,305 @@
+"""Gauss-Newton fit of the object's pose to one frame set (equation 1 over all views).
+
+Correspondences are refreshed by rendering between steps: depth pixels against the plane of the
+triangle that they hit, mask contours against the render's rim. Weights are Geman-McClure with a
+scale that shrinks from the size of the expected error to that of the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track.candidates import MIN_PIXELS
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
+from intercap_core.object_track.view_report import ViewReport, quick_report
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer, default_renderer
+from intercap_core.rigid.shots import Rendering, Surface
+from intercap_core.rigid.twist import moved
+
+DEPTH_SCALES_M = (0.050, 0.012)  # Geman-McClure scale: first, last
+CONTOUR_SCALES_PX = (30.0, 6.0)  # at full resolution
+SHRINK = 0.5  # of the scales from step to step
+MAX_STEP_M, MAX_STEP_RAD = 0.06, np.radians(20)
+CONVERGED_M, CONVERGED_RAD = 5e-4, np.radians(0.1)
+# A pose this near to the one drawn last is a quarter of a pixel off: steps on from the same
+# renderings, whose residuals are linear in so small a motion.
+REDRAWN_M, REDRAWN_RAD = 1.5e-3, np.radians(0.3)
+DAMPING = 1e-3  # of the diagonal
+REPORT_SCALE = 4.0  # times the last contour scale: residuals that a report counts
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """Where the object is expected: keeps motions that nothing shows (a bottle's spin) at rest."""
+
+    pose: np.ndarray  # (4, 4) master_from_object
+    sigma_m: float = 0.06
+    sigma_rad: float = float(np.radians(15))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A pose (4, 4) master_from_object, its covariance (6, 6) and how each view agrees."""
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    views: tuple[ViewReport, ...]
+
+    @property
+    def score(self) -> float:
+        """Agreement over all views, 0 to 1, each view by the pixels it could show.
+
+        A view without a candidate counts with overlap 0: a pose that no detector supports is not
+        as good as one that six do. Where no detector has looked, depth alone counts.
+        """
+        total, weight = 0.0, 0.0
+        for view in self.views:
+            if view.visible_px < MIN_PIXELS:
+                continue
+            overlap = 0.0 if np.isnan(view.overlap) else view.overlap
+            agreement = overlap if np.isnan(view.depth_agreement) else view.depth_agreement
+            if not view.detected:
+                if np.isnan(view.depth_agreement):
+                    continue
+                overlap = agreement
+            total += view.visible_px * 0.5 * (overlap + agreement)
+            weight += view.visible_px
+        return total / weight if weight else 0.0
+
+    @property
+    def confidence(self) -> float:
+        """:attr:`score`, less where few views support it: one view can agree by chance."""
+        return self.score * (1 - 0.5**self.support)
+
+    @property
+    def mean_overlap(self) -> float:
+        """Mean IoU over the views with a candidate; 0 where there is none."""
+        overlaps = [view.overlap for view in self.views if not np.isnan(view.overlap)]
+        return float(np.mean(overlaps)) if overlaps else 0.0
+
+    @property
+    def support(self) -> int:
+        """Number of views with a candidate, or whose depth agrees with what is visible."""
+        return sum(
+            not np.isnan(view.overlap)
+            or (view.visible_px >= 3 * MIN_PIXELS and view.depth_agreement > 0.5)
+            for view in self.views
+        )
+
+
+def fit_pose(
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    *,
+    prior: MotionPrior | None,
+    min_overlap: float,
+    background_term: bool,
+    labels: tuple[str, ...] = (),
+    rounds: tuple[int, ...] = (4, 5),
+    start_scale: float = 1.0,
+    twist: np.ndarray | None = None,
+    renderer: Renderer | None = None,
+) -> Fit:
+    """Fit the pose (4, 4) to all views, starting from ``pose``.
+
+    Before each of the ``rounds`` (Gauss-Newton steps at most), every view keeps the candidate
+    that overlaps the render most, if by ``min_overlap``. ``background_term`` also penalises
+    render over known background. ``start_scale`` shrinks the first robust scale where the start is
+    known better than from a search. The pivot of the rotation is the mesh's origin. ``twist`` (6,)
+    is the object's turn and shift in a second (rad, m), by which each view sees it when it exposes;
+    None = at rest. To first order in what it moves meanwhile, a step of the pose is the same step
+    of what every view sees. ``renderer`` draws; None = the CPU.
+    """
+    renderer = renderer or default_renderer()
+    depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
+    depth_scale = max(depth_scale * start_scale, DEPTH_SCALES_M[1])
+    contour_scale = max(contour_scale * start_scale, CONTOUR_SCALES_PX[1])
+    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
+    drawn_pose = pose  # what the fits look at
+    _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
+    information = np.eye(6)
+    done = False
+    for number, steps in enumerate(rounds):
+        if number == 0:
+            renderer.crew.map(ViewFit.choose, fits)
+        elif not any(renderer.crew.map(ViewFit.choose_again, fits)) and done:
+            break
+        done = False
+        last = np.zeros(6)
+        for _ in range(steps):
+            information, step = _step(
+                renderer, fits, prior, drawn_pose, depth_scale, contour_scale, background_term
+            )
+            pose = moved(drawn_pose, step)
+            settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
+            depth_scale = max(depth_scale * SHRINK, DEPTH_SCALES_M[1])
+            contour_scale = max(contour_scale * SHRINK, CONTOUR_SCALES_PX[1])
+            done = settled and _below(step - last, CONVERGED_M, CONVERGED_RAD)
+            if done:
+                break
+            if _below(step, REDRAWN_M, REDRAWN_RAD):
+                last = step
+            else:
+                last, drawn_pose = np.zeros(6), pose
+                _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
+    report_scale = REPORT_SCALE * CONTOUR_SCALES_PX[1]
+    reports = renderer.crew.map(lambda fit: fit.report(report_scale), fits)
+    return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), tuple(reports))
+
+
+def _step(
+    renderer: Renderer,
+    fits: list[ViewFit],
+    prior: MotionPrior | None,
+    pose: np.ndarray,
+    depth_scale: float,
+    contour_scale: float,
+    background: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix (6, 6) over all views at the pose they look at, and the step (6,) from it."""
+
+    def terms(fit: ViewFit) -> NormalEquations:
+        return fit.normal_equations(depth_scale, contour_scale, background)
+
+    hessian, gradient = _prior_terms(prior, pose)
+    for h, g in renderer.crew.map(terms, fits):
+        hessian += h
+        gradient += g
+    damped = hessian + np.diag(DAMPING * np.diag(hessian) + 1e-9)
+    return hessian, _limited(-np.linalg.solve(damped, gradient))
+
+
+def _below(step: np.ndarray, metres: float, radians: float) -> bool:
+    return bool(np.abs(step[3:]).max() < metres and np.abs(step[:3]).max() < radians)
+
+
+def _look(
+    renderer: Renderer,
+    mesh: ObjectMesh,
+    views: list[View],
+    fits: list[ViewFit],
+    seen: list[np.ndarray],
+) -> None:
+    """Draw what each view sees, all at once, and show it to the views' fits."""
+    for fit, pose, drawn in zip(fits, seen, _draw(renderer, mesh, views, seen), strict=True):
+        fit.see(pose, drawn)
+
+
+def _draw(
+    renderer: Renderer, mesh: ObjectMesh, views: list[View], seen: list[np.ndarray]
+) -> list[list[Rendering]]:
+    """The renderings of each view's pose, in the order of :func:`.view_fit.shots_of`."""
+    shots = [shots_of(view, pose) for view, pose in zip(views, seen, strict=True)]
+    drawn = iter(renderer.draw(Surface.of(mesh), [shot for group in shots for shot in group]))
+    return [[next(drawn) for _ in group] for group in shots]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What each view of a frame set says about small motions of a pose: the weighted J'J
+    ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
+    one standard deviation; zero from a view that says nothing. No prior is in them. ``reports`` is
+    how each view agrees with the pose."""
+
+    information: np.ndarray
+    gradient: np.ndarray
+    reports: tuple[ViewReport, ...]
+
+
+def evidence_at(
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    *,
+    min_overlap: float,
+    background_term: bool,
+    labels: tuple[str, ...] = (),
+    twist: np.ndarray | None = None,
+    renderer: Renderer | None = None,
+) -> Evidence:
+    """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
+    renderer = renderer or default_renderer()
+    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
+    _look(renderer, mesh, views, fits, _seen(pose, views, twist))
+
+    def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
+        fit.choose()
+        found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
+        return found, fit.report(REPORT_SCALE * CONTOUR_SCALES_PX[1])
+
+    found = renderer.crew.map(terms, fits)
+    return Evidence(
+        np.array([h for (h, _), _ in found]),
+        np.array([g for (_, g), _ in found]),
+        tuple(report for _, report in found),
+    )
+
+
+def assess(
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    *,
+    min_overlap: float,
+    labels: tuple[str, ...] = (),
+    renderer: Renderer | None = None,
+) -> Fit:
+    """How well a pose (4, 4) agrees with all views, without changing it."""
+    return assess_all(
+        mesh, views, pose[None], min_overlap=min_overlap, labels=labels, renderer=renderer
+    )[0]
+
+
+def assess_all(
+    mesh: ObjectMesh,
+    views: list[View],
+    poses: np.ndarray,
+    *,
+    min_overlap: float,
+    labels: tuple[str, ...] = (),
+    renderer: Renderer | None = None,
+) -> list[Fit]:
+    """:func:`assess` of many poses (N, 4, 4) at once."""
+    renderer = renderer or default_renderer()
+    cases = [(view, pose) for pose in poses for view in views]
+    drawn = _draw(renderer, mesh, [view for view, _ in cases], [pose for _, pose in cases])
+
+    def compare(number: int) -> ViewReport:
+        (view, pose), (silhouette, *depth) = cases[number], drawn[number]
+        return quick_report(
+            mesh, view, pose, silhouette, depth[0] if depth else None, min_overlap, labels
+        )
+
+    reports = renderer.crew.map(compare, range(len(cases)))
+    unknown = np.full((6, 6), np.nan)
+    count = len(views)
+    return [
+        Fit(pose, unknown, tuple(reports[i * count : (i + 1) * count]))
+        for i, pose in enumerate(poses)
+    ]
+
+
+def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if prior is None:
+        return np.eye(6), np.zeros(6)
+    turn = Rotation.from_matrix(pose[:3, :3] @ prior.pose[:3, :3].T).as_rotvec()
+    away = np.concatenate([turn, pose[:3, 3] - prior.pose[:3, 3]])
+    weight = np.repeat([prior.sigma_rad**-2, prior.sigma_m**-2], 3)
+    return np.diag(weight), weight * away
+
+
+def _limited(step: np.ndarray) -> np.ndarray:
+    turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+    return step / max(1.0, turn / MAX_STEP_RAD, shift / MAX_STEP_M)
+
+
+def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
+    """The pose that each view shows: the same array where it exposes at the frame set's time."""
+    late = [0.0 if twist is None else view.geometry.time_offset_s for view in views]
+    return [pose if not t or twist is None else moved(pose, t * twist) for t in late]

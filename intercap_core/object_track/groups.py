@@ -1,0 +1,208 @@
+"""Candidates of different views that may show one object: joined where they lie together in space.
+
+Where depth measures a candidate its points say where it is; else the rays through the middles of
+two views' masks do, where they meet and both masks have the size that the object would have there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from intercap_core.camera.transforms import apply
+from intercap_core.camera.triangulation import midpoints
+from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.object_track.outlines import Outline
+from intercap_core.rigid.mesh import ObjectMesh
+
+PERSON_LABELS = frozenset({"person"})
+MIN_POINTS = 15  # of a candidate's cloud, or pixels of its mask
+MAX_GROUPS = 3
+TOGETHER, APART_M = 0.6, 0.03  # of the diameter: measured centres of one object's two sides
+CROSSING = 0.35  # of the diameter: a ray through a mask's middle from the object's
+# Width of a mask over the diameter, in the object's place: seen end on, half hidden; smeared.
+SMALLEST, LARGEST = 0.12, 1.25
+UNLIKELY = 0.5  # what a sighting with another class's label counts; detectors err
+UNNAMED = 0.8  # one that no detector named
+MOST = 0.3  # share of the person's pixels
+OF_PERSON = 0.6  # share of a candidate's pixels on the person, from which it is the person
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One candidate of one image: its ``outline`` (None where all of it is cut off) and, where the
+    view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,).
+    ``value``: 1 where its label is one of the object's, less else."""
+
+    view: int
+    candidate: Candidate
+    value: float
+    points: np.ndarray
+    centre: np.ndarray | None
+    outline: Outline | None
+
+    def away(self, point: np.ndarray, diameter: float) -> float:
+        """How far the candidate is from a place (3,), in units of what still is one object."""
+        if self.centre is not None:
+            return float(np.linalg.norm(self.centre - point)) / (TOGETHER * diameter + APART_M)
+        outline = self.outline
+        assert outline is not None
+        towards = point - outline.eye
+        along = float(towards @ outline.ray)
+        if not SMALLEST * diameter < outline.extent * along < LARGEST * diameter + APART_M:
+            return np.inf
+        across = float(np.linalg.norm(towards - along * outline.ray))
+        return across / (CROSSING * diameter + APART_M)
+
+
+Group = list[Sighting]
+"""At most one sighting a view."""
+
+
+def find_groups(
+    mesh: ObjectMesh,
+    views: list[View],
+    labels: tuple[str, ...],
+    worth: Callable[[np.ndarray], float] | None = None,
+    near: np.ndarray | None = None,
+    limit: int = MAX_GROUPS,
+) -> list[Group]:
+    """The first ``limit`` groups of candidates that may be the object, the most likely first.
+
+    ``labels`` are the classes that the object may be given; ``worth`` says of a place (3,) how
+    likely what is there is the object; ``near`` (3,) prefers candidates near a place.
+    """
+    measured = _measured(views, mesh.diameter, labels)
+    outlined = _outlined(views, labels)
+    places = [(s.centre, [s]) for s in measured if s.centre is not None]
+    places += [(point, []) for point in _crossings(outlined, mesh.diameter)]
+    sightings = measured + outlined
+    groups: list[tuple[float, Group]] = []
+    for place, anchor in places:
+        group = list(anchor)
+        for view in sorted({s.view for s in sightings} - {s.view for s in anchor}):
+            others = [s for s in sightings if s.view == view]
+            away = [s.away(place, mesh.diameter) for s in others]
+            nearest = int(np.argmin(away))
+            if away[nearest] < 1:
+                group.append(others[nearest])
+        value = sum(s.value for s in group)
+        if worth is not None:
+            value *= worth(centre_of(group))
+        if near is not None:
+            value -= 2.0 * float(np.linalg.norm(place - near))
+        groups.append((value, group))
+    groups.sort(key=lambda item: -item[0])
+    return _different([group for _, group in groups], limit)
+
+
+def centre_of(group: Group) -> np.ndarray:
+    """Where the group is (3,): the mean of the views' mean points, or where their rays cross."""
+    # the mean of the views' means: a near view holds more points but not more of the object
+    means = [s.points.mean(0) for s in group if len(s.points)]
+    if means:
+        return np.mean(means, axis=0)
+    eyes = np.array([s.outline.eye for s in group if s.outline])
+    rays = np.array([s.outline.ray for s in group if s.outline])
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    return np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, eyes))
+
+
+def _different(groups: list[Group], limit: int) -> list[Group]:
+    """The first few groups that share at most half of their members with an earlier one."""
+    kept: list[Group] = []
+    for group in groups:
+        if len(kept) == limit:
+            break
+        members = {(s.view, s.candidate.index) for s in group}
+        known = [{(s.view, s.candidate.index) for s in other} for other in kept]
+        if all(len(members & other) <= 0.5 * len(members) for other in known):
+            kept.append(group)
+    return kept
+
+
+def _crossings(outlined: list[Sighting], diameter: float) -> list[np.ndarray]:
+    """Points (3,) where the rays of two views' masks meet that both fit the object's size."""
+    found = []
+    for a, b in combinations(outlined, 2):
+        if a.view == b.view:
+            continue
+        assert a.outline is not None and b.outline is not None
+        point, _ = midpoints(a.outline.ray, b.outline.ray, a.outline.eye, b.outline.eye)
+        if np.isfinite(point).all() and max(s.away(point, diameter) for s in (a, b)) < 1:
+            found.append(point)
+    return found
+
+
+def _could_be(view: View) -> list[Candidate]:
+    """All but those on the person: labels err, so none is left out for its label alone."""
+    found = []
+    for candidate in view.candidates:
+        mask = candidate.mask
+        if mask.area:
+            person = view.person.window(mask.x0, mask.y0, *mask.mask.shape)
+            on_person = (person & mask.mask).sum() > OF_PERSON * mask.area
+            large = candidate.label in PERSON_LABELS or mask.area > MOST * view.person.area
+            if not (on_person and large):  # what is held before the body may lie in its mask
+                found.append(candidate)
+    return found
+
+
+def _value(label: str, labels: tuple[str, ...]) -> float:
+    if label == "":
+        return UNNAMED
+    return 1.0 if label in labels or (not labels and label not in PERSON_LABELS) else UNLIKELY
+
+
+def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
+    """The outline of every candidate in views without depth that could be the object."""
+    found = []
+    for number, view in enumerate(views):
+        for candidate in _could_be(view) if view.depth is None else ():
+            outline = Outline.of(view, candidate) if candidate.mask.area >= MIN_POINTS else None
+            if outline is not None:
+                value = _value(candidate.label, labels)
+                nothing = np.zeros((0, 3))
+                found.append(Sighting(number, candidate, value, nothing, None, outline))
+    return found
+
+
+def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> list[Sighting]:
+    """The measured points of every candidate that could be the object."""
+    found = []
+    for number, view in enumerate(views):
+        geometry = view.geometry
+        if view.depth is None or geometry.depth_lens is None:
+            continue
+        candidates = _could_be(view)
+        if not candidates:
+            continue
+        stride = max(1, 2 // geometry.depth_step)
+        depth = view.depth[::stride, ::stride]
+        rays = geometry.depth_lens.rays[::stride, ::stride]
+        valid = (depth > 0) & np.isfinite(rays[..., 0])
+        depth, rays = depth[valid], rays[valid]
+        local = np.column_stack([rays * depth[:, None], depth])
+        camera = geometry.camera
+        assert camera.colour_from_depth is not None
+        pixel = np.rint(geometry.lens.project(apply(camera.colour_from_depth, local))).astype(int)
+        for candidate in candidates:
+            inside = np.flatnonzero(candidate.mask.sample(pixel[:, 0], pixel[:, 1]))
+            if len(inside) < MIN_POINTS:
+                continue
+            z = depth[inside]
+            inside = inside[np.abs(z - np.median(z)) < 0.75 * diameter]
+            if len(inside) < MIN_POINTS:
+                continue  # two surfaces, with the middle between them
+            points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
+            centre = np.median(points, axis=0)
+            spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
+            if spread > 0.75 * diameter:
+                continue
+            value = _value(candidate.label, labels)
+            outline = Outline.of(view, candidate)
+            found.append(Sighting(number, candidate, value, points, centre, outline))
+    return found

@@ -1,0 +1,124 @@
+"""Which poses are not to be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.fit import Fit
+from intercap_core.rigid.mesh import ObjectMesh
+
+LOST_SCORE = 0.20
+# By how much the mean score of one pose has to be better than another's, over all frames of a run
+# and over one: errors of masks last several frames and agree over views.
+DECIDED, DECIDED_ONE = 0.01, 0.03
+UNSURE_M, UNSURE_RAD = 0.03, np.radians(15)  # standard deviations that are as good as lost
+UNNAMED_FRAMES, UNNAMED_M = 4, 0.05  # that the object is followed without any candidate
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One frame of the track.
+
+    ``leapt``: a search found its pose, away from where tracking had it; ``recovered``: the first
+    frame that is not lost after lost ones or a leap; ``disagree``: the passes ended in different
+    poses and the images do not decide between them; ``ambiguous``: a quite different pose explains
+    the images nearly as well; ``free_axis`` (3,), master frame: a turn about it through the
+    object's origin changes nothing that was seen, 0 = there is none.
+    """
+
+    fit: Fit
+    lost: bool
+    leapt: bool = False
+    recovered: bool = False
+    disagree: bool = False
+    ambiguous: bool = False
+    resting: bool = False
+    free_axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def score(self) -> float:
+        """The fit's agreement with the images, 0 where it is not believed."""
+        return 0.0 if self.lost else self.fit.score
+
+
+def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
+    """A fit, lost where the images do not bear it out."""
+    lost = fit.support == 0 or fit.score < LOST_SCORE
+    lost |= 0 < fit.mean_overlap < settings.lost_overlap
+    return FrameResult(fit, lost)
+
+
+def decided(gain: np.ndarray) -> bool:
+    """Whether the images decide between two poses by the differences (N,) of their scores."""
+    return bool(
+        len(gain) and abs(gain.mean()) > DECIDED + (DECIDED_ONE - DECIDED) / np.sqrt(len(gain))
+    )
+
+
+class Named:
+    """Where a candidate last bore the track out: depth alone fits the floor as well as a box.
+
+    ``place`` (3,), metres, is where the track starts.
+    """
+
+    def __init__(self, place: np.ndarray) -> None:
+        self._place = place
+        self._frames = 0
+
+    def believes(self, place: np.ndarray, fit: Fit) -> bool:
+        """Whether the object may be at ``place`` (3,): some view's candidate shows it, or one did
+        a few frames ago, or there; where no detector looked, always."""
+        looked = any(view.detected for view in fit.views)
+        if not looked or any(view.candidate >= 0 for view in fit.views):
+            self._place, self._frames = place, 0
+            return True
+        self._frames += 1
+        stayed = float(np.linalg.norm(place - self._place)) < UNNAMED_M
+        return self._frames <= UNNAMED_FRAMES or stayed
+
+
+def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
+    """The frames (T) of a final track, those flagged that nothing bears out for long or that may be
+    elsewhere by their covariance: lost where the place is not known, ambiguous where the turn is
+    not."""
+    later = _unnamed(mesh, frames)
+    sooner = _unnamed(mesh, frames[::-1])[::-1]
+    result = []
+    for frame, unnamed in zip(frames, later & sooner, strict=True):
+        shift, turn = _deviations(mesh, frame.fit)
+        lost = frame.lost or bool(unnamed) or shift > UNSURE_M
+        unsure = frame.ambiguous or turn > UNSURE_RAD
+        result.append(replace(frame, lost=lost, ambiguous=unsure and not lost))
+    return result
+
+
+def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
+    """Which frames (T) no candidate bears out, seen from those before."""
+    places = [mesh.centre_at(frame.fit.pose) for frame in frames]
+    named = Named(places[0])
+    believed = [named.believes(at, frame.fit) for at, frame in zip(places, frames, strict=True)]
+    return ~np.array(believed)
+
+
+def _deviations(mesh: ObjectMesh, fit: Fit) -> tuple[float, float]:
+    """Standard deviations of the centre, metres, in its worst direction, and of the turn, radians,
+    about its second worst axis: on which side a handle is, about one axis, is decided elsewhere."""
+    arm = fit.pose[:3, :3] @ mesh.centre_of_mass
+    about = np.cross(np.eye(3), arm)  # row i: shift of the centre by a turn about axis i
+    to_centre = np.concatenate([about.T, np.eye(3)], axis=1)
+    shift = to_centre @ fit.covariance @ to_centre.T
+    turn = fit.covariance[:3, :3]
+    if mesh.symmetry.sphere:
+        turn = np.zeros((3, 3))
+    elif mesh.symmetry.axis is not None:
+        axis = fit.pose[:3, :3] @ mesh.symmetry.axis
+        across = np.eye(3) - np.outer(axis, axis)
+        turn = across @ turn @ across
+    return _deviation(shift, -1), _deviation(turn, -2)
+
+
+def _deviation(covariance: np.ndarray, number: int) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[number], 0.0)))

@@ -1,0 +1,45 @@
+"""How the tracked object moves: where it is expected next, and how surely."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track.fit import MotionPrior
+
+STILL_M, STILL_RAD = 0.004, np.radians(1.5)  # slower than this: no motion is predicted
+ONSET_M, ONSET_RAD = 0.02, np.radians(5)  # in one frame, from rest
+GROWTH_LOST_M, GROWTH_LOST_RAD = 0.04, np.radians(8)  # standard deviation added a lost frame
+
+
+def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """The next pose at constant velocity; the last one where the object is at rest."""
+    shift = now[:3, 3] - before[:3, 3]
+    turn = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T)
+    predicted = now.copy()
+    if np.linalg.norm(shift) > STILL_M:
+        predicted[:3, 3] += shift
+    if turn.magnitude() > STILL_RAD:
+        predicted[:3, :3] = turn.as_matrix() @ now[:3, :3]
+    return predicted
+
+
+def expected(
+    before: np.ndarray, now: np.ndarray, predicted: np.ndarray, lost_for: int
+) -> MotionPrior:
+    """How far the object may be from the prediction: it may start to move, turn or stop.
+
+    From rest one frame of a hand's acceleration, in motion half of the last step beside that, and
+    more for every frame since it was last seen.
+    """
+    shift = float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
+    turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())
+    return MotionPrior(
+        predicted,
+        ONSET_M + 0.5 * shift + lost_for * GROWTH_LOST_M,
+        ONSET_RAD + 0.5 * turn + lost_for * GROWTH_LOST_RAD,
+    )
+
+
+def loose(prior: MotionPrior) -> np.ndarray:
+    return np.diag(np.repeat([prior.sigma_rad**2, prior.sigma_m**2], 3))

@@ -1,0 +1,114 @@
+"""Whether the detector knows the object at all, and whether the mesh has that thing's size.
+
+A mesh in decimetres, or one scaled by mistake, passes every check of the file alone. Where depth
+lies under a candidate's mask, the mask's extent in pixels is one in metres.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from intercap_core.camera.masks import Runs
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply
+from intercap_core.capture.frames import Frames
+from intercap_core.detections.read import Detections
+
+LABELS_TOLD = 8
+SETS = 6  # that are looked at, spread over the recording
+STRIDE = 3  # of the depth pixels
+MIN_POINTS = 8  # of them under a mask
+MIN_SIGHTINGS = 5
+# A mask is smaller than the object where that is seen end on or hidden by a hand, and larger where
+# it also covers the person; most are neither, and a wrong unit is a factor of ten.
+DOUBTFUL = 4.0
+MOST, LEAST = 90, 25  # percentiles of the extents that say how large and how small it may be
+
+
+def label_doubt(detections: Detections, labels: tuple[str, ...]) -> str | None:
+    """Say in words that candidates have labels and none has one of ``labels``; else None.
+
+    The detector's classes may be numbered in another way. Labels may be wrong, so the object is
+    searched for all the same.
+    """
+    counts = Counter(
+        candidate.label
+        for t in range(detections.num_sets)
+        for c in range(len(detections.camera_names))
+        for candidate in detections.candidates(t, c)
+        if candidate.label
+    )
+    if not labels or not counts or counts.keys() & {*labels}:
+        return None
+    often = sorted(counts, key=lambda label: (-counts[label], label))
+    more = f" and {len(often) - LABELS_TOLD} more" if len(often) > LABELS_TOLD else ""
+    told = ", ".join(f"{label} ({counts[label]})" for label in often[:LABELS_TOLD])
+    return (
+        f"no candidate has one of its labels ({', '.join(labels)}), found {told}{more}; add the "
+        "label to objects.yaml, or set detections.category_names"
+    )
+
+
+def size_doubt(
+    frames: Frames, detections: Detections, rig: Rig, diameter_m: float, labels: tuple[str, ...]
+) -> str | None:
+    """Say in words that the mesh is several times larger or smaller than the object appears.
+
+    ``diameter_m`` is the mesh's. None where it fits, where no candidate has one of ``labels`` or
+    where too few lie on measured depth.
+    """
+    extents = [
+        extent
+        for t in np.unique(np.linspace(0, frames.num_sets - 1, SETS).round().astype(int)).tolist()
+        for c in range(len(rig))
+        for extent in _extents(frames, detections, rig[c], t, c, labels)
+    ]
+    if len(extents) < MIN_SIGHTINGS:
+        return None
+    largest, smallest = np.percentile(extents, [MOST, LEAST])
+    if smallest <= DOUBTFUL * diameter_m and diameter_m <= DOUBTFUL * largest:
+        return None
+    typical = float(np.median(extents))
+    word = "large" if diameter_m > typical else "small"
+    ratio = max(diameter_m / typical, typical / diameter_m)
+    return (
+        f"the mesh is {diameter_m:.3g} m across, and what is labelled {' or '.join(labels)} "
+        f"measures {typical:.2g} m ({len(extents)} masks on depth): {ratio:.2g} times too {word}; "
+        "check the mesh's unit, or the labels"
+    )
+
+
+def _extents(
+    frames: Frames,
+    detections: Detections,
+    camera: Camera,
+    t: int,
+    c: int,
+    labels: tuple[str, ...],
+) -> list[float]:
+    """Diagonals, metres, of the candidates of one image that lie on measured depth."""
+    candidates = [one for one in detections.candidates(t, c) if one.label in labels]
+    if not candidates or camera.depth is None or camera.colour_from_depth is None:
+        return []
+    depth = frames.depth(t, c)
+    if depth is None:
+        return []
+    z = depth[::STRIDE, ::STRIDE] * np.float32(1e-3)
+    rays = camera.depth.rays[::STRIDE, ::STRIDE]
+    valid = (z > 0) & np.isfinite(rays[..., 0])
+    local = np.column_stack([rays[valid] * z[valid][:, None], z[valid]])
+    points = apply(camera.colour_from_depth, local)
+    pixels = np.rint(camera.colour.project(points)).astype(np.int64)
+    found = []
+    for candidate in candidates:
+        runs: Runs = candidate.runs
+        under = runs.sample(pixels[:, 0], pixels[:, 1])
+        if under.sum() >= MIN_POINTS:
+            _, _, width, height = runs.box
+            away = float(np.median(points[under, 2]))
+            found.append(
+                float(np.hypot(width / camera.colour.fx, height / camera.colour.fy)) * away
+            )
+    return found

@@ -1,0 +1,155 @@
+"""The images of one recording and the questions that tracking asks of them, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+
+import numpy as np
+
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.fit import (
+    Evidence,
+    Fit,
+    MotionPrior,
+    assess_all,
+    evidence_at,
+    fit_pose,
+)
+from intercap_core.object_track.places import Places
+from intercap_core.object_track.search import plausibility, rank_frames, search
+from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer, open_renderer
+
+PASS_ROUNDS = (3, 3)
+PASS_SCALE = 0.5
+LOOK_OVERLAP = 0.1  # of a candidate that a pose is compared with, before it is fitted
+
+
+@dataclass(eq=False)
+class Observer:
+    """One object in T frames.
+
+    ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
+    labels alone; ``labels`` the classes the object may be given; ``up`` (3,) the vertical;
+    ``joints`` (T, K, 3) of the person, NaN unknown, master frame; ``surveyed`` frames in which
+    something was seen that may be the object, the most promising first.
+    """
+
+    mesh: ObjectMesh
+    load: Callable[[int], list[View]]
+    labels_by_view: list[list[list[str]]]
+    settings: ObjectTrackSettings
+    labels: tuple[str, ...] = ()
+    up: np.ndarray | None = None
+    joints: np.ndarray | None = None
+    views: Callable[[int], list[View]] = field(init=False)
+    renderer: Renderer = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.views = ViewCache(self.load)
+        self.renderer = open_renderer(self.settings.render_on)
+
+    @property
+    def count(self) -> int:
+        """Frames, T."""
+        return len(self.labels_by_view)
+
+    @cached_property
+    def _survey(self) -> tuple[Places, list[int]]:
+        return Places.survey(self.mesh, self.views, self.count, self.labels, self.joints)
+
+    @property
+    def places(self) -> Places:
+        """Where in the room the object may be."""
+        return self._survey[0]
+
+    def frames_to_search(self) -> list[int]:
+        """All frames, the most promising first."""
+        first = self._survey[1]
+        known = set(first)
+        return first + [t for t in rank_frames(self.labels_by_view, self.labels) if t not in known]
+
+    def promise(self, t: int) -> int:
+        """Views of frame t with a candidate that has one of the object's labels, or none."""
+        return sum(
+            any(label in self.labels or not label or not self.labels for label in view)
+            for view in self.labels_by_view[t]
+        )
+
+    def search(self, t: int, near: np.ndarray | None = None) -> list[Fit]:
+        """Fitted hypotheses of frame t, the best first; ``near`` (3,) prefers a place."""
+        return search(
+            self.mesh,
+            self.views(t),
+            labels=self.labels,
+            up=self.up,
+            min_overlap=self.settings.min_overlap,
+            background_term=self.settings.background_term,
+            worth=partial(self.places.worth, t),
+            near=near,
+            renderer=self.renderer,
+        )
+
+    def fit(
+        self,
+        t: int,
+        pose: np.ndarray,
+        prior: MotionPrior,
+        rounds: tuple[int, ...] = PASS_ROUNDS,
+        scale: float = PASS_SCALE,
+        twist: np.ndarray | None = None,
+    ) -> Fit:
+        """The pose (4, 4) of frame t fitted from one that is nearly right."""
+        return fit_pose(
+            self.mesh,
+            self.views(t),
+            pose,
+            prior=prior,
+            min_overlap=self.settings.min_overlap,
+            background_term=self.settings.background_term,
+            labels=self.labels,
+            rounds=rounds,
+            start_scale=scale,
+            twist=twist,
+            renderer=self.renderer,
+        )
+
+    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> Evidence:
+        """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,)."""
+        return evidence_at(
+            self.mesh,
+            self.views(t),
+            pose,
+            min_overlap=self.settings.min_overlap,
+            background_term=self.settings.background_term,
+            labels=self.labels,
+            twist=twist,
+            renderer=self.renderer,
+        )
+
+    def assess(self, t: int, pose: np.ndarray) -> Fit:
+        """How well a pose (4, 4) agrees with frame t as it is."""
+        return self.assess_all(t, pose[None])[0]
+
+    def assess_all(self, t: int, poses: np.ndarray) -> list[Fit]:
+        """:meth:`assess` of many poses (N, 4, 4) at once."""
+        return assess_all(
+            self.mesh,
+            self.views(t),
+            poses,
+            min_overlap=LOOK_OVERLAP,
+            labels=self.labels,
+            renderer=self.renderer,
+        )
+
+    def plausibility(self, fit: Fit) -> float:
+        """A fit's confidence, a little more where the object stands."""
+        return plausibility(fit, self.up)
+
+    def value(self, t: int, fit: Fit) -> float:
+        """:meth:`plausibility`, less where what is there in frame t is hardly the object."""
+        return self.plausibility(fit) * self.places.worth(t, self.mesh.centre_at(fit.pose))

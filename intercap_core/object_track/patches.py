@@ -1,0 +1,196 @@
+"""The part of a view around the object that a fit compares with: measured points, mask contours.
+
+Cut once where a fit begins, with room for the pose to move; renderings come and go inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from intercap_core.camera.projection_kernels import project_point
+from intercap_core.energy.object_silhouette_kernel import rim
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.rigid.shots import Rendering
+
+PATCH_MARGIN_M = 0.08  # the pose may move this far before measured points leave the patch
+OUTSIDE_MASK_WEIGHT = 0.3  # of a depth pixel at the rendered depth that the candidate leaves out
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPatch:
+    """Measured points in a window of the reduced depth image that begins at pixel (x0, y0).
+
+    ``depth`` (h, w) metres, 0 invalid; ``points`` (h, w, 3) float32, master frame; ``trust``
+    (h, w) 1 inside the candidate, less outside, 0 on a person; ``on_person`` (h, w) bool.
+    """
+
+    x0: int
+    y0: int
+    depth: np.ndarray
+    points: np.ndarray
+    trust: np.ndarray
+    on_person: np.ndarray
+
+    @classmethod
+    def cut(cls, view: View, mask: ReducedMask, predicted: Rendering) -> DepthPatch | None:
+        """Cut around a rendering in the depth image; None without depth, or out of the image.
+
+        ``mask`` is the candidate's, in the reduced colour image.
+        """
+        geometry = view.geometry
+        lens = geometry.depth_lens
+        if view.depth is None or lens is None or predicted.area == 0:
+            return None
+        margin = int(_pixels_per_metre(predicted, lens.fx) * PATCH_MARGIN_M) + 2
+        left, top, right, bottom = _around(predicted, margin, view.depth.shape)
+        if left >= right or top >= bottom:
+            return None
+        colour_from_depth = geometry.camera.colour_from_depth
+        assert colour_from_depth is not None
+        person = view.person
+        depth, points, trust, on_person = _lift(
+            view.depth, lens.rays, left, top, right, bottom, np.asarray(colour_from_depth),
+            geometry.master_from_depth, geometry.lens.parameters, mask.mask, mask.x0, mask.y0,
+            person.mask, person.x0, person.y0,
+        )  # fmt: skip
+        return cls(left, top, depth, points, trust, on_person)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The first pixel x, y in the reduced depth image."""
+        return self.x0, self.y0
+
+
+@dataclass(frozen=True, eq=False)
+class ContourPatch:
+    """The candidate's mask in a window of the reduced colour image that begins at (x0, y0).
+
+    ``inside`` the mask and ``person`` who is in it but outside the mask, (h, w) bool; pixels x, y
+    of the window: ``rim`` (R, 2) all pixels on the mask's border, row y from ``starts`` (h + 1,),
+    and ``contour`` (K, 2) those of them where no person in front ends the mask.
+    """
+
+    x0: int
+    y0: int
+    inside: np.ndarray
+    person: np.ndarray
+    rim: np.ndarray
+    starts: np.ndarray
+    contour: np.ndarray
+
+    @classmethod
+    def cut(cls, view: View, mask: ReducedMask, predicted: Rendering) -> ContourPatch | None:
+        """Cut around a rendering in the colour image; None where the mask has no border there."""
+        lens = view.geometry.lens
+        margin = int(_pixels_per_metre(predicted, lens.fx) * PATCH_MARGIN_M) + 4
+        left, top, right, bottom = _around(predicted, margin, (lens.height, lens.width))
+        shape = (max(bottom - top, 0), max(right - left, 0))
+        inside = mask.window(left, top, *shape)
+        person = view.person.window(left, top, *shape) & ~inside
+        border, starts = rim(inside)
+        if not len(border):
+            return None
+        return cls(left, top, inside, person, border, starts, _own(border, person))
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The first pixel x, y in the reduced colour image."""
+        return self.x0, self.y0
+
+    def holds(self, image: Rendering) -> bool:
+        """Whether a rendering lies inside the window."""
+        height, width = self.inside.shape
+        own_height, own_width = image.face.shape
+        return (
+            image.x0 >= self.x0
+            and image.y0 >= self.y0
+            and image.x0 + own_width <= self.x0 + width
+            and image.y0 + own_height <= self.y0 + height
+        )
+
+
+def _pixels_per_metre(rendering: Rendering, focal: float) -> float:
+    depth = rendering.depth[rendering.mask]
+    return focal / float(np.median(depth)) if len(depth) else 0.0
+
+
+def _around(image: Rendering, margin: int, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """A rendering's window widened and clipped to the image (H, W): left, top, right, bottom."""
+    height, width = image.face.shape
+    return (
+        max(image.x0 - margin, 0),
+        max(image.y0 - margin, 0),
+        min(image.x0 + width + margin, shape[1]),
+        min(image.y0 + height + margin, shape[0]),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _own(border, person):
+    """Border pixels (K, 2) with no person (h, w) among the pixel and its eight neighbours."""
+    height, width = person.shape
+    kept = np.empty_like(border)
+    count = 0
+    for i in range(border.shape[0]):
+        x, y = border[i, 0], border[i, 1]
+        free = True
+        for v in range(max(y - 1, 0), min(y + 2, height)):
+            for u in range(max(x - 1, 0), min(x + 2, width)):
+                free &= not person[v, u]
+        if free:
+            kept[count] = border[i]
+            count += 1
+    return kept[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _lift(
+    image, rays, left, top, right, bottom, colour_from_depth, master_from_depth, colour, mask, mx,
+    my, person, px, py,
+):  # fmt: skip
+    """Depth, points, trust and on_person of a :class:`DepthPatch`; masks with their first pixels.
+
+    ``colour`` (13,) is the reduced colour lens, in whose pixels the masks are.
+    """
+    height, width = bottom - top, right - left
+    depth = np.zeros((height, width), np.float32)
+    points = np.zeros((height, width, 3), np.float32)
+    trust = np.full((height, width), np.float32(OUTSIDE_MASK_WEIGHT), np.float32)
+    on_person = np.zeros((height, width), np.bool_)
+    to_colour, to_master = colour_from_depth, master_from_depth
+    for v in range(height):
+        for u in range(width):
+            z = np.float64(image[top + v, left + u])
+            ray_x, ray_y = rays[top + v, left + u, 0], rays[top + v, left + u, 1]
+            if not z > 0 or not np.isfinite(ray_x):
+                continue
+            x, y = ray_x * z, ray_y * z
+            depth[v, u] = z
+            for axis in range(3):
+                points[v, u, axis] = (
+                    to_master[axis, 0] * x
+                    + to_master[axis, 1] * y
+                    + to_master[axis, 2] * z
+                    + to_master[axis, 3]
+                )
+            column, row = project_point(
+                to_colour[0, 0] * x + to_colour[0, 1] * y + to_colour[0, 2] * z + to_colour[0, 3],
+                to_colour[1, 0] * x + to_colour[1, 1] * y + to_colour[1, 2] * z + to_colour[1, 3],
+                to_colour[2, 0] * x + to_colour[2, 1] * y + to_colour[2, 2] * z + to_colour[2, 3],
+                colour,
+            )
+            i, j = int(np.rint(column)), int(np.rint(row))
+            if 0 <= i - mx < mask.shape[1] and 0 <= j - my < mask.shape[0] and mask[j - my, i - mx]:
+                trust[v, u] = 1.0
+            elif (
+                0 <= i - px < person.shape[1]
+                and 0 <= j - py < person.shape[0]
+                and person[j - py, i - px]
+            ):
+                trust[v, u] = 0.0
+                on_person[v, u] = True
+    return depth, points, trust, on_person

@@ -1,0 +1,155 @@
+"""Where in the room the object may be, over the whole recording: which of several like ones it is.
+
+Another chair, a second cup: what has the object's class and size is not always the object. The
+object is what the person handles: it moves, or the person is at it. What stands in one place from
+the first frame to the last while nobody comes near is another, and so is what stands there while
+the object is soundly tracked elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.groups import centre_of, find_groups
+from intercap_core.rigid.mesh import ObjectMesh
+
+SURVEYED = 12  # frames looked at, spread over the recording
+GROUPS = 6  # of each frame
+SAME_PLACE, SAME_PLACE_M = 0.3, 0.05  # of the diameter: views see now one side, now another
+PRESENT, ABSENT = 0.85, 0.5  # shares of the frames: always there, there for a while only
+AT_HAND_M, FAR_M = 0.10, 0.45  # from the nearest joint to the object, about
+NEAREST = 0.1  # quantile of the frames: a person is not at the object all the time
+MOVED = 0.8  # worth of what was not in this place all the time, wherever the person is
+LEAST = 0.1  # worth of what stands apart all the time
+BESIDE = 2  # frames in which something stands there while the object is elsewhere: another thing
+_BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what the mouth does
+
+
+@dataclass(eq=False)
+class Standing:
+    """A place (3,), metres, master frame, where something was in ``share`` of the surveyed frames:
+    in ``frames``, and in those of ``beside`` while the object was elsewhere."""
+
+    place: np.ndarray
+    share: float
+    frames: frozenset[int] = frozenset()
+    beside: set[int] = field(default_factory=set)
+
+
+class Places:
+    """What was seen where, and how much it is worth to look there.
+
+    ``joints`` (T, K, 3) of the person, NaN unknown, metres, master frame; None where no person is
+    known.
+    """
+
+    def __init__(
+        self, mesh: ObjectMesh, standing: list[Standing], joints: np.ndarray | None
+    ) -> None:
+        self._reach = 0.5 * mesh.radius
+        self._same = SAME_PLACE * mesh.diameter + SAME_PLACE_M
+        self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
+        self._standing = [(s, self._standing_worth(s)) for s in standing]
+
+    @classmethod
+    def survey(
+        cls,
+        mesh: ObjectMesh,
+        load: Callable[[int], list[View]],
+        count: int,
+        labels: tuple[str, ...],
+        joints: np.ndarray | None,
+    ) -> tuple[Places, list[int]]:
+        """Look at a few of ``count`` frames; also those frames, the most promising first."""
+        frames = sorted({int(t) for t in np.linspace(0, count - 1, SURVEYED).round()})
+        seen = []
+        for t in frames:
+            groups = find_groups(mesh, load(t), labels, limit=GROUPS)
+            seen.append([(centre_of(g), sum(s.value for s in g)) for g in groups])
+        same = SAME_PLACE * mesh.diameter + SAME_PLACE_M
+        places = cls(mesh, _clusters(frames, seen, same), joints)
+        best = [
+            max((value * places.worth(t, place) for place, value in here), default=0.0)
+            for t, here in zip(frames, seen, strict=True)
+        ]
+        order = np.argsort(-np.array(best), kind="stable")
+        return places, [frames[i] for i in order if best[i] > 0]
+
+    def worth(self, t: int, place: np.ndarray) -> float:
+        """How likely what is at ``place`` (3,) in frame t is the object: 0.1 to 1."""
+        found = self._nearest(place)
+        if found is None:
+            return max(MOVED, _closeness(self._gaps(place, slice(t, t + 1))))
+        standing, worth = found
+        return LEAST if len(standing.beside) >= BESIDE else worth
+
+    def taken(self, place: np.ndarray) -> bool:
+        """Whether another thing stands at ``place`` (3,): the object was elsewhere meanwhile."""
+        found = self._nearest(place)
+        return found is not None and len(found[0].beside) >= BESIDE
+
+    def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
+        """What stands at ``place`` (3,) and what it is worth."""
+        away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
+        nearest = int(np.argmin(away)) if away else 0
+        return self._standing[nearest] if away and away[nearest] < self._same else None
+
+    def claim(self, place: np.ndarray) -> None:
+        """What is at ``place`` (3,) is the object, whoever comes near."""
+        self._standing = [
+            (s, worth)
+            for s, worth in self._standing
+            if np.linalg.norm(s.place - place) >= self._same
+        ]
+
+    def tracked(self, t: int, place: np.ndarray) -> None:
+        """The object is at ``place`` (3,) in frame t beyond doubt."""
+        for s, _ in self._standing:
+            if t in s.frames and np.linalg.norm(s.place - place) >= self._same:
+                s.beside.add(t)
+
+    def _standing_worth(self, standing: Standing) -> float:
+        handled = _closeness(self._gaps(standing.place, slice(None)))
+        left = MOVED * min((PRESENT - standing.share) / (PRESENT - ABSENT), 1.0)
+        return max(handled, left, LEAST)
+
+    def _gaps(self, place: np.ndarray, frames: slice) -> np.ndarray:
+        """About how far (N,) the person is from an object there, metres, where that is known."""
+        if self._joints is None:
+            return np.zeros(0)
+        distance = np.linalg.norm(self._joints[frames] - place, axis=-1)
+        nearest = np.where(np.isfinite(distance), distance, np.inf).min(1)
+        return np.maximum(nearest[np.isfinite(nearest)] - self._reach, 0.0)
+
+
+def _closeness(gaps: np.ndarray) -> float:
+    """From the nearest of the gaps (N,), metres: 1 at hand, 0.1 far away or unknown."""
+    gap = float(np.quantile(gaps, NEAREST)) if len(gaps) else np.inf
+    return float(np.clip((FAR_M - gap) / (FAR_M - AT_HAND_M), LEAST, 1.0))
+
+
+def _clusters(
+    frames: list[int], seen: list[list[tuple[np.ndarray, float]]], same: float
+) -> list[Standing]:
+    """Places in which something was ``seen`` in more than one of the ``frames``."""
+    every = [(t, place) for t, here in zip(frames, seen, strict=True) for place, _ in here]
+    places = np.array([place for _, place in every]).reshape(-1, 3)
+    frame = np.array([t for t, _ in every], int)
+    free = np.ones(len(every), bool)
+    looked = sum(1 for here in seen if here)
+    found: list[Standing] = []
+    while free.any():
+        together = (np.linalg.norm(places[:, None] - places, axis=-1) < same) & free
+        counts = np.array([len(set(frame[row])) for row in together])
+        best = int(np.where(free, counts, -1).argmax())
+        if counts[best] < 2:
+            break
+        members = together[best]
+        there = frozenset(frame[members].tolist())
+        found.append(Standing(places[members].mean(0), counts[best] / max(looked, 1), there))
+        free &= ~members
+    return found

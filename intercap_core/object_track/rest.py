@@ -1,0 +1,187 @@
+"""When the object is at rest: a change-point test on what each frame's images say.
+
+A segment rests if one pose explains all its frames within their evidence, whose errors last: masks
+and calibration make a resting object look as if it crept. So a frame that moves must pay for a pose
+of its own more than lasting errors would buy it, and the cheapest partition of the recording into
+rests and motions is found exactly (dynamic programming; Jackson et al. 2005). How far estimates
+wander at rest is measured on the rests themselves, once, to see slow motions too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.object_track.smooth import Looks, between
+
+LASTING_S = 0.3  # errors of masks last about so long: frames closer than that are one observation
+MOVING = 9.0  # cost of one observation's own pose: six numbers, each to be told from noise
+SEGMENT = 8.0  # cost of one more rest: its pose and where it begins and ends
+MIN_REST_S = 0.25
+MAX_REST = 900  # frames tested against one pose
+LIMIT = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away nothing is tested
+WANDER = (0.5, 2.0)  # bounds of the measured variance of resting estimates, times the stated one
+BLIP = 2  # frames that an object cannot use to go somewhere and come back
+EDGE = 9.0  # squared normalised distance of a rest's first or last frame that has set out
+SAME, APART = 10.0, 25.0  # squared normalised distances of poses that are one, and that are not
+
+
+def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Which frames (T,) rest, as segments numbered from 0, -1 where the object moves.
+
+    Frames without evidence rest where those around them do at one pose.
+    """
+    looks = looks.about(centre)
+    count = len(times)
+    own = looks.own
+    poses = looks.poses.copy()
+    poses[:, :3, :3] = _turned(own[:, :3]) @ poses[:, :3, :3]
+    poses[:, :3, 3] += own[:, 3:]
+    information = _without_blips(poses, looks.information)
+    seen = np.trace(information, axis1=1, axis2=2) > 0
+    step = float(np.median(np.diff(times))) if count > 1 else LASTING_S
+    share = min(1.0, step / LASTING_S)
+    shortest = max(3, round(MIN_REST_S / step))
+    wander = 1.0
+    segments = np.full(count, -1)
+    for _ in range(2):
+        segments, spread = _partition(poses, information, seen, share / wander, share, shortest)
+        if spread is None:
+            break
+        wander = float(np.clip(wander * spread, *WANDER))
+    information = information / wander
+    return _joined(_trimmed(segments, poses, information), poses, information * share, seen)
+
+
+def _partition(
+    poses: np.ndarray,
+    information: np.ndarray,
+    seen: np.ndarray,
+    weight: float,
+    share: float,
+    shortest: int,
+) -> tuple[np.ndarray, float | None]:
+    """Segments (T,), and the mean squared residual of a degree of freedom at rest."""
+    count = len(poses)
+    moving = np.where(seen, MOVING, 1.0) * share
+    best_rest, best_move = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
+    best_rest[0] = best_move[0] = 0.0
+    began = np.zeros(count + 1, int)
+    rested_before = np.zeros(count + 1, bool)
+    residual = np.zeros(count + 1)
+    # forwards: what ends before frame a is known when segments that begin there are tried
+    for a in range(count):
+        if a:
+            stay, go = best_move[a - 1], best_rest[a - 1]
+            best_move[a] = min(stay, go) + moving[a - 1]
+            rested_before[a] = go < stay
+        until = min(a + MAX_REST, count)
+        spread = _spread(poses[a:until], information[a:until], seen[a:until])
+        ends = a + 1 + np.arange(len(spread))
+        cost = best_move[a] + SEGMENT + 0.5 * weight * spread
+        better = (cost < best_rest[ends]) & (ends - a >= shortest)
+        best_rest[ends[better]] = cost[better]
+        began[ends[better]] = a
+        residual[ends[better]] = spread[better]
+    best_move[count] = min(best_move[count - 1], best_rest[count - 1]) + moving[-1]
+    rested_before[count] = best_rest[count - 1] < best_move[count - 1]
+    segments = np.full(count, -1)
+    squares, freedom, number, end = 0.0, 0.0, 0, count
+    rests = bool(best_rest[count] < best_move[count])
+    while end > 0:
+        if rests:
+            start = int(began[end])
+            segments[start:end] = number
+            squares += residual[end]
+            freedom += 6.0 * max(int(seen[start:end].sum()) - 1, 0)
+            number, end, rests = number + 1, start, False
+        else:
+            rests = bool(rested_before[end])
+            end -= 1
+    segments = np.where(segments >= 0, number - 1 - segments, -1)
+    return segments, squares / freedom * weight / share if freedom else None
+
+
+def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Squared normalised distances (L,) of the first 1, 2, ... frames from their common pose."""
+    away = between(np.broadcast_to(poses[0], poses.shape), poses)
+    away[~seen] = 0
+    far = (np.abs(away) > LIMIT).any(1)
+    count = int(far.argmax()) if far.any() else len(poses)
+    away, information = away[:count], information[:count]
+    pulled = np.einsum("tij,tj->ti", information, away)
+    total = information.cumsum(0) + 1e-9 * np.eye(6)
+    pull = pulled.cumsum(0)
+    common = np.linalg.solve(total, pull[..., None])[..., 0]
+    squares = np.einsum("ti,ti->t", pulled, away).cumsum()
+    return np.maximum(squares - np.einsum("ti,ti->t", pull, common), 0.0)
+
+
+def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """The segments (T,) without frames at their ends that are on their way: errors that last do
+    not begin just when a motion does."""
+    result = segments.copy()
+    for number in range(segments.max(initial=-1) + 1):
+        rest = np.flatnonzero(segments == number)
+        away = between(poses[rest[[len(rest) // 2]]], poses[rest])
+        pull = np.einsum("tij,tj->i", information[rest], away)
+        common = np.linalg.solve(information[rest].sum(0) + 1e-9 * np.eye(6), pull)
+        off = np.einsum("ti,tij,tj->t", away - common, information[rest], away - common) > EDGE
+        if off.all():
+            continue
+        inside = np.flatnonzero(~off)
+        if rest[0] > 0:
+            result[rest[: inside[0]]] = -1
+        if rest[-1] < len(segments) - 1:
+            result[rest[inside[-1] + 1 :]] = -1
+    return result
+
+
+def _joined(
+    segments: np.ndarray, poses: np.ndarray, information: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
+    """The segments (T,) with two that a blip or the longest rest parted made one again, where one
+    pose explains both."""
+    result = np.full_like(segments, -1)
+    number, last = -1, np.zeros(0, int)
+    for old in range(segments.max(initial=-1) + 1):
+        rest = np.flatnonzero(segments == old)
+        if len(last) and rest[0] - last[-1] <= BLIP + 1:
+            both = np.concatenate([last, rest])
+            spreads = [_spread(poses[i], information[i], seen[i]) for i in (both, last, rest)]
+            apart = 0.5 * (spreads[0][-1] - spreads[1][-1] - spreads[2][-1])
+            if len(spreads[0]) == len(both) and apart < SEGMENT:
+                result[last[0] : rest[-1] + 1] = number
+                last = both
+                continue
+        number, last = number + 1, rest
+        result[rest] = number
+    return result
+
+
+def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """The information (T, 6, 6), none where a frame or two are elsewhere between equal ones."""
+    result = information.copy()
+    for width in range(1, BLIP + 1):
+        inner = np.arange(1, len(poses) - width)
+        if not len(inner):
+            break
+        before, after = inner - 1, inner + width
+        same = _distance(poses, information, before, after) < SAME
+        for k in range(width):
+            same &= _distance(poses, information, before, inner + k) > APART
+        for k in range(width):
+            result[inner[same] + k] = 0
+    return result
+
+
+def _distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
+    """Squared distances (N,) of frames a and b in the evidence of the one that says less."""
+    away = between(poses[a], poses[b])
+    both = [np.einsum("ni,nij,nj->n", away, information[i], away) for i in (a, b)]
+    return np.minimum(*both)
+
+
+def _turned(turns: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(turns).as_matrix()

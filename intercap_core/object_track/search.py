@@ -1,0 +1,226 @@
+"""Find the object's pose in a frame set with nothing to start from.
+
+Candidates of different views are joined where they lie together; rotations from a grid over SO(3)
+modulo the symmetry group are aligned to what they show, points or silhouettes; the best are
+rendered and compared with every view, and the best of those are fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track.alignment import align
+from intercap_core.object_track.evidence import View
+from intercap_core.object_track.fit import Fit, assess_all, fit_pose
+from intercap_core.object_track.groups import PERSON_LABELS, find_groups
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer
+from intercap_core.rigid.symmetry import SymmetryGroup
+
+GRID = 240  # rotations of a trivial group: about 40 degrees apart, inside the fit's basin
+UPRIGHT = 24  # turns about the vertical of the standing pose, 15 degrees apart
+COMPARED = 16  # poses rendered after ICP
+FITTED = 6  # poses fitted after rendering
+GOOD_ENOUGH = 0.55  # confidence above which less likely groups are not searched
+NEAR_TURNS = 12  # turns about each axis of the best pose that are compared with it
+TURNS_FITTED = 4
+SAME_AXIS_COSINE = float(np.cos(np.radians(10)))
+STANDING_BONUS = 0.03  # of confidence
+STANDING_COSINE = float(np.cos(np.radians(12)))
+SAME_POSE_M, SAME_POSE_DEG = 0.02, 12.0
+
+
+def search(
+    mesh: ObjectMesh,
+    views: list[View],
+    *,
+    labels: tuple[str, ...],
+    up: np.ndarray | None,
+    min_overlap: float,
+    background_term: bool,
+    worth: Callable[[np.ndarray], float] | None = None,
+    near: np.ndarray | None = None,
+    renderer: Renderer | None = None,
+) -> list[Fit]:
+    """Fitted hypotheses of the pose, the most plausible first; none where nothing is detected.
+
+    ``labels`` are the detector classes that the object may be given (empty: any but a person);
+    ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
+    ``worth`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near`` (3,)
+    prefers candidates near a place where the object was seen; ``renderer`` draws, None = the CPU.
+    """
+
+    def value(fit: Fit) -> float:
+        return plausibility(fit, up) * (1.0 if worth is None else worth(mesh.centre_at(fit.pose)))
+
+    def fitted(starts: list[Fit]) -> list[Fit]:
+        return [
+            fit_pose(
+                mesh,
+                views,
+                start.pose,
+                prior=None,
+                min_overlap=min(min_overlap, 0.2),
+                background_term=background_term,
+                labels=labels,
+                renderer=renderer,
+            )
+            for start in starts
+        ]
+
+    def compared(poses: np.ndarray) -> list[Fit]:
+        return assess_all(mesh, views, poses, min_overlap=0.1, labels=labels, renderer=renderer)
+
+    groups = find_groups(mesh, views, labels, worth, near)
+    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
+    rotations = rotation_grid(mesh.symmetry, up)
+    found: list[Fit] = []
+    for group in groups:
+        if found and max(map(value, found)) > GOOD_ENOUGH:
+            break
+        poses, residual = align(mesh, field, group, views, rotations)
+        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED)
+        likely = sorted(compared(poses[distinct]), key=lambda fit: -fit.confidence)
+        found += fitted(likely[:FITTED])
+    found.sort(key=lambda fit: -value(fit))
+    if found and not mesh.symmetry.sphere:
+        # a mug looks much the same with its handle elsewhere, a box from its back
+        turned = compared(found[0].pose @ own_turns(mesh, NEAR_TURNS))
+        found += fitted(sorted(turned, key=lambda fit: -fit.score)[:TURNS_FITTED])
+        found.sort(key=lambda fit: -value(fit))
+    kept: list[Fit] = []
+    for fit in found:
+        if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
+    """Turns (N, 4, 4) of the object about the axes of its frame and its principal axes.
+
+    ``steps`` angles a full turn; those that the symmetry group holds anyway are left out. They
+    turn about the middle of its box, where a turned silhouette covers the old one best.
+    """
+    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    found = []
+    for axis in own_axes(mesh):
+        for angle in 2 * np.pi * np.arange(1, steps) / steps:
+            turn = np.eye(4)
+            turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
+            turn[:3, 3] = centre - turn[:3, :3] @ centre
+            if not same_pose(mesh, turn, np.eye(4)):
+                found.append(turn)
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def own_axes(mesh: ObjectMesh) -> np.ndarray:
+    """Unit vectors (N, 3): the axes of the object's frame and its principal axes if others."""
+    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
+    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a mug's handle tilts them
+    return np.concatenate([np.eye(3), principal[:, new]], 1).T
+
+
+def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) -> list[int]:
+    """Frames in the order in which to search them.
+
+    ``labels_by_view`` [T][C][candidates] are the candidates' labels. Frames in which more views
+    hold a likely label come first; among equals those far from the ones taken already.
+    """
+    count = len(labels_by_view)
+    support = np.array(
+        [
+            sum(
+                any((label in labels) if labels else (label not in PERSON_LABELS) for label in view)
+                for view in frame
+            )
+            for frame in labels_by_view
+        ],
+        float,
+    )
+    order: list[int] = []
+    distance = np.full(count, float(count))
+    rest = np.ones(count, bool)
+    while rest.any():
+        value = np.where(rest, support + np.minimum(distance / max(count, 1), 0.5), -np.inf)
+        frame = int(value.argmax())
+        order.append(frame)
+        rest[frame] = False
+        distance = np.minimum(distance, np.abs(np.arange(count) - frame))
+    return order
+
+
+def plausibility(fit: Fit, up: np.ndarray | None) -> float:
+    """A fit's confidence, and a little more where the object stands as it does when let go.
+
+    Decides between poses that the images hardly tell apart: a mug is seldom upside down.
+    """
+    if up is None:
+        return fit.confidence
+    upright = float(fit.pose[:3, 2] @ up) / float(np.linalg.norm(up))
+    return fit.confidence + (STANDING_BONUS if upright > STANDING_COSINE else 0.0)
+
+
+def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
+    """Rotations (N, 3, 3) that cover SO(3) modulo the group, and the upright ones."""
+    if symmetry.sphere:
+        return np.eye(3)[None]
+    spread = 2 if symmetry.axis is not None else 1
+    grid = _super_fibonacci(GRID)
+    if up is not None:
+        turns = Rotation.from_rotvec(
+            np.outer(2 * np.pi * np.arange(UPRIGHT) / UPRIGHT, (0, 0, 1))
+        ).as_matrix()
+        grid = np.concatenate([_standing(up) @ turns, grid])
+    # one of each set of equivalent rotations: those nearest to what was kept already
+    kept: list[np.ndarray] = []
+    spacing = 12.0 * spread
+    for rotation in grid:
+        if (
+            symmetry.trivial
+            or not kept
+            or symmetry.rotation_error_deg(np.array(kept), rotation).min() > spacing
+        ):
+            kept.append(rotation)
+    return np.array(kept)
+
+
+def same_pose(mesh: ObjectMesh, a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two poses (4, 4) are one, up to symmetry and a small difference."""
+    angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
+    shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
+    return angle < SAME_POSE_DEG and shift < SAME_POSE_M
+
+
+def _super_fibonacci(count: int) -> np.ndarray:
+    """Evenly spread rotations (count, 3, 3): Alexa, Super-Fibonacci Spirals, CVPR 2022."""
+    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
+    s = np.arange(count) + 0.5
+    r, big_r = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / phi, 2 * np.pi * s / psi
+    quaternions = np.stack(
+        [r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)], 1
+    )
+    return Rotation.from_quat(quaternions).as_matrix()
+
+
+def _standing(up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) that takes the object's z axis to ``up``."""
+    z = up / np.linalg.norm(up)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], 1)
+
+
+def _distinct(mesh: ObjectMesh, poses: np.ndarray, order: np.ndarray, count: int) -> list[int]:
+    """The first ``count`` poses of ``order`` that are not the same as one before."""
+    kept: list[int] = []
+    for index in order:
+        if not any(same_pose(mesh, poses[index], poses[other]) for other in kept):
+            kept.append(int(index))
+            if len(kept) == count:
+                break
+    return kept

@@ -1,0 +1,37 @@
+"""Frame sets as tracking uses them, kept while memory allows: each pass looks at all of them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+from intercap_core.object_track.evidence import View
+
+MAX_BYTES = 800_000_000  # 90 frame sets of six unreduced depth images, 360 of a suitcase's
+
+
+class ViewCache:
+    """Calls ``load(t)`` for the views of frame t, and again only when others took its place."""
+
+    def __init__(self, load: Callable[[int], list[View]], max_bytes: int = MAX_BYTES) -> None:
+        self._load = load
+        self._max_bytes = max_bytes
+        self._kept: OrderedDict[int, list[View]] = OrderedDict()
+        self._bytes = 0
+
+    def __call__(self, t: int) -> list[View]:
+        """The views of frame t, one a camera."""
+        if t in self._kept:
+            self._kept.move_to_end(t)
+            return self._kept[t]
+        views = self._load(t)
+        self._kept[t] = views
+        self._bytes += _size(views)
+        while self._bytes > self._max_bytes and len(self._kept) > 1:
+            _, oldest = self._kept.popitem(last=False)
+            self._bytes -= _size(oldest)
+        return views
+
+
+def _size(views: list[View]) -> int:
+    return sum(view.nbytes for view in views)

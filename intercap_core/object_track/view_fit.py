@@ -1,0 +1,218 @@
+"""One view's part of the object's energy while a pose is fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.energy import object_depth_kernel, object_silhouette_kernel
+from intercap_core.object_track.candidates import MIN_PIXELS, choose, mask_overlap, visible_pixels
+from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.object_track.patches import ContourPatch, DepthPatch
+from intercap_core.object_track.reduced_mask import EMPTY
+from intercap_core.object_track.view_report import (
+    FREE_SPACE_M,
+    ViewReport,
+    depth_agreement,
+    unhidden,
+)
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.shots import Rendering, Shot
+
+DEPTH_SIGMA_M = 0.005  # of one view: ranging bias and calibration rather than pixel noise
+CONTOUR_SIGMA_PX = 2.0  # of a detector's contour at full resolution
+# A view's pixels err together, so each term of a view counts as few independent samples.
+DEPTH_SAMPLES = 4.0
+CONTOUR_SAMPLES = 3.0
+GATE = 2.5  # correspondences farther than this many robust scales are left out
+MIN_MATCHES = 3  # of a contour
+REPORT_DEPTH_M = 0.1  # a pixel measured farther from the render shows something else
+
+NormalEquations = tuple[np.ndarray, np.ndarray]
+"""J'WJ (6, 6) and J'Wr (6,), in units of one standard deviation."""
+
+
+def shots_of(view: View, pose: np.ndarray) -> list[Shot]:
+    """What is drawn of a pose (4, 4) master_from_object: the colour image and, if any, depth."""
+    geometry = view.geometry
+    shots = [Shot(geometry.lens, geometry.colour_from_master @ pose)]
+    if view.depth is not None and geometry.depth_lens is not None:
+        shots.append(Shot(geometry.depth_lens, geometry.depth_from_master @ pose))
+    return shots
+
+
+class ViewFit:
+    """One view while a pose is fitted: its chosen candidate and the measured points around.
+
+    It looks at one pose at a time, given with its renderings by :meth:`see`, and thus may run
+    beside the other views' on another thread.
+    """
+
+    def __init__(
+        self, mesh: ObjectMesh, view: View, min_overlap: float, labels: tuple[str, ...]
+    ) -> None:
+        self._mesh = mesh
+        self._view = view
+        self._min_overlap = min_overlap
+        self._labels = labels
+        self._candidate: Candidate | None = None
+        self._contour_patch: ContourPatch | None = None
+        self._depth_patch: DepthPatch | None = None
+
+    def see(self, pose: np.ndarray, drawn: list[Rendering]) -> None:
+        """Look at a pose (4, 4) whose renderings are ``drawn``, in the order of :func:`shots_of`"""
+        self._pose = pose
+        self._silhouette = drawn[0]
+        self._drawn_depth = drawn[1] if len(drawn) > 1 else None
+
+    # --- evidence ------------------------------------------------------------------------------
+
+    def choose(self) -> None:
+        """Keep the candidate that overlaps the render most, and cut the evidence around it."""
+        self._candidate = choose(self._view, self._silhouette, self._min_overlap, self._labels)
+        self._cut()
+
+    def choose_again(self) -> bool:
+        """Look at the candidates again from a new pose; whether another one is kept now."""
+        found = choose(self._view, self._silhouette, self._min_overlap, self._labels)
+        if found is self._candidate:
+            return False
+        self._candidate = found
+        self._cut()
+        return True
+
+    def _cut(self) -> None:
+        mask = self._candidate.mask if self._candidate else EMPTY
+        overlap = mask_overlap(self._silhouette, mask, self._view.person)
+        self._contour_trust = float(np.clip((overlap - 0.3) / 0.4, 0.1, 1.0))
+        self._contour_patch = self._depth_patch = None
+        if self._candidate is not None:
+            self._contour_patch = ContourPatch.cut(self._view, mask, self._silhouette)
+        if self._drawn_depth is not None:
+            self._depth_patch = DepthPatch.cut(self._view, mask, self._drawn_depth)
+
+    # --- the energy at the pose that is seen ---------------------------------------------------
+
+    def normal_equations(
+        self, depth_scale_m: float, contour_scale_px: float, background: bool
+    ) -> NormalEquations:
+        """Both terms of equation 1; ``contour_scale_px`` is at full resolution."""
+        h_depth, g_depth = self._depth_terms(depth_scale_m)
+        h_contour, g_contour, _ = self._contour_terms(contour_scale_px, background)
+        return h_depth + h_contour, g_depth + g_contour
+
+    def _depth_terms(self, scale_m: float) -> NormalEquations:
+        patch, drawn = self._depth_patch, self._drawn_depth
+        if patch is None or drawn is None:
+            return np.zeros((6, 6)), np.zeros(6)
+        hessian, gradient, count = object_depth_kernel.normal_equations(
+            drawn.depth,
+            drawn.face,
+            (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
+            patch.depth,
+            patch.points,
+            patch.trust,
+            self._mesh.face_normals,
+            self._pose[:3, :3],
+            self._pose[:3, 3],
+            self._view.geometry.master_from_depth[:3, 3],
+            GATE * scale_m,
+            scale_m,
+        )
+        if count < MIN_PIXELS:
+            return np.zeros((6, 6)), np.zeros(6)
+        samples = DEPTH_SAMPLES * count / (count + 10 * MIN_PIXELS)
+        weight = samples / count / DEPTH_SIGMA_M**2
+        return weight * hessian, weight * gradient
+
+    def _contour_terms(
+        self, scale_px: float, background: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The normal equations and the residuals (N,) in pixels of the reduced image."""
+        nothing = np.zeros((6, 6)), np.zeros(6), np.zeros(0)
+        patch, drawn, geometry = self._contour_patch, self._silhouette, self._view.geometry
+        # moved out of the evidence: depth alone leads until it is cut anew
+        if patch is None or not patch.holds(drawn):
+            return nothing
+        scale = scale_px / geometry.step
+        corner = (drawn.x0, drawn.y0)
+        at, target, missed, rim_size = object_silhouette_kernel.correspondences(
+            drawn.face,
+            corner,
+            patch.inside,
+            patch.person,
+            patch.place,
+            patch.contour,
+            patch.rim,
+            patch.starts,
+            background,
+            GATE * scale,
+            MIN_PIXELS,
+        )
+        measured, lens = self._depth_patch, geometry.depth_lens
+        if measured is not None and lens is not None and missed < len(at):
+            clear = object_silhouette_kernel.sees_past(
+                at[missed:],
+                drawn.depth,
+                corner,
+                geometry.lens.rays,
+                geometry.depth_from_colour,
+                lens.parameters,
+                measured.depth,
+                measured.place,
+                FREE_SPACE_M,
+            )
+            kept = np.concatenate([np.ones(missed, bool), clear])
+            at, target = at[kept], target[kept]
+        if len(at) < MIN_MATCHES:
+            return nothing
+        hessian, gradient, residuals = object_silhouette_kernel.normal_equations(
+            at,
+            target,
+            drawn.depth,
+            corner,
+            geometry.lens.rays,
+            geometry.lens.parameters,
+            geometry.master_from_colour,
+            self._pose[:3, 3],
+            scale,
+        )
+        # Weights go by the whole rim: a rim that fits nearly everywhere must not let the few
+        # pixels that do not count as much as a rim that is off all around.
+        samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
+        weight = self._contour_trust * samples / (CONTOUR_SIGMA_PX / geometry.step) ** 2
+        return weight * hessian, weight * gradient, residuals
+
+    # --- the outcome ---------------------------------------------------------------------------
+
+    def report(self, contour_scale_px: float) -> ViewReport:
+        """Compare the renderings with the view; the scale is at full resolution."""
+        view, image = self._view, self._silhouette
+        overlap = contour = float("nan")
+        if self._candidate is not None:
+            overlap = mask_overlap(image, self._candidate.mask, view.person)
+            _, _, residuals = self._contour_terms(contour_scale_px, True)
+            contour = float(np.median(residuals)) * view.geometry.step if len(residuals) else 0.0
+        visible = visible_pixels(image, view.person)
+        depth_residual = agreement = float("nan")
+        patch, drawn = self._depth_patch, self._drawn_depth
+        if patch is not None and drawn is not None:
+            gap, across, where = object_depth_kernel.matches(
+                drawn.depth,
+                drawn.face,
+                (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
+                patch.depth,
+                patch.points,
+                self._mesh.face_normals,
+                self._pose[:3, :3],
+                view.geometry.master_from_depth[:3, 3],
+            )
+            column, row = where.T
+            mine = (patch.trust[row, column] == 1.0) & (np.abs(gap) < REPORT_DEPTH_M)
+            if mine.sum() >= MIN_PIXELS:
+                depth_residual = float(np.median(across[mine]))
+            agreement, free = depth_agreement(gap, across, patch.on_person[row, column])
+            visible = unhidden(image, visible, free, len(gap))
+        number = self._candidate.index if self._candidate is not None else -1
+        return ViewReport(
+            number, overlap, depth_residual, contour, visible, agreement, view.detected
+        )

@@ -1,0 +1,298 @@
+"""The track decided over all frames: turns, weakly seen frames, rest, smoothness, uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track.choices import best_sequence, other_fits, weak_frames
+from intercap_core.object_track.fit import Evidence, Fit, MotionPrior
+from intercap_core.object_track.lost import UNSURE_M, FrameResult, judged
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.rest import resting
+from intercap_core.object_track.smooth import UNKNOWN, Looks, smooth
+from intercap_core.object_track.turns import angle_between, choose_turns, near_turns
+from intercap_core.rigid.pose_interpolation import bridge_poses
+from intercap_core.rigid.twist import twists
+
+TURNS_EVERY_S = 0.2
+QUITE_DIFFERENT_RAD = np.radians(20)
+DOUBT = 0.35  # probability of quite different turns, from which a frame is ambiguous
+TURN_LOSS = 0.01  # of the score, that a turn may cost a run of frames which others decide
+SAME_ERRORS = 4.0  # variance of what views err together and apart over what they err apart ...
+SAME_TURNS = 1.5  # ... of turns: what all have in common (calibration, large masks) rather shifts
+LEAST_NOISE = 0.05  # variance of the views' errors over the stated one: they cannot know better
+LOOKED_AT = 12  # frames of a rest that are looked at again
+WORSE = 0.97  # of the score, below which a smoothed pose is not where to look again
+FOUND = 0.7  # of the usual score, with which a lost frame is found between its neighbours
+FREE_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
+_TURNS_LESS = np.repeat([np.sqrt(SAME_TURNS / SAME_ERRORS), 1.0], 3)
+
+
+class WholeTrack:
+    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds.
+
+    In the frame ``sure``, annotated by a person, the object is not turned.
+    """
+
+    def __init__(self, observer: Observer, times: np.ndarray, sure: int | None = None) -> None:
+        self._sure = sure
+        self._observer = observer
+        self._mesh = observer.mesh
+        self._times = times
+
+    def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
+        """The frames with the poses, covariances, rests and free axes that all together show.
+
+        A lost frame's pose is a guess: it is found again where its neighbours lead to a pose that
+        the images bear out. Where they pull a frame far from what it shows, it is lost unless the
+        images bear that out.
+        """
+        lost = np.array([frame.lost for frame in frames])
+        if lost.all():
+            return frames
+        fits = [frame.fit for frame in frames]
+        fits, doubt, spread = self._turned(fits, lost, np.array([f.leapt for f in frames]))
+        fits = self._decided(fits, lost)
+        fits, segment, free_axis, pulled = self._smoothed(fits, lost, spread)
+        guessed = lost | pulled
+        known = [fit.score for fit, unknown in zip(fits, lost, strict=True) if not unknown]
+        enough = FOUND * float(np.median(known))
+        return [
+            replace(
+                frame,
+                fit=fit,
+                lost=bool(guess)
+                and (fit.score < enough or judged(fit, self._observer.settings).lost),
+                ambiguous=frame.ambiguous or bool(unsure and not frame.lost),
+                resting=bool(number >= 0),
+                free_axis=axis,
+            )
+            for frame, fit, number, axis, unsure, guess in zip(
+                frames, fits, segment, free_axis, doubt, guessed, strict=True
+            )
+        ]
+
+    # --- which of several poses ----------------------------------------------------------------
+
+    def _turned(
+        self, fits: list[Fit], lost: np.ndarray, broken: np.ndarray
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray]:
+        """The fits, those on the wrong side turned and fitted anew; the frames (T,) in which a
+        quite different turn may be the true one, and what that adds to the variance of their turns
+        (T, 3, 3), object frame."""
+        count = len(fits)
+        doubt, spread = np.zeros(count, bool), np.zeros((count, 3, 3))
+        turns = near_turns(self._mesh)
+        if len(turns) == 1:
+            return fits, doubt, spread
+        step = float(np.median(np.diff(self._times))) if count > 1 else TURNS_EVERY_S
+        keys = np.arange(0, count, max(1, round(TURNS_EVERY_S / step)))
+        if self._sure is not None:
+            keys = np.union1d(keys, self._sure)
+        scores = np.full((len(keys), len(turns)), np.nan)
+        for k, t in enumerate(keys):
+            if not lost[t]:
+                found = self._observer.assess_all(int(t), fits[t].pose @ turns)
+                scores[k] = [self._observer.plausibility(fit) for fit in found]
+        if self._sure is not None:
+            scores[keys == self._sure, 1:] = 0.0
+        if np.isnan(scores).all():
+            return fits, doubt, spread
+        jumped = lost | broken
+        between = [bool(jumped[a : b + 1].any()) for a, b in pairwise(keys)]
+        gaps = np.diff(self._times[keys])
+        chosen, probability = choose_turns(scores, turns, gaps, np.array(between, bool))
+        nearest = np.abs(np.arange(count)[:, None] - keys).argmin(1)
+        result = list(fits)
+        of_frame = np.where(lost, 0, chosen[nearest])
+        for run in np.split(np.arange(count), 1 + np.flatnonzero(np.diff(of_frame))):
+            if of_frame[run[0]]:
+                turn = turns[of_frame[run[0]]]
+                found = [self._fit_near(int(t), fits[t].pose @ turn) for t in run]
+                gain = [fit.score - fits[t].score for fit, t in zip(found, run, strict=True)]
+                if np.mean(gain) > -TURN_LOSS:
+                    result[run[0] : run[-1] + 1] = found
+                else:
+                    of_frame[run] = 0
+        # turns that are not the chosen one's neighbours
+        far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
+        other = np.where(far[of_frame], probability[nearest], 0.0)
+        kept, rivals = turns[of_frame][:, None, :3, :3], turns[None, :, :3, :3]
+        relative = (kept.transpose(0, 1, 3, 2) @ rivals).reshape(-1, 3, 3)
+        away = Rotation.from_matrix(relative).as_rotvec().reshape(*other.shape, 3)
+        doubt = other.sum(1) > DOUBT
+        spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], away, away)
+        return result, doubt, spread
+
+    def _decided(self, fits: list[Fit], lost: np.ndarray) -> list[Fit]:
+        """The fits, in weakly seen frames those that the neighbours prefer among several."""
+        if self._mesh.symmetry.sphere:
+            return fits
+        weak = weak_frames(np.array([fit.score for fit in fits]), lost)
+        if not weak.any():
+            return fits
+        options = [[fit] for fit in fits]
+        for t in map(int, np.flatnonzero(weak)[::-1]):
+            options[t] += other_fits(
+                self._mesh,
+                fits[t].pose,
+                partial(self._observer.assess_all, t),
+                partial(self._fit_near, t),
+            )
+        path = best_sequence(self._mesh, options, self._times)
+        return [own[i] for own, i in zip(options, path, strict=True)]
+
+    def _fit_near(self, t: int, pose: np.ndarray) -> Fit:
+        return self._observer.fit(t, pose, MotionPrior(pose))
+
+    # --- all frames together -------------------------------------------------------------------
+
+    def _smoothed(
+        self, fits: list[Fit], lost: np.ndarray, spread: np.ndarray
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray]:
+        """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
+        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show;
+        ``spread`` (T, 3, 3) is the variance of the turns by which the object may be other than it
+        was fitted, object frame."""
+        poses = self._unwrapped(np.array([fit.pose for fit in fits]))
+        poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
+        motion = twists(poses, ~lost, self._times)
+        found = [
+            None if lost[t] else self._observer.evidence(t, poses[t], motion[t])
+            for t in range(len(fits))
+        ]
+        track, covariance, segment = self._solved(poses, found, poses)
+        motion = twists(track, np.ones(len(fits), bool), self._times)
+        motion[segment >= 0] = 0
+        looked = poses.copy()
+        for t in reversed(self._worth_a_look(segment)):  # what was read last is still there
+            again = self._observer.evidence(t, track[t], motion[t])
+            before = found[t]
+            if before is None or _score(again) >= WORSE * _score(before):
+                found[t], looked[t] = again, track[t]
+        track, covariance, segment = self._solved(looked, found, track)
+        covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
+        covariance[:, :3, :3] += track[:, :3, :3] @ spread @ track[:, :3, :3].transpose(0, 2, 1)
+        free = self._free_axes(track, covariance)
+        result = [
+            replace(fit, pose=pose, covariance=spread, views=seen.reports if seen else fit.views)
+            for fit, pose, spread, seen in zip(fits, track, covariance, found, strict=True)
+        ]
+        pulled = self._apart(looked, track) & np.array([seen is not None for seen in found])
+        for t in map(int, np.flatnonzero(pulled)):
+            result[t] = replace(result[t], views=self._observer.assess(t, track[t]).views)
+        return result, segment, free, pulled
+
+    def _apart(self, one: np.ndarray, two: np.ndarray) -> np.ndarray:
+        """In which frames (T,) the object is elsewhere by poses (T, 4, 4) than by others."""
+        centre = self._mesh.centre_at
+        away = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
+        return np.linalg.norm(away, axis=-1) > UNSURE_M
+
+    def _solved(
+        self, looked: np.ndarray, found: list[Evidence | None], start: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
+        rests."""
+        count = len(looked)
+        noise = _noise([e for e in found if e is not None])
+        information, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        for t, evidence in enumerate(found):
+            if evidence is not None:
+                information[t] = evidence.information.sum(0) / noise
+                gradient[t] = evidence.gradient.sum(0) / noise
+        looks = self._without_symmetry(Looks(looked, information, gradient))
+        centre = self._mesh.centre_of_mass
+        segment = resting(looks, self._times, centre)
+        same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
+        node = np.concatenate([[0], np.cumsum(~same)])
+        poses, covariance = smooth(looks, start, node, self._times, centre)
+        return poses, covariance, segment
+
+    def _worth_a_look(self, segment: np.ndarray) -> list[int]:
+        """All moving frames and a few of each rest."""
+        frames = list(np.flatnonzero(segment < 0))
+        for number in range(segment.max(initial=-1) + 1):
+            rest = np.flatnonzero(segment == number)
+            some = np.linspace(0, len(rest) - 1, min(LOOKED_AT, len(rest))).round().astype(int)
+            frames += list(rest[some])
+        return sorted(map(int, frames))
+
+    def _unwrapped(self, poses: np.ndarray) -> np.ndarray:
+        """Equivalent poses (T, 4, 4) that follow each other as closely as the symmetry allows."""
+        symmetry = self._mesh.symmetry
+        if symmetry.trivial:
+            return poses
+        result = poses.copy()
+        for t in range(1, len(poses)):
+            result[t] = symmetry.nearest_equivalent_pose(poses[t], result[t - 1])
+        return result
+
+    def _axes(self, pose: np.ndarray) -> np.ndarray:
+        """Steps (N, 6) of a pose that leave all images as they are: turns about the symmetry's
+        axis, or any of a sphere's."""
+        symmetry = self._mesh.symmetry
+        if symmetry.sphere:
+            axes, offset = np.eye(3), np.zeros(3)
+        elif symmetry.axis is not None and symmetry.offset is not None:
+            axes, offset = symmetry.axis[None], symmetry.offset
+        else:
+            return np.zeros((0, 6))
+        turn = axes @ pose[:3, :3].T
+        return np.concatenate([turn, -np.cross(turn, pose[:3, :3] @ offset)], axis=1)
+
+    def _without_symmetry(self, looks: Looks) -> Looks:
+        """The evidence without what the facets of a round mesh pretend to know of its spin."""
+        information, gradient = looks.information.copy(), looks.gradient.copy()
+        for t, pose in enumerate(looks.poses):
+            for step in self._axes(pose):
+                row = information[t] @ step
+                size = float(step @ row)
+                if size > 1e-9:
+                    gradient[t] -= row * (step @ gradient[t]) / size
+                    information[t] -= np.outer(row, row) / size
+        return Looks(looks.poses, information, gradient)
+
+    def _free_axes(self, poses: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """Axes (T, 3) about which a turn shows nothing; ``covariance`` becomes wide about them."""
+        axes = np.zeros((len(poses), 3))
+        for t, pose in enumerate(poses):
+            steps = self._axes(pose)
+            for step in steps:
+                along = step[:3] @ covariance[t][:3, :3] @ step[:3]
+                covariance[t] += np.outer(step, step) * max(UNKNOWN[0] ** 2 - along, 0)
+            if len(steps):
+                axes[t] = steps[0, :3]
+                continue
+            variance, vectors = np.linalg.eigh(covariance[t][:3, :3])
+            if variance[-1] > FREE_RAD**2:
+                axes[t] = vectors[:, -1]
+        return axes
+
+
+def _noise(found: list[Evidence]) -> float:
+    """Variance of the evidence over what it states, from how far the views' pulls disagree.
+
+    At the minimum each view v of a frame still pulls by g_v; if it errs independently with s^2
+    times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What all views
+    have in common (calibration, masks that are too large) does not show and comes on top.
+    """
+    squares = freedom = 0.0
+    for evidence in found:
+        total = evidence.information.sum(0) + np.diag(UNKNOWN**-2)
+        inverse = np.linalg.inv(total)
+        share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
+        pull = evidence.gradient
+        squares += float(np.einsum("vi,ij,vj->", pull, inverse, pull))
+        freedom += float((6 * share * (1 - share)).sum())
+    apart = squares / freedom if freedom > 1 else 1.0
+    return SAME_ERRORS * float(np.clip(apart, LEAST_NOISE / SAME_ERRORS, 1.0))
+
+
+def _score(evidence: Evidence) -> float:
+    return Fit(np.eye(4), np.eye(6), evidence.reports).score

@@ -1,0 +1,164 @@
+"""Which way the body faces where the views agree: whether their left is truly the left.
+
+Decided for arms, legs and head of all sets together, by dynamic programming over the eight ways of
+exchanging them: knees and ankles bend one way, the nose is in front of the ears and of the chest,
+shoulders and hips face the same way, nobody turns about between two images, and detectors are
+mostly right. A hand belongs to the arm that ends where it begins.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER
+
+# Costs in units of a negative log likelihood. The body's build is certain, a turned head and a
+# twisted back (each up to some 80 degrees) less so; detectors exchange the sides in most views of
+# about one set in twenty.
+_HINGES, _HEAD, _TWIST, _NOSE, _DETECTED = 8.0, 6.0, 6.0, 3.0, 3.0
+_CHANGE = 1.0
+_STEP_M = 0.04  # motion from set to set that is worth one such unit
+_LARGEST_STEP_M = 0.3
+_MEMORY_S = 0.5  # motion is judged over gaps as long as this
+_SHORT_M = 0.03  # directions of shorter vectors are noise
+_ROOT_APART_M = 0.08  # two detectors' wrists of one arm are no farther apart than this
+_CROSSED = 0.5
+
+_AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
+_LIMBS = (ARMS, LEGS, HEAD)
+_STATES = np.array(list(product((False, True), repeat=len(_LIMBS))))
+
+
+def mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | None) -> np.ndarray:
+    """Which limbs of triangulated points (T, 135, 3), NaN = not known, have left for right.
+
+    ``share`` (T, 3): of the views that see arms, legs and head, how many had them exchanged so far;
+    ``times`` (T,) seconds, None = each set stands alone. Returns (T, 4) bool, by LIMBS.
+    """
+    result = np.zeros((len(points), len(LIMBS)), bool)
+    if not len(points):
+        return result
+    cost = _build(points) + _detected(points, share)
+    states = cost.argmin(1) if times is None else _cheapest(cost, points, times)
+    result[:, :3] = _STATES[states]
+    result[:, 3] = _other_hands(exchange_points(points, result))
+    return result
+
+
+def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Values (T, 135, ...) with the limbs that ``which`` (T, 4) names exchanged."""
+    result = values.copy()
+    for limb, at in zip(LIMBS, which.T, strict=True):
+        rows = np.flatnonzero(at)[:, None]
+        result[rows, limb] = values[rows, PARTNER[limb]]
+    return result
+
+
+def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Cost (T, 8) of contradicting the detector, by the share of views."""
+    known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)
+    wrong = np.where(_STATES, 1 - share[:, None], share[:, None])
+    return _DETECTED * np.where(known[:, None], wrong, 0).sum(2)
+
+
+def _build(points: np.ndarray) -> np.ndarray:
+    """Cost (T, 8) of a body that could not be built so."""
+
+    def between(start: str, end: str) -> np.ndarray:
+        return points[:, _AT[end]] - points[:, _AT[start]]
+
+    hips, shoulders = between("right_hip", "left_hip"), between("right_shoulder", "left_shoulder")
+    ears = between("right_ear", "left_ear")
+    up = between("mid_hip", "neck")
+    nose = points[:, _AT["nose"]] - points[:, [_AT["left_ear"], _AT["right_ear"]]].mean(1)
+    # whichever way a leg is stretched, its knee and its ankle turn about the line of the hips
+    hinges = np.zeros(len(points))
+    for side in ("left", "right"):
+        thigh, shin = (
+            between(f"{side}_hip", f"{side}_knee"),
+            between(f"{side}_knee", f"{side}_ankle"),
+        )
+        foot = between(f"{side}_heel", f"{side}_big_toe")
+        hinges += 0.5 * (_cosine(_hinge(thigh, shin), hips) + _cosine(_hinge(foot, shin), hips))
+    twist = _cosine(_unit(_perpendicular(shoulders, up)), _perpendicular(hips, up))
+    chest = np.cross(_unit(shoulders), _unit(up))
+    looks = _cosine(chest, nose)
+    head = _cosine(np.cross(_unit(up), _unit(nose)), ears)
+    arms, legs, turned = np.where(_STATES, -1.0, 1.0).T
+    return (
+        _HINGES * np.maximum(0, -legs * hinges[:, None])
+        + _TWIST * np.maximum(0, -arms * legs * twist[:, None])
+        + _NOSE * np.maximum(0, -arms * looks[:, None])
+        + _HEAD * np.maximum(0, -turned * head[:, None])
+    )
+
+
+def _cheapest(cost: np.ndarray, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The states (T,) of least total ``cost`` (T, 8), motion included (Viterbi 1967)."""
+    change = _CHANGE * (_STATES[:, None] != _STATES[None]).sum(2)
+    total, came_from = cost[0], []
+    last, when = points[0].copy(), np.full(points.shape[1], times[0])
+    for t in range(1, len(points)):
+        reach = total[:, None] + change + cost[t]
+        last[times[t] - when > _MEMORY_S] = np.nan
+        for number, limb in enumerate(_LIMBS):
+            straight = _motion(last[limb], points[t, limb])
+            crossed = _motion(last[PARTNER[limb]], points[t, limb])
+            differ = _STATES[:, None, number] != _STATES[None, :, number]
+            reach = reach + np.where(differ, crossed, straight)
+        came_from.append(reach.argmin(0))
+        total = reach.min(0)
+        known = np.isfinite(points[t, :, 0])
+        last[known], when[known] = points[t, known], times[t]
+    chosen = [int(total.argmin())]
+    for back in reversed(came_from):
+        chosen.append(int(back[chosen[-1]]))
+    return np.array(chosen[::-1])
+
+
+def _motion(before: np.ndarray, now: np.ndarray) -> float:
+    """Cost of moving points (n, 3) so far; 0 where fewer than two are known."""
+    step = np.linalg.norm(now - before, axis=1)
+    step = step[np.isfinite(step)]
+    return float(np.minimum(step, _LARGEST_STEP_M).mean() / _STEP_M) if len(step) > 1 else 0.0
+
+
+def _other_hands(points: np.ndarray) -> np.ndarray:
+    """Whether the hands (T,) begin where the other side's arm ends."""
+    wrists = points[:, [_AT["left_wrist"], _AT["right_wrist"]]]
+    roots = points[:, [_AT["left_hand_wrist"], _AT["right_hand_wrist"]]]
+    own = np.linalg.norm(wrists - roots, axis=2)
+    other = np.linalg.norm(wrists - roots[:, ::-1], axis=2)
+    both = np.isfinite(own) & np.isfinite(other)
+    count = np.maximum(both.sum(1), 1)
+    own, other = (np.where(both, d, 0).sum(1) / count for d in (own, other))
+    return both.any(1) & (own > _ROOT_APART_M) & (other < _CROSSED * own)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Directions (..., 3), NaN for what is too short to have one."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > _SHORT_M, vectors / np.maximum(length, _SHORT_M), np.nan)
+
+
+def _hinge(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The axis (T, 3) about which one bone (T, 3) turns into another, by the sine of the turn."""
+    return np.cross(_unit(first), _unit(second))
+
+
+def _perpendicular(vectors: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The part of vectors (T, 3) across an axis (T, 3)."""
+    axis = _unit(axis)
+    return vectors - (vectors * axis).sum(-1, keepdims=True) * axis
+
+
+def _cosine(weighted: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Product (T,) of vectors with unit directions, at most one in size; 0 where unknown.
+
+    ``weighted`` keeps its length where that is less than one.
+    """
+    length = np.linalg.norm(weighted, axis=-1, keepdims=True)
+    return np.nan_to_num((weighted / np.maximum(length, 1.0) * _unit(direction)).sum(-1))

@@ -1,0 +1,73 @@
+"""The candidate that is the subject, chosen by the keypoints inside it rather than by its label."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.camera.masks import Runs
+from intercap_core.detections.instance import PERSON_LABEL
+from intercap_core.detections.read import Candidate
+from intercap_core.errors import UserError
+
+MIN_SHARE = 0.5  # of the subject's points inside the mask
+LABEL_BONUS = 0.15  # labels are mostly right; one that fits much better still wins
+OUTSIDE_COST = 0.5  # for a mask that lies wholly outside the subject's box
+BOX_MARGIN = 0.25  # of the box of the points, for what has none: hair, soles, clothes
+MIN_POINTS = 4
+# Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
+# Pairs of the 25 body points.
+BONES = np.array([
+    (0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (1, 8), (8, 9), (9, 10), (10, 11),
+    (8, 12), (12, 13), (13, 14),
+])  # fmt: skip
+
+
+def choose_mask(
+    candidates: list[Candidate], points: np.ndarray, seen: np.ndarray, where: str
+) -> bytes:
+    """The RLE of the subject's candidate in one image; empty where none fits.
+
+    ``points`` (25, 2) pixels of the body and ``seen`` (25,) bool. Raises UserError, naming
+    ``where``, for a candidate whose RLE does not decode.
+    """
+    samples = _samples(points, seen)
+    if len(samples) < MIN_POINTS:
+        return b""
+    x, y = np.rint(samples).astype(np.int64).T
+    best, best_score = b"", 0.0
+    for candidate in candidates:
+        try:
+            runs = candidate.runs
+        except ValueError as error:
+            raise UserError(
+                f"{where}, candidate {candidate.index} ({candidate.label}): {error}; re-run stage "
+                "'detections' for this sequence"
+            ) from None
+        share = float(runs.sample(x, y).mean())
+        if share < MIN_SHARE:
+            continue
+        score = share - OUTSIDE_COST * _share_outside(runs, samples)
+        score += LABEL_BONUS * (candidate.label == PERSON_LABEL)
+        if score > best_score:
+            best, best_score = candidate.rle, score
+    return best
+
+
+def _samples(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    bones = BONES[seen[BONES].all(1)]
+    return np.concatenate([points[seen], points[bones].mean(1)])
+
+
+def _share_outside(runs: Runs, samples: np.ndarray) -> float:
+    """Share of the mask outside the points' box with a margin, read on a coarse grid."""
+    low, high = samples.min(0), samples.max(0)
+    margin = BOX_MARGIN * float((high - low).max())
+    x0, y0, width, height = runs.box
+    if not width or not height:
+        return 1.0
+    step = max(1, int(max(width, height) / 64))
+    y, x = np.mgrid[y0 : y0 + height : step, x0 : x0 + width : step]
+    inside = runs.sample(x, y)
+    grid = np.stack([x, y], -1)
+    in_box = ((grid >= low - margin) & (grid <= high + margin)).all(-1)
+    return float((inside & ~in_box).sum() / max(1, inside.sum()))

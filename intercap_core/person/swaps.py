@@ -1,0 +1,162 @@
+"""Limbs whose left and right a detector exchanged.
+
+The views of each set are brought to agree (:mod:`.agreement`), and all sets together tell which
+side is the left (:mod:`.facing`). After that a view's limb counts as exchanged when the points that
+the views agree on fit it much better with the sides exchanged. A view that stands alone has its
+limb's motion in the image, which an exchange makes jump and jump back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.triangulation import (
+    Triangulation,
+    pixel_scale,
+    reproject,
+    triangulate,
+)
+from intercap_core.person.agreement import agree
+from intercap_core.person.facing import exchange_points, mirrored
+from intercap_core.person.sides import LIMBS, PARTNER
+
+ROUNDS = 2
+MUCH_BETTER = 0.5  # exchanged cost over cost as detected
+MIN_POINTS = 2
+FEW_VIEWS = 4
+EXCHANGED_PX_AT_1080P = 3.0  # what a set exchanged costs: detectors are mostly right
+# An exchange that the recording begins or ends with shows one jump alone, as a fast turn does.
+OPEN_PX_AT_1080P = 100.0
+JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
+
+
+def triangulate_people(
+    keypoints: np.ndarray,
+    rig: Rig,
+    times: np.ndarray | None = None,
+    *,
+    min_confidence: float,
+    max_error_px: float,
+) -> tuple[np.ndarray, Triangulation]:
+    """Triangulate the subject, exchanging sides where views, build or motion say so.
+
+    ``keypoints`` (T, C, 135, 3 or more): x, y, confidence, and whatever else goes with a point;
+    ``times`` (T,) seconds, None: motion from set to set is not judged. Returns them with limbs
+    exchanged back, and the triangulation of T * 135 points, set by set.
+    """
+    keypoints = keypoints.copy()
+    agreed = agree(keypoints, rig, min_confidence=min_confidence)
+    found = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    seeing = np.stack(
+        [(keypoints[:, :, limb, 2] >= min_confidence).any(2).sum(1) for limb in LIMBS], 1
+    )
+    share = agreed.sum(1) / np.maximum(seeing, 1)
+    turned = mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
+    if turned.any():
+        keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
+        found = Triangulation(*(
+            exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned)
+            .reshape(part.shape)
+            for part in (found.points, found.inlier, found.error, found.view_error)
+        ))  # fmt: skip
+    for _ in range(ROUNDS):
+        exchanged = exchange(keypoints, found.points.reshape(len(keypoints), -1, 3), rig,
+                             min_confidence=min_confidence, max_error_px=max_error_px)  # fmt: skip
+        if not exchanged:
+            break
+        found = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    return keypoints, found
+
+
+def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
+    """Exchange back limbs that jump to the other side for a while, where few views see the subject.
+
+    ``keypoints`` (T, C, 135, 3); each view and limb on its own: the sides that move least over all
+    sets, by dynamic programming. Returns them exchanged in sets that few views see.
+    """
+    result = keypoints.copy()
+    few = (keypoints[..., 2] > 0).any(2).sum(1) <= FEW_VIEWS
+    for c, scale in enumerate(pixel_scale(rig)):
+        sets = np.flatnonzero((keypoints[:, c, :, 2] > 0).any(1))
+        if len(sets) < 3 or not few[sets].any():
+            continue
+        for limb in LIMBS:
+            options = np.stack([keypoints[sets, c][:, side] for side in (limb, PARTNER[limb])])
+            wrong = sets[_least_motion(options, scale, min_confidence)]
+            wrong = wrong[few[wrong]]
+            result[wrong[:, None], c, limb] = keypoints[wrong[:, None], c, PARTNER[limb]]
+    return result
+
+
+def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
+    """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
+    price = EXCHANGED_PX_AT_1080P * scale
+    open_price = np.array([0.0, OPEN_PX_AT_1080P * scale])
+    total, came_from = open_price + np.array([0.0, price]), []
+    seen = options[..., 2] >= min_confidence
+    for t in range(1, options.shape[1]):
+        both = seen[:, None, t - 1] & seen[None, :, t]  # (before, now, n)
+        moved = np.linalg.norm(options[:, None, t - 1, :, :2] - options[None, :, t, :, :2], axis=-1)
+        moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
+        reach = total[:, None] + moved / np.maximum(both.sum(-1), 1) + [0.0, price]
+        came_from.append(reach.argmin(0))
+        total = reach.min(0)
+    chosen = [int((total + open_price).argmin())]
+    for back in reversed(came_from):
+        chosen.append(int(back[chosen[-1]]))
+    return np.array(chosen[::-1], bool)
+
+
+def exchange(
+    keypoints: np.ndarray,
+    points: np.ndarray,
+    rig: Rig,
+    *,
+    min_confidence: float,
+    max_error_px: float,
+) -> int:
+    """Exchange in place the limbs of ``keypoints`` (T, C, 135, 3 or more) that fit ``points``
+    (T, 135, 3) much better the other way; return how many."""
+    sets, views = keypoints.shape[:2]
+    known = np.isfinite(points[..., 0])
+    pixels = reproject(np.nan_to_num(points.reshape(-1, 3), nan=1.0), rig)
+    pixels = np.swapaxes(pixels.reshape(sets, -1, views, 2), 1, 2)  # (T, C, 135, 2)
+    limit = max_error_px * pixel_scale(rig)[:, None]
+    seen = keypoints[..., 2] >= min_confidence
+    count = 0
+    for limb in LIMBS:
+        partner = PARTNER[limb]
+        own = known[:, None, limb]
+        as_found = _cost(
+            pixels[:, :, limb], keypoints[:, :, limb, :2], own & seen[:, :, limb], limit
+        )
+        other = _cost(
+            pixels[:, :, limb], keypoints[:, :, partner, :2], own & seen[:, :, partner], limit
+        )
+        # A mean truncated cost of a quarter: half of the points are off by the limit or more.
+        wrong = (as_found > 0.25) & (other < MUCH_BETTER * as_found)
+        t, c = np.nonzero(wrong)
+        keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], partner]
+        count += len(t)
+    return count
+
+
+def _cost(
+    expected: np.ndarray, found: np.ndarray, valid: np.ndarray, limit: np.ndarray
+) -> np.ndarray:
+    """Mean truncated squared error (T, C) in units of the limit; NaN with too few points."""
+    # Truncated well beyond the limit, so that an exchange is told from another mistake.
+    error = np.linalg.norm(expected - found, axis=-1) / limit
+    square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
+    count = valid.sum(-1)
+    return np.where(count >= MIN_POINTS, square / np.maximum(count, 1), np.nan)
+
+
+def _triangulate(
+    keypoints: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
+) -> Triangulation:
+    points = np.swapaxes(keypoints[..., :3], 1, 2).astype(np.float64)
+    by_point = points.reshape(-1, len(rig), 3)
+    weights = np.where(by_point[..., 2] >= min_confidence, by_point[..., 2], 0)
+    return triangulate(by_point[..., :2], weights, rig, max_error_px=max_error_px)

@@ -1,0 +1,129 @@
+"""Run one stage of one sequence of a project: settings, tables and annotation to its arguments."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from intercap_core import artefacts, schemas
+from intercap_core.errors import UserError
+from intercap_core.pipeline.job import last_failure
+from intercap_core.project import Project
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+
+
+def run_step(
+    stage: str,
+    project: Project,
+    sequence: str,
+    *,
+    inputs: Mapping[str, Path],
+    output: Path,
+) -> None:
+    """Call ``intercap_core.stages.<stage>.run`` with what its signature asks for.
+
+    ``inputs`` are the artefacts by the name of the stage that wrote them; ``output`` is an artefact
+    or, for the export, a folder. Raises UserError where an input is missing, unreadable or of
+    another sequence, and where the stage finds a fault in it.
+    """
+    annotation = project.annotation(sequence)
+    _check_inputs(stage, sequence, inputs)
+    if STAGES[stage].on_device:
+        check_device(project)
+    run = importlib.import_module(f"intercap_core.stages.{stage}").run
+    row = project.sequences[sequence]
+    known: dict[str, Any] = {
+        **inputs,
+        "output": output,
+        "settings": getattr(project.config, stage),
+        "body_settings": project.config.body_fit,
+        "sequence": row,
+        "object_": project.objects[row.object],
+        "subject": project.subjects[row.subject],
+        "body_models": project.config.body_models,
+        "device": project.config.device,
+        "truth": row.truth,
+        "frames_to_drop": annotation.drop_frames,
+        "floor": annotation.floor,
+        "initial": annotation.object_pose,
+        "contact": annotation.contact,
+    }
+    run(**{name: known[name] for name in inspect.signature(run).parameters})
+
+
+def check_device(project: Project) -> None:
+    """Raise UserError where the settings ask for a device that this machine does not have."""
+    if project.config.device == "cpu":
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        raise UserError(
+            f"{project.path}: device is {project.config.device}, but PyTorch finds no such device "
+            "here; set device: cpu, or run on a machine that has one"
+        )
+
+
+def _check_inputs(stage: str, sequence: str, inputs: Mapping[str, Path]) -> None:
+    for name in STAGES[stage].reads:
+        with artefacts.read(inputs[name], getattr(schemas, name.upper())) as source:
+            found = source.attributes["sequence"]
+        if found != sequence:
+            raise UserError(
+                f"{inputs[name]}: holds sequence {found!r}, expected {sequence!r}; delete it and "
+                f"re-run stage {name!r} for sequence {sequence!r}"
+            )
+
+
+def run_studio(project: Project, sequence: str) -> Path:
+    """Make one virtual recording; returns its folder.
+
+    Raises UserError where the project's studio does not make this sequence.
+    """
+    folder = project.recordings_made(sequence)
+    if project.config.studio is None or folder is None:
+        raise UserError(
+            f"{project.path}: studio.captures does not name {sequence!r}; its recordings are real"
+        )
+    from intercap_core.studio.capture import make_capture
+
+    make_capture(
+        project.config.studio.captures[sequence],
+        project.config.studio,
+        sequence=sequence,
+        objects=project.objects[project.sequences[sequence].object],
+        output=folder,
+    )
+    return folder
+
+
+def run_dataset(project: Project) -> Path:
+    """Aggregate the project's sequences and write the report; returns the page's path.
+
+    Sequences that the project excludes because they failed are named in it. Raises UserError
+    where an artefact is missing or broken.
+    """
+    from intercap_core.stages import dataset
+
+    folder = project.results
+    reasons = {name: last_failure(project.logs / name) for name in project.config.exclude}
+    dataset.run(
+        dataset=project.config.dataset,
+        sequences={
+            name: {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES}
+            for name in project.sequences
+        },
+        objects=project.objects,
+        subjects=project.subjects,
+        body_models=project.config.body_models,
+        settings=project.config.report,
+        report=folder / "report.html",
+        summary=folder / "summary.json",
+        heatmaps=folder / "heatmaps.h5",
+        tables_folder=folder / "tables",
+        failed={name: reason for name, reason in reasons.items() if reason},
+    )
+    return folder / "report.html"

@@ -1,1 +1,0 @@
-"""Body and object refined together over all frames (equation 6)."""

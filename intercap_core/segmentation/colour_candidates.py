@@ -1,0 +1,210 @@
+"""The person's mask and candidates of the object from colour images, where a camera has no depth.
+
+What differs in colour from the median of the recording stands before the scene. The person is what
+of it lies around the projected keypoints. Nothing measures how far a thing is, so what covers the
+person in the image is taken for the person, and what rests for most of a recording is not seen.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numba
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import apply
+from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.depth_masks import encode_window
+from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
+from intercap_core.segmentation.person_volume import bones_of
+
+SCALE = 2  # images are decoded at half their size, which JPEG does in a quarter of the time
+MAX_SAMPLES = 15
+MIN_SAMPLES = 3  # of a pixel without the person: fewer tell no background
+# Horprasert, Harwood and Davis (1999): a pixel is split into brightness along the background's
+# colour and what is off it. A shadow is darker, of the same colour.
+OFF_COLOUR, SHADOW, HIGHLIGHT = 14.0, 0.5, 1.4  # grey levels, share, share
+DARK = 40.0  # colours of the background below this have no direction
+DARK_CHANGE = 30.0
+GAIN_STRIDE = 16  # exposure is compared at every so many pixels
+MIN_CELLS = 60  # of a candidate, at the reduced size
+MAX_CANDIDATES = 5
+SAMPLE_MARGINS, PERSON_MARGINS, THING_MARGINS = 5.0, 2.0, 1.0  # around the person's usual build
+COLOUR_SCORE = 0.5
+
+
+class ColourSegmenter:
+    """Segments the views of a recording that have colour alone.
+
+    ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
+    (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known.
+    """
+
+    def __init__(self, frames: Frames, scene: Artefact, joints: np.ndarray) -> None:
+        self._frames = frames
+        self._rig = Rig.from_artefact(scene)
+        self._joints = joints
+        self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+
+    def segment(self, t: int, c: int) -> ViewSegments | None:
+        """One image; None where it does not decode, or its background or the person is unknown."""
+        if c not in self._backgrounds:
+            self._backgrounds[c] = self._background(c)
+        background = self._backgrounds[c]
+        bones = bones_of(self._joints[t])
+        image = self._image(t, c) if background is not None and len(bones) else None
+        if image is None or background is None:
+            return None
+        camera = self._rig[c]
+        moved = before(image, *background)
+        # clothes of the wall's colour, or a place that the person never left: the body is there
+        person = drawn(bones, camera, moved.shape, 0)
+        person |= moved & drawn(bones, camera, moved.shape, PERSON_MARGINS)
+        things = moved & ~drawn(bones, camera, moved.shape, THING_MARGINS)
+        block = np.ones((3, 3), np.uint8)
+        rest = cv2.morphologyEx(things.view(np.uint8), cv2.MORPH_OPEN, block)
+        _, label, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=8)
+        areas = stats[:, cv2.CC_STAT_AREA]
+        large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= MIN_CELLS]
+        candidates = [
+            ImageCandidate(self._rle(label == k, camera), COLOUR_SCORE, float("nan"), -1)
+            for k in large[:MAX_CANDIDATES]
+        ]
+        return ViewSegments(self._rle(person, camera) if person.any() else b"", candidates)
+
+    def _image(self, t: int, c: int) -> np.ndarray | None:
+        jpeg = self._frames.colour_jpeg(t, c)
+        if jpeg is None:
+            return None
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
+        lens = self._rig[c].colour
+        size = (-(-lens.height // SCALE), -(-lens.width // SCALE), 3)
+        return image if image is not None and image.shape == size else None
+
+    def _background(self, c: int) -> tuple[np.ndarray, np.ndarray] | None:
+        sets = np.flatnonzero(self._frames.colour_available[:, c])
+        if len(sets) > MAX_SAMPLES:
+            sets = sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
+        images, people = [], []
+        for t in sets:
+            image, bones = self._image(int(t), c), bones_of(self._joints[t])
+            if image is not None:
+                images.append(image)
+                people.append(drawn(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))
+        if len(images) < MIN_SAMPLES:
+            return None
+        return median_without(np.stack(images), np.stack(people))
+
+    def _rle(self, mask: np.ndarray, camera: Camera) -> bytes:
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        top, left = int(rows[0]), int(columns[0])
+        window = mask[top : rows[-1] + 1, left : columns[-1] + 1].astype(np.uint8)
+        lens = camera.colour
+        return encode_window(window, left, top, SCALE, lens.width, lens.height)
+
+
+def median_without(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median colour (H, W, 3) float32 of images (S, H, W, 3) uint8 where nobody is, and whether it
+    is known (H, W) bool; ``people`` (S, H, W) bool.
+
+    Exposures are brought to that of the first image before.
+    """
+    gains = np.stack([_gain(image, images[0]) for image in images])
+    seen = len(images) - people.sum(0)
+    return _median(images, people, gains), seen >= MIN_SAMPLES
+
+
+@numba.njit(cache=True)
+def _median(images: np.ndarray, people: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    samples, height, width, channels = images.shape
+    median = np.zeros((height, width, channels), np.float32)
+    values = np.empty(samples, np.float32)
+    for y in range(height):
+        for x in range(width):
+            for channel in range(channels):
+                count = 0
+                for s in range(samples):
+                    if people[s, y, x]:
+                        continue
+                    value = min(images[s, y, x, channel] * gains[s, channel], np.float32(255))
+                    at = count  # sorted as they come: there are few
+                    while at > 0 and values[at - 1] > value:
+                        values[at] = values[at - 1]
+                        at -= 1
+                    values[at] = value
+                    count += 1
+                if count:
+                    median[y, x, channel] = values[(count - 1) // 2]
+    return median
+
+
+def before(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool of an image (H, W, 3) uint8 that differ from the ``background`` (H, W, 3)
+    float32 by more than a shadow does, holes closed; False where that is not ``known`` (H, W)."""
+    changed = _changed(image, background, _gain(image, background)) & known
+    block = np.ones((3, 3), np.uint8)
+    opened = cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, block)
+    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+@numba.njit(cache=True)
+def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    height, width, channels = image.shape
+    found = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            power = along = length = largest = np.float32(0)
+            for channel in range(channels):
+                seen = image[y, x, channel] * gain[channel]
+                known = background[y, x, channel]
+                power += known * known
+                along += seen * known
+                length += seen * seen
+                largest = max(largest, abs(seen - known))
+            if power < DARK * DARK:
+                found[y, x] = largest > DARK_CHANGE
+                continue
+            brightness = along / power
+            off = length - brightness * along  # squared distance from the background's colour
+            found[y, x] = (
+                off > OFF_COLOUR * OFF_COLOUR or brightness < SHADOW or brightness > HIGHLIGHT
+            )
+    return found
+
+
+def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Factors (3,) float32 that bring an image's exposure to the reference's."""
+    few = np.s_[::GAIN_STRIDE, ::GAIN_STRIDE]
+    a, b = image[few].astype(np.float32), reference[few].astype(np.float32)
+    good = (a > DARK / 2) & (a < 250) & (b > DARK / 2) & (b < 250)
+    gains = np.ones(3, np.float32)
+    for channel in range(3):
+        use = good[..., channel]
+        if use.any():
+            gains[channel] = np.median(b[..., channel][use] / a[..., channel][use])
+    return gains
+
+
+def drawn(bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: float) -> np.ndarray:
+    """Where the person's volume, ``margins`` larger, is in the reduced colour image: (H, W) bool.
+
+    ``bones`` (B, 9), master frame, of :func:`.person_volume.bones_of`.
+    """
+    mask = np.zeros(shape[:2], np.uint8)
+    if not len(bones):
+        return mask > 0
+    ends = apply(camera.colour_from_master, bones[:, :6].astype(np.float64).reshape(-1, 3))
+    pixels = (camera.colour.project(ends) / SCALE).reshape(-1, 4)
+    radius = bones[:, 6:8].mean(1) + margins * bones[:, 8]
+    distance = ends[:, 2].reshape(-1, 2).mean(1)
+    shown = camera.colour.inside_model(ends).reshape(-1, 2).all(1)
+    shown &= np.abs(pixels).max(1) < 1e4  # False for what is not a number
+    width = 2 * radius[shown] * camera.colour.fx / distance[shown] / SCALE
+    for (x0, y0, x1, y1), thick in zip(
+        np.rint(pixels[shown]).astype(int).tolist(),
+        np.rint(width).astype(int).tolist(),
+        strict=True,
+    ):
+        cv2.line(mask, (x0, y0), (x1, y1), 1, thickness=max(1, thick))
+    return mask > 0

@@ -1,0 +1,38 @@
+"""Masks and candidates from the images alone, by depth where a camera measures it, else colour."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.colour_candidates import ColourSegmenter
+from intercap_core.segmentation.image_candidates import DepthSegmenter
+from intercap_core.segmentation.image_segments import ViewSegments
+
+
+def segment_images(
+    frames: Frames, scene: Artefact, joints: np.ndarray, wanted: np.ndarray
+) -> dict[tuple[int, int], ViewSegments]:
+    """Segment the images ``wanted`` (T, C) bool; by moment and camera, those that can be.
+
+    ``frames`` are read by the moment that their images show, ``scene`` is the scene artefact,
+    ``joints`` (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known.
+    """
+    posed = np.isfinite(scene["master_from_colour"]).all((1, 2)) & scene["present"]
+    wanted = wanted & posed
+    found: dict[tuple[int, int], ViewSegments] = {}
+    depth = wanted & frames.depth_available
+    if depth.any() and np.isfinite(joints).any():
+        segmenter = DepthSegmenter(frames, scene, joints, np.flatnonzero(depth.any(0)).tolist())
+        for t in np.flatnonzero(depth.any(1)).tolist():
+            segments = segmenter.segment(t, np.flatnonzero(depth[t]).tolist())
+            found.update({(t, c): view for c, view in segments.items()})
+    colour = wanted & ~depth & frames.colour_available
+    if colour.any() and np.isfinite(joints).any():
+        by_colour = ColourSegmenter(frames, scene, joints)
+        for t, c in np.argwhere(colour).tolist():
+            view = by_colour.segment(t, c)
+            if view is not None:
+                found[t, c] = view
+    return found

@@ -1,0 +1,100 @@
+"""Background that is none: what was steady for one camera, but is no furniture.
+
+A suitcase that stands for most of a recording where one camera can measure nothing behind it looks
+like furniture to that camera. Another one that holds farther depth on the same line of sight as its
+background saw it gone. And somebody who stands still leaves traces in small patches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.segmentation.foreground import DepthBackground, DepthView
+from intercap_core.segmentation.person_volume import outside
+
+# The other camera's background is farther by this: calibration and the slope of grazing surfaces.
+BEHIND_M, BEHIND_PER_DEPTH = 0.05, 0.01
+AROUND_PX = 5  # pixels all of which must be so far: edges of the background are uncertain
+MIN_AREA_PX = 5  # across, of what is taken out of a background
+_UNKNOWN = np.uint16(0)
+PATCH_PX = 400  # smooth surfaces of at least so many pixels are no traces of a person
+SMOOTH_MM = 100.0
+INSIDE_MARGINS, INSIDE_SHARE = 1.0, 0.4  # where, and for what share of the moments, a trace lies
+
+
+def see_through(
+    views: list[DepthView],
+    backgrounds: list[DepthBackground],
+    low: np.ndarray,
+    high: np.ndarray,
+) -> list[DepthBackground]:
+    """The backgrounds without what another camera sees through; the box as elsewhere, z up."""
+    nearest = [
+        cv2.erode(background.depth, np.ones((AROUND_PX, AROUND_PX), np.uint8))
+        for background in backgrounds
+    ]
+    result = []
+    for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
+        index = np.flatnonzero(background.depth)
+        points, _ = view.points(background.depth, index)
+        inside = ((points > low) & (points < high)).all(1)
+        index, points = index[inside], points[inside]
+        gone: np.ndarray = np.zeros(background.depth.shape, np.uint8)
+        for other, far in enumerate(nearest):
+            if other != number:
+                gone.ravel()[index[_before(views[other], far, points)]] = 1
+        block = np.ones((MIN_AREA_PX, MIN_AREA_PX), np.uint8)
+        closed = cv2.morphologyEx(gone, cv2.MORPH_CLOSE, block)
+        whole = cv2.morphologyEx(closed, cv2.MORPH_OPEN, block)
+        result.append(_without(background, whole > 0))
+    return result
+
+
+def without_person(
+    view: DepthView, background: DepthBackground, bodies: list[np.ndarray]
+) -> DepthBackground:
+    """The background without small patches that the person was in for much of the time.
+
+    ``bodies``: bones (B, 9) of :func:`.person_volume.bones_of` at some moments, view's frame.
+    """
+    depth = background.depth
+    block = np.ones((3, 3), np.uint8)
+    nearest = cv2.erode(depth.astype(np.float32), block)
+    farthest = cv2.dilate(depth.astype(np.float32), block)
+    smooth = ((nearest > 0) & (farthest - nearest < SMOOTH_MM)).view(np.uint8)
+    _, label, stats, _ = cv2.connectedComponentsWithStats(smooth, connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= PATCH_PX
+    large[0] = False
+    surface = cv2.dilate(large[label].view(np.uint8), block) > 0
+    index = np.flatnonzero((depth > 0) & ~surface & (depth <= background.reach))
+    points, _ = view.points(depth, index)
+    inside = np.zeros(len(index))
+    for bones in bodies:
+        inside += outside(points, bones) < INSIDE_MARGINS
+    trace = np.zeros(depth.shape, bool)
+    trace.ravel()[index[inside > INSIDE_SHARE * len(bodies)]] = True
+    return _without(background, trace)
+
+
+def _without(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
+    taken = gone & (background.depth > 0)
+    depth = np.where(taken, _UNKNOWN, background.depth)
+    limit = np.where(taken, background.reach, background.limit)
+    return replace(background, depth=depth, limit=limit)
+
+
+def _before(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether points (N, 3) lie clearly before the background ``nearest`` (H, W) mm of a view."""
+    lens = view.camera.depth
+    assert lens is not None
+    local = apply(invert(view.target_from_depth), points)
+    seen = lens.sees(local)
+    column, row = np.rint(np.where(seen[:, None], lens.project(local), 0)).astype(int).T
+    column, row = np.clip(column, 0, lens.width - 1), np.clip(row, 0, lens.height - 1)
+    behind = nearest[row, column] * np.float32(1e-3) - view.bias_m
+    z = local[:, 2]
+    return seen & (nearest[row, column] > 0) & (behind > z + BEHIND_M + BEHIND_PER_DEPTH * z)

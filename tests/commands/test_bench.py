@@ -1,0 +1,33 @@
+"""What `intercap bench` says of the extraction, on recordings whose size is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from intercap_core.commands.bench import extraction
+from intercap_core.config import Config, ObjectEntry, SubjectEntry
+from intercap_core.project import Project
+from tests.helpers.kinect_files import entry_of, record
+
+
+def test_extraction_counts_sets_and_whole_files(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for camera in range(2):
+        record(folder, camera, range(4))
+    (folder / "notes.txt").write_text("no recording")
+    entry = entry_of(folder, cameras=2)
+    config = Config(dataset="trial", results=tmp_path)
+    subjects = {entry.subject: SubjectEntry(subject=entry.subject, gender="neutral")}
+    objects = {entry.object: ObjectEntry(name=entry.object, mesh=tmp_path / "none.ply")}
+    project = Project(config, tmp_path / "config.yaml", {"one": entry}, subjects, objects)
+    project.results.mkdir()
+    found = extraction(project, "one", 4)
+    recorded = sum(path.stat().st_size for path in folder.glob("*.mkv"))
+    assert found["frames.recorded_bytes_per_set"] == pytest.approx(recorded / 4, abs=1)
+    ratio = found["frames.bytes_per_set"] / found["frames.recorded_bytes_per_set"]
+    assert found["frames.bytes_ratio"] == pytest.approx(ratio, abs=1e-3)
+    assert found["frames.fps"] > 0
+    assert not list(project.results.iterdir())  # nothing is left

@@ -1,0 +1,462 @@
+"""The command line: help at once, faults in one line, what a file holds."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import io
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from rich.console import Console
+
+from intercap_core import artefacts
+from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Camera
+from intercap_core.commands.check import (
+    check_detector,
+    faults_of_sequences,
+    notes_of_sequences,
+)
+from intercap_core.commands.run import Watcher
+from intercap_core.errors import UserError
+from intercap_core.pipeline.step import check_device
+from intercap_core.project import load_project
+from intercap_core.schemas import DETECTIONS
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.studio.calibration import write_calibration
+from intercap_core.studio.mkv import MkvWriter
+from tests.helpers.synthetic_capture import ring, write_frames
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SCENE = ("scene", "config/demo/config.yaml", "cup_drink_s02")
+
+
+def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "intercap_core.cli", *arguments],
+        cwd=folder,
+        env={"PATH": "/usr/bin:/bin", "COLUMNS": "200", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_help_answers_at_once_and_teaches() -> None:
+    start = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = intercap("--help")
+    end = resource.getrusage(resource.RUSAGE_CHILDREN)
+    # Processor time, not wall time: whatever else the machine does
+    assert end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime < 1.0
+    assert done.returncode == 0
+    for command in ("check", "run", "inspect", "object-track", "intercap run config/demo"):
+        assert command in done.stdout
+
+
+def test_every_command_has_an_example() -> None:
+    from intercap_core.cli import app
+
+    commands = [c for c in app.registered_commands if c.name != "docs"]
+    texts = {c.name or c.callback.__name__: c.callback.__doc__ or "" for c in commands}  # type: ignore[union-attr]
+    texts.pop("docs", None)
+    assert len(texts) >= len(STAGES) + 6
+    assert not [name for name, text in texts.items() if "Example" not in text]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; import intercap_core.cli, intercap_core.pipeline.job; "
+        "print([m for m in ('torch', 'open3d', 'cv2', 'numpy', 'h5py', 'scipy', 'matplotlib')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_stage_reads_what_earlier_ones_wrote() -> None:
+    for place, stage in enumerate(STAGES.values()):
+        assert set(stage.reads) <= set(list(STAGES)[:place]), stage.name
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_what_a_stage_reads_is_what_its_arguments_say(stage: str) -> None:
+    run = importlib.import_module(f"intercap_core.stages.{stage}").run
+    asked = inspect.signature(run).parameters
+    assert set(STAGES[stage].reads) == set(asked) & set(SEQUENCE_STAGES)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("check", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
+        (("joint", "config/demo/config.yaml", "nobody"), "there is no sequence 'nobody'"),
+        (("studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
+        ((*SCENE, "--output", "README.md"), "README.md: exists and is not an artefact"),
+        ((*SCENE, "--output", "docs"), "docs: is a folder, expected a file"),
+        ((*SCENE, "--output", "README.md/a.h5"), "README.md/a.h5: cannot be written ("),
+        ((*SCENE, "--output", "/proc/a.h5"), "/proc/a.h5: cannot be written ("),
+        (("evaluate", "--output", "/proc/a.json"), "/proc/a.json: cannot be written ("),
+        (("inspect", "README.md"), "README.md: not an artefact"),
+        (("inspect", "nowhere.h5"), "nowhere.h5: there is no such file"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_one(arguments: tuple[str, ...], says: str) -> None:
+    done = intercap(*arguments)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("threads", ["0", "-1"])
+def test_threads_are_one_or_more(threads: str) -> None:
+    done = intercap(*SCENE, "--threads", threads)
+    assert done.returncode == 2
+    assert "--threads" in done.stderr
+
+
+def write_recording(path: Path) -> None:
+    """A recording of one camera whose head is right, with one image."""
+    modes = {"colour_mode": "720P", "depth_mode": "NFOV_2X2BINNED"}
+    colour = Intrinsics(1280, 720, 612.0, 612.0, 640.0, 360.0, np.zeros(8))
+    depth = Intrinsics(320, 288, 252.0, 252.0, 160.0, 144.0, np.zeros(8), 1.5)
+    camera = Camera(path.stem, colour, depth, np.eye(4), np.eye(4))
+    content = write_calibration(camera, serial="1", **modes)
+    jpeg = cv2.imencode(".jpg", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()
+    with MkvWriter(path, calibration_json=content, fps=30, serial="1", **modes) as writer:
+        writer.write_colour(jpeg, 1000)
+        writer.write_depth(np.ones((288, 320), np.uint16), 1000)
+
+
+@pytest.fixture
+def small_project(tmp_path: Path) -> Path:
+    """A folder with a project of one good sequence and two that lack files."""
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cup.ply")
+    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", {"k1": np.eye(4)}))
+    (tmp_path / "config.yaml").write_text("dataset: trial\n")
+    (tmp_path / "subjects.tsv").write_text("subject\tgender\ns01\tmale\n")
+    (tmp_path / "objects.yaml").write_text("cup: {mesh: cup.ply}\n")
+    (tmp_path / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\n"
+        "good\ts01\tcup\trec\trig.json\nbad\ts01\tcup\tnone\tnone.json\n"
+        "empty\ts01\tcup\t.\trig.json\n"
+    )
+    (tmp_path / "rec").mkdir()
+    write_recording(tmp_path / "rec" / "k1.mkv")
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
+    return tmp_path
+
+
+def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert done.returncode == 1
+    assert "1 of 3 sequences are ready" in done.stdout
+    problems = done.stderr.splitlines()
+    assert len(problems) == 4
+    assert sum("'bad'" in line for line in problems) == 3
+    assert "'empty'" in problems[-1]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "says"),
+    [
+        ("rec/k1.mkv", "", "sequence 'good': rec/k1.mkv: "),
+        ("rec/k2.mkv", None, "sequence 'good': rig.json: has no pose of k2"),
+        ("rig.json", "{}", "sequence 'good': rig.json: expected 'master'"),
+        ("cup.ply", "a mesh", "sequence 'good': cup.ply: "),
+        ("annotations/godo.yaml", "", "problem: annotations/godo.yaml: no sequence has this"),
+        ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
+    ],
+)
+def test_ready_means_that_the_files_can_be_used(
+    small_project: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    content: str | None,
+    says: str,
+) -> None:
+    monkeypatch.chdir(small_project)
+    project = load_project(Path("config.yaml"), {"exclude": ["bad", "empty"]})
+    assert faults_of_sequences(project) == []
+    if content is None:
+        write_recording(Path(file))
+    else:
+        Path(file).write_text(content)
+    (fault,) = faults_of_sequences(project)
+    assert says in f"problem: {fault}"
+
+
+def test_cameras_that_no_recording_is_of(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    settings = {"exclude": ["bad", "empty"], "frames": {"cameras": ["k9"]}}
+    (fault,) = faults_of_sequences(load_project(Path("config.yaml"), settings))
+    assert "the setting frames.cameras names 'k9', rec has k1" in str(fault)
+    settings = settings | {"frames": {"cameras": ["k1"]}}
+    assert faults_of_sequences(load_project(Path("config.yaml"), settings)) == []
+    assert "\n" not in str(fault)
+
+
+def test_check_notes_cameras_without_recording_or_detections(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    exclude = {"exclude": ["bad", "empty"]}
+    (note,) = notes_of_sequences(load_project(Path("config.yaml"), exclude))
+    assert str(note).startswith("sequence 'good': its row names neither keypoints nor candidates")
+
+    write_rig_file(Path("rig.json"), Extrinsics("k1", {"k1": np.eye(4), "k2": np.eye(4)}))
+    table = Path("sequences.tsv")
+    head, good, *others = table.read_text().splitlines()
+    lines = [f"{head}\tkeypoints\tcandidates", f"{good}\tpoints\tmasks"]
+    table.write_text("\n".join([*lines, *(f"{line}\t\t" for line in others)]) + "\n")
+    (small_project / "points" / "camera1").mkdir(parents=True)
+    (small_project / "masks").mkdir()
+    missing = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml"), exclude))]
+    assert [text.partition(": ")[2].partition(";")[0] for text in missing] == [
+        "rec records k1", "points has no folder k1 and no k1.json", "masks has no k1.json",
+    ]  # fmt: skip
+    assert "rig.json also has k2" in missing[0]
+    (small_project / "points" / "k1").mkdir()
+    (small_project / "masks" / "k1.json").write_text("[]")
+    assert len(notes_of_sequences(load_project(Path("config.yaml"), exclude))) == 1
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert "note: sequence 'good': rec records k1" in done.stdout
+
+
+LARGE = [
+    {"image_id": n, "category_id": 53, "segmentation": [[1, 2, 30, 2, 30, 40, 1, 40]]}
+    for n in range(5000)
+]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("{", "k1.json is not valid JSON"),
+        ("{}", "k1.json holds an empty object, expected a list of results"),
+        ([LARGE[0] | {"segmentation": {"size": [7, 7], "counts": "?"}}],
+         "1 of its first 1 results cannot be used (first: entry 0 (image 0): the mask has 7x7"),
+        ([LARGE[0] | {"segmentation": [[1, 2]]}, LARGE[1] | {"category_name": "mug"}, *LARGE],
+         "(first: entry 0 (image 0): a polygon"),
+        (LARGE, "the first results are labelled apple, none of which object 'cup' expects (mug)"),
+        ([LARGE[0] | {"category_name": "mug"}, *LARGE[1:]], ""),
+        ([], ""),
+    ],
+)  # fmt: skip
+def test_check_looks_at_the_first_candidates(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch, content: str | list, says: str
+) -> None:
+    monkeypatch.chdir(small_project)
+    table, objects = Path("sequences.tsv"), Path("objects.yaml")
+    head, good, *_ = table.read_text().splitlines()
+    table.write_text(f"{head}\tcandidates\n{good}\tmasks\n")
+    objects.write_text(yaml.safe_dump({"cup": {"mesh": "cup.ply", "labels": ["mug"]}}))
+    Path("config.yaml").write_text("dataset: small\n")
+    Path("masks").mkdir()
+    Path("masks/k1.json").write_text(content if isinstance(content, str) else json.dumps(content))
+    notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
+    assert len(notes) == bool(says)
+    assert not says or says in notes[0]
+
+
+WHOLE_BODY = [v for i in range(133) for v in (10.0 + i, 20.0, 0.5)]
+FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("k1.json", "{", "k1.json is not valid JSON"),
+        ("k1.json", {"bodies": []}, "k1.json holds an object with bodies, expected OpenPose's"),
+        ("k1.json", [{"image_id": 0, "keypoints": [1.0] * 54}],
+         "1 of its first 1 people cannot be used (first: entry 0 (image 0): has 18 keypoints"),
+        ("k1.json", [{"image_id": 0, "keypoints": FAR_OUT}], "another size"),
+        ("k1/0_keypoints.json", {"people": [{"pose_keypoints_2d": [1.0] * 54}]}, "54 numbers"),
+        ("k1/0.json", [{"keypoints": [*WHOLE_BODY[:-1], 7.0]}], "1 of 133 confidences are beyond"),
+        ("k1.json", [{"image_id": 0, "keypoints": WHOLE_BODY}] * 300, ""),
+        ("k1/0_keypoints.json", {"people": []}, ""),
+    ],
+)  # fmt: skip
+def test_check_looks_at_the_first_keypoints(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: object, says: str
+) -> None:
+    monkeypatch.chdir(small_project)
+    table = Path("sequences.tsv")
+    head, good, *_ = table.read_text().splitlines()
+    table.write_text(f"{head}\tkeypoints\n{good}\tpoints\n")
+    Path("points/k1").mkdir(parents=True)
+    text = content if isinstance(content, str) else json.dumps(content)
+    Path("points", name).write_text(text)
+    notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
+    notes = [note for note in notes if "candidates" not in note]
+    assert len(notes) == bool(says), notes
+    assert not says or says in notes[0]
+
+
+def test_objects_that_the_model_does_not_know_are_noted(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnxruntime")
+    tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+    monkeypatch.chdir(small_project)
+    names = {"names": "{0: 'suitcase', 1: 'cup'}"}
+    path = tiny_onnx.yolo(small_project / "model.onnx", (64, 64), names)
+    settings = {"detections": {"segmentation_model": path.name}}
+    for labels, count in ((["mug"], 1), (["mug", "cup"], 0), ([], 0)):
+        Path("objects.yaml").write_text(
+            yaml.safe_dump({"cup": {"mesh": "cup.ply", "labels": labels}})
+        )
+        notes = check_detector(load_project(Path("config.yaml"), settings))
+        assert len(notes) == count
+        assert not notes or "(suitcase, cup) is a label of object 'cup' (mug)" in str(notes[0])
+
+
+@pytest.mark.parametrize("model", ["segmentation_model", "keypoint_model"])
+def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path, model: str) -> None:
+    (small_project / "model.onnx").write_text("not a model")
+    config = small_project / "config.yaml"
+    config.write_text(config.read_text() + f"detections: {{{model}: model.onnx}}\n")
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert done.returncode == 1 and "model.onnx: " in done.stderr
+    assert "Traceback" not in done.stderr
+    (small_project / "model.onnx").unlink()
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert f"{model} is model.onnx, and there is no such file" in done.stderr
+
+
+@pytest.mark.parametrize("model", ["neutral", "vposer"])
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_body_file_that_cannot_be_used_stops_before_any_job(
+    small_project: Path, command: str, model: str
+) -> None:
+    (small_project / "body.npz").write_text("not a body")
+    config = small_project / "config.yaml"
+    config.write_text(config.read_text() + f"body_models: {{{model}: body.npz}}\n")
+    done = intercap(command, "config.yaml", folder=small_project)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert " file body.npz " in done.stderr
+
+
+def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_project)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    check_device(load_project(Path("config.yaml")))
+    with pytest.raises(UserError, match=r"config\.yaml: device is cuda, .* set device: cpu"):
+        check_device(load_project(Path("config.yaml"), {"device": "cuda"}))
+
+
+@pytest.fixture
+def detections(tmp_path: Path) -> Path:
+    """A detections artefact of one camera and two frame sets."""
+    path = tmp_path / "detections.h5"
+    lengths = {"T": 2, "C": 1}
+    with artefacts.write(path, DETECTIONS, sequence="one") as writer:
+        for key, field in DETECTIONS.fields.items():
+            if "{camera}" not in key:
+                shape = [lengths.get(dim) or int(dim) for dim in field.dims]
+                text = field.dtype == "str"
+                writer.put(key, ["k1"] * shape[0] if text else np.ones(shape, field.dtype))
+    return path
+
+
+def test_inspect_says_what_a_file_holds(detections: Path) -> None:
+    done = intercap("inspect", str(detections), "--verify")
+    assert done.returncode == 0, done.stderr
+    assert "sequence  one" in done.stdout
+    row = next(line for line in done.stdout.splitlines() if "keypoints_found" in line)
+    assert "2 x 1" in row
+    assert "bool" in row
+    assert "checksum is right" in done.stdout
+
+
+def test_inspect_shows_what_looks_like_markup_and_what_is_not_declared(detections: Path) -> None:
+    with h5py.File(detections, "r+") as file:
+        file.attrs["sequence"] = "[/one] [red]two"
+        file["extra"] = np.ones(3)
+        file["scalar"] = True
+    done = intercap("inspect", str(detections), "--verify")
+    assert done.returncode == 0, done.stderr
+    assert "sequence  [/one] [red]two" in done.stdout
+    assert done.stdout.count("(not part of this schema)") == 2
+
+
+def test_inspect_finds_damage(detections: Path) -> None:
+    with h5py.File(detections) as file:
+        offset = file["camera_names"].id.get_chunk_info(0).byte_offset
+        size = file["camera_names"].id.get_chunk_info(0).size
+    data = np.frombuffer(detections.read_bytes(), np.uint8).copy()
+    data[offset : offset + size] ^= 0xFF
+    detections.write_bytes(data.tobytes())
+    done = intercap("inspect", str(detections), "--verify")
+    assert done.returncode == 1
+    assert "'camera_names' is damaged" in done.stderr
+    assert "re-run stage 'detections'" in done.stderr
+
+
+def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path) -> None:
+    place = small_project / "results" / "trial" / "good"
+    place.mkdir(parents=True)
+    write_frames(place / "frames.h5", ring(1)[0], num_sets=1)
+    done = intercap("person", "config.yaml", "good", folder=small_project)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "error: results/trial/good/frames.h5: holds sequence 'test', expected 'good'; "
+        "delete it and re-run stage 'frames' for sequence 'good'\n"
+    )
+
+
+def test_reasons_that_look_like_markup_are_shown_as_they_are(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    words = io.StringIO()
+    watcher = Watcher(load_project(Path("config.yaml")), Console(file=words, width=200))
+    log = Path("logs/trial/good/scene.log")
+    log.parent.mkdir(parents=True)
+    log.write_text("12:00:00 failed: a[/b] has [3] points\n")
+    watcher.tell()
+    assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
+
+
+def test_a_log_that_is_removed_while_it_is_looked_at_is_no_job(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    watcher = Watcher(load_project(Path("config.yaml")), Console(file=io.StringIO()))
+    gone = Path("logs/trial/good/scene.log")
+    gone.parent.mkdir(parents=True)
+    gone.symlink_to("removed.log")  # listed, but there is nothing behind it
+    assert watcher.jobs() == {}
+
+
+def test_real_recordings_below_the_results_are_never_made(small_project: Path) -> None:
+    place = small_project / "results" / "trial" / "recordings" / "good"
+    place.parent.mkdir(parents=True)
+    (small_project / "rec").rename(place)
+    (small_project / "rig.json").rename(place / "calibration.json")
+    (small_project / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\n"
+        "good\ts01\tcup\tresults/trial/recordings/good"
+        "\tresults/trial/recordings/good/calibration.json\n"
+    )
+    done = intercap("run", "config.yaml", "--", "--dry-run", folder=small_project)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "good: reading and synchronising" in done.stdout
+    assert "virtual recording" not in done.stdout

@@ -1,0 +1,401 @@
+"""A small capture with known answers: every artefact from frames to joint, made from one body.
+
+Three cameras look at a standing person whose right palm touches a ball. The fits are the truth
+moved by constants, so that every error against the truth can be worked out by hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import yaml
+
+from intercap_core import artefacts
+from intercap_core.body.artefact import file_digest
+from intercap_core.body.loading import OPEN_BODY
+from intercap_core.body.model import BodyModel, with_hand_mean
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.camera import masks
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import rigid
+from intercap_core.config import BodyModels, ObjectEntry, SubjectEntry
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import render_scene
+from intercap_core.rigid.shots import Drawable, Rendering
+from intercap_core.schemas import (
+    BODY_FIT,
+    CONTACT_REGIONS,
+    DETECTIONS,
+    FRAMES,
+    JOINT,
+    OBJECT_TRACK,
+    PERSON,
+    SCENE,
+    TRUTH,
+)
+
+FPS = 15.0
+BODY_OFFSET_M = 0.010  # the fitted body stands this much beside the true one, down
+OBJECT_OFFSET_M = 0.004  # the tracked ball, down too; the joint result is half as far off
+SUBJECT = SubjectEntry(subject="p01", gender="neutral")
+BODY_MODELS = BodyModels()
+
+
+@dataclass
+class Capture:
+    """Paths of the artefacts, by stage, and what they were made from."""
+
+    paths: dict[str, Path]
+    object_: ObjectEntry
+    mesh: ObjectMesh
+    model: BodyModel
+    rig: Rig
+    vertices: np.ndarray  # (T, V, 3), true
+    joints: np.ndarray  # (T, 55, 3), true
+    rotation: np.ndarray
+    translation: np.ndarray
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def inputs(self, *stages: str) -> dict[str, Path]:
+        return {stage: self.paths[stage] for stage in stages}
+
+
+def object_entry(name: str) -> ObjectEntry:
+    """An object of the project's own table."""
+    folder = Path(__file__).resolve().parents[2] / "config"
+    entry = ObjectEntry(name=name, **yaml.safe_load((folder / "objects.yaml").read_text())[name])
+    paths = {"mesh": folder / entry.mesh, "contact_vertices": folder / entry.contact_vertices}
+    return entry.model_copy(update=paths)
+
+
+def _fill(writer: artefacts.Writer, schema: artefacts.Schema, **dims: int) -> None:
+    """Write zeros for what the schema asks for and these tests do not look at."""
+    for key, declared in schema.fields.items():
+        if declared.optional or "{camera}" in key or key in writer._file:
+            continue
+        shape = [int(d) if d.isdigit() else dims.get(d, 1) for d in declared.dims]
+        empty = np.full(shape, "") if declared.dtype == "str" else np.zeros(shape, declared.dtype)
+        writer.put(key, empty)
+    for name in schema.attributes:
+        writer.attributes.setdefault(name, "")
+
+
+def _rig(count: int = 3) -> Rig:
+    bent = np.array([0.08, -0.05, 1e-3, -1e-3, 0.01, 0, 0, 0])
+    colour = Intrinsics(480, 270, 230.0, 230.0, 239.5, 134.5, bent)
+    depth = Intrinsics(320, 288, 200.0, 200.0, 159.5, 143.5)
+    between = np.eye(4)
+    between[0, 3] = -0.032
+    middle = np.array([0.0, 0.0, 2.4])
+    cameras = []
+    for index in range(count):
+        angle = 2 * np.pi * index / count
+        turn = cv2.Rodrigues(np.array([0.0, -angle, 0.0]))[0]
+        pose = rigid(turn, middle - turn @ middle)
+        cameras.append(Camera(f"k{index + 1}", colour, depth, between, pose))
+    return Rig(tuple(cameras))
+
+
+def _body(model: BodyModel, total: int) -> BodyParameters:
+    params = with_hand_mean(model, model.zeros(total))
+    params.betas = torch.full((1, model.num_betas), 0.3)
+    params.global_orient[:, 0] = np.pi  # y up and facing +z becomes y down and facing the camera
+    params.body_pose[:, 3 * 15 + 2] = -0.9  # left_shoulder and right_shoulder: arms down
+    params.body_pose[:, 3 * 16 + 2] = 0.9
+    params.transl[:] = torch.tensor([0.0, 0.25, 2.4])
+    params.transl[:, 0] += 0.01 * torch.arange(total)
+    return params
+
+
+def make_capture(
+    folder: Path, *, name: str = "cap", object_name: str = "football", total: int = 5
+) -> Capture:
+    """Write all artefacts of a capture of ``total`` frame sets into ``folder``."""
+    torch.manual_seed(0)
+    model = BodyModel.load()
+    entry = object_entry(object_name)
+    mesh = ObjectMesh.load(entry)
+    params = _body(model, total)
+    params = model.parameters(params.vector())
+    with torch.no_grad():
+        posed = model.forward(params)
+        tips = model.keypoints(posed)[:, [29, 33, 37, 41, 45, 50, 54, 58, 62, 66]].numpy()
+    vertices, joints = posed.vertices.numpy(), posed.joints.numpy()
+    palm = vertices[:, model.regions["right_hand"]]
+    side = palm[:, :, 0].argmin(1)  # outermost palm vertex, image left
+    touch = palm[np.arange(total), side].astype(np.float64)
+    radius = float(np.abs(mesh.vertices[:, 0]).max())
+    rotation = np.repeat(np.eye(3)[None], total, 0)
+    translation = touch + np.array([-(radius - 0.001), 0.0, 0.0])
+    rig = _rig()
+    capture = Capture(
+        {stage: folder / f"{stage}.h5" for stage in
+         ("frames", "detections", "scene", "person", "object_track", "body_fit", "joint", "truth",
+          "metrics")},
+        entry, mesh, model, rig, vertices, joints, rotation, translation,
+    )  # fmt: skip
+    views = _draw(capture)
+    _write_frames(capture, views, name)
+    _write_scene(capture, name)
+    _write_detections(capture, views, name)
+    _write_person(capture, views, name)
+    _write_fits(capture, params, name)
+    _write_truth(capture, tips, name)
+    return capture
+
+
+def _drawables(capture: Capture, t: int, camera_from_master: np.ndarray) -> list[Drawable]:
+    pose = rigid(capture.rotation[t], capture.translation[t])
+    vertices = capture.vertices[t].astype(float)
+    return [
+        Drawable(vertices, capture.model.faces.numpy(), camera_from_master),
+        Drawable(capture.mesh.vertices, capture.mesh.faces, camera_from_master @ pose),
+    ]
+
+
+def _draw(capture: Capture) -> list[list[tuple[Rendering, Rendering]]]:
+    """Colour and depth renderings (T, C)."""
+    return [
+        [
+            (
+                render_scene(_drawables(capture, t, camera.colour_from_master), camera.colour),
+                render_scene(_drawables(capture, t, camera.depth_from_master), camera.depth),
+            )
+            for camera in capture.rig
+        ]
+        for t in range(len(capture.vertices))
+    ]
+
+
+def _write_frames(capture: Capture, views: Any, name: str) -> None:
+    rig, total = capture.rig, len(views)
+    count = len(rig)
+    with artefacts.write(
+        capture.paths["frames"], FRAMES, sequence=name, master="k1", fps=FPS
+    ) as writer:
+        for key, value in rig.datasets().items():
+            writer.put(key, value)
+        writer.put("master_from_colour", rig.master_from_colour)
+        writer.put("gravity", np.tile([0.0, 1.0, 0.0], (count, 1)))
+        writer.put("present", np.ones(count, bool))
+        writer.put("truncated", np.zeros(count, bool))
+        writer.put("note", [""] * count)
+        writer.put("times", np.arange(total) / FPS)
+        writer.put("dropped", np.zeros(total, bool))
+        index = np.repeat(np.arange(total)[:, None], count, 1)
+        writer.put("colour_index", index)
+        writer.put("depth_index", index)
+        writer.put("skew", np.zeros((total, count)))
+        _fill(writer, FRAMES, T=total, C=count)
+        for c, camera in enumerate(rig):
+            packets, depths = [], []
+            for t in range(total):
+                colour, depth = views[t][c]
+                lens = camera.colour
+                shade = np.linspace(90, 160, lens.width)[None, :, None]
+                image = np.repeat(np.repeat(shade, lens.height, 0), 3, 2).astype(np.uint8)
+                image[colour.full_mask(lens, 0)] = (60, 90, 180)
+                image[colour.full_mask(lens, 1)] = (200, 200, 40)
+                packets.append(cv2.imencode(".jpg", image)[1].tobytes())
+                whole = np.full((camera.depth.height, camera.depth.width), 4000, np.uint16)
+                window = whole[depth.window]
+                window[depth.mask] = np.rint(1e3 * depth.depth[depth.mask])
+                depths.append(whole)
+            offsets, values = artefacts.pack_ragged(packets)
+            times = (np.arange(total) * 1e6 / FPS).astype(np.int64)
+            group = f"cameras/{camera.name}"
+            writer.put(f"{group}/colour", values)
+            writer.put(f"{group}/colour_offsets", offsets)
+            writer.put(f"{group}/colour_time", times)
+            writer.put(f"{group}/depth", np.stack(depths))
+            writer.put(f"{group}/depth_time", times)
+
+
+def _write_scene(capture: Capture, name: str) -> None:
+    rig, total = capture.rig, len(capture.vertices)
+    count = len(rig)
+    floor = float(capture.vertices[..., 1].max())
+    start = rig.master_from_colour.copy()
+    start[1, 0, 3] += 0.012
+    zup = np.eye(4)
+    zup[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    zup[2, 3] = floor
+    with artefacts.write(
+        capture.paths["scene"], SCENE, sequence=name, master="k1", fps=FPS,
+        extrinsics_refined=True, ground_found=True, ground_source="fitted", ground_rms=0.004,
+        ground_inliers=1000,
+    ) as writer:  # fmt: skip
+        for key, value in rig.datasets().items():
+            writer.put(key, value)
+        writer.put("present", np.ones(count, bool))
+        writer.put("times", np.arange(total) / FPS)
+        writer.put("master_from_colour", rig.master_from_colour)
+        writer.put("master_from_colour_start", start)
+        writer.put("depth_bias", np.zeros(count))
+        writer.put("pairs", np.array([[0, 1], [1, 2], [2, 0]]))
+        writer.put("pair_points", np.full(3, 5000))
+        writer.put("pair_residual_before", [0.012, 0.011, 0.006])
+        writer.put("pair_residual_after", [0.004, 0.004, 0.003])
+        writer.put("time_offset", np.zeros(count))
+        writer.put("time_offset_sigma", np.full(count, np.nan))
+        writer.put("slip", np.zeros((total, count), int))
+        writer.put("image_of", np.arange(total)[:, None].repeat(count, 1))
+        writer.put("ground_point", [0.0, floor, 2.4])
+        writer.put("ground_normal", [0.0, -1.0, 0.0])
+        writer.put("zup_from_master", zup)
+        _fill(writer, SCENE, T=total, C=count, P=3)
+        for camera in rig:
+            shape = (camera.depth.height, camera.depth.width)
+            writer.put(f"cameras/{camera.name}/background", np.full(shape, 4000))
+
+
+def _write_detections(capture: Capture, views: Any, name: str) -> None:
+    rig, total = capture.rig, len(views)
+    with artefacts.write(capture.paths["detections"], DETECTIONS, sequence=name) as writer:
+        writer.put("camera_names", rig.names)
+        writer.put("colour_size", [(c.colour.width, c.colour.height) for c in rig])
+        writer.put("note", [""] * len(rig))
+        writer.put("keypoints_found", np.ones((total, len(rig)), bool))
+        writer.put("candidates_found", np.ones((total, len(rig)), bool))
+        _fill(writer, DETECTIONS, T=total, C=len(rig))
+        for c, camera in enumerate(rig):
+            group = f"cameras/{camera.name}"
+            rles = [masks.encode(views[t][c][0].full_mask(camera.colour, 1)) for t in range(total)]
+            offsets, values = artefacts.pack_ragged(rles)
+            writer.put(f"{group}/people_offsets", np.arange(total + 1))
+            writer.put(f"{group}/people", np.zeros((total, 135, 3)))
+            writer.put(f"{group}/candidate_offsets", np.arange(total + 1))
+            writer.put(f"{group}/candidate_labels", ["sports ball"] * total)
+            writer.put(f"{group}/candidate_scores", np.full(total, 0.9))
+            writer.put(f"{group}/candidate_boxes", np.zeros((total, 4)))
+            writer.put(f"{group}/rle_offsets", offsets)
+            writer.put(f"{group}/rle", values)
+
+
+def _write_person(capture: Capture, views: Any, name: str) -> None:
+    rig, total = capture.rig, len(views)
+    count = len(rig)
+    rles = [
+        masks.encode(views[t][c][0].full_mask(camera.colour, 0))
+        for t in range(total)
+        for c, camera in enumerate(rig)
+    ]
+    offsets, values = artefacts.pack_ragged(rles)
+    missing = np.zeros(total, bool)
+    missing[-1] = True
+    with artefacts.write(
+        capture.paths["person"], PERSON, sequence=name, images_alone=False
+    ) as writer:
+        writer.put("camera_names", rig.names)
+        writer.put("person", np.zeros((total, count), int))
+        writer.put("keypoints", np.zeros((total, count, 135, 3)))
+        writer.put("joints", np.zeros((total, 135, 3)))
+        writer.put("joint_views", np.full((total, 135), 3))
+        writer.put("joint_error", np.zeros((total, 135)))
+        writer.put("inlier", np.ones((total, count, 135), bool))
+        writer.put("missing", missing)
+        writer.put("mask_offsets", offsets)
+        writer.put("mask_rle", values)
+        _fill(writer, PERSON, T=total, C=count)
+
+
+def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
+    rig, total = capture.rig, len(capture.vertices)
+    count = len(rig)
+    body = {key: getattr(params, key).numpy().copy() for key in vars(params)}
+    body["transl"][:, 1] += BODY_OFFSET_M
+    body["joints"] = capture.joints + np.array([0, BODY_OFFSET_M, 0])
+    body["keypoint_residual"] = np.full((total, count), 5.0)
+    body["cloud_residual"] = np.full(total, 0.01)
+    lost = np.zeros(total, bool)
+    lost[0] = True
+    with artefacts.write(
+        capture.paths["object_track"], OBJECT_TRACK, sequence=name,
+        object=capture.object_.name, seed_frame=0, seed_source="search",
+    ) as writer:  # fmt: skip
+        writer.put("camera_names", rig.names)
+        writer.put("rotation", capture.rotation)
+        writer.put("translation", capture.translation + np.array([0, OBJECT_OFFSET_M, 0]))
+        writer.put("candidate", np.zeros((total, count), int))
+        for key, value in {
+            "overlap": 0.9, "depth_residual": 0.003, "silhouette_residual": 1
+        }.items():  # fmt: skip
+            writer.put(key, np.full((total, count), value))
+        writer.put("views", np.full(total, count))
+        writer.put("covariance", np.repeat(np.eye(6)[None] * 0.004**2, total, 0))
+        writer.put("lost", lost)
+        writer.put("recovered", np.zeros(total, bool))
+        for key in ("disagree", "ambiguous", "resting"):
+            writer.put(key, np.zeros(total, bool))
+        writer.put("free_axis", np.zeros((total, 3)))
+        _fill(writer, OBJECT_TRACK, T=total, C=count)
+    identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}
+    with artefacts.write(
+        capture.paths["body_fit"], BODY_FIT, body_model=file_digest(OPEN_BODY), **identity
+    ) as writer:
+        for key, value in body.items():
+            writer.put(key, value)
+        writer.put("joint_sigma", np.full((total, 55), 0.01))
+        writer.put("failed", np.zeros(total, bool))
+        writer.put("bridged", np.zeros(total, bool))
+        _fill(writer, BODY_FIT, T=total, C=count)
+    with artefacts.write(
+        capture.paths["joint"], JOINT, body_model=file_digest(OPEN_BODY),
+        object=capture.object_.name, iterations=3, **identity,
+    ) as writer:  # fmt: skip
+        for key, value in body.items():
+            writer.put(key, value[0] if key == "betas" else value)
+        writer.put("rotation", capture.rotation)
+        writer.put("translation", capture.translation + np.array([0, OBJECT_OFFSET_M / 2, 0]))
+        writer.put("region_names", CONTACT_REGIONS)
+        writer.put("contact_probability", np.full((total, len(CONTACT_REGIONS)), 0.5))
+        writer.put("contact_annotated", np.full((total, len(CONTACT_REGIONS)), -1))
+        writer.put("time_offset", np.zeros(count))
+        writer.put("energy_names", ["object", "body"])
+        writer.put("energy_before", [2.0, 1.0])
+        writer.put("energy_after", [1.0, 0.5])
+        writer.put("flagged", np.zeros(total, bool))
+        writer.put("flag_reason", [""] * total)
+        _fill(writer, JOINT, T=total, C=count)
+
+
+def _write_truth(capture: Capture, tips: np.ndarray, name: str) -> None:
+    rig, total = capture.rig, len(capture.vertices)
+    faces = capture.model.faces.numpy()
+    # each vertex is the first corner of the first face that has it
+    order = np.argsort(faces.ravel(), kind="stable")
+    first = order[np.searchsorted(faces.ravel()[order], np.arange(capture.model.num_vertices))]
+    face, corner = np.divmod(first, 3)
+    contact = np.zeros((total, len(CONTACT_REGIONS)), bool)
+    contact[:, CONTACT_REGIONS.index("right_hand")] = True
+    with artefacts.write(
+        capture.paths["truth"], TRUTH, sequence=name, interaction="hold", subject="p01",
+        object=capture.object_.name, ground_offset=0.0, fps=FPS,
+    ) as writer:  # fmt: skip
+        writer.put("times", np.arange(total) / FPS)
+        writer.put("body_vertices", capture.vertices)
+        writer.put("body_faces", faces)
+        writer.put("correspondence_face", face)
+        writer.put("correspondence_weights", np.eye(3)[corner])
+        writer.put("joints", capture.joints)
+        writer.put("fingertips", tips)
+        writer.put("object_vertices", capture.mesh.vertices)
+        writer.put("object_faces", capture.mesh.faces)
+        writer.put("rotation", capture.rotation)
+        writer.put("translation", capture.translation)
+        writer.put("object_views", np.full(total, len(rig)))
+        writer.put("region_names", CONTACT_REGIONS)
+        writer.put("region_contact", contact)
+        writer.put("camera_names", rig.names)
+        writer.put("master_from_colour", rig.master_from_colour)
+        writer.put("time_offset", np.zeros(len(rig)))
+        writer.put("slip", np.zeros((total, len(rig)), int))
+        writer.put("ground_normal", [0.0, -1.0, 0.0])
+        writer.put("body_visible", np.ones((total, capture.model.num_vertices), bool))
+        writer.put("object_visible", np.ones((total, len(capture.mesh.vertices)), bool))

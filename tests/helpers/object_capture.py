@@ -1,0 +1,248 @@
+"""A ring of cameras that sees one object move beside a person-like post: images and artefacts.
+
+The post stands for the person: it hides the object from some cameras and has its own mask. What
+the detector gives is the true mask, shuffled among distractors, with wrong labels and misses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.artefacts import pack_ragged
+from intercap_core.camera.masks import encode
+from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.transforms import invert, rigid
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import render_scene
+from intercap_core.rigid.shots import Drawable
+from intercap_core.schemas import DETECTIONS, FRAMES, PERSON, SCENE
+from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH, looking_at
+
+FPS = 15.0
+COLOUR_HALF = COLOUR.scaled(0.5)
+DEPTH_LENS = DEPTH.scaled(5 / 3)  # half of NFOV's 640 x 576
+Detected = list[tuple[int, str, float, bytes]]
+
+
+def ring(count: int, radius: float = 2.2) -> tuple[Rig, np.ndarray]:
+    """Cameras around the origin of a z-up room, and master_from_room (4, 4)."""
+    poses = []
+    for i in range(count):
+        angle = 2 * np.pi * i / count + 0.3
+        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.5])
+        poses.append(looking_at(eye, np.array([0, 0, 0.6])))
+    master = invert(poses[0])
+    cameras = tuple(
+        Camera(f"k{i + 1}", COLOUR_HALF, DEPTH_LENS, COLOUR_FROM_DEPTH, master @ pose)
+        for i, pose in enumerate(poses)
+    )
+    return Rig(cameras), master
+
+
+@dataclass
+class ObjectCapture:
+    """Images of ``count`` frames; ``poses`` (T, 4, 4) are the true master_from_object."""
+
+    mesh: ObjectMesh
+    rig: Rig
+    master_from_room: np.ndarray
+    poses: np.ndarray
+    label: str
+    depth_noise_m: float = 0.002
+    missed: set[tuple[int, int]] = field(default_factory=set)  # (t, c) without the object
+    hidden: set[int] = field(default_factory=set)  # frames in which the object is not there at all
+    speed: float = 0.03  # metres a frame
+    turn_deg: float = 3.0  # a frame
+    time_offset: np.ndarray = field(default_factory=lambda: np.zeros(16))  # of each camera, seconds
+
+    @classmethod
+    def make(
+        cls,
+        mesh: ObjectMesh,
+        frames: int,
+        *,
+        cameras: int = 4,
+        label: str = "suitcase",
+        speed: float = 0.03,
+        turn_deg: float = 3.0,
+    ) -> ObjectCapture:
+        """The object glides and turns in front of the post, ``speed`` metres a frame."""
+        rig, master_from_room = ring(cameras)
+        capture = cls(
+            mesh, rig, master_from_room, np.zeros((frames, 4, 4)), label,
+            speed=speed, turn_deg=turn_deg,
+        )  # fmt: skip
+        capture.poses[:] = [capture.pose_at(t) for t in range(frames)]
+        return capture
+
+    @property
+    def times(self) -> np.ndarray:
+        return np.arange(len(self.poses)) / FPS
+
+    def pose_at(self, t: float) -> np.ndarray:
+        """master_from_object (4, 4), ``t`` in frames."""
+        turn = Rotation.from_euler("zx", [40 + self.turn_deg * t, 8], degrees=True).as_matrix()
+        place = np.array([0.25, -0.2 + self.speed * t, 0.5])
+        return self.master_from_room @ rigid(turn, place)
+
+    def image(self, t: int, c: int) -> tuple[np.ndarray, bytes, Detected]:
+        """Depth (H, W) uint16 mm, the person's RLE and candidates of one image."""
+        rng = np.random.default_rng([t, c])
+        camera = self.rig[c]
+        depth, _ = self._draw(t, c, DEPTH_LENS, camera.depth_from_master)
+        noisy = depth + rng.normal(scale=self.depth_noise_m, size=depth.shape)
+        millimetres = np.where(depth > 0, np.rint(noisy * 1000), 0).astype(np.uint16)
+        _, body = self._draw(t, c, COLOUR_HALF, camera.colour_from_master)
+        person = encode(body == 1)
+        distractor = np.zeros(body.shape, bool)
+        distractor[20:60, 700:800] = True
+        found = [("person", body == 1), (self.label, distractor)]
+        if (t, c) not in self.missed and (body == 0).sum() > 40:
+            # every third label is wrong; the score says nothing
+            found.append((self.label if (t + c) % 3 else "bed", body == 0))
+        rng.shuffle(found)
+        detected = [
+            (i, label, float(rng.uniform(0.3, 1)), encode(mask))
+            for i, (label, mask) in enumerate(found)
+        ]
+        return millimetres, person, detected
+
+    def _draw(self, t: int, c: int, lens, camera_from_master):
+        """Depth (H, W) and which body (H, W): 0 object, 1 post, 2 floor, -1 nothing."""
+        post = trimesh.creation.cylinder(radius=0.14, height=1.7, sections=24)
+        floor = trimesh.creation.box((5, 5, 0.02))
+        in_room = camera_from_master @ self.master_from_room
+        at_post = in_room @ rigid(np.eye(3), np.array([-0.12, 0.0, 0.85]))
+        at_floor = in_room @ rigid(np.eye(3), np.array([0, 0, -0.02]))
+        exposed = self.pose_at(t + FPS * self.time_offset[c])
+        object_pose = camera_from_master @ exposed
+        if t in self.hidden:
+            object_pose = camera_from_master @ rigid(np.eye(3), np.array([0, 0, 50.0]))
+        image = render_scene(
+            [
+                Drawable(self.mesh.vertices, self.mesh.faces, object_pose),
+                Drawable(np.asarray(post.vertices), np.asarray(post.faces), at_post),
+                Drawable(*_tiles(floor), at_floor),
+            ],
+            lens,
+        )
+        depth = np.zeros((lens.height, lens.width), np.float32)
+        body = np.full((lens.height, lens.width), -1, np.int16)
+        depth[image.window], body[image.window] = image.depth, image.body
+        return depth, body
+
+    def write(self, folder: Path) -> dict[str, Path]:
+        """The artefacts that the stage reads: frames, scene, detections, person."""
+        count, cameras = len(self.poses), len(self.rig)
+        images = [[self.image(t, c) for c in range(cameras)] for t in range(count)]
+        names = list(self.rig.names)
+        models = self.rig.datasets()
+        extrinsics = self.rig.master_from_colour
+        times = self.times
+        paths = {
+            stage: folder / f"{stage}.h5" for stage in ("frames", "scene", "detections", "person")
+        }
+        index = np.tile(np.arange(count)[:, None], (1, cameras))
+        with artefacts.write(paths["frames"], FRAMES, sequence="glide", master="k1", fps=FPS) as w:
+            for key, value in models.items():
+                w.put(key, value)
+            w.put("master_from_colour", extrinsics)
+            w.put("gravity", np.full((cameras, 3), np.nan))
+            for key in ("present", "truncated"):
+                w.put(key, np.full(cameras, key == "present"))
+            w.put("note", [""] * cameras)
+            w.put("times", times)
+            w.put("dropped", np.zeros(count, bool))
+            w.put("colour_index", np.full((count, cameras), -1))
+            w.put("depth_index", index)
+            w.put("skew", np.zeros((count, cameras)))
+            for c, name in enumerate(names):
+                w.put(f"cameras/{name}/colour", np.zeros(0, np.uint8))
+                w.put(f"cameras/{name}/colour_offsets", np.zeros(1, np.int64))
+                w.put(f"cameras/{name}/colour_time", np.zeros(0, np.int64))
+                w.put(f"cameras/{name}/depth", np.stack([images[t][c][0] for t in range(count)]))
+                w.put(f"cameras/{name}/depth_time", np.arange(count, dtype=np.int64))
+        up = invert(self.master_from_room)
+        with artefacts.write(
+            paths["scene"],
+            SCENE,
+            sequence="glide",
+            master="k1",
+            fps=FPS,
+            extrinsics_refined=False,
+            extrinsics_converged=False,
+            verdict="",
+            ground_found=True,
+            ground_source="fitted",
+            ground_rms=0.0,
+            ground_inliers=100,
+        ) as w:
+            for key, value in models.items():
+                w.put(key, value)
+            for key in ("master_from_colour", "master_from_colour_start"):
+                w.put(key, extrinsics)
+            w.put("present", np.ones(cameras, bool))
+            w.put("times", times)
+            w.put("depth_bias", np.zeros(cameras))
+            w.put("pairs", np.zeros((0, 2), np.int32))
+            w.put("note", [""] * cameras)
+            for key in SCENE.fields:
+                if key.startswith("pair_"):
+                    w.put(key, np.zeros(0, int))
+            w.put("time_offset", self.time_offset[:cameras])
+            w.put("time_offset_sigma", np.full(cameras, np.nan))
+            w.put("slip", np.zeros((count, cameras), np.int32))
+            w.put("image_of", index)
+            w.put("ground_point", self.master_from_room[:3, 3])
+            w.put("ground_normal", self.master_from_room[:3, 2])
+            w.put("zup_from_master", up)
+            for name in names:
+                shape = (DEPTH_LENS.height, DEPTH_LENS.width)
+                w.put(f"cameras/{name}/background", np.zeros(shape, np.uint16))
+        with artefacts.write(paths["detections"], DETECTIONS, sequence="glide") as w:
+            w.put("camera_names", names)
+            w.put("colour_size", models["colour_size"])
+            w.put("note", [""] * cameras)
+            w.put("keypoints_found", np.zeros((count, cameras), bool))
+            w.put("candidates_found", np.ones((count, cameras), bool))
+            for c, name in enumerate(names):
+                found = [images[t][c][2] for t in range(count)]
+                flat = [candidate for frame in found for candidate in frame]
+                offsets, rle = pack_ragged([candidate[3] for candidate in flat])
+                group = f"cameras/{name}"
+                w.put(f"{group}/people_offsets", np.zeros(count + 1, np.int64))
+                w.put(f"{group}/people", np.zeros((0, 135, 3)))
+                starts = np.concatenate([[0], np.cumsum([len(frame) for frame in found])])
+                w.put(f"{group}/candidate_offsets", starts)
+                w.put(f"{group}/candidate_labels", [candidate[1] for candidate in flat])
+                w.put(f"{group}/candidate_scores", [candidate[2] for candidate in flat])
+                w.put(f"{group}/candidate_boxes", np.zeros((len(flat), 4)))
+                w.put(f"{group}/rle_offsets", offsets)
+                w.put(f"{group}/rle", rle)
+        offsets, rle = pack_ragged([images[t][c][1] for t in range(count) for c in range(cameras)])
+        shape = (count, cameras, 135)
+        with artefacts.write(paths["person"], PERSON, sequence="glide", images_alone=False) as w:
+            w.put("camera_names", names)
+            w.put("person", np.zeros((count, cameras), np.int32))
+            w.put("keypoints", np.zeros((*shape, 3)))
+            w.put("joints", np.full((count, 135, 3), np.nan))
+            w.put("joint_views", np.zeros((count, 135), np.int8))
+            w.put("joint_error", np.full((count, 135), np.nan))
+            w.put("inlier", np.zeros(shape, bool))
+            w.put("missing", np.zeros(count, bool))
+            w.put("mask_offsets", offsets)
+            w.put("mask_rle", rle)
+            w.put("mask_source", np.ones((count, cameras), np.int8))
+        return paths
+
+
+def _tiles(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces with short edges: a face that reaches behind a camera is not drawn."""
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, 0.5)
+    return np.asarray(vertices), np.asarray(faces)

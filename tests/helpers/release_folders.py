@@ -1,0 +1,150 @@
+"""Writers of the InterCap release's and BEHAVE's folders, from a rig and its images.
+
+Colour is a JPEG as it is, depth (H, W) uint16 on the colour grid, millimetres; None = no file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import invert
+from intercap_core.capture.frames import Frames
+from tests.helpers.aligned_depth import depth_on_colour
+
+Colour = Callable[[int, int], bytes | None]  # of set t and camera c
+Depth = Callable[[int, int], np.ndarray | None]
+
+
+def write_intercap(
+    root: Path,
+    rig: Rig,
+    *,
+    numbers: Iterable[int],
+    colour: Colour,
+    depth: Depth,
+    sequence: str = "01/03/Seg_1",
+    calibration: str = "calibration_first",
+) -> tuple[Path, Path]:
+    """Write one sequence under ``root``; returns the folders of recordings and of calibration.
+
+    ``colour`` and ``depth`` are asked for each frame number and camera index.
+    """
+    recordings = root / "RGBD_Images" / sequence
+    for c in range(len(rig)):
+        folder = recordings / f"Frames_Cam{c + 1}"
+        (folder / "color").mkdir(parents=True, exist_ok=True)
+        (folder / "depth").mkdir(exist_ok=True)
+        for number in numbers:
+            _write(folder / "color" / f"{number:05d}.jpg", colour(number, c))
+            _write(folder / "depth" / f"{number:05d}.png", _png(depth(number, c)))
+    folder = root / "Data" / calibration
+    folder.mkdir(parents=True, exist_ok=True)
+    for c, camera in enumerate(rig):
+        lens, camera_from_world = camera.colour, camera.colour_from_master
+        content = {
+            "f": [lens.fx, lens.fy],
+            "c": [lens.cx, lens.cy],
+            "k": lens.distortion.tolist(),
+            "R": cv2.Rodrigues(camera_from_world[:3, :3])[0].ravel().tolist(),
+            "T": camera_from_world[:3, 3].tolist(),
+        }
+        name = f"Color_{c + 1}.json" if c else "Color.json"
+        (folder / name).write_text(json.dumps(content))
+    return recordings, folder
+
+
+def write_behave(
+    root: Path,
+    rig: Rig,
+    *,
+    times: Iterable[str],
+    colour: Colour,
+    depth: Depth,
+    sequence: str = "Date03_Sub03_chairwood_hand",
+) -> tuple[Path, Path]:
+    """Write one sequence under ``root``; camera c of the rig is Kinect c, the world is Kinect 1's.
+
+    ``times`` are the texts in the names of the frame folders, such as "0003.000".
+    """
+    recordings = root / "sequences" / sequence
+    for t, text in enumerate(times):
+        folder = recordings / f"t{text}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for c in range(len(rig)):
+            _write(folder / f"k{c}.color.jpg", colour(t, c))
+            _write(folder / f"k{c}.depth.png", _png(depth(t, c)))
+    config = root / "calibs" / sequence.partition("_")[0] / "config"
+    for c, camera in enumerate(rig):
+        local_to_world = invert(rig[1].master_from_colour) @ camera.master_from_colour
+        (config / str(c)).mkdir(parents=True, exist_ok=True)
+        pose = {
+            "rotation": local_to_world[:3, :3].ravel().tolist(),
+            "translation": local_to_world[:3, 3].tolist(),
+        }
+        (config / str(c) / "config.json").write_text(json.dumps(pose))
+        lens = root / "calibs" / "intrinsics" / str(c) / "calibration.json"
+        lens.parent.mkdir(parents=True, exist_ok=True)
+        lens.write_text(json.dumps({"color": behave_lens(camera.colour)}))
+    info = {
+        "config": f"../../calibs/{config.parent.name}/config",
+        "intrinsic": "../../calibs/intrinsics",
+        "cat": sequence.split("_")[2],
+        "gender": "male",
+        "empty": None,
+        "kinects": list(range(len(rig))),
+    }
+    (recordings / "info.json").write_text(json.dumps(info))
+    return recordings, config
+
+
+def behave_lens(lens: Intrinsics) -> dict[str, object]:
+    """The colour part of ``calibration.json``."""
+    pinhole = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    opencv = [*pinhole.values(), *lens.distortion.tolist()]
+    return {"width": lens.width, "height": lens.height, **pinhole, "opencv": opencv}
+
+
+def convert_frames(
+    frames: Frames, root: Path, layout: str, sets: Iterable[int]
+) -> tuple[Path, Path]:
+    """Write frame sets of any capture as ``layout`` has them, depth on the colour grid.
+
+    Frame set t becomes InterCap's frame t, and BEHAVE's moment of t seconds; BEHAVE's Kinect 1 is
+    the second camera. Returns the folders of recordings and of calibration.
+    """
+    chosen = list(sets)
+
+    def depth(t: int, c: int) -> np.ndarray | None:
+        image = frames.depth(t, c)
+        return None if image is None else depth_on_colour(image, frames.rig[c])
+
+    if layout == "intercap":
+        return write_intercap(
+            root, frames.rig, numbers=chosen, colour=frames.colour_jpeg, depth=depth
+        )
+    return write_behave(
+        root,
+        frames.rig,
+        times=[f"{t:04d}.000" for t in chosen],
+        colour=lambda index, c: frames.colour_jpeg(chosen[index], c),
+        depth=lambda index, c: depth(chosen[index], c),
+    )
+
+
+def _png(depth: np.ndarray | None) -> bytes | None:
+    if depth is None:
+        return None
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    return cv2.imencode(".png", depth, fast)[1].tobytes()
+
+
+def _write(path: Path, content: bytes | None) -> None:
+    if content is not None:
+        path.write_bytes(content)

@@ -1,0 +1,227 @@
+"""The joint energy on a small scene: a body, a box, a floor."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core.body.model import BodyModel
+from intercap_core.config import JointSettings
+from intercap_core.contact.patches import contact_patches
+from intercap_core.energy import smoothness
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.minimise import minimise
+from intercap_core.joint.object_data import TrackedPoses
+from intercap_core.joint.problem import Ground, Problem
+from intercap_core.joint.state import BODY, SIZE, State
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.pose_interpolation import bridge_poses
+from intercap_core.rigid.symmetry import SymmetryGroup
+from intercap_core.schemas import CONTACT_REGIONS
+
+FRAMES = 5
+LEFT_HAND = CONTACT_REGIONS.index("left_hand")
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return BodyModel.load()
+
+
+@pytest.fixture(scope="module")
+def box() -> ObjectMesh:
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    return ObjectMesh(
+        name="box",
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces, np.int32),
+        contact_vertices=np.arange(8),
+        symmetry=SymmetryGroup.none(),
+        colours=np.zeros((8, 3), np.uint8),
+    )
+
+
+def _hold(state: State, sigma: float):
+    """A data term that holds the body where it started."""
+    start = state.body.copy()
+
+    def add(now: State, out: NormalEquations) -> None:
+        away = now.body - start
+        hessian = np.repeat(np.eye(BODY)[None] / sigma**2, len(now), axis=0)
+        energy = 0.5 * float(np.square(away / sigma).sum())
+        out.add_blocks("body_data", slice(0, BODY), hessian, away / sigma**2, energy)
+
+    return add
+
+
+def _state(model: BodyModel, gap: float) -> State:
+    """Bodies in the T-pose with a box ``gap`` metres below the left palm (y points up here)."""
+    body = np.zeros((FRAMES, BODY))
+    state = State(body, np.zeros(10), np.zeros((FRAMES, 10)), np.tile(np.eye(3), (FRAMES, 1, 1)),
+                  np.zeros((FRAMES, 3)))  # fmt: skip
+    palm = model(state.parameters(model)).vertices[0, model.regions["left_hand"]].numpy()
+    below = palm[palm[:, 1].argmin()] - [0, 0.05 + gap, 0]
+    return State(body, state.betas, state.expression, state.rotation, np.tile(below, (FRAMES, 1)))
+
+
+def _problem(
+    model, box, state, *, data=(), floor=None, touching=(), known=None, start=None, still=False
+) -> Problem:
+    patches = contact_patches(model)
+    probability = np.zeros((len(state), len(CONTACT_REGIONS)))
+    probability[:, list(touching)] = 1
+    return Problem(
+        model=model,
+        mesh=box,
+        field=DistanceField(box.vertices, box.faces),
+        patches=patches,
+        data=data,
+        probability=probability,
+        floor=floor,
+        fps=15.0,
+        settings=JointSettings(),
+        start=start or state,
+        body_known=np.ones(len(state), bool),
+        object_known=np.ones(len(state), bool) if known is None else known,
+        object_still=np.full(len(state) - 1, still),
+    )
+
+
+def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
+    covariance = np.repeat(np.eye(6)[None] * sigma**2, len(state), axis=0)
+    agree = np.zeros_like(lost)
+    return TrackedPoses.from_track(
+        state.rotation, state.translation, covariance, lost, agree, agree,
+        seen=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
+        time_offset=np.zeros(3),
+    )  # fmt: skip
+
+
+def test_tracked_poses_follow_the_views_that_they_rest_on():
+    """Two cameras found to be 2 and 4 ms later than the tracker took them: the pose is 3 ms late,
+    where both see the object."""
+    times = np.arange(6) / 15
+    way = np.outer(times, [1.0, 0.0, 0.5])
+    seen = np.zeros((6, 3), bool)
+    seen[:, 1], seen[:3, 2] = True, True
+    lost = np.arange(6) == 5
+    tracked = TrackedPoses.from_track(
+        np.repeat(np.eye(3)[None], 6, 0), way, np.repeat(np.eye(6)[None], 6, 0), lost, lost,
+        np.zeros(6, bool), seen=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
+    )  # fmt: skip
+    found = tracked.at(np.array([0.0, 0.003, 0.004])).translation - way
+    late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
+    assert found == pytest.approx(-late[:, None] * [1.0, 0.0, 0.5])
+    assert np.array_equal(tracked.at(tracked.time_offset).translation, way)
+
+
+def test_an_object_at_rest_moves_as_one(model, box):
+    """A hand that comes down onto it frame by frame moves it once, in all of them."""
+    state = _state(model, 0.012)
+    tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
+    data = (_hold(state, 0.02), tracked.add)
+    problem = _problem(model, box, state, data=data, still=True)
+    problem.probability[FRAMES // 2 :, LEFT_HAND] = 1
+    found = minimise(problem.equations, state, max_steps=8).state
+    assert np.linalg.norm(found.translation[0] - state.translation[0]) > 0.001
+    assert np.linalg.norm(np.diff(found.translation, axis=0), axis=1).max() < 2e-4
+    turn = found.rotation[1:] @ found.rotation[:-1].transpose(0, 2, 1)
+    assert np.abs(turn - np.eye(3)).max() < np.radians(0.1)
+
+
+def test_contact_closes_a_gap_between_hand_and_object(model, box):
+    state = _state(model, 0.012)
+    tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
+    problem = _problem(
+        model, box, state, data=(_hold(state, 0.02), tracked.add), touching=[LEFT_HAND]
+    )
+    _, near = problem.proximity(state)
+    hand = problem.skin.patch[problem.patches.region == LEFT_HAND]
+    minimum = minimise(problem.equations, state, max_steps=8)
+    _, after = problem.proximity(minimum.state)
+    assert near.distance[:, hand].min() > 0.011
+    assert (np.abs(after.distance[:, hand].min(axis=1)) < 0.004).all()
+
+
+def test_penetration_is_pushed_out(model, box):
+    state = _state(model, -0.012)
+    tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
+    problem = _problem(model, box, state, data=(_hold(state, 0.02), tracked.add))
+    minimum = minimise(problem.equations, state, max_steps=8)
+    _, after = problem.proximity(minimum.state)
+    assert (after.distance.min(axis=1) > -0.006).all()
+
+
+def test_a_floor_carries_the_object(model, box):
+    state = _state(model, 0.5)
+    top = state.translation[0, 1] - 0.05 + 0.03  # the box starts 3 cm deep in the floor
+    floor = Ground(np.array([0, top, 0]), np.array([0, 1.0, 0]))
+    tracked = _tracked(state, 0.05, np.zeros(FRAMES, bool))
+    problem = _problem(model, box, state, data=(_hold(state, 0.001), tracked.add), floor=floor)
+    minimum = minimise(problem.equations, state, max_steps=8)
+    rise = minimum.state.translation[:, 1] - state.translation[:, 1]
+    assert (rise > 0.02).all()
+
+
+def test_a_lost_frame_is_carried_by_its_neighbours(model, box):
+    state = _state(model, 0.5)
+    line = state.translation + np.arange(FRAMES)[:, None] * [0.02, 0, 0]
+    lost = np.arange(FRAMES) == 2
+    good = State(state.body, state.betas, state.expression, state.rotation, line)
+    tracked = _tracked(good, 0.005, lost)
+    wrong = line.copy()
+    wrong[2] += [0.1, 0.1, 0]
+    start = State(state.body, state.betas, state.expression, state.rotation, wrong)
+    problem = _problem(model, box, start, data=(_hold(start, 0.01), tracked.add), known=~lost)
+    minimum = minimise(problem.equations, start, max_steps=10)
+    np.testing.assert_allclose(minimum.state.translation[2], line[2], atol=0.004)
+
+
+def test_gradient_is_the_derivative_of_the_energy(model, box):
+    """With weights that do not depend on the state the equations' gradient is exact."""
+    state = _state(model, 0.5)
+    rng = np.random.default_rng(0)
+    moved = state.moved(rng.normal(scale=0.01, size=(FRAMES, SIZE)))
+    settings = JointSettings(body_smoothness=1e-4, object_smoothness=1e-4)
+    tracked = _tracked(state, 1.0, np.zeros(FRAMES, bool))
+    problem = _problem(model, box, moved, data=(_hold(state, 0.1), tracked.add))
+    problem.settings = settings
+    gradient = problem.equations(moved).gradient
+    direction = rng.normal(size=(FRAMES, SIZE))
+    direction /= np.linalg.norm(direction)
+    step = 1e-4
+    numeric = (
+        problem.equations(moved.moved(step * direction)).energy["body_data"]
+        - problem.equations(moved.moved(-step * direction)).energy["body_data"]
+    ) / (2 * step)
+    only = NormalEquations(FRAMES)
+    problem.data[0](moved, only)
+    assert numeric == pytest.approx(float((only.gradient * direction).sum()), rel=1e-4)
+    assert np.isfinite(gradient).all()
+
+
+def test_bridging_takes_the_straight_way():
+    rotation = np.tile(np.eye(3), (5, 1, 1))
+    translation = np.array([[0.0, 0, 0], [9, 9, 9], [9, 9, 9], [0.3, 0, 0], [9, 9, 9]])
+    known = np.array([True, False, False, True, False])
+    _, moved = bridge_poses(rotation, translation, known)
+    np.testing.assert_allclose(moved[:, 0], [0, 0.1, 0.2, 0.3, 0.3])
+
+
+def test_a_passing_pull_does_not_shake_a_steady_track(model, box):
+    """One frame of contact moves the neighbours along instead of kicking its own frame."""
+    state = _state(model, 0.010)
+    tracked = _tracked(state, 0.01, np.zeros(FRAMES, bool))
+    problem = _problem(model, box, state, data=(_hold(state, 0.001), tracked.add))
+    problem.probability[2, LEFT_HAND] = 1
+    moved = minimise(problem.equations, state, max_steps=8).state.translation - state.translation
+    assert np.abs(np.diff(moved, axis=0)).max() < 0.002
+
+
+def test_jitter_is_the_noise_of_a_smooth_motion():
+    rng = np.random.default_rng(5)
+    t = np.arange(200)[:, None, None] / 30
+    smooth = np.concatenate([np.sin(t), np.cos(1.3 * t), t], axis=2)
+    noisy = smooth + rng.normal(scale=0.003, size=smooth.shape)
+    assert smoothness.jitter(noisy, np.ones(200, bool)) == pytest.approx(0.003, rel=0.2)
+    assert smoothness.jitter(smooth, np.ones(200, bool)) < 1e-5

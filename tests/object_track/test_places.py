@@ -1,0 +1,89 @@
+"""Which of two like things is the object, and a start with everything wrong at once."""
+
+import numpy as np
+import pytest
+
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.passes import Tracker
+from intercap_core.object_track.places import Places, Standing
+from intercap_core.rigid.mesh import ObjectMesh
+from tests.helpers.harsh_capture import FPS, HarshCapture
+from tests.rigid.conftest import catalogue
+
+HANDLED, APART = np.array([0.0, 0.0, 2.0]), np.array([1.2, 0.0, 2.5])
+
+
+@pytest.fixture(scope="module")
+def bottle() -> ObjectMesh:
+    return ObjectMesh.load(catalogue()["bottle"])
+
+
+def _joints(place: np.ndarray, count: int) -> np.ndarray:
+    joints = np.full((count, 135, 3), np.nan)
+    joints[:, :25] = place + np.array([0.0, 0.0, 0.05])
+    return joints
+
+
+def test_what_the_person_is_at_or_what_left_is_the_object(bottle):
+    standing = [Standing(HANDLED, 1.0), Standing(APART, 1.0)]
+    places = Places(bottle, standing, _joints(HANDLED, 20))
+    assert places.worth(3, HANDLED) == 1.0 and places.worth(3, APART) == 0.1
+    elsewhere = np.array([-1.0, 0.0, 3.0])
+    assert 0.1 < places.worth(3, elsewhere) < 1.0  # something new there moves
+    left = Places(bottle, [Standing(HANDLED, 1.0), Standing(APART, 0.4)], None)
+    assert left.worth(3, APART) > left.worth(3, HANDLED)
+    places.claim(APART)
+    assert places.worth(3, APART) > 0.5
+
+
+def test_a_brief_visit_is_not_being_handled(bottle):
+    joints = _joints(HANDLED, 40)
+    joints[:2, :25] = APART
+    places = Places(bottle, [Standing(APART, 1.0)], joints)
+    assert places.worth(3, APART) == 0.1
+
+
+def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
+    twin = Standing(APART, 0.8, frozenset({8, 12, 16}))
+    places = Places(bottle, [twin], _joints(APART, 20))  # the person walks past it
+    assert places.worth(3, APART) == 1.0
+    places.tracked(8, HANDLED)
+    places.tracked(9, HANDLED)  # nobody looked at what stands where in this frame
+    places.tracked(12, APART + 0.01)  # the object itself
+    assert places.worth(3, APART) == 1.0
+    places.tracked(16, HANDLED)
+    assert places.worth(3, APART) == 0.1
+
+
+@pytest.mark.parametrize("name", ["tennis_racquet"])
+def test_starts_by_itself_beside_a_twin_with_all_that_detectors_do_wrong(name):
+    entry = catalogue()[name]
+    mesh = ObjectMesh.load(entry)
+    capture = HarshCapture(mesh, 4, label=entry.labels[0], still=0.2)
+    images = [capture.views(t) for t in range(capture.count)]
+    labels = [[[c.label for c in view.candidates] for view in views] for views in images]
+    up = capture.master_from_room[:3, 2]
+
+    def tracker(joints):
+        return Tracker(
+            mesh.simplified(600), images.__getitem__, labels, ObjectTrackSettings(),
+            times=np.arange(capture.count) / FPS, labels=entry.labels, up=up, joints=joints,
+        )  # fmt: skip
+
+    for frame, true in zip(tracker(capture.joints).run().frames, capture.poses, strict=True):
+        pose = frame.fit.pose
+        assert not frame.lost
+        assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.02
+        assert mesh.symmetry.rotation_error_deg(pose[:3, :3], true[:3, :3]) < 10
+
+
+def test_frames_with_something_that_moves_are_searched_first(bottle):
+    capture = HarshCapture(bottle, 3, label="bottle", missed=(1.0, 1.0))
+    observer = Observer(
+        bottle, capture.views, [[[]] * 6] * 3, ObjectTrackSettings(), ("bottle",),
+        joints=capture.joints,
+    )  # fmt: skip
+    assert sorted(observer.frames_to_search()) == [0, 1, 2]
+    worth = [worth for _, worth in observer.places._standing]
+    assert worth and max(worth) < 0.5, "only the twin is seen, and nobody is there"

@@ -1,0 +1,192 @@
+"""The track over all frames: smoothing, rest and turns on evidence that is made up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track.rest import resting
+from intercap_core.object_track.smooth import Looks, smooth
+from intercap_core.object_track.turns import choose_turns
+from intercap_core.rigid.twist import moved
+
+SIGMA = np.repeat([np.radians(1.0), 0.003], 3)
+CENTRE = np.array([0.02, -0.01, 0.05])
+FPS = 15.0
+
+
+def looks_at(poses: np.ndarray, sigma: np.ndarray = SIGMA, seed: int = 0) -> Looks:
+    """Independent honest looks at poses (T, 4, 4), each taken somewhere near the truth."""
+    rng = np.random.default_rng(seed)
+    information = np.tile(np.diag(sigma**-2.0), (len(poses), 1, 1))
+    beside = rng.normal(size=(len(poses), 6)) * SIGMA
+    noise = rng.normal(size=(len(poses), 6)) * sigma
+    # the minimum lies at the truth + noise, seen from beside the truth
+    gradient = np.einsum("tij,tj->ti", information, beside - noise)
+    return Looks(moved(poses, beside), information, gradient)
+
+
+def lifted(count: int, starts: int, stops: int) -> np.ndarray:
+    """Poses (T, 4, 4) at rest until a smooth lift of 40 cm and 60 degrees, then at rest again."""
+    done = np.clip((np.arange(count) - starts) / (stops - starts), 0, 1)
+    done = done**2 * (3 - 2 * done)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    turn = np.radians(60) * done[:, None] * np.array([0, 0.6, 0.8])
+    poses[:, :3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    poses[:, :3, 3] = np.array([0.3, 0.1, 2.0]) + done[:, None] * np.array([0.0, -0.4, 0.0])
+    return poses
+
+
+def shift(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distance (T,) of the object's centre from the truth, metres."""
+    offset = (found[:, :3, :3] - true[:, :3, :3]) @ CENTRE + found[:, :3, 3] - true[:, :3, 3]
+    return np.linalg.norm(offset, axis=1)
+
+
+def test_smoothing_helps_and_knows_how_sure_it_is() -> None:
+    true = lifted(60, 5, 55)
+    times = np.arange(60) / 30.0
+    looks = looks_at(true)
+    found, covariance = smooth(looks, looks.poses, np.arange(60), times, CENTRE)
+    alone = moved(looks.poses, looks.own)
+    assert shift(found, true).mean() < 0.7 * shift(alone, true).mean()
+    error = found[:, :3, 3] - true[:, :3, 3]
+    solved = np.linalg.solve(covariance[:, 3:, 3:], error[..., None])[..., 0]
+    assert 0.6 < np.einsum("ti,ti->t", error, solved).mean() / 3 < 1.7
+
+
+def test_frames_without_evidence_are_bridged_and_unsure() -> None:
+    true = lifted(45, 5, 40)
+    looks = looks_at(true)
+    looks.information[20:24], looks.gradient[20:24] = 0, 0
+    looks.poses[20:24] = looks.poses[19]
+    start = looks.poses.copy()
+    found, covariance = smooth(looks, start, np.arange(45), np.arange(45) / FPS, CENTRE)
+    assert shift(found, true)[20:24].max() < 0.03
+    sigma = np.sqrt(covariance[:, 3, 3])
+    assert sigma[21:23].min() > 3 * sigma[10]
+
+
+def test_one_wrong_frame_does_not_drag_its_neighbours() -> None:
+    true = lifted(45, 5, 40)
+    looks = looks_at(true)
+    looks.poses[20, :3, 3] += 0.15
+    found, _ = smooth(looks, looks.poses, np.arange(45), np.arange(45) / FPS, CENTRE)
+    assert shift(found, true).max() < 0.03
+
+
+@pytest.mark.parametrize("leap", [0.25, 0.6])
+def test_a_leap_between_two_places_does_not_drag_what_is_sure(leap: float) -> None:
+    true = np.tile(np.eye(4), (20, 1, 1))
+    true[:, 2, 3] = 2.0
+    true[8:12, 0, 3] = leap  # wrong, then a frame that saw nothing, then right
+    looks = looks_at(true)
+    looks.information[11], looks.gradient[11] = 0, 0
+    start = looks.poses.copy()
+    start[11, 0, 3] = leap / 2
+    found, _ = smooth(looks, start, np.arange(20), np.arange(20) / FPS, CENTRE)
+    assert np.delete(shift(found, true), 11).max() < 0.02
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_short_recordings(count: int) -> None:
+    true = lifted(10, 8, 9)[:count]
+    looks = looks_at(true)
+    times = np.arange(count) / FPS
+    segment = resting(looks, times, CENTRE)
+    found, covariance = smooth(looks, looks.poses, np.arange(count), times, CENTRE)
+    assert segment.shape == (count,)
+    assert shift(found, true).max() < 0.015
+    assert np.isfinite(covariance).all()
+
+
+@pytest.mark.parametrize("fps", [15.0, 30.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_rest_is_found_and_left_at_once(fps: float, seed: int) -> None:
+    starts, stops, count = round(1.3 * fps), round(2.2 * fps), round(3.5 * fps)
+    true = lifted(count, starts, stops)
+    looks = looks_at(true, seed=seed)
+    segment = resting(looks, np.arange(count) / fps, CENTRE)
+    assert segment.max() == 1
+    away = shift(true, np.tile(true[:1], (count, 1, 1)))
+    first = np.flatnonzero(segment == 0)
+    assert first[0] == 0 and first[-1] >= starts - 3
+    assert away[first].max() < 0.010  # in motion before it is a centimetre away
+    second = np.flatnonzero(segment == 1)
+    assert second[-1] == count - 1 and second[0] <= stops + 3
+    to_go = shift(true, np.tile(true[-1:], (count, 1, 1)))
+    assert (segment[(away > 0.01) & (to_go > 0.01)] == -1).all()
+
+
+def test_errors_that_last_are_no_motion() -> None:
+    rng = np.random.default_rng(2)
+    true = lifted(60, 58, 59)[:55]
+    looks = looks_at(true)
+    # masks wrong by about one standard deviation for half a second at a time
+    wrong = np.repeat(rng.normal(size=(11, 6)) * SIGMA, 5, axis=0)
+    looks.gradient[:] -= np.einsum("tij,tj->ti", looks.information, wrong)
+    segment = resting(looks, np.arange(55) / FPS, CENTRE)
+    assert (segment == 0).all()
+    found, covariance = smooth(looks, looks.poses, np.zeros(55, int), np.arange(55) / FPS, CENTRE)
+    assert (found == found[0]).all()
+    assert shift(found, true)[0] < 0.003
+    # what lasts does not average out, so a long rest is no surer than a look
+    assert np.sqrt(covariance[0, 3, 3]) > 0.8 * SIGMA[3]
+
+
+def test_a_slow_carry_is_no_rest() -> None:
+    true = lifted(45, 0, 44)
+    true[:, 1, 3] = 0.1 + 0.05 * np.arange(45) / FPS  # five centimetres a second
+    segment = resting(looks_at(true), np.arange(45) / FPS, CENTRE)
+    assert (segment == -1).all()
+
+
+def about_z(degrees: list[float]) -> np.ndarray:
+    turns = np.tile(np.eye(4), (len(degrees), 1, 1))
+    turns[:, :3, :3] = Rotation.from_euler(
+        "z", np.array(degrees)[:, None], degrees=True
+    ).as_matrix()
+    return turns
+
+
+def test_a_turn_is_decided_by_all_frames() -> None:
+    turns = about_z([0, 90, 180, 270])
+    rng = np.random.default_rng(3)
+    scores = 0.7 + 0.02 * rng.normal(size=(20, 4))
+    scores[:, 2] += 0.02  # hardly visible in one frame
+    chosen, probability = choose_turns(scores, turns, np.full(19, 0.2), np.zeros(19, bool))
+    assert (chosen == 2).all()
+    assert np.allclose(probability.sum(1), 1)
+    assert probability[:, 2].min() > 0.9
+    alone, unsure = choose_turns(scores[:1] * 0 + 0.7, turns, np.zeros(0), np.zeros(0, bool))
+    assert alone.shape == (1,) and np.allclose(unsure, 0.25)
+
+
+def test_a_turn_changes_where_the_track_was_lost() -> None:
+    turns = about_z([0, 180])
+    scores = np.full((10, 2), 0.7)
+    scores[:5, 0] += 0.03
+    scores[5:, 1] += 0.03
+    scores[4:6] = np.nan
+    broken = np.zeros(9, bool)
+    whole, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
+    assert len(set(whole)) == 1 or np.diff(whole).nonzero()[0].size == 1
+    broken[4] = True
+    chosen, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
+    assert (chosen[[0, 3, 6, 9]] == [0, 0, 1, 1]).all()
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_a_wrong_frame_does_not_end_a_rest(width: int) -> None:
+    true = lifted(40, 38, 39)[:30]
+    looks = looks_at(true)
+    looks.poses[12 : 12 + width, :3, 3] += [0.1, 0.0, 0.02]
+    segment = resting(looks, np.arange(30) / FPS, CENTRE)
+    assert (segment == 0).all()
+
+
+def test_a_long_rest_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("intercap_core.object_track.rest.MAX_REST", 20)
+    true = lifted(60, 58, 59)[:55]
+    assert (resting(looks_at(true), np.arange(55) / FPS, CENTRE) == 0).all()

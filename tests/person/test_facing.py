@@ -1,0 +1,100 @@
+"""Whole bodies and limbs with left taken for right, in some or in all views."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.person.agreement import agree
+from intercap_core.person.facing import mirrored
+from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swapped
+from intercap_core.person.swaps import triangulate_people
+from tests.helpers.synthetic_capture import ring
+from tests.helpers.synthetic_people import seen_by, stick_person, walking
+
+RIG, UP = ring()
+SETS = 14
+TIMES = np.arange(SETS) / 15
+TRUTH = walking(SETS, np.array([-0.2, 0.1]), np.array([0.01, 0.0]))
+ALL = np.concatenate(LIMBS)
+
+
+@pytest.fixture(scope="module")
+def clean() -> np.ndarray:
+    keypoints = seen_by(TRUTH, RIG, UP)
+    keypoints[..., :2] += np.random.default_rng(0).normal(0, 2, keypoints[..., :2].shape)
+    return keypoints
+
+
+def put_right(damaged: np.ndarray, rig=RIG) -> tuple[np.ndarray, np.ndarray]:
+    fixed, found = triangulate_people(damaged, rig, TIMES, min_confidence=0.3, max_error_px=20)
+    error = found.points.reshape(SETS, 135, 3) - apply(invert(UP), TRUTH.reshape(-1, 3)).reshape(
+        SETS, 135, 3
+    )
+    return fixed, np.linalg.norm(error, axis=2)
+
+
+@pytest.mark.parametrize(
+    ("sets", "views"),
+    [
+        (slice(4, 10), [0, 2, 4]),  # three against three
+        (slice(4, 10), [0, 2, 3, 4]),
+        (slice(4, 10), range(6)),
+        (slice(0, 5), range(6)),  # from the beginning on
+        (slice(0, 11), range(6)),  # most of the time
+    ],
+)
+def test_people_taken_for_their_mirror_image_are_turned_back(clean, sets, views):
+    damaged = clean.copy()
+    for c in views:
+        damaged[sets, c] = swapped(damaged[sets, c])
+    fixed, error = put_right(damaged)
+    np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
+    assert error.max() < 0.03
+
+
+@pytest.mark.parametrize("limb", [LEGS, HANDS], ids=["legs", "hands"])
+def test_a_limb_that_all_views_exchange_is_put_back(clean, limb):
+    damaged = clean.copy()
+    damaged[4:10] = swapped(damaged[4:10], limb)
+    fixed, _ = put_right(damaged)
+    np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
+
+
+def test_two_views_that_contradict_each_other(clean):
+    damaged = np.zeros_like(clean)
+    damaged[:, :2] = clean[:, :2]
+    damaged[4:10, 1] = swapped(damaged[4:10, 1])
+    fixed, _ = put_right(damaged)
+    limbs = np.r_[ARMS, LEGS, HANDS]  # two views cannot tell four points of a head apart
+    np.testing.assert_array_equal(fixed[:, :2][:, :, limbs], clean[:, :2][:, :, limbs])
+
+
+def test_views_that_agree_stay(clean):
+    keypoints = clean.copy()
+    assert not agree(keypoints, RIG, min_confidence=0.3).any()
+    np.testing.assert_array_equal(keypoints, clean)
+    unseen = np.zeros_like(clean)
+    assert not agree(unseen, RIG, min_confidence=0.3).any()
+
+
+def test_a_kneeling_person_does_not_face_backwards():
+    """Feet that point backwards are no contradiction: the shin does too."""
+    body = stick_person()
+    knee = body[[10, 13]].copy()
+    ahead = np.array([1.0, 0, 0])
+    body[[11, 14]] = knee - 0.42 * ahead
+    for heel, big, small, k in ((24, 22, 23, 0), (21, 19, 20, 1)):
+        body[heel] = knee[k] - 0.45 * ahead + [0, 0, 0.03]
+        body[[big, small]] = knee[k] - 0.6 * ahead - [0, 0, 0.08]
+    still = np.repeat(body[None], 3, 0)
+    share = np.zeros((3, 3))
+    assert not mirrored(still, share, np.arange(3) / 15).any()
+    turned = still[:, PARTNER]
+    assert mirrored(turned, share, None).all()
+
+
+def test_nothing_known_is_nothing_decided():
+    assert not mirrored(np.full((4, 135, 3), np.nan), np.zeros((4, 3)), TIMES[:4]).any()
+    assert mirrored(np.zeros((0, 135, 3)), np.zeros((0, 3)), TIMES[:0]).shape == (0, 4)
