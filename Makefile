@@ -1,6 +1,6 @@
 # make demo      three virtual recordings, everything computed, the report's path at the end
 # make test      the whole test suite
-# make lint      ruff, snakefmt, mypy, snakemake --lint
+# make lint      ruff, import-linter, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track and the body's fit, those of config/body to
 #                the latter), tables and results/evaluation.json
@@ -15,7 +15,7 @@ STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
-.PHONY: demo test lint ruff-check ruff-format snakefmt mypy snakemake-lint evaluate bench docs \
+.PHONY: demo test lint ruff-check ruff-format imports snakefmt mypy snakemake-lint evaluate bench docs \
     environment clean
 
 demo: $(STAMP)
@@ -24,13 +24,16 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest
 
-lint: ruff-check ruff-format snakefmt mypy snakemake-lint
+lint: ruff-check ruff-format imports snakefmt mypy snakemake-lint
 
 ruff-check: $(STAMP)
 	$(BIN)/ruff check .
 
 ruff-format: $(STAMP)
 	$(BIN)/ruff format --check .
+
+imports: $(STAMP)
+	$(BIN)/lint-imports
 
 snakefmt: $(STAMP)
 	$(BIN)/snakefmt --check Snakefile workflow

@@ -8,9 +8,10 @@ All rho have rho(0) = 0 and slope 1 at 0, so a scale alone says where a residual
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from numba.extending import register_jitable
 from torch import Tensor
 
 
@@ -33,6 +34,21 @@ def huber(squared: Tensor, scale: float | Tensor) -> Robust:
     root = torch.where(inside, scale, root)
     rho = torch.where(inside, squared, 2 * scale * root - scale * scale)
     return Robust(rho, scale / root)
+
+
+# Of a Gaussian, sigma over the median of absolute deviations: 1 / Phi^-1(3/4) (Hampel 1974).
+SIGMA_PER_MAD = 1.4826
+
+
+@register_jitable
+def geman_mcclure_weight(squared: Any, scale: Any) -> Any:
+    """Weight in (0, 1] of squared residuals: the slope of :func:`geman_mcclure`'s rho.
+
+    ``squared`` (...) and ``scale``^2 are in the same units; tensors, arrays and numbers alike, also
+    inside compiled kernels.
+    """
+    share = scale * scale / (squared + scale * scale)
+    return share * share
 
 
 def geman_mcclure(squared: Tensor, scale: float | Tensor) -> Robust:
