@@ -1,10 +1,10 @@
 """Which body regions touch the object in which frames, from geometry and motion alone.
 
 The paper annotates contact by hand. Here every region has a two-state hidden Markov chain over the
-frames (touching or not). Three things speak for contact: the region is as near as the fits are
-accurate; it moves along with an object that moves; and an object that moves must be held by
-something, so the region that follows it best is believed first. Annotated intervals enter as
-strong evidence whose ends may be some frames off.
+frames (touching or not). Three things are evidence of contact: the region is as near as the fits
+are accurate; it moves along with an object that moves; and an object that moves must be held by
+something, so the region that follows it best is the most likely one. Annotated intervals enter as
+strong evidence whose ends may be some frames off. The result is Q_t of equation 6.
 """
 
 from __future__ import annotations
@@ -15,23 +15,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ANY_REGION, ContactInterval
-
-# Chance for a region to begin or end touching, per second: an interaction of a few seconds has a
-# handful of changes.
-_CHANGES_PER_SECOND = 0.6
-_PRIOR = 0.15  # share of frames that a region touches, before anything is seen
-_FREE_RANGE = 0.40  # a free hand is anywhere within its reach of the object, metres
-# Fit errors last: the evidence of one frame repeats in its neighbours for about this long.
-_CORRELATION_S = 0.2
-_MOVING = 0.12  # an object moves when its surface does so faster than this, m/s
-_SLIP = 0.12  # speed of skin over a held surface that the fits' jitter explains, m/s
-_ANNOTATION_SLACK = 5  # frames by which an annotated end may be off
-_ANNOTATED_LOGIT = 6.0
+from intercap_core.contact.constants import (
+    ANNOTATED_LOGIT,
+    ANNOTATION_SLACK,
+    CHANGES_PER_SECOND,
+    EVIDENCE_CORRELATION_S,
+    FREE_RANGE,
+    HELD_SPEED_FACTOR,
+    HOLDER_LOGIT,
+    HOLDER_REACH,
+    MAX_SLIP_LOGIT,
+    MOVING_SPEED,
+    OUTLIER_PROBABILITY,
+    SLIP_SIGMA,
+    TOUCHING_PRIOR,
+)
 
 
 @dataclass(frozen=True)
 class RegionMotion:
-    """What is known of R regions in T frames.
+    """Observations of R regions in T frames.
 
     ``distance`` (T, R) signed distance of the region's nearest area to the object, metres;
     ``slip`` (T, R) speed of that area relative to the object's surface beside it, m/s;
@@ -54,54 +57,54 @@ def contact_probability(
     (T, R) are further log odds, from :func:`annotation_evidence`.
     """
     evidence = _distance_evidence(motion) + _motion_evidence(motion)
-    evidence = evidence / max(1.0, _CORRELATION_S * fps)
+    evidence = evidence / max(1.0, EVIDENCE_CORRELATION_S * fps)
     evidence += _holder_evidence(motion, evidence, fps)
     return smooth(evidence + given, fps)
 
 
 def _distance_evidence(motion: RegionMotion) -> np.ndarray:
-    """Log odds of the distance: normal around the surface against anywhere within reach.
+    """Log odds (T, R) of the distance: normal about the surface against uniform within reach.
 
-    A region inside the object touches it: depth is error. Where the distance is hardly known, both
-    are equally wide and nothing is learnt.
+    A region inside the object touches it: its depth is error. Where the distance is hardly known,
+    both likelihoods are equally wide and the log odds are near zero.
     """
     distance = np.maximum(motion.distance, 0.0)
-    free = np.log(_FREE_RANGE + np.sqrt(2 * np.pi) * motion.sigma)
+    free = np.log(FREE_RANGE + np.sqrt(2 * np.pi) * motion.sigma)
     touching = -0.5 * np.square(distance / motion.sigma) - np.log(motion.sigma * np.sqrt(2 * np.pi))
     # An error of some millimetres beyond the stated one must not be impossible.
-    return np.logaddexp(touching, np.log(0.01) - free) + free
+    return np.logaddexp(touching, np.log(OUTLIER_PROBABILITY) - free) + free
 
 
 def _motion_evidence(motion: RegionMotion) -> np.ndarray:
-    """Log odds of the slip, in frames where the object moves: half-normal against the spread of
-    velocities that a region unaware of the object would have relative to it."""
-    moving = motion.object_speed > _MOVING
-    spread = np.maximum(motion.object_speed, _MOVING)
-    holding = -0.5 * np.square(motion.slip / _SLIP) - np.log(_SLIP)
+    """Log odds (T, R) of the slip in frames where the object moves: half-normal with the jitter's
+    standard deviation if the region holds the object, with the object's speed if it is free."""
+    moving = motion.object_speed > MOVING_SPEED
+    spread = np.maximum(motion.object_speed, MOVING_SPEED)
+    holding = -0.5 * np.square(motion.slip / SLIP_SIGMA) - np.log(SLIP_SIGMA)
     free = -0.5 * np.square(motion.slip / spread) - np.log(spread)
-    return np.where(moving, np.clip(holding - free, -4.0, 4.0), 0.0)
+    return np.where(moving, np.clip(holding - free, -MAX_SLIP_LOGIT, MAX_SLIP_LOGIT), 0.0)
 
 
 def _holder_evidence(motion: RegionMotion, evidence: np.ndarray, fps: float) -> np.ndarray:
-    """An object that moves is moved by something: raise the best candidate within reach."""
+    """Log odds (T, R) that a moving object adds to the most likely holder within reach."""
     out = np.zeros_like(evidence)
-    moving = motion.object_speed.max(axis=1) > 2 * _MOVING
-    reachable = motion.distance < 4 * motion.sigma
+    moving = motion.object_speed.max(axis=1) > HELD_SPEED_FACTOR * MOVING_SPEED
+    reachable = motion.distance < HOLDER_REACH * motion.sigma
     score = np.where(reachable, evidence, -np.inf)
     best = score.argmax(axis=1)
     frames = np.flatnonzero(moving & reachable.any(axis=1))
-    out[frames, best[frames]] = 2.0 / max(1.0, _CORRELATION_S * fps)
+    out[frames, best[frames]] = HOLDER_LOGIT / max(1.0, EVIDENCE_CORRELATION_S * fps)
     return out
 
 
 def smooth(evidence: np.ndarray, fps: float) -> np.ndarray:
     """Posterior (T, R) of two-state Markov chains given log odds ``evidence`` (T, R) by frame."""
-    change = min(0.5, _CHANGES_PER_SECOND / fps)
-    begin, end = 2 * change * _PRIOR, 2 * change * (1 - _PRIOR)
+    change = min(0.5, CHANGES_PER_SECOND / fps)
+    begin, end = 2 * change * TOUCHING_PRIOR, 2 * change * (1 - TOUCHING_PRIOR)
     transition = np.log(np.array([[1 - begin, begin], [end, 1 - end]]))
     frames, regions = evidence.shape
     emission = np.stack([np.zeros_like(evidence), evidence], axis=2)  # (T, R, 2)
-    start = np.log(np.array([1 - _PRIOR, _PRIOR]))
+    start = np.log(np.array([1 - TOUCHING_PRIOR, TOUCHING_PRIOR]))
     forward = np.empty((frames, regions, 2))
     forward[0] = start + emission[0]
     for t in range(1, frames):
@@ -119,10 +122,10 @@ def annotation_evidence(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log odds (T, R) that annotated intervals add, and the labels (T, R) int8 they state.
 
-    Regions named by no interval are annotated as free throughout: who annotates a sequence's
-    contact annotates all of it. While some part touches that is not named, regions have no label
-    (-1) and no evidence unless they are named as well. Towards an interval's ends the evidence
-    fades to nothing over the frames by which people err.
+    Regions that no interval names are annotated as free throughout: a sequence's contact is
+    annotated as a whole. While some unnamed part touches (``any``), regions have no label (-1) and
+    no evidence unless they are named as well. Towards an interval's ends the evidence fades to
+    zero over the frames by which annotators err.
     """
     labels = np.zeros((frames, len(regions)), np.int8)
     for interval in sorted(intervals, key=lambda interval: interval.part != ANY_REGION):
@@ -140,7 +143,7 @@ def annotation_evidence(
             if len(changes)
             else np.full(frames, np.inf)
         )
-        certainty = np.clip(nearest / _ANNOTATION_SLACK, 0.0, 1.0)
+        certainty = np.clip(nearest / ANNOTATION_SLACK, 0.0, 1.0)
         sign = np.choose(labels[:, r] + 1, (0.0, -1.0, 1.0))
-        evidence[:, r] = sign * certainty * _ANNOTATED_LOGIT
+        evidence[:, r] = sign * certainty * ANNOTATED_LOGIT
     return evidence, labels

@@ -1,15 +1,13 @@
-"""What contact detection looks at: how near each region is and how it moves with the object."""
+"""The observations of contact detection: each region's distance to the object and its slip."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.contact.constants import MIN_DISTANCE_SIGMA, NEAREST_VERTICES
 from intercap_core.contact.detect import RegionMotion
 from intercap_core.contact.patches import Patches
 from intercap_core.energy.proximity import Proximity
-
-_NEAREST = 6  # vertices that make up a region's nearest area
-_MIN_SIGMA = 0.008  # skin, clothing and the two meshes: never surer than this, metres
 
 
 def region_motion(
@@ -36,21 +34,21 @@ def region_motion(
     distance, slip, speed, sigma = (np.zeros((frames, regions)) for _ in range(4))
     for r in range(regions):
         members = np.flatnonzero(patches.region == r)
-        order = np.argsort(near.distance[:, members], axis=1, kind="stable")[:, :_NEAREST]
+        order = np.argsort(near.distance[:, members], axis=1, kind="stable")[:, :NEAREST_VERTICES]
         nearest = members[order]  # (T, k)
         rows = np.arange(frames)[:, None]
         distance[:, r] = near.distance[rows, nearest].mean(axis=1)
         slip[:, r] = skin_speed[rows, nearest].mean(axis=1)
         speed[:, r] = surface_speed[rows, nearest].mean(axis=1)
         joint = joint_sigma[rows, patches.joint[nearest]].mean(axis=1)
-        sigma[:, r] = np.sqrt(joint**2 + object_sigma**2 + _MIN_SIGMA**2)
+        sigma[:, r] = np.sqrt(joint**2 + object_sigma**2 + MIN_DISTANCE_SIGMA**2)
     return RegionMotion(distance, slip, speed, sigma)
 
 
 def _speed_over_object(
     points: np.ndarray, rotation: np.ndarray, translation: np.ndarray, fps: float
 ) -> np.ndarray:
-    """Speed (T, N) of points (T, N, 3) as the object sees them."""
+    """Speed (T, N) of points (T, N, 3) in the object's frame, m/s."""
     local = np.einsum("tji,tnj->tni", rotation, points - translation[:, None])
     return np.linalg.norm(_derivative(local, fps), axis=2)
 
@@ -58,7 +56,7 @@ def _speed_over_object(
 def _rigid_speed(
     surface: np.ndarray, rotation: np.ndarray, translation: np.ndarray, fps: float
 ) -> np.ndarray:
-    """Speed (T, N) of the object's surface points (T, N, 3), each carried by the object."""
+    """Speed (T, N) of the object's surface points (T, N, 3), moving rigidly with it, m/s."""
     local = np.einsum("tji,tnj->tni", rotation, surface - translation[:, None])
     turn, shift = _derivative(rotation, fps), _derivative(translation, fps)
     velocity = np.einsum("tij,tnj->tni", turn, local) + shift[:, None]

@@ -1,4 +1,4 @@
-"""The body's likely-contact vertices, thinned and cut into patches that touch as one."""
+"""The body's likely-contact vertices (H of the appendix), subsampled and cut into patches."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.model import BodyModel
+from intercap_core.contact.constants import HAND_VERTICES, OTHER_VERTICES
 from intercap_core.schemas import CONTACT_REGIONS
 
-# Vertices kept of each region: fingers are thin and wrap around things, the rest is smooth.
-_HAND_VERTICES = 240
-_OTHER_VERTICES = 60
 _FIRST_FINGER_JOINT = 25  # joints 25-39 are the left hand's, 40-54 the right's, three a finger
 _PALM = -1
 
@@ -33,17 +31,17 @@ class Patches:
 def contact_patches(model: BodyModel) -> Patches:
     """Cut every region of ``CONTACT_REGIONS``: hands into palm and fingers, others are whole."""
     template = model.template.cpu().numpy()
-    driver = model.skinning_weights.cpu().numpy().argmax(axis=1)
+    joint_of = model.skinning_weights.cpu().numpy().argmax(axis=1)
     region_of_patch: list[int] = []
     vertices, region, patch, share = [], [], [], []
     for r, name in enumerate(CONTACT_REGIONS):
         ids = np.asarray(model.regions[name])
         hand = name.endswith("_hand")
-        kept = ids[farthest_points(template[ids], _HAND_VERTICES if hand else _OTHER_VERTICES)]
+        kept = ids[farthest_points(template[ids], HAND_VERTICES if hand else OTHER_VERTICES)]
         part = np.full(len(kept), _PALM)
         if hand:
-            finger = driver[kept] >= _FIRST_FINGER_JOINT
-            part[finger] = (driver[kept][finger] - _FIRST_FINGER_JOINT) // 3
+            finger = joint_of[kept] >= _FIRST_FINGER_JOINT
+            part[finger] = (joint_of[kept][finger] - _FIRST_FINGER_JOINT) // 3
         for value in np.unique(part):
             members = kept[part == value]
             vertices.append(members)
@@ -57,7 +55,7 @@ def contact_patches(model: BodyModel) -> Patches:
         region=np.concatenate(region),
         patch=np.concatenate(patch),
         region_of_patch=np.array(region_of_patch),
-        joint=driver[ids],
+        joint=joint_of[ids],
         share=np.concatenate(share),
     )
 

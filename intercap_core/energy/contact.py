@@ -1,10 +1,16 @@
-"""Contact term E_C of equation 6 and the appendix: body areas that touch are drawn to the object.
+"""Contact term E_C of equation 6 (A.4): body areas that touch are drawn to the object.
 
-E_C = CD(H(W(body)), H'(W'(object))): the distances between the body's likely-contact vertices and
-the closest points of the object. Here each region is cut into patches (a palm, each finger, a
-sole): the nearest patches carry the weight, within a patch the nearest vertices, and a patch that
-is far gives up (Geman-McClure), so that a hand holding a handle with three fingers does not drag
-the other two along. The paper's gate Q_t is the probability that the region touches.
+    E_C = CD( H(W(body)), H'(W'(object)) )
+
+CD is the Chamfer distance between H, the body's likely-contact vertices, and H', their closest
+points on the object: the signed distances of :mod:`.proximity`. Equation 6 weighs it by the binary
+Q_t, which is the probability that a region touches here, and adds an E_C without Q_t, which is left
+out: a body that does not touch is not drawn to the object.
+
+Beyond the paper each region is cut into patches (a palm, each finger, a sole). The nearest patches
+carry the weight, within a patch the nearest vertices, and a patch that is far is an outlier
+(Geman-McClure), so that a hand holding a handle with three fingers does not drag the other two
+along.
 """
 
 from __future__ import annotations
@@ -13,13 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# A vertex counts in its patch, and a patch in its region, by how much farther it is than the
-# nearest: skin yields and meshes are some millimetres wrong, so contact is an area of this depth.
-SOFTNESS = 0.006
-# A patch farther than this gives up: the accuracy that keypoints and depth leave to a hand.
-REACH = 0.02
-# Nearer than this is contact and pulls no more: half the distance at which datasets call it so.
-TOLERANCE = 0.002
+from intercap_core.energy.constants import (
+    CONTACT_OUTLIER,
+    CONTACT_SOFTNESS,
+    CONTACT_TOLERANCE,
+)
+from intercap_core.solve.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True)
@@ -59,19 +64,20 @@ def term(
     ``distance`` (T, N) signed distances to the object, metres; ``probability`` (T, P) that each
     patch's region touches. One patch in one frame has the energy q rho(s) / 2, with q probability
     times gate, s the mean square residual over the patch's area and Geman-McClure's
-    rho(s) = R^2 s / (R^2 + s), R = ``REACH``; its weights are q rho'(s) spread over that area.
+    rho(s) = R^2 s / (R^2 + s), R = ``CONTACT_OUTLIER``; its weights are q rho'(s) spread over that
+    area.
     """
-    residual = np.sign(distance) * np.maximum(np.abs(distance) - TOLERANCE, 0.0)
+    residual = np.sign(distance) * np.maximum(np.abs(distance) - CONTACT_TOLERANCE, 0.0)
     square = np.zeros_like(probability)
     contribution = spread.area * np.square(residual)
     for patch in range(probability.shape[1]):
         square[:, patch] = contribution[:, patch_of == patch].sum(axis=1)
     gate = probability * spread.gate
-    robust = REACH**2 / (REACH**2 + square)
-    weight = spread.area * (gate * robust**2)[:, patch_of]
-    return residual, weight, 0.5 * float((gate * square * robust).sum())
+    weight = spread.area * (gate * geman_mcclure_weight(square, CONTACT_OUTLIER))[:, patch_of]
+    rho = CONTACT_OUTLIER**2 / (CONTACT_OUTLIER**2 + square)  # over the square
+    return residual, weight, 0.5 * float((gate * square * rho).sum())
 
 
-def _closeness(away: np.ndarray) -> np.ndarray:
-    """1 for what is nearest, falling off over ``SOFTNESS``."""
-    return np.exp(-np.square(away / SOFTNESS) / 2)
+def _closeness(farther: np.ndarray) -> np.ndarray:
+    """1 at the nearest, falling off with metres ``farther`` over ``CONTACT_SOFTNESS``."""
+    return np.exp(-np.square(farther / CONTACT_SOFTNESS) / 2)

@@ -1,7 +1,9 @@
-"""Ground support E_G and E_G' of the appendix: nothing sinks into the floor.
+"""Ground support E_G and E_G' of equation 6 (A.5, A.6): nothing sinks into the floor.
 
-|| RL(n . (p - W)) ||^2 over the vertices W of the body and of the object, with p a point of the
-floor, n its upward normal and RL the rectifier.
+    E_G = sum over vertices W of the body of || RL(n . (p - W)) ||^2
+    E_G' = sum over vertices W' of the object of || RL(n . (p - W')) ||^2
+
+with p a point of the floor, n its upward normal and RL the rectifier max(0, x).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Signed distances of body points to the moving object, and how they change: shared by the
-contact and penetration terms.
+"""Signed distances of body points to the moving object, with derivatives: shared by the terms of
+contact and penetration in equation 6.
 
 d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
 from q to x. Both terms of the paper are functions of this one distance.
@@ -11,10 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.energy.constants import ON_SURFACE
 from intercap_core.rigid.distance import DistanceField
-
-# Nearer than this the direction from the surface to the point is noise: the face's normal is used.
-_ON_SURFACE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,8 @@ def proximity(
     offset = flat - closest.points
     length = np.linalg.norm(offset, axis=1)
     sign = np.where(inside, -1.0, 1.0)
-    direction = sign[:, None] * offset / np.maximum(length, _ON_SURFACE)[:, None]
-    direction = np.where((length < _ON_SURFACE)[:, None], closest.normals, direction)
+    direction = sign[:, None] * offset / np.maximum(length, ON_SURFACE)[:, None]
+    direction = np.where((length < ON_SURFACE)[:, None], closest.normals, direction)
     normals = np.einsum("tij,tnj->tni", rotation, direction.reshape(frames, count, 3))
     # d/dw of -n . (exp(w) (q - t)) = -((q - t) x n); turning n itself changes nothing to first
     # order since x - q is parallel to it.

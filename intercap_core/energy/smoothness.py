@@ -1,19 +1,20 @@
-"""Motion terms E_S (body) and E_A (object) of equation 6 and the appendix: small accelerations.
+"""Motion terms E_S (body) and E_A (object) of equation 6 (A.1, A.3): small accelerations.
 
-E_A is the paper's: squared second differences of all object vertices. For a rigid body that sum
-depends on the vertices only through their mean and covariance, so six points with the same moments
-give the same energy. E_S uses the same differences of the body's joints where the paper uses the
-latent velocities of LEMO's network, whose weights are not free. Both are made robust: a start, a
-stop or an impact is an outlier of smooth motion, and is paid for once instead of smeared.
+    E_A = 1 / (T - 2) sum over t of || W'_(t-1) + W'_(t+1) - 2 W'_t ||^2  over object vertices W'
+    E_S = 1 / (Q (T - 2)) sum over t of || z_(t+1) - z_t ||^2  over latents z of LEMO's network
 
-A third term knows that a sequential fit's errors last: calibration, clothing and a mask's errors
-are the same in the next frame, so what the joint fit corrects must change slowly, up to the fit's
-own jitter. Without it contact that comes and goes would shake a fit that was steady.
+For a rigid body E_A depends on the vertices only through their mean and covariance, so six points
+with the same moments give the same energy. E_S is E_A's form over the body's joints, since LEMO's
+weights are not free. Beyond the paper: both are robust, since a start, a stop or an impact is an
+outlier of smooth motion. Differences and jitter also serve the drift terms
+(:mod:`intercap_core.joint.terms.drift`).
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+from intercap_core.solve.robust import SIGMA_PER_MAD
 
 ACCELERATION = (1.0, -2.0, 1.0)  # of frames t-1, t, t+1
 RATE = (-1.0, 1.0)  # of frames t, t+1
@@ -43,7 +44,9 @@ def jitter(points: np.ndarray, known: np.ndarray) -> float:
     if not whole.any():
         return 0.0
     fourth = np.sum([f * points[k : k + count] for k, f in enumerate(_FOURTH)], axis=0)
-    return float(1.4826 * np.median(np.abs(fourth[whole])) / np.sqrt(np.square(_FOURTH).sum()))
+    return float(
+        SIGMA_PER_MAD * np.median(np.abs(fourth[whole])) / np.sqrt(np.square(_FOURTH).sum())
+    )
 
 
 def moment_points(vertices: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from intercap_core.config import ContactInterval
+from intercap_core.contact.constants import CHANGES_PER_SECOND, TOUCHING_PRIOR
 from intercap_core.contact.detect import (
     RegionMotion,
     annotation_evidence,
@@ -48,15 +49,13 @@ def test_a_near_hand_that_lets_a_moving_object_slide_past_is_less_likely_than_on
 def test_posterior_equals_enumeration_of_all_paths():
     evidence = np.array([[1.0], [-2.0], [0.5], [3.0]])
     got = smooth(evidence, FPS)
-    from intercap_core.contact import detect
-
-    change = detect._CHANGES_PER_SECOND / FPS
-    begin, end = 2 * change * detect._PRIOR, 2 * change * (1 - detect._PRIOR)
+    change = CHANGES_PER_SECOND / FPS
+    begin, end = 2 * change * TOUCHING_PRIOR, 2 * change * (1 - TOUCHING_PRIOR)
     transition = np.array([[1 - begin, begin], [end, 1 - end]])
     total, touching = 0.0, np.zeros(4)
     for code in range(16):
         path = [(code >> t) & 1 for t in range(4)]
-        weight = detect._PRIOR if path[0] else 1 - detect._PRIOR
+        weight = TOUCHING_PRIOR if path[0] else 1 - TOUCHING_PRIOR
         for t in range(3):
             weight *= transition[path[t], path[t + 1]]
         weight *= np.exp(sum(evidence[t, 0] for t in range(4) if path[t]))

@@ -6,6 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.energy import contact, ground, penetration, smoothness
+from intercap_core.energy.constants import PENETRATION_TOLERANCE
 from intercap_core.energy.proximity import proximity
 from intercap_core.rigid.distance import DistanceField
 
@@ -97,9 +98,9 @@ def test_contact_weights_are_the_derivative_of_its_energy():
 
 
 def test_only_depth_beyond_the_tolerance_is_paid_for():
-    distance = np.array([[0.01, -0.5 * penetration.TOLERANCE, -0.006]])
+    distance = np.array([[0.01, -0.5 * PENETRATION_TOLERANCE, -0.006]])
     residual, weight = penetration.weights(distance, np.full(3, 2.0))
-    np.testing.assert_allclose(residual[0], [0, 0, -0.006 + penetration.TOLERANCE])
+    np.testing.assert_allclose(residual[0], [0, 0, -0.006 + PENETRATION_TOLERANCE])
     np.testing.assert_allclose(weight[0], [0, 0, 2])
 
 

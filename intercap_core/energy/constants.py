@@ -1,0 +1,21 @@
+"""Numbers of the terms of the joint energy: each with its unit and the reason for its value."""
+
+from __future__ import annotations
+
+# --- contact and penetration of body and object
+
+# A vertex counts in its patch, and a patch in its region, by how much farther it is than the
+# nearest, metres: skin yields and meshes are some millimetres wrong, so contact is an area of this
+# depth. Tuned on the studio.
+CONTACT_SOFTNESS = 0.006
+# Distance at which a patch starts to count as an outlier, metres: the accuracy that keypoints and
+# depth leave to a hand. Tuned on the studio.
+CONTACT_OUTLIER = 0.02
+# Nearer than this is contact and costs nothing, metres: half the distance (4.5 mm) at which
+# ``contact_mm`` of the settings calls it contact, rounded down. Tuned on the studio.
+CONTACT_TOLERANCE = 0.002
+# Contact leaves the mesh up to this deep in the surface, metres: skin yields. Tuned on the studio.
+PENETRATION_TOLERANCE = 0.001
+# Nearer to the surface than this, metres, the direction to the closest point is noise: the face's
+# normal is used. Tuned on the studio.
+ON_SURFACE = 1e-4
