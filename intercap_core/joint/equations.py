@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from intercap_core.joint.state import SIZE
+from intercap_core.joint.state import ALL
 from intercap_core.solve.banded import BandedSystem
 
 
@@ -14,14 +14,14 @@ class NormalEquations:
 
     ``bands`` (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or fewer for short recordings,
     ``gradient`` (T, n) and ``energy`` of each term, one half of the weighted sum of squares.
-    ``ties`` are stiff parts of the matrix, each over some columns: damping by their diagonal would
-    hold in place what only has to move together.
+    ``ties`` are stiff parts of the matrix, each over some columns, that are not damped: damping by
+    their large diagonal would freeze an object that has to move as one over many frames.
     """
 
     def __init__(self, frames: int) -> None:
-        self.bands = np.zeros((min(3, frames), frames, SIZE, SIZE))
+        self.bands = np.zeros((min(3, frames), frames, ALL.stop, ALL.stop))
         self.ties: list[tuple[slice, np.ndarray]] = []
-        self.gradient = np.zeros((frames, SIZE))
+        self.gradient = np.zeros((frames, ALL.stop))
         self.energy: dict[str, float] = {}
 
     def step(self, damping: float) -> np.ndarray | None:

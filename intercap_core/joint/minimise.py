@@ -8,23 +8,35 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.joint.constants import (
+    DAMPING_DOWN,
+    DAMPING_UP,
+    INITIAL_DAMPING,
+    MAX_STEP_SHIFT,
+    MAX_STEP_TURN,
+    MIN_DAMPING,
+    MIN_GAIN_SHARE,
+)
 from intercap_core.joint.equations import NormalEquations
-from intercap_core.joint.state import State
+from intercap_core.joint.state import (
+    BODY_SHIFT,
+    BODY_TURNS,
+    OBJECT_SHIFT,
+    OBJECT_TURN,
+    State,
+)
 
 log = logging.getLogger(__name__)
-
-_DAMPING = 1e-3
-_MAX_TURN, _MAX_SHIFT = 0.5, 0.1  # of one step: rad, metres
-_CONVERGED = 0.03  # a step that gains less than this share of what the round has gained ends it
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where the energy was left, the equations there, the number of accepted steps, and whether
-    the last one gained little."""
+    """Where the energy was left, the equations there, the energy of each term at the start, the
+    number of accepted steps, and whether the last one gained little."""
 
     state: State
     equations: NormalEquations
+    energy_before: dict[str, float]
     steps: int
     converged: bool
 
@@ -32,38 +44,41 @@ class Minimum:
 def minimise(
     linearise: Callable[[State], NormalEquations], state: State, *, max_steps: int
 ) -> Minimum:
-    """Descend from ``state`` by at most ``max_steps`` steps, each accepted only if the energy
-    becomes less.
+    """Try at most ``max_steps`` steps from ``state``, each accepted only if it lowers the energy.
 
     Progress is measured against the round's own, since most of the energy is noise that no state
     explains.
     """
-    damping, accepted, gained, converged = _DAMPING, 0, 0.0, False
+    damping, accepted, gained, converged = INITIAL_DAMPING, 0, 0.0, False
     here = linearise(state)
+    before = here.energy
     for _ in range(max_steps):
         step = here.step(damping)
         if step is None:
-            damping *= 10
+            damping *= DAMPING_UP
             continue
         trial = state.moved(_limited(step))
         there = linearise(trial)
         log.info("energy %.4g -> %.4g (damping %.0e)", here.total, there.total, damping)
         if not there.total < here.total:
-            damping *= 10
+            damping *= DAMPING_UP
             continue
         gain = here.total - there.total
         gained += gain
         state, here, accepted = trial, there, accepted + 1
-        damping = max(damping / 5, 1e-6)
-        if gain < _CONVERGED * gained:
+        damping = max(damping / DAMPING_DOWN, MIN_DAMPING)
+        if gain < MIN_GAIN_SHARE * gained:
             converged = True
             break
-    return Minimum(state, here, accepted, converged)
+    return Minimum(state, here, before, accepted, converged)
 
 
 def _limited(step: np.ndarray) -> np.ndarray:
     """Keep every frame's step within what a linearisation can promise."""
-    turns = np.abs(step[:, :165]).max(axis=1)
-    turns = np.maximum(turns, np.abs(step[:, 168:171]).max(axis=1))
-    shifts = np.maximum(np.abs(step[:, 165:168]).max(axis=1), np.abs(step[:, 171:]).max(axis=1))
-    return step / np.maximum(1.0, np.maximum(turns / _MAX_TURN, shifts / _MAX_SHIFT))[:, None]
+
+    def largest(*columns: slice) -> np.ndarray:
+        return np.maximum.reduce([np.abs(step[:, part]).max(axis=1) for part in columns])
+
+    turns, shifts = largest(BODY_TURNS, OBJECT_TURN), largest(BODY_SHIFT, OBJECT_SHIFT)
+    excess = np.maximum(turns / MAX_STEP_TURN, shifts / MAX_STEP_SHIFT)
+    return step / np.maximum(1.0, excess)[:, None]

@@ -1,4 +1,4 @@
-"""What the cameras see beside a fitted body, as the estimate of their time offsets wants it."""
+"""Residuals of keypoints and clouds by camera, as the estimate of time offsets takes them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
 from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.camera import projection
+from intercap_core.joint.constants import HALF_WEIGHT_POINTS
 from intercap_core.joint.time_offsets import Sightings
-
-_FEW_POINTS = 2.0  # of a camera's points on a sample with which it counts half
 
 
 def keypoint_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings:
@@ -50,13 +49,13 @@ def cloud_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings | Non
         -_array(found.distance)[..., None],
         np.broadcast_to(_array(along)[:, None, :, None], shape),
         np.ones((*shape, 1)),
-        _array(found.points / (found.points + _FEW_POINTS)),
+        _array(found.points / (found.points + HALF_WEIGHT_POINTS)),
         joint.cpu().numpy(),
     )
 
 
 def _part_of_keypoint(index: np.ndarray) -> np.ndarray:
-    """Each body keypoint by itself; a hand's err as one, and so do the face's."""
+    """Each body keypoint is a part of its own; all of a hand are one, and all of the face."""
     starts = (LEFT_HAND.start, RIGHT_HAND.start, FACE.start)
     hand_or_face = BODY.stop - 1 + np.searchsorted(starts, index, side="right")
     return np.where(index < BODY.stop, index, hand_or_face)

@@ -11,9 +11,13 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL, BodyParameters
 
-BODY = TRANSL.stop  # 55 rotation vectors and the translation
-OBJECT = slice(BODY, BODY + 6)  # turn about the object's origin (left), then shift
-SIZE = BODY + 6  # unknowns of one frame
+# Columns of one frame's unknowns.
+BODY = slice(0, TRANSL.stop)  # 55 rotation vectors and the translation
+BODY_TURNS, BODY_SHIFT = slice(0, TRANSL.start), TRANSL
+OBJECT = slice(BODY.stop, BODY.stop + 6)  # turn about the object's origin (left), then shift
+OBJECT_TURN = slice(OBJECT.start, OBJECT.start + 3)
+OBJECT_SHIFT = slice(OBJECT.start + 3, OBJECT.stop)
+ALL = slice(0, OBJECT.stop)
 
 
 @dataclass(frozen=True)
@@ -40,11 +44,11 @@ class State:
 
     def moved(self, step: np.ndarray) -> State:
         """The state after ``step`` (T, 174)."""
-        turn = Rotation.from_rotvec(step[:, OBJECT][:, :3]).as_matrix()
+        turn = Rotation.from_rotvec(step[:, OBJECT_TURN]).as_matrix()
         return State(
-            self.body + step[:, :BODY],
+            self.body + step[:, BODY],
             self.betas,
             self.expression,
             turn @ self.rotation,
-            self.translation + step[:, OBJECT][:, 3:],
+            self.translation + step[:, OBJECT_SHIFT],
         )

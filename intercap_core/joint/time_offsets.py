@@ -1,18 +1,18 @@
-"""Each camera's time offset from what a fit of the moving body leaves over.
+"""Each camera's time offset from the residuals of a fit of the moving body (beyond the paper).
 
-Where camera c exposes tau_c later than the fit believes, it sees every point farther along its way.
+Where camera c exposes tau_c later than the fit assumes, it sees every point farther along its path.
 With r = prediction minus observation of a point that a view sees, u the prediction's velocity in
 that view and J its derivative by the point's position,
 
     r_c = - u_c tau_c + J_c e + b_c + noise,
 
-e is the fit's own error at that point and moment, which all views share, and b_c what a camera
-always sees off about the point (the detector's idea of a joint, calibration, clothing). e is
-eliminated for each point and moment, b by taking everything relative to its mean over time. Both
-errors and noise last over many frames: r and u are taken as innovations of a first-order
-autoregression whose coefficient is that of the residuals themselves. What is left is weighted by
-its own scale and robustly (Geman-McClure), and solved for all cameras at once with a prior on
-their offsets; the master's is zero, since the sets' times are the master's.
+e is the fit's own error at that point and moment, which all views share, and b_c a camera's
+constant bias at the point (the detector's definition of a joint, calibration, clothing). e is
+eliminated for each point and moment, b by subtracting the mean over time. Both errors and noise
+last over many frames: r and u are replaced by the innovations of a first-order autoregression whose
+coefficient is that of the residuals themselves. The remaining residuals are weighted by their own
+scale and robustly (Geman-McClure), and solved for all cameras at once with a prior on their
+offsets; the master's is zero, since the frame sets' times are the master's.
 """
 
 from __future__ import annotations
@@ -22,26 +22,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LOOSE_SIGMA_S = 0.010  # of an offset that nothing is known of: beyond it sets would be mismatched
-# A fitted point's error; loose, so that it is the views' disagreement that tells.
-POINT_SIGMA_M = 0.03
-MAX_CORRELATION = 0.98
-ROBUST_SCALE = 3.0  # standard deviations at which an innovation starts to count as an outlier
-ROUNDS = 4
-PART_POINTS = 4.0  # points of one part count as at most so many: they err together
-_GAP = 1.5  # of the usual time step: rows farther apart are no neighbours
-_LEAST_ROWS = 50
-# What is known before comes from the same keypoints: it is not taken as surer than this.
-_PRIOR_SIGMA_S = 0.0005
+from intercap_core.joint.constants import (
+    INNOVATION_OUTLIER,
+    LOOSE_OFFSET_SIGMA_S,
+    MAX_CORRELATION,
+    MAX_STEP_RATIO,
+    MIN_INNOVATIONS,
+    MIN_PRIOR_SIGMA_S,
+    OFFSET_ITERATIONS,
+    POINT_SIGMA_M,
+    POINTS_PER_PART,
+)
+from intercap_core.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """What C cameras see of K points in T frames, D numbers each (pixels, or one distance).
+    """Observations by C cameras of K points in T frames, D numbers each (pixels, or a distance).
 
     residual (T,C,K,D) prediction minus observation; velocity (T,C,K,D) of the prediction, a second;
     by_point (T,C,K,D,P) derivative of the prediction by P coordinates of the point's position,
-    metres; weight (T,C,K) relative trust, 0 = not seen; part (K,): points of one part err together.
+    metres; weight (T,C,K) relative confidence, 0 = not seen; part (K,): errors within a part are
+    correlated.
     """
 
     residual: np.ndarray
@@ -53,8 +55,8 @@ class Sightings:
 
 @dataclass(frozen=True)
 class OffsetPrior:
-    """What is known beside the sightings: ``offset`` (C,) and ``sigma`` (C,), seconds, sigma NaN
-    where nothing is (:data:`LOOSE_SIGMA_S` about zero); ``master`` has none."""
+    """Prior of the offsets: ``offset`` (C,) and ``sigma`` (C,), seconds. Sigma is NaN where nothing
+    is known (then ``LOOSE_OFFSET_SIGMA_S`` about zero); the camera ``master`` has offset zero."""
 
     offset: np.ndarray
     sigma: np.ndarray
@@ -78,17 +80,18 @@ def estimate_offsets(
 ) -> TimeOffsets:
     """Estimate all offsets (C,), seconds.
 
-    ``current`` (C,) are the offsets that the predictions allow for; ``times`` (T,) of the frames.
+    ``current`` (C,) are the offsets with which the predictions were made; ``times`` (T,) of the
+    frames.
     """
     count = len(current)
     known = np.isfinite(prior.sigma)
     expected = np.where(known, prior.offset, 0.0) - current
-    sigma = np.maximum(np.where(known, prior.sigma, LOOSE_SIGMA_S), _PRIOR_SIGMA_S)
+    sigma = np.maximum(np.where(known, prior.sigma, LOOSE_OFFSET_SIGMA_S), MIN_PRIOR_SIGMA_S)
     precision = np.diag(sigma**-2.0)
     free = np.arange(count) != prior.master
     all_innovations = [found for s in sightings if (found := _Innovations.of(s, times)) is not None]
     change = np.zeros(count)
-    for _ in range(ROUNDS):
+    for _ in range(OFFSET_ITERATIONS):
         hessian, gradient = precision.copy(), precision @ (expected - change)
         for found in all_innovations:
             h, g = found.normal_equations(change)
@@ -103,7 +106,7 @@ def estimate_offsets(
 
 @dataclass(eq=False)
 class _Innovations:
-    """Sightings as innovations over time, without their means: rows of T - 1 frames, in units of
+    """Sightings as innovations over time, means subtracted: rows of T - 1 frames, in units of
     their own standard deviation."""
 
     residual: np.ndarray
@@ -114,13 +117,13 @@ class _Innovations:
 
     @classmethod
     def of(cls, seen: Sightings, times: np.ndarray) -> _Innovations | None:
-        """None where too few rows follow each other."""
+        """None where too few rows are of successive frames."""
         step = np.diff(times)
         if not len(step):
             return None
-        following = (step < _GAP * np.median(step))[:, None, None]
+        following = (step < MAX_STEP_RATIO * np.median(step))[:, None, None]
         weight = np.minimum(seen.weight[1:], seen.weight[:-1]) * following
-        if np.count_nonzero(weight) < _LEAST_ROWS:
+        if np.count_nonzero(weight) < MIN_INNOVATIONS:
             return None
         correlation = _correlation(_centred(seen.residual, seen.weight), weight > 0)
         residual, velocity = (
@@ -129,9 +132,9 @@ class _Innovations:
         scale = np.ones(residual.shape[2])
         for part in np.unique(seen.part):
             here = seen.part == part
-            weight[:, :, here] *= min(1.0, PART_POINTS / np.count_nonzero(here))
+            weight[:, :, here] *= min(1.0, POINTS_PER_PART / np.count_nonzero(here))
             size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
-            scale[here] = 1.4826 * np.median(size) if len(size) else 1.0
+            scale[here] = SIGMA_PER_MAD * np.median(size) if len(size) else 1.0
         scale = np.maximum(scale, 1e-9)[:, None]
         return cls(
             residual / scale,
@@ -141,47 +144,47 @@ class _Innovations:
             seen.part,
         )
 
-    def _left(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What offsets ``change`` (C,) and the best point errors leave (T-1,C,K,D), robust weights
-        (T-1,C,K), and the points' inverse matrices (T-1,K,P,P)."""
+    def _remaining(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (T-1,C,K,D) after offsets ``change`` (C,) and the best point errors, robust
+        weights (T-1,C,K), and the points' inverse matrices (T-1,K,P,P)."""
         residual = self.residual + self.velocity * change[:, None, None]
         weight = self._robust(residual)
-        left, inverse = self._without_point_errors(residual, weight)
+        remaining, inverse = self._without_point_errors(residual, weight)
         for _ in range(2):
-            weight = self._robust(left)
-            left, inverse = self._without_point_errors(residual, weight)
-        return left, weight, inverse
+            weight = self._robust(remaining)
+            remaining, inverse = self._without_point_errors(residual, weight)
+        return remaining, weight, inverse
 
     def _robust(self, residual: np.ndarray) -> np.ndarray:
         square = (residual**2).sum(-1) / residual.shape[-1]
-        return self.weight * (ROBUST_SCALE**2 / (ROBUST_SCALE**2 + square)) ** 2
+        return self.weight * geman_mcclure_weight(square, INNOVATION_OUTLIER)
 
     def _without_point_errors(
         self, residual: np.ndarray, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        pulled = self.by_point * weight[..., None, None]
-        matrix = np.einsum("tckdp,tckdq->tkpq", pulled, self.by_point)
+        weighted = self.by_point * weight[..., None, None]
+        matrix = np.einsum("tckdp,tckdq->tkpq", weighted, self.by_point)
         inverse = np.linalg.inv(matrix + np.eye(matrix.shape[-1]) * POINT_SIGMA_M**-2)
-        pull = np.einsum("tckdp,tckd->tkp", pulled, residual)
-        error = np.einsum("tkpq,tkq->tkp", inverse, pull)
+        gradient = np.einsum("tckdp,tckd->tkp", weighted, residual)
+        error = np.einsum("tkpq,tkq->tkp", inverse, gradient)
         return residual - np.einsum("tckdp,tkp->tckd", self.by_point, error), inverse
 
     def normal_equations(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """H (C,C) and g (C,) of the offsets' next correction H^-1 g, point errors eliminated."""
-        left, weight, inverse = self._left(change)
+        remaining, weight, inverse = self._remaining(change)
         along = self.velocity * weight[..., None]
         own = (along * self.velocity).sum((0, 2, 3))
         cross = np.einsum("tckd,tckdp->tckp", along, self.by_point)
         shared = np.einsum("tckp,tkpq,tjkq->cj", cross, inverse, cross, optimize=True)
-        return np.diag(own) - shared, -(along * left).sum((0, 2, 3))
+        return np.diag(own) - shared, -(along * remaining).sum((0, 2, 3))
 
     def spread(self, change: np.ndarray) -> np.ndarray:
-        """Covariance (C,C) of g, taken from how far frames and parts of the body differ in theirs:
-        errors that last count in the one, errors of a moment in the other."""
-        left, weight, _ = self._left(change)
-        pull = (self.velocity * weight[..., None] * left).sum(3)  # (T-1, C, K)
-        parts = [pull[:, :, self.part == part].sum((0, 2)) for part in np.unique(self.part)]
-        groups = np.concatenate([np.array(parts), pull.sum(2)])
+        """Covariance (C,C) of g, from its scatter over body parts (errors that last) and over
+        frames (errors of a moment)."""
+        remaining, weight, _ = self._remaining(change)
+        gradient = (self.velocity * weight[..., None] * remaining).sum(3)  # (T-1, C, K)
+        parts = [gradient[:, :, self.part == part].sum((0, 2)) for part in np.unique(self.part)]
+        groups = np.concatenate([np.array(parts), gradient.sum(2)])
         return groups.T @ groups
 
 
@@ -196,7 +199,7 @@ def _correlation(residual: np.ndarray, both: np.ndarray) -> float:
     """Correlation of successive residuals (T,C,K,D) where ``both`` (T-1,C,K) are seen, outliers
     clipped."""
     now, before = residual[1:][both], residual[:-1][both]
-    limit = ROBUST_SCALE * 1.4826 * np.median(np.abs(now))
+    limit = INNOVATION_OUTLIER * SIGMA_PER_MAD * np.median(np.abs(now))
     now, before = (np.clip(x, -limit, limit) for x in (now, before))
     power = np.sqrt((now**2).sum() * (before**2).sum())
     return float(np.clip((now * before).sum() / max(power, 1e-30), 0.0, MAX_CORRELATION))

@@ -9,10 +9,14 @@ from intercap_core.config import JointSettings
 from intercap_core.contact.patches import contact_patches
 from intercap_core.energy import smoothness
 from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import minimise
-from intercap_core.joint.object_data import TrackedPoses
-from intercap_core.joint.problem import Ground, Problem
-from intercap_core.joint.state import BODY, SIZE, State
+from intercap_core.joint.problem import Problem, Trust, joint_terms
+from intercap_core.joint.state import ALL, BODY, State
+from intercap_core.joint.terms.contact import Contact
+from intercap_core.joint.terms.ground import Ground
+from intercap_core.joint.terms.object_data import ObjectData, TrackedPoses
+from intercap_core.joint.terms.term import Term
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.pose_interpolation import bridge_poses
@@ -41,22 +45,71 @@ def box() -> ObjectMesh:
     )
 
 
-def _hold(state: State, sigma: float):
+class _Hold(Term):
     """A data term that holds the body where it started."""
-    start = state.body.copy()
 
-    def add(now: State, out: NormalEquations) -> None:
-        away = now.body - start
-        hessian = np.repeat(np.eye(BODY)[None] / sigma**2, len(now), axis=0)
-        energy = 0.5 * float(np.square(away / sigma).sum())
-        out.add_blocks("body_data", slice(0, BODY), hessian, away / sigma**2, energy)
+    name = "body_data"
 
-    return add
+    def __init__(self, state: State, sigma: float) -> None:
+        self._start, self._sigma = state.body.copy(), sigma
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        offset = state.body - self._start
+        hessian = np.repeat(np.eye(BODY.stop)[None] / self._sigma**2, len(state), axis=0)
+        energy = 0.5 * float(np.square(offset / self._sigma).sum())
+        equations.add_blocks(self.name, BODY, hessian, offset / self._sigma**2, energy)
+
+
+class _Scene:
+    """A joint problem with what it is made of."""
+
+    def __init__(
+        self,
+        model,
+        box,
+        state,
+        *,
+        data=(),
+        floor=None,
+        touching=(),
+        known=None,
+        start=None,
+        still=False,
+        settings=None,
+    ) -> None:
+        field = DistanceField(box.vertices, box.faces)
+        self.geometry = Geometry(model, box, field, contact_patches(model))
+        self.probability = np.zeros((len(state), len(CONTACT_REGIONS)))
+        self.probability[:, list(touching)] = 1
+        contact = Contact(self.geometry, 1.0)
+        contact.take_probability(self.probability)
+        every = np.ones(len(state), bool)
+        terms = joint_terms(
+            self.geometry,
+            settings or JointSettings(),
+            start or state,
+            data=data,
+            contact=contact,
+            floor=floor,
+            fps=15.0,
+            trust=Trust(
+                body=every,
+                object_=every if known is None else known,
+                still=np.full(len(state) - 1, still),
+            ),
+        )
+        self.problem = Problem(terms)
+        self.problem.refresh(start or state)
+        self.equations = self.problem.equations
+
+    def distance(self, state: State) -> np.ndarray:
+        """(T, N) of the skin's vertices to the box."""
+        return self.geometry.at(state).proximity.distance
 
 
 def _state(model: BodyModel, gap: float) -> State:
     """Bodies in the T-pose with a box ``gap`` metres below the left palm (y points up here)."""
-    body = np.zeros((FRAMES, BODY))
+    body = np.zeros((FRAMES, BODY.stop))
     state = State(body, np.zeros(10), np.zeros((FRAMES, 10)), np.tile(np.eye(3), (FRAMES, 1, 1)),
                   np.zeros((FRAMES, 3)))  # fmt: skip
     palm = model(state.parameters(model)).vertices[0, model.regions["left_hand"]].numpy()
@@ -64,35 +117,12 @@ def _state(model: BodyModel, gap: float) -> State:
     return State(body, state.betas, state.expression, state.rotation, np.tile(below, (FRAMES, 1)))
 
 
-def _problem(
-    model, box, state, *, data=(), floor=None, touching=(), known=None, start=None, still=False
-) -> Problem:
-    patches = contact_patches(model)
-    probability = np.zeros((len(state), len(CONTACT_REGIONS)))
-    probability[:, list(touching)] = 1
-    return Problem(
-        model=model,
-        mesh=box,
-        field=DistanceField(box.vertices, box.faces),
-        patches=patches,
-        data=data,
-        probability=probability,
-        floor=floor,
-        fps=15.0,
-        settings=JointSettings(),
-        start=start or state,
-        body_known=np.ones(len(state), bool),
-        object_known=np.ones(len(state), bool) if known is None else known,
-        object_still=np.full(len(state) - 1, still),
-    )
-
-
 def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
     covariance = np.repeat(np.eye(6)[None] * sigma**2, len(state), axis=0)
     agree = np.zeros_like(lost)
     return TrackedPoses.from_track(
         state.rotation, state.translation, covariance, lost, agree, agree,
-        seen=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
+        visible=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
         time_offset=np.zeros(3),
     )  # fmt: skip
 
@@ -107,7 +137,7 @@ def test_tracked_poses_follow_the_views_that_they_rest_on():
     lost = np.arange(6) == 5
     tracked = TrackedPoses.from_track(
         np.repeat(np.eye(3)[None], 6, 0), way, np.repeat(np.eye(6)[None], 6, 0), lost, lost,
-        np.zeros(6, bool), seen=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
+        np.zeros(6, bool), visible=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
     )  # fmt: skip
     found = tracked.at(np.array([0.0, 0.003, 0.004])).translation - way
     late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
@@ -119,8 +149,8 @@ def test_an_object_at_rest_moves_as_one(model, box):
     """A hand that comes down onto it frame by frame moves it once, in all of them."""
     state = _state(model, 0.012)
     tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
-    data = (_hold(state, 0.02), tracked.add)
-    problem = _problem(model, box, state, data=data, still=True)
+    data = (_Hold(state, 0.02), ObjectData(tracked))
+    problem = _Scene(model, box, state, data=data, still=True)
     problem.probability[FRAMES // 2 :, LEFT_HAND] = 1
     found = minimise(problem.equations, state, max_steps=8).state
     assert np.linalg.norm(found.translation[0] - state.translation[0]) > 0.001
@@ -132,24 +162,23 @@ def test_an_object_at_rest_moves_as_one(model, box):
 def test_contact_closes_a_gap_between_hand_and_object(model, box):
     state = _state(model, 0.012)
     tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
-    problem = _problem(
-        model, box, state, data=(_hold(state, 0.02), tracked.add), touching=[LEFT_HAND]
+    problem = _Scene(
+        model, box, state, data=(_Hold(state, 0.02), ObjectData(tracked)), touching=[LEFT_HAND]
     )
-    _, near = problem.proximity(state)
-    hand = problem.skin.patch[problem.patches.region == LEFT_HAND]
+    geometry = problem.geometry
+    hand = geometry.skin.patch[geometry.patches.region == LEFT_HAND]
     minimum = minimise(problem.equations, state, max_steps=8)
-    _, after = problem.proximity(minimum.state)
-    assert near.distance[:, hand].min() > 0.011
-    assert (np.abs(after.distance[:, hand].min(axis=1)) < 0.004).all()
+    assert problem.distance(state)[:, hand].min() > 0.011
+    after = problem.distance(minimum.state)[:, hand]
+    assert (np.abs(after.min(axis=1)) < 0.004).all()
 
 
 def test_penetration_is_pushed_out(model, box):
     state = _state(model, -0.012)
     tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
-    problem = _problem(model, box, state, data=(_hold(state, 0.02), tracked.add))
+    problem = _Scene(model, box, state, data=(_Hold(state, 0.02), ObjectData(tracked)))
     minimum = minimise(problem.equations, state, max_steps=8)
-    _, after = problem.proximity(minimum.state)
-    assert (after.distance.min(axis=1) > -0.006).all()
+    assert (problem.distance(minimum.state).min(axis=1) > -0.006).all()
 
 
 def test_a_floor_carries_the_object(model, box):
@@ -157,7 +186,9 @@ def test_a_floor_carries_the_object(model, box):
     top = state.translation[0, 1] - 0.05 + 0.03  # the box starts 3 cm deep in the floor
     floor = Ground(np.array([0, top, 0]), np.array([0, 1.0, 0]))
     tracked = _tracked(state, 0.05, np.zeros(FRAMES, bool))
-    problem = _problem(model, box, state, data=(_hold(state, 0.001), tracked.add), floor=floor)
+    problem = _Scene(
+        model, box, state, data=(_Hold(state, 0.001), ObjectData(tracked)), floor=floor
+    )
     minimum = minimise(problem.equations, state, max_steps=8)
     rise = minimum.state.translation[:, 1] - state.translation[:, 1]
     assert (rise > 0.02).all()
@@ -172,7 +203,7 @@ def test_a_lost_frame_is_carried_by_its_neighbours(model, box):
     wrong = line.copy()
     wrong[2] += [0.1, 0.1, 0]
     start = State(state.body, state.betas, state.expression, state.rotation, wrong)
-    problem = _problem(model, box, start, data=(_hold(start, 0.01), tracked.add), known=~lost)
+    problem = _Scene(model, box, start, data=(_Hold(start, 0.01), ObjectData(tracked)), known=~lost)
     minimum = minimise(problem.equations, start, max_steps=10)
     np.testing.assert_allclose(minimum.state.translation[2], line[2], atol=0.004)
 
@@ -181,13 +212,13 @@ def test_gradient_is_the_derivative_of_the_energy(model, box):
     """With weights that do not depend on the state the equations' gradient is exact."""
     state = _state(model, 0.5)
     rng = np.random.default_rng(0)
-    moved = state.moved(rng.normal(scale=0.01, size=(FRAMES, SIZE)))
+    moved = state.moved(rng.normal(scale=0.01, size=(FRAMES, ALL.stop)))
     settings = JointSettings(body_smoothness=1e-4, object_smoothness=1e-4)
     tracked = _tracked(state, 1.0, np.zeros(FRAMES, bool))
-    problem = _problem(model, box, moved, data=(_hold(state, 0.1), tracked.add))
-    problem.settings = settings
+    hold = _Hold(state, 0.1)
+    problem = _Scene(model, box, moved, data=(hold, ObjectData(tracked)), settings=settings)
     gradient = problem.equations(moved).gradient
-    direction = rng.normal(size=(FRAMES, SIZE))
+    direction = rng.normal(size=(FRAMES, ALL.stop))
     direction /= np.linalg.norm(direction)
     step = 1e-4
     numeric = (
@@ -195,7 +226,7 @@ def test_gradient_is_the_derivative_of_the_energy(model, box):
         - problem.equations(moved.moved(-step * direction)).energy["body_data"]
     ) / (2 * step)
     only = NormalEquations(FRAMES)
-    problem.data[0](moved, only)
+    hold.add(moved, only)
     assert numeric == pytest.approx(float((only.gradient * direction).sum()), rel=1e-4)
     assert np.isfinite(gradient).all()
 
@@ -212,7 +243,7 @@ def test_a_passing_pull_does_not_shake_a_steady_track(model, box):
     """One frame of contact moves the neighbours along instead of kicking its own frame."""
     state = _state(model, 0.010)
     tracked = _tracked(state, 0.01, np.zeros(FRAMES, bool))
-    problem = _problem(model, box, state, data=(_hold(state, 0.001), tracked.add))
+    problem = _Scene(model, box, state, data=(_Hold(state, 0.001), ObjectData(tracked)))
     problem.probability[2, LEFT_HAND] = 1
     moved = minimise(problem.equations, state, max_steps=8).state.translation - state.translation
     assert np.abs(np.diff(moved, axis=0)).max() < 0.002

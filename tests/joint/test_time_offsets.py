@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from intercap_core.joint.constants import LOOSE_OFFSET_SIGMA_S
 from intercap_core.joint.time_offsets import (
-    LOOSE_SIGMA_S,
     OffsetPrior,
     Sightings,
     estimate_offsets,
@@ -94,7 +94,7 @@ def test_without_motion_the_prior_stays():
     given = OffsetPrior(TRUE, np.array([0, 1, 1, np.nan, 2]) * 1e-3, 0)
     found = estimate_offsets([still], TIMES, np.zeros(C), given)
     assert found.offset == pytest.approx([0, TRUE[1], TRUE[2], 0, TRUE[4]])
-    assert found.sigma == pytest.approx([0, 1e-3, 1e-3, LOOSE_SIGMA_S, 2e-3], rel=1e-3)
+    assert found.sigma == pytest.approx([0, 1e-3, 1e-3, LOOSE_OFFSET_SIGMA_S, 2e-3], rel=1e-3)
     assert estimate_offsets([], TIMES, np.zeros(C), given).offset == pytest.approx(found.offset)
 
 
@@ -102,7 +102,9 @@ def test_a_camera_that_sees_nothing_keeps_its_prior():
     seen = _sightings()
     seen.weight[:, 3] = 0
     found = estimate_offsets([seen], TIMES, np.zeros(C), NOTHING)
-    assert found.offset[3] == pytest.approx(0) and found.sigma[3] == pytest.approx(LOOSE_SIGMA_S)
+    assert found.offset[3] == pytest.approx(0) and found.sigma[3] == pytest.approx(
+        LOOSE_OFFSET_SIGMA_S
+    )
     assert np.abs(found.offset - TRUE)[[1, 2, 4]].max() < 1.5e-3
 
 

@@ -1,4 +1,9 @@
-"""E_B in the joint energy: equation 2 as the body fit left it, shape and coverings settled."""
+"""Body data: E_B of equation 6, which is equation 2 as the body fit left it.
+
+Shape, thickness of clothing and keypoint offsets stay as the body fit found them. E_B's own terms
+and weights are those of :mod:`intercap_core.body_fit.problem`; no setting of the joint fit weighs
+them. A frame without a fit stays near the pose interpolated there.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +21,16 @@ from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
+from intercap_core.joint.constants import (
+    BRIDGED_BODY_SHIFT,
+    BRIDGED_BODY_TURN,
+    OFFSET_UNCHANGED_S,
+)
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.sightings import cloud_sightings, keypoint_sightings
-from intercap_core.joint.state import BODY, State
+from intercap_core.joint.state import BODY, BODY_SHIFT, State
+from intercap_core.joint.terms.term import Term
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets, estimate_offsets
-
-# Frames without a believable fit stay near where they were bridged unless their neighbours pull.
-_BRIDGED_TURN, _BRIDGED_SHIFT = 0.3, 0.1  # rad, metres
-_OFFSET_SAME_S = 0.0003  # what a hand at 3 m/s moves meanwhile is a millimetre
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +44,10 @@ class Residuals:
     cloud_m: np.ndarray
 
 
-class BodyData:
-    """Keypoints, clouds and priors of all frames; frames that the body fit gave up have no say."""
+class BodyData(Term):
+    """E_B of the frames whose fit is ``trusted`` (T,): keypoints, clouds and priors."""
+
+    name = "body_data"
 
     def __init__(self, fitter: Fitter, problem: BodyProblem, trusted: np.ndarray) -> None:
         self._fitter, self._problem = fitter, problem
@@ -59,10 +68,10 @@ class BodyData:
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
     ) -> BodyData:
-        """Read the images' evidence and what the body fit found to be constant."""
-        seen = read_observations(scene, person)
-        clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
-        fitter = Fitter(model, seen, clouds, settings, pose_prior)
+        """Read the observations and what the body fit found to be constant."""
+        observations = read_observations(scene, person)
+        clouds = list(person_clouds(frames, observations, settings.points_per_frame, model.device))
+        fitter = Fitter(model, observations, clouds, settings, pose_prior)
         settled = Settled(
             *(
                 torch.from_numpy(body_fit[name])
@@ -76,7 +85,7 @@ class BodyData:
             )
         )
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
-        problem.columns = torch.arange(BODY, device=model.device)
+        problem.columns = torch.arange(BODY.stop, device=model.device)
         return cls(fitter, problem, ~body_fit["failed"])
 
     def refresh(self, state: State) -> None:
@@ -86,26 +95,26 @@ class BodyData:
         if self._bridged is None:
             self._bridged = state.body.copy()
 
-    def add(self, state: State, out: NormalEquations) -> None:
+    def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
         assert self._bridged is not None, "refresh comes first"
-        own = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
-        none = own.new_zeros(0)
-        normal = self._problem.linearise(own, none, self._index)
+        pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
+        shared = pose.new_zeros(0)  # nothing that all frames share is free here
+        normal = self._problem.linearise(pose, shared, self._index)
         frames = self._fitter.frames[self._trusted]
-        hessian = np.zeros((len(state), BODY, BODY))
-        gradient = np.zeros((len(state), BODY))
+        hessian = np.zeros((len(state), BODY.stop, BODY.stop))
+        gradient = np.zeros((len(state), BODY.stop))
         hessian[frames] = normal.hessian.double().cpu().numpy()[self._trusted]
         gradient[frames] = normal.gradient.double().cpu().numpy()[self._trusted]
         energy = float(normal.cost.double().cpu().numpy()[self._trusted].sum())
-        rest = np.setdiff1d(np.arange(len(state)), frames)
-        precision = np.full(BODY, _BRIDGED_TURN**-2)
-        precision[-3:] = _BRIDGED_SHIFT**-2
-        away = state.body[rest] - self._bridged[rest]
-        hessian[rest] = np.diag(precision)
-        gradient[rest] = precision * away
-        energy += 0.5 * float((precision * away**2).sum())
-        out.add_blocks("body_data", slice(0, BODY), hessian, gradient, energy)
+        bridged = np.setdiff1d(np.arange(len(state)), frames)
+        precision = np.full(BODY.stop, BRIDGED_BODY_TURN**-2)
+        precision[BODY_SHIFT] = BRIDGED_BODY_SHIFT**-2
+        offset = state.body[bridged] - self._bridged[bridged]
+        hessian[bridged] = np.diag(precision)
+        gradient[bridged] = precision * offset
+        energy += 0.5 * float((precision * offset**2).sum())
+        equations.add_blocks(self.name, BODY, hessian, gradient, energy)
 
     def residuals(self, state: State) -> Residuals:
         """How far the images are from ``state``."""
@@ -119,7 +128,7 @@ class BodyData:
 
     @property
     def time_offset(self) -> np.ndarray:
-        """(C,) seconds by which the predictions take the cameras to expose late."""
+        """(C,) seconds by which each camera is predicted to expose late."""
         return self._fitter.evidence.seen.time_offset
 
     def estimate_offsets(self, prior: OffsetPrior) -> TimeOffsets:
@@ -136,10 +145,10 @@ class BodyData:
         return offsets
 
     def take_offsets(self, offset: np.ndarray) -> float:
-        """Predict with other offsets (C,) from now on; the largest change, seconds."""
+        """Predict with offsets (C,) from now on; returns the largest change, seconds."""
         evidence = self._fitter.evidence
         change = float(np.abs(offset - self.time_offset).max())
-        if change > _OFFSET_SAME_S:
+        if change > OFFSET_UNCHANGED_S:
             evidence.seen = replace(evidence.seen, time_offset=offset)
             self._fitter.observe(self._problem)
         return change

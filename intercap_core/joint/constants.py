@@ -1,0 +1,118 @@
+"""Numbers of the joint fit: each with its unit and the reason for its value."""
+
+from __future__ import annotations
+
+from math import radians
+
+# --- measurement noise: what a true fit leaves over, in the joint energy
+
+# Distance of a patch that truly touches, after errors of skin, mesh and calibration, metres.
+# Tuned on the studio.
+CONTACT_SIGMA = 0.003
+# Depth of a vertex inside the object beyond the tolerance, metres. Tuned on the studio.
+PENETRATION_SIGMA = 0.003
+# Depth of a vertex below the floor, metres: the ground plane's own error. Tuned on the studio.
+GROUND_SIGMA = 0.005
+# Vertices of the body's mesh, inside the object or below the floor, that are one measurement:
+# neighbours err together. Tuned on the studio.
+VERTICES_PER_MEASUREMENT = 10.0
+# Vertices of the object on which it stands at least: fewer would each count as a measurement of
+# their own when an edge just touches the floor. Tuned on the studio.
+MIN_STANDING_VERTICES = 4
+# A tracked pose is never surer than this, rad and metres: the meshes differ from the things
+# themselves. Tuned on the studio.
+TRACK_FLOOR_TURN = radians(0.1)
+TRACK_FLOOR_SHIFT = 0.001
+# What is added where different poses explain a frame equally well, rad and metres: it is nearly
+# always the turn (on which side the handle is). Tuned on the studio.
+AMBIGUOUS_TURN = radians(10.0)
+AMBIGUOUS_SHIFT = 0.002
+
+# --- frames without a measurement: how far they may leave the pose that was interpolated
+
+BRIDGED_OBJECT_TURN = 0.5  # rad; tuned on the studio
+BRIDGED_OBJECT_SHIFT = 0.15  # metres; tuned on the studio
+BRIDGED_BODY_TURN = 0.3  # rad, of each joint; tuned on the studio
+BRIDGED_BODY_SHIFT = 0.1  # metres; tuned on the studio
+# Standard deviation of the object's position where the track is lost, metres: contact detection
+# then learns nothing from the distance. Tuned on the studio.
+UNTRACKED_SIGMA = 0.5
+
+# --- human motion
+
+# Standard deviation of accelerations in everyday motion, m/s^2: trunk and limbs stay below some
+# of them outside impacts, hands reach ten, carried objects are in between. Tuned on the studio.
+BODY_ACCELERATION = 6.0
+FINGER_ACCELERATION = 10.0
+OBJECT_ACCELERATION = 6.0
+# Accelerations beyond so many standard deviations count as a start, a stop or an impact. Tuned on
+# the studio.
+ACCELERATION_OUTLIER = 2.0
+
+# --- lasting errors of the sequential fits
+
+# How fast they change: a random walk, metres in one second. Tuned on the studio.
+BODY_DRIFT = 0.010
+OBJECT_DRIFT = 0.004
+# Points of the body or the object whose corrections are one measurement: neighbouring points move
+# as one. Tuned on the studio.
+DRIFT_POINTS_PER_MEASUREMENT = 2.0
+# Distance that an object at rest moves between frames, metres: practically none. Tuned on the
+# studio.
+RESTING_SIGMA = 2e-5
+
+# --- time offsets of the cameras
+
+# Standard deviation of an offset that nothing is known of, seconds: beyond it the frame sets would
+# have been matched differently (a third of the time between frames at 30 fps).
+LOOSE_OFFSET_SIGMA_S = 0.010
+# The prior comes from the same keypoints: it is not taken as surer than this, seconds. Tuned on
+# the studio.
+MIN_PRIOR_SIGMA_S = 0.0005
+# A fitted point's own error, metres; loose, so that only disagreement between views counts. Tuned
+# on the studio.
+POINT_SIGMA_M = 0.03
+MAX_CORRELATION = 0.98  # of successive residuals; tuned on the studio
+# Standard deviations at which an innovation starts to count as an outlier. Tuned on the studio.
+INNOVATION_OUTLIER = 3.0
+# Points of one part of the body count as at most so many: their errors are correlated. Tuned on
+# the studio.
+POINTS_PER_PART = 4.0
+# Number of a camera's depth points on a sample with which the sample has half its full weight.
+# Tuned on the studio.
+HALF_WEIGHT_POINTS = 2.0
+# Rows farther apart than this share of the median time step are no neighbours: one frame missing
+# makes a step of 2.
+MAX_STEP_RATIO = 1.5
+MIN_INNOVATIONS = 50  # fewer seen points of successive frames give no estimate; tuned on the studio
+# Changes of offsets below this are not followed, seconds: a hand at 3 m/s moves a millimetre
+# meanwhile.
+OFFSET_UNCHANGED_S = 0.0003
+# Changes of offsets above this call for another round, seconds: 3 mm of that hand's motion.
+OFFSET_CHANGED_S = 0.001
+
+# --- solver effort
+
+# Most accepted steps of each round; contact is estimated anew between rounds, and the first moves
+# the most. Tuned on the studio.
+ROUND_STEPS = (6, 4, 3)
+OFFSET_ITERATIONS = 4  # reweightings of the offsets' normal equations; tuned on the studio
+# Damping of Levenberg-Marquardt, share of the diagonal. Tuned on the studio.
+INITIAL_DAMPING = 1e-3
+MIN_DAMPING = 1e-6
+DAMPING_UP, DAMPING_DOWN = 10.0, 5.0  # factors after a rejected and an accepted step
+# Largest change in one step, rad and metres: how far a linearisation of skinning is believed.
+# Tuned on the studio.
+MAX_STEP_TURN = 0.5
+MAX_STEP_SHIFT = 0.1
+# A step that gains less than this share of what the round has gained ends it. Tuned on the studio.
+MIN_GAIN_SHARE = 0.03
+# Largest change of a contact probability after which another round has nothing new to work with.
+# Tuned on the studio.
+CONTACT_CONVERGED = 0.1
+
+# --- decision
+
+# A frame with a skin vertex deeper than this inside the object is flagged, metres: far beyond what
+# skin yields, so one of the two poses is wrong. Tuned on the studio.
+FLAGGED_DEPTH = 0.03

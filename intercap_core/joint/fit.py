@@ -1,0 +1,164 @@
+"""The joint fit: contact is estimated, the energy lowered, and so on until nothing changes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.config import ContactInterval, JointSettings
+from intercap_core.contact.detect import annotation_evidence, contact_probability
+from intercap_core.contact.motion import region_motion
+from intercap_core.joint.constants import (
+    CONTACT_CONVERGED,
+    FLAGGED_DEPTH,
+    OFFSET_CHANGED_S,
+    ROUND_STEPS,
+)
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.minimise import minimise
+from intercap_core.joint.problem import Problem, joint_terms
+from intercap_core.joint.sequential import Flags, SequentialFits
+from intercap_core.joint.state import State
+from intercap_core.joint.terms.body_data import BodyData, Residuals
+from intercap_core.joint.terms.contact import Contact
+from intercap_core.joint.terms.ground import Ground
+from intercap_core.joint.terms.object_data import ObjectData
+from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
+from intercap_core.schemas import CONTACT_REGIONS
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """``probability`` (T, R) and the ``labels`` (T, R) of the annotation, -1 where none."""
+
+    probability: np.ndarray
+    labels: np.ndarray
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """The refined state, with contact, time offsets and residuals there, the energy by term before
+    and after, the number of ``steps``, and the reasons (T,) not to trust a frame, "" = none."""
+
+    state: State
+    contact: ContactEstimate
+    time_offsets: TimeOffsets
+    residuals: Residuals
+    energy_before: dict[str, float]
+    energy_after: dict[str, float]
+    steps: int
+    flag_reasons: list[str]
+
+
+def fit(
+    geometry: Geometry,
+    sequential: SequentialFits,
+    body_data: BodyData,
+    *,
+    floor: Ground | None,
+    fps: float,
+    prior: OffsetPrior,
+    settings: JointSettings,
+    intervals: Sequence[ContactInterval] | None,
+) -> JointFit:
+    """Minimise equation 6 from the sequential fits.
+
+    ``intervals`` are the annotated contacts, None where contact is to be detected.
+    """
+    state = sequential.state
+    object_data = ObjectData(sequential.tracked)
+    contact = Contact(geometry, settings.contact_weight)
+    problem = Problem(
+        joint_terms(
+            geometry,
+            settings,
+            state,
+            data=(body_data, object_data),
+            contact=contact,
+            floor=floor,
+            fps=fps,
+            trust=sequential.trust,
+        )
+    )
+
+    def estimate_contact(at: State) -> ContactEstimate:
+        return _estimate_contact(geometry, at, sequential, fps, settings, intervals)
+
+    steps, energy_before = 0, None
+    estimate = estimate_contact(state)
+    for max_steps in ROUND_STEPS:
+        contact.take_probability(estimate.probability)
+        problem.refresh(state)
+        offset_change = body_data.take_offsets(body_data.estimate_offsets(prior).offset)
+        object_data.take_offsets(body_data.time_offset)
+        minimum = minimise(problem.equations, state, max_steps=max_steps)
+        state, steps = minimum.state, steps + minimum.steps
+        energy_before = energy_before or minimum.energy_before
+        log.info("%d steps, energy %.4g", steps, minimum.equations.total)
+        previous, estimate = estimate, estimate_contact(state)
+        contact_change = np.abs(estimate.probability - previous.probability).max()
+        if (
+            minimum.converged
+            and contact_change < CONTACT_CONVERGED
+            and offset_change < OFFSET_CHANGED_S
+        ):
+            break
+    residuals = body_data.residuals(state)
+    return JointFit(
+        state=state,
+        contact=estimate,
+        time_offsets=body_data.estimate_offsets(prior),
+        residuals=residuals,
+        energy_before=energy_before or {},
+        energy_after=minimum.equations.energy,
+        steps=steps,
+        flag_reasons=_flag_reasons(geometry, state, sequential.flags),
+    )
+
+
+def _estimate_contact(
+    geometry: Geometry,
+    state: State,
+    sequential: SequentialFits,
+    fps: float,
+    settings: JointSettings,
+    intervals: Sequence[ContactInterval] | None,
+) -> ContactEstimate:
+    """Contact by region at ``state``: detected, annotated, or none where both are switched off."""
+    shape = (len(state), len(CONTACT_REGIONS))
+    given, labels = np.zeros(shape), np.full(shape, -1, np.int8)
+    if intervals is not None:
+        given, labels = annotation_evidence(intervals, CONTACT_REGIONS, len(state))
+    elif not settings.detect_contact:
+        return ContactEstimate(np.zeros(shape), labels)
+    posed, at_patch = geometry.at(state), geometry.skin.patch
+    motion = region_motion(
+        geometry.patches,
+        posed.skin[:, at_patch],
+        posed.proximity.at(at_patch),
+        state.rotation,
+        state.translation,
+        sequential.joint_sigma,
+        sequential.object_sigma,
+        fps,
+    )
+    return ContactEstimate(contact_probability(motion, fps, given=given), labels)
+
+
+def _flag_reasons(geometry: Geometry, state: State, flags: Flags) -> list[str]:
+    """Why each frame (T,) should not be trusted; "" where it can be."""
+    deep = geometry.at(state).proximity.distance.min(axis=1) < -FLAGGED_DEPTH
+    causes = (
+        (flags.filled, "body not seen well enough, filled in"),
+        (flags.uncertain, "body not determined by what was seen"),
+        (flags.lost, "object lost, filled in"),
+        (flags.disagree, "object passes disagree"),
+        (flags.ambiguous, "object pose ambiguous"),
+        (deep, "body deep inside the object"),
+    )
+    return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]

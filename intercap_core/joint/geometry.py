@@ -1,0 +1,108 @@
+"""What several terms need of one state, computed once: the body's skin, joints, the object."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.contact.patches import Patches
+from intercap_core.energy import smoothness
+from intercap_core.energy.proximity import Proximity, proximity
+from intercap_core.joint.skin import Skin
+from intercap_core.joint.state import BODY, State
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
+
+
+class Geometry:
+    """The meshes, and what they are at one state; terms share one instance."""
+
+    def __init__(
+        self,
+        model: BodyModel,
+        mesh: ObjectMesh,
+        field: DistanceField,
+        patches: Patches,
+    ) -> None:
+        self.model, self.mesh, self.field, self.patches = model, mesh, field, patches
+        self.skin = Skin.watch(model, patches)
+        self.moments = smoothness.moment_points(mesh.vertices)
+        self._last: PosedGeometry | None = None
+
+    def at(self, state: State) -> PosedGeometry:
+        """The geometry at ``state``; the last state's is kept, since all terms ask for the same.
+
+        A state is never changed in place, so it is known by its identity.
+        """
+        if self._last is None or self._last.state is not state:
+            self._last = PosedGeometry(self, state)
+        return self._last
+
+
+class PosedGeometry:
+    """Points, distances and derivatives at one state, each computed when first asked for.
+
+    Master frame, metres.
+    """
+
+    def __init__(self, geometry: Geometry, state: State) -> None:
+        self._geometry, self.state = geometry, state
+
+    @cached_property
+    def _parameters(self) -> BodyParameters:
+        return self.state.parameters(self._geometry.model)
+
+    @cached_property
+    def skin(self) -> np.ndarray:
+        """(T, N, 3) the skin's vertices."""
+        g = self._geometry
+        with torch.no_grad():
+            body = g.model(self._parameters, vertex_ids=g.skin.vertices)
+        return body.vertices.double().cpu().numpy()
+
+    @cached_property
+    def proximity(self) -> Proximity:
+        """Distance of the N skin vertices to the object."""
+        state = self.state
+        return proximity(self._geometry.field, self.skin, state.rotation, state.translation)
+
+    def skin_by_body(self, directions: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Derivative (T, A, 168) by the body, of the skin vertices ``index`` (A,) along
+        ``directions`` (T, N, 3) of all."""
+        if not len(index):
+            return np.zeros((len(self.state), 0, BODY.stop))
+        g = self._geometry
+        lin = g.model.linearise(self._parameters, vertex_ids=g.skin.vertices[index])
+        along = torch.as_tensor(
+            np.ascontiguousarray(directions[:, index]),
+            dtype=lin.points.dtype,
+            device=lin.points.device,
+        )
+        return lin.along(along[:, :, None])[:, :, 0, BODY].double().cpu().numpy()
+
+    @cached_property
+    def joints(self) -> tuple[np.ndarray, np.ndarray]:
+        """The body's joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body."""
+        lin = self._geometry.model.linearise(
+            self._parameters, vertex_ids=np.zeros(0, np.int64), joints=True
+        )
+        jacobian = lin.full()[..., BODY].double().cpu().numpy()
+        return lin.joints.double().cpu().numpy(), jacobian
+
+    @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (T, 6, 3) with the object's moments and their derivative (T, 6, 3, 6) by it."""
+        state = self.state
+        return smoothness.points_by_object(
+            self._geometry.moments, state.rotation, state.translation
+        )
+
+    @cached_property
+    def object_vertices(self) -> np.ndarray:
+        """(T, V, 3) the object's vertices."""
+        turned = np.einsum("tij,nj->tni", self.state.rotation, self._geometry.mesh.vertices)
+        return turned + self.state.translation[:, None]

@@ -1,0 +1,103 @@
+"""Where the joint fit starts: what the two sequential stages, body and object, have found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.body.parameters import TRANSL
+from intercap_core.joint.constants import UNTRACKED_SIGMA
+from intercap_core.joint.problem import Trust
+from intercap_core.joint.state import State
+from intercap_core.joint.terms.object_data import TrackedPoses
+from intercap_core.rigid.pose_interpolation import bridge_poses
+
+# In the order of `BodyParameters`.
+_POSE = (
+    "global_orient",
+    "body_pose",
+    "jaw_pose",
+    "leye_pose",
+    "reye_pose",
+    "left_hand_pose",
+    "right_hand_pose",
+    "transl",
+)
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Frames (T,) in which a sequential fit says that it cannot be trusted.
+
+    ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
+    was seen; ``lost``, ``disagree`` and ``ambiguous``: the object track's.
+    """
+
+    filled: np.ndarray
+    uncertain: np.ndarray
+    lost: np.ndarray
+    disagree: np.ndarray
+    ambiguous: np.ndarray
+
+
+@dataclass(frozen=True)
+class SequentialFits:
+    """One state of body and object, and how far it is believed.
+
+    ``state`` has the mean shape and, where the object is lost, interpolated poses. ``joint_sigma``
+    (T, 55) and ``object_sigma`` (T,) are stated standard deviations of positions, metres.
+    """
+
+    state: State
+    tracked: TrackedPoses
+    trust: Trust
+    flags: Flags
+    joint_sigma: np.ndarray
+    object_sigma: np.ndarray
+
+    @classmethod
+    def read(cls, body: Artefact, track: Artefact, scene: Artefact) -> SequentialFits:
+        """Read body_fit.h5, object_track.h5 and, for the cameras' times, scene.h5."""
+        state = _state(body, track)
+        failed, lost = body["failed"], track["lost"]
+        flags = Flags(
+            filled=failed | body["bridged"],
+            uncertain=body["uncertain"],
+            lost=lost,
+            disagree=track["disagree"],
+            ambiguous=track["ambiguous"],
+        )
+        resting = track["resting"]
+        tracked = TrackedPoses.from_track(
+            state.rotation,
+            state.translation,
+            track["covariance"],
+            lost,
+            flags.disagree | flags.ambiguous,
+            resting,
+            visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
+            times=scene["times"],
+            time_offset=scene["time_offset"],
+        )
+        sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
+        return cls(
+            state=state,
+            tracked=tracked,
+            trust=Trust(~failed, ~lost, resting[1:] & resting[:-1]),
+            flags=flags,
+            joint_sigma=body["joint_sigma"].astype(float),
+            object_sigma=np.where(lost | ~np.isfinite(sigma), UNTRACKED_SIGMA, sigma),
+        )
+
+
+def _state(body: Artefact, track: Artefact) -> State:
+    """The sequential fits as one state: the mean shape, lost object poses interpolated."""
+    vector = np.concatenate([body[name] for name in _POSE], axis=1).astype(float)
+    assert vector.shape[1] == TRANSL.stop
+    betas = body["betas"].astype(float)
+    fitted = ~body["failed"]
+    shape = betas[fitted].mean(axis=0) if fitted.any() else betas.mean(axis=0)
+    rotation, translation = bridge_poses(track["rotation"], track["translation"], ~track["lost"])
+    return State(vector, shape, body["expression"].astype(float), rotation, translation)

@@ -1,0 +1,55 @@
+"""Contact: Q_t E_C of equation 6, weighed by lambda_Q (setting ``contact_weight``).
+
+The residuals, and what differs from the paper, are in :mod:`intercap_core.energy.contact`. The
+paper's binary Q_t is the probability that each region touches, annotated or detected.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.energy import contact
+from intercap_core.joint.constants import CONTACT_SIGMA
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.state import State
+from intercap_core.joint.terms.coupled import add_distances
+from intercap_core.joint.terms.term import Term
+
+
+class Contact(Term):
+    """Q_t E_C; Q (T, R), the probability that each region touches, is set between rounds."""
+
+    name = "contact"
+
+    def __init__(self, geometry: Geometry, weight: float) -> None:
+        self._geometry, self._scale = geometry, weight / CONTACT_SIGMA**2
+        self._probability: np.ndarray | None = None
+        self._shares: contact.Shares | None = None
+
+    def take_probability(self, probability: np.ndarray) -> None:
+        """Use this probability (T, R) that each region touches from now on."""
+        self._probability = probability
+
+    def refresh(self, state: State) -> None:
+        """Take anew which vertices carry the contact."""
+        patches = self._geometry.patches
+        distance = self._geometry.at(state).proximity.distance[:, self._geometry.skin.patch]
+        self._shares = contact.shares(distance, patches.patch, patches.region_of_patch)
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add Q_t E_C at ``state`` with the vertices' shares of the last :meth:`refresh`."""
+        assert self._shares is not None, "refresh comes first"
+        assert self._probability is not None, "take_probability comes first"
+        patches, at_patch = self._geometry.patches, self._geometry.skin.patch
+        posed = self._geometry.at(state)
+        distance = posed.proximity.distance
+        touch, weight, energy = contact.term(
+            distance[:, at_patch],
+            patches.patch,
+            self._shares,
+            self._probability[:, patches.region_of_patch],
+        )
+        residual, weights = np.zeros_like(distance), np.zeros_like(distance)
+        residual[:, at_patch], weights[:, at_patch] = touch, weight * self._scale
+        add_distances(self.name, posed, residual, weights, energy * self._scale, equations)

@@ -1,0 +1,124 @@
+"""Drift (beyond the paper): corrections of the sequential fits change slowly.
+
+    E = sum over frames t, points i of |c_i(t+1) - c_i(t)|^2 / (2 sigma^2),  c = X - X_sequential
+
+A sequential fit's errors last: calibration, clothing and a mask's errors are the same in the next
+frame. sigma^2 is that of a random walk over one frame plus the sequential fit's own jitter.
+Without it contact that comes and goes would shake a fit that was steady. While the object rests
+(``object_still``) its corrections are the same in all frames. No setting weighs these terms.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from intercap_core.energy import smoothness
+from intercap_core.joint.constants import (
+    BODY_DRIFT,
+    DRIFT_POINTS_PER_MEASUREMENT,
+    OBJECT_DRIFT,
+    RESTING_SIGMA,
+)
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.state import BODY, OBJECT, State
+from intercap_core.joint.terms.term import Term
+
+
+class BodyDrift(Term):
+    """Drift of the 55 joints between frames that the body fit believes, ``known`` (T,)."""
+
+    name = "body_drift"
+
+    def __init__(
+        self, geometry: Geometry, sequential: State, fps: float, known: np.ndarray
+    ) -> None:
+        self._geometry = geometry
+        model = geometry.model
+        with torch.no_grad():
+            body = model(sequential.parameters(model), vertex_ids=np.array([0]))
+        self._sequential = body.joints.double().cpu().numpy()
+        self._sigma = _sigma(self._sequential, known, BODY_DRIFT, fps)
+        self._pairs = known[1:] & known[:-1]
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add the drift at ``state``."""
+        if len(state) < 3:
+            return
+        joints, jacobian = self._geometry.at(state).joints
+        correction = joints - self._sequential
+        _add_pairs(self.name, BODY, correction, jacobian, self._pairs, self._sigma, equations)
+
+
+class ObjectDrift(Term):
+    """Drift of the object's points between frames that the tracker believes, ``known`` (T,);
+    none over the steps ``still`` (T-1,) in which the object rests."""
+
+    name = "object_drift"
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        sequential: State,
+        fps: float,
+        known: np.ndarray,
+        still: np.ndarray,
+    ) -> None:
+        self._geometry = geometry
+        self._sequential, _ = geometry.at(sequential).moments
+        self._sigma = _sigma(self._sequential, known, OBJECT_DRIFT, fps)
+        self._pairs, self._still = known[1:] & known[:-1] & ~still, still
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add the drift at ``state``."""
+        if len(state) < 3:
+            return
+        points, jacobian = self._geometry.at(state).moments
+        correction = points - self._sequential
+        _add_pairs(self.name, OBJECT, correction, jacobian, self._pairs, self._sigma, equations)
+        _add_pairs(
+            self.name,
+            OBJECT,
+            correction,
+            jacobian,
+            self._still,
+            RESTING_SIGMA,
+            equations,
+            tie=True,
+        )
+
+
+def _sigma(points: np.ndarray, known: np.ndarray, drift: float, fps: float) -> float:
+    """Standard deviation, in metres, of the change of corrections from frame to frame."""
+    noise = smoothness.jitter(points, known)
+    return np.sqrt(drift**2 / fps + 2 * noise**2)
+
+
+def _add_pairs(
+    name: str,
+    columns: slice,
+    correction: np.ndarray,
+    jacobian: np.ndarray,
+    pairs: np.ndarray,
+    sigma: float,
+    equations: NormalEquations,
+    *,
+    tie: bool = False,
+) -> None:
+    """Add the changes of ``correction`` (T, N, 3) over the steps ``pairs`` (T-1,), with the points'
+    ``jacobian`` (T, N, 3, m) over ``columns`` and standard deviation ``sigma``, metres."""
+    frames, count = correction.shape[:2]
+    change = np.diff(correction, axis=0).reshape(frames - 1, -1)
+    weight = np.repeat(pairs[:, None] / sigma**2, 3 * count, axis=1)
+    weight /= DRIFT_POINTS_PER_MEASUREMENT
+    equations.add_differences(
+        name,
+        columns,
+        smoothness.RATE,
+        jacobian.reshape(frames, 3 * count, -1),
+        weight,
+        change,
+        0.5 * float((weight * change**2).sum()),
+        tie=tie,
+    )

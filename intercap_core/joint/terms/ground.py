@@ -1,0 +1,81 @@
+"""Ground support: E_G (body) and E_G' (object) of equation 6, from the paper's appendix.
+
+Weighed by lambda_G (setting ``ground_weight``); residuals in :mod:`intercap_core.energy.ground`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.energy import ground
+from intercap_core.joint.constants import (
+    GROUND_SIGMA,
+    MIN_STANDING_VERTICES,
+    VERTICES_PER_MEASUREMENT,
+)
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.state import BODY, OBJECT, State
+from intercap_core.joint.terms.term import Term
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor: ``point`` (3,) and upward unit ``normal`` (3,), master frame, metres."""
+
+    point: np.ndarray
+    normal: np.ndarray
+
+
+class BodyGround(Term):
+    """E_G: the body does not sink into the floor."""
+
+    name = "ground"
+
+    def __init__(self, geometry: Geometry, floor: Ground, weight: float) -> None:
+        self._geometry, self._floor = geometry, floor
+        self._scale = weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add E_G at ``state``."""
+        posed = self._geometry.at(state)
+        height = ground.residuals(posed.skin, self._floor.point, self._floor.normal)
+        weight = np.where(height < 0, self._geometry.skin.share, 0.0) * self._scale
+        index = np.flatnonzero(weight.any(axis=0))
+        normals = np.broadcast_to(self._floor.normal, posed.skin.shape)
+        rows = posed.skin_by_body(normals, index)
+        equations.add_rows(self.name, BODY, rows, weight[:, index], height[:, index])
+
+
+class ObjectGround(Term):
+    """E_G': the object does not sink into the floor.
+
+    An object stands on few vertices: together they count as one measurement.
+    """
+
+    name = "ground"
+
+    def __init__(self, geometry: Geometry, floor: Ground, weight: float) -> None:
+        self._geometry, self._floor, self._weight = geometry, floor, weight
+        self._standing: np.ndarray | None = None
+
+    def refresh(self, state: State) -> None:
+        """Take anew on how many vertices the object stands."""
+        below = self._height(state) < 0
+        self._standing = np.maximum(below.sum(axis=1, keepdims=True), MIN_STANDING_VERTICES)
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add E_G' at ``state`` with the number of vertices of the last :meth:`refresh`."""
+        assert self._standing is not None, "refresh comes first"
+        height = self._height(state)
+        weight = (height < 0) / self._standing
+        weight = weight * self._weight / GROUND_SIGMA**2
+        vertices = self._geometry.at(state).object_vertices
+        rows = ground.by_object(vertices, state.translation, self._floor.normal)
+        equations.add_rows(self.name, OBJECT, rows, weight, height)
+
+    def _height(self, state: State) -> np.ndarray:
+        vertices = self._geometry.at(state).object_vertices
+        return ground.residuals(vertices, self._floor.point, self._floor.normal)

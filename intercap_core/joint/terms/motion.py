@@ -1,0 +1,82 @@
+"""Smooth motion: E_S (body) and E_A (object) of equation 6, from the paper's appendix.
+
+Weighed by lambda_S and lambda_A (settings ``body_smoothness`` and ``object_smoothness``); what
+differs from the paper is in :mod:`intercap_core.energy.smoothness`. Recordings of fewer than three
+frames have no acceleration.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.body.joints import NUM_JOINTS
+from intercap_core.energy import smoothness
+from intercap_core.joint.constants import (
+    ACCELERATION_OUTLIER,
+    BODY_ACCELERATION,
+    FINGER_ACCELERATION,
+    OBJECT_ACCELERATION,
+)
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.state import BODY, OBJECT, State
+from intercap_core.joint.terms.term import Term
+
+_FIRST_FINGER = 25  # joints from here on are the fingers'
+
+
+class BodyMotion(Term):
+    """E_S: small accelerations of the 55 joints."""
+
+    name = "body_motion"
+
+    def __init__(self, geometry: Geometry, fps: float, weight: float) -> None:
+        self._geometry, self._fps, self._weight = geometry, fps, weight
+        fingers = np.arange(NUM_JOINTS) >= _FIRST_FINGER
+        self._sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add E_S at ``state``."""
+        frames = len(state)
+        if frames < 3:
+            return
+        joints, jacobian = self._geometry.at(state).joints
+        acceleration = smoothness.accelerations(joints, self._fps) / self._sigma[:, None]
+        weight, energy = smoothness.robust(acceleration, ACCELERATION_OUTLIER)
+        rows = jacobian * (self._fps**2 / self._sigma[:, None, None])
+        equations.add_differences(
+            self.name,
+            BODY,
+            smoothness.ACCELERATION,
+            rows.reshape(frames, -1, BODY.stop),
+            np.repeat(weight * self._weight, 3, axis=1),
+            acceleration.reshape(frames - 2, -1),
+            energy * self._weight,
+        )
+
+
+class ObjectMotion(Term):
+    """E_A: small accelerations of the object's points."""
+
+    name = "object_motion"
+
+    def __init__(self, geometry: Geometry, fps: float, weight: float) -> None:
+        self._geometry, self._fps, self._weight = geometry, fps, weight
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add E_A at ``state``."""
+        frames = len(state)
+        if frames < 3:
+            return
+        points, jacobian = self._geometry.at(state).moments
+        acceleration = smoothness.accelerations(points, self._fps) / OBJECT_ACCELERATION
+        weight, energy = smoothness.robust(acceleration, ACCELERATION_OUTLIER)
+        equations.add_differences(
+            self.name,
+            OBJECT,
+            smoothness.ACCELERATION,
+            jacobian.reshape(frames, -1, 6) * (self._fps**2 / OBJECT_ACCELERATION),
+            np.repeat(weight * self._weight, 3, axis=1),
+            acceleration.reshape(frames - 2, -1),
+            energy * self._weight,
+        )
