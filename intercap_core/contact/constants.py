@@ -23,8 +23,8 @@ OUTLIER_PROBABILITY = 0.01
 CHANGES_PER_SECOND = 0.6
 # Share of frames in which a region touches, before anything is seen. Tuned on the studio.
 TOUCHING_PRIOR = 0.15
-# A free hand is anywhere within this distance of the object, metres: half an arm's length. Tuned on the
-# studio.
+# A free hand is anywhere within this distance of the object, metres: half an arm's length. Tuned on
+# the studio.
 FREE_RANGE = 0.40
 # An object moves when its surface does so faster than this, m/s: the track's jitter stays below.
 # Tuned on the studio.

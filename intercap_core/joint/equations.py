@@ -32,7 +32,7 @@ class NormalEquations:
         factor = BandedSystem(damped).factorise()
         if factor is None:
             return None
-        return factor.solve(-torch.from_numpy(self.gradient))[0].numpy()
+        return factor.solve(-torch.from_numpy(self.gradient)).numpy()
 
     @property
     def total(self) -> float:
