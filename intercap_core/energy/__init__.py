@@ -1,0 +1,57 @@
+"""The terms of the energy: residuals and Jacobians, one file a term.
+
+The table says where each equation of the InterCap paper (Huang et al. 2022; "A.n" of its appendix)
+is found, and what goes beyond the paper. Files are below ``intercap_core/``. A setting is the
+weight or switch of a term, "same" that of the row above, "-" where its strength follows from the
+noise of what is measured. Formulas and differences from the paper are in ``docs/equations.md``.
+
+| paper | term | file | function or class | setting |
+| --- | --- | --- | --- | --- |
+| 1 | E_O: silhouette | energy/object_silhouette.py | residuals | - |
+| 1 | E_O: silhouette, compiled | energy/object_silhouette_kernel.py | normal_equations | - |
+| 1 | E_O: depth | energy/object_depth.py | residuals | - |
+| 1 | E_O: depth, compiled | energy/object_depth_kernel.py | normal_equations | - |
+| 1 | E_O: sum over views | object_track/fit.py | fit_pose | - |
+| beyond | background | energy/object_silhouette.py | residuals | object_track.background_term |
+| beyond | expected object pose | object_track/fit.py | MotionPrior | - |
+| beyond | object track over time | object_track/smooth.py | smooth | - |
+| 2 | E_B: sum of terms | body_fit/problem.py | BodyProblem | - |
+| 2, 3 | E_J | energy/body_keypoints.py | reprojection | - |
+| 2, 3 | E_J, compiled | energy/body_keypoints_kernel.py | add_equations | - |
+| 2, 4 | E_D | energy/body_cloud.py | residuals | body_fit.cloud_weight |
+| 2, 4 | E_D, compiled | energy/body_cloud_kernel.py | add_equations | same |
+| 2, 5 | E_P_self | energy/body_self.py | assemble | body_fit.self_penetration_weight |
+| 2, 5 | E_P_self, compiled | energy/body_surface_kernel.py | add_self_equations | same |
+| 2 | E_theta_b | body/priors.py | rest_pose | - |
+| 2 | E_theta_b with VPoser | body/vposer.py | VPoser | - |
+| 2 | E_theta_h | body/priors.py | hand_pose | - |
+| 2 | E_theta_f (jaw, eyes) | body/priors.py | rest_pose | - |
+| 2 | E_alpha | body/priors.py | bending | - |
+| 2 | E_beta, E_psi: sum of priors | energy/body_priors.py | assemble | - |
+| 2 | priors, compiled | energy/body_priors_kernel.py | add_priors | - |
+| beyond | joint limits | body/priors.py | joint_limits | - |
+| beyond | triangulated keypoints | energy/body_keypoints.py | triangulated | - |
+| beyond | keypoint offsets | energy/body_keypoints.py | assemble_offsets | - |
+| beyond | thickness of clothing | energy/body_samples.py | Covering | - |
+| beyond | free space | body_fit/free_space.py | seen_through | body_fit.cloud_weight |
+| 6 | E: sum of terms | joint/problem.py | joint_terms | - |
+| 6 | E_B | joint/terms/body_data.py | BodyData | - |
+| 6 | E_O | joint/terms/object_data.py | ObjectData | - |
+| 6, A.4 | E_C: residuals | energy/contact.py | term | joint.contact_weight |
+| 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
+| beyond | Q_t, detected | contact/detect.py | contact_probability | joint.detect_contact |
+| beyond | body in object: residuals | energy/penetration.py | weights | joint.penetration_weight |
+| beyond | body in object | joint/terms/penetration.py | Penetration | joint.penetration_weight |
+| 6, A.5 | E_G: residuals | energy/ground.py | residuals | joint.ground_weight |
+| 6, A.5 | E_G | joint/terms/ground.py | BodyGround | joint.ground_weight |
+| 6, A.6 | E_G' | joint/terms/ground.py | ObjectGround | joint.ground_weight |
+| 6, A.1 | E_S | joint/terms/motion.py | BodyMotion | joint.body_smoothness |
+| 6, A.3 | E_A: residuals | energy/smoothness.py | accelerations | joint.object_smoothness |
+| 6, A.3 | E_A | joint/terms/motion.py | ObjectMotion | joint.object_smoothness |
+| beyond | drift of the body | joint/terms/drift.py | BodyDrift | - |
+| beyond | drift of the object | joint/terms/drift.py | ObjectDrift | - |
+| beyond | time offsets of the cameras | joint/time_offsets.py | estimate_offsets | - |
+
+Terms take arrays and return residuals, weights and Jacobians, or add to normal equations. Their
+callers find correspondences and weigh terms against each other.
+"""
