@@ -29,8 +29,7 @@ FREE_RANGE = 0.40
 # An object moves when its surface does so faster than this, m/s: the track's jitter stays below.
 # Tuned on the studio.
 MOVING_SPEED = 0.12
-# The object is held by somebody when it moves faster than so many times ``MOVING_SPEED``. Tuned on
-# the studio.
+# An object that moves faster than so many times ``MOVING_SPEED`` is held. Tuned on the studio.
 HELD_SPEED_FACTOR = 2.0
 
 # --- decision

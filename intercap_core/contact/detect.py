@@ -49,7 +49,10 @@ class RegionMotion:
 
 
 def contact_probability(
-    motion: RegionMotion, fps: float, *, given: np.ndarray | float = 0.0
+    motion: RegionMotion,
+    fps: float,
+    *,
+    given: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """Probability (T, R) that each region touches the object, smoothed over time.
 
@@ -118,7 +121,9 @@ def smooth(evidence: np.ndarray, fps: float) -> np.ndarray:
 
 
 def annotation_evidence(
-    intervals: Sequence[ContactInterval], regions: Sequence[str], frames: int
+    intervals: Sequence[ContactInterval],
+    regions: Sequence[str],
+    frames: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log odds (T, R) that annotated intervals add, and the labels (T, R) int8 they state.
 

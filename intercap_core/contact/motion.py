@@ -46,7 +46,10 @@ def region_motion(
 
 
 def _speed_over_object(
-    points: np.ndarray, rotation: np.ndarray, translation: np.ndarray, fps: float
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    fps: float,
 ) -> np.ndarray:
     """Speed (T, N) of points (T, N, 3) in the object's frame, m/s."""
     local = np.einsum("tji,tnj->tni", rotation, points - translation[:, None])
@@ -54,7 +57,10 @@ def _speed_over_object(
 
 
 def _rigid_speed(
-    surface: np.ndarray, rotation: np.ndarray, translation: np.ndarray, fps: float
+    surface: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    fps: float,
 ) -> np.ndarray:
     """Speed (T, N) of the object's surface points (T, N, 3), moving rigidly with it, m/s."""
     local = np.einsum("tji,tnj->tni", rotation, surface - translation[:, None])

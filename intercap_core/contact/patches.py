@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.contact.constants import HAND_VERTICES, OTHER_VERTICES
 from intercap_core.schemas import CONTACT_REGIONS
 
-_FIRST_FINGER_JOINT = 25  # joints 25-39 are the left hand's, 40-54 the right's, three a finger
+# Joints from here on are the fingers', three a finger, first of the left hand.
+_FIRST_FINGER_JOINT = JOINT_INDEX["left_index1"]
 _PALM = -1
 
 

@@ -57,7 +57,10 @@ def shares(distance: np.ndarray, patch_of: np.ndarray, region_of_patch: np.ndarr
 
 
 def term(
-    distance: np.ndarray, patch_of: np.ndarray, spread: Shares, probability: np.ndarray
+    distance: np.ndarray,
+    patch_of: np.ndarray,
+    spread: Shares,
+    probability: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Residuals (T, N) in metres, weights (T, N) and energy (m^2) of all contact vertices.
 

@@ -33,7 +33,10 @@ class Proximity:
 
 
 def proximity(
-    field: DistanceField, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+    field: DistanceField,
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
 ) -> Proximity:
     """Distances of ``points`` (T, N, 3) to the object at ``rotation`` (T, 3, 3) and
     ``translation`` (T, 3), all in the master frame, with exact first derivatives."""

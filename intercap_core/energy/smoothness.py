@@ -33,14 +33,14 @@ def robust(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
     return 1.0 / root, float(scale**2 * (root - 1.0).sum())
 
 
-def jitter(points: np.ndarray, known: np.ndarray) -> float:
+def jitter(points: np.ndarray, valid: np.ndarray) -> float:
     """Standard deviation, in metres, of noise that is independent from frame to frame in points
     (T, N, 3), from the median size of fourth differences: motion itself hardly has any. Only runs
-    of ``known`` (T,) frames count; 0 where there is none of five."""
+    of ``valid`` (T,) frames count; 0 where there is none of five."""
     count = len(points) - len(_FOURTH) + 1
     if count < 1:
         return 0.0
-    whole = np.all([known[k : k + count] for k in range(len(_FOURTH))], axis=0)
+    whole = np.all([valid[k : k + count] for k in range(len(_FOURTH))], axis=0)
     if not whole.any():
         return 0.0
     fourth = np.sum([f * points[k : k + count] for k, f in enumerate(_FOURTH)], axis=0)
@@ -63,7 +63,9 @@ def moment_points(vertices: np.ndarray) -> np.ndarray:
 
 
 def points_by_object(
-    points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Object points (N, 3) moved to all frames (T, N, 3), and their derivative (T, N, 3, 6) by
     (w, d) for the motion X' = exp(w)(X - t) + t + d."""

@@ -101,7 +101,7 @@ OFFSET_ITERATIONS = 4  # reweightings of the offsets' normal equations; tuned on
 INITIAL_DAMPING = 1e-3
 MIN_DAMPING = 1e-6
 DAMPING_UP, DAMPING_DOWN = 10.0, 5.0  # factors after a rejected and an accepted step
-# Largest change in one step, rad and metres: how far a linearisation of skinning is believed.
+# Largest change in one step, rad and metres: beyond it a linearisation of skinning is poor.
 # Tuned on the studio.
 MAX_STEP_TURN = 0.5
 MAX_STEP_SHIFT = 0.1

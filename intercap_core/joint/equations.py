@@ -40,7 +40,12 @@ class NormalEquations:
         return float(sum(self.energy.values()))
 
     def add_blocks(
-        self, term: str, columns: slice, hessian: np.ndarray, gradient: np.ndarray, energy: float
+        self,
+        term: str,
+        columns: slice,
+        hessian: np.ndarray,
+        gradient: np.ndarray,
+        energy: float,
     ) -> None:
         """Add ready J^T W J (T, m, m) and J^T W r (T, m) over ``columns`` of every frame."""
         self.bands[0][:, columns, columns] += hessian

@@ -29,7 +29,7 @@ class Geometry:
         patches: Patches,
     ) -> None:
         self.model, self.mesh, self.field, self.patches = model, mesh, field, patches
-        self.skin = Skin.watch(model, patches)
+        self.skin = Skin.select(model, patches)
         self.moments = smoothness.moment_points(mesh.vertices)
         self._last: PosedGeometry | None = None
 

@@ -42,7 +42,10 @@ class Minimum:
 
 
 def minimise(
-    linearise: Callable[[State], NormalEquations], state: State, *, max_steps: int
+    linearise: Callable[[State], NormalEquations],
+    state: State,
+    *,
+    max_steps: int,
 ) -> Minimum:
     """Try at most ``max_steps`` steps from ``state``, each accepted only if it lowers the energy.
 

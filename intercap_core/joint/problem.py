@@ -29,7 +29,7 @@ from intercap_core.joint.terms.term import Term
 
 @dataclass(frozen=True)
 class Trust:
-    """Frames in which the sequential fits are believed.
+    """Frames in which the sequential fits are trusted.
 
     ``body`` and ``object_`` (T,) flags, ``still`` (T-1,) the steps over which the object rests.
     """

@@ -29,7 +29,7 @@ _POSE = (
 
 @dataclass(frozen=True)
 class Flags:
-    """Frames (T,) in which a sequential fit says that it cannot be trusted.
+    """Frames (T,) that a sequential fit has flagged.
 
     ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
     was seen; ``lost``, ``disagree`` and ``ambiguous``: the object track's.
@@ -44,7 +44,7 @@ class Flags:
 
 @dataclass(frozen=True)
 class SequentialFits:
-    """One state of body and object, and how far it is believed.
+    """One state of body and object, and how far it is to be trusted.
 
     ``state`` has the mean shape and, where the object is lost, interpolated poses. ``joint_sigma``
     (T, 55) and ``object_sigma`` (T,) are stated standard deviations of positions, metres.

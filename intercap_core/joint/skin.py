@@ -1,4 +1,4 @@
-"""The body's vertices that the joint fit watches: contact patches dense, the rest thin."""
+"""The body's vertices that are compared with object and floor: patches dense, the rest sparse."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from intercap_core.energy.body_samples import choose_samples
 @dataclass(frozen=True)
 class Skin:
     """``vertices`` (N,) ids, ascending; ``share`` (N,) how many vertices of the mesh each stands
-    for; ``patch`` (M,) where in them the contact patches' vertices are."""
+    for; ``patch`` (M,) the contact patches' places among them."""
 
     vertices: np.ndarray
     share: np.ndarray
     patch: np.ndarray
 
     @classmethod
-    def watch(cls, model: BodyModel, patches: Patches) -> Skin:
+    def select(cls, model: BodyModel, patches: Patches) -> Skin:
         """All contact patches and an even sample of the outer skin."""
         vertices = np.union1d(patches.vertices, choose_samples(model).vertex)
         template = model.template.double().cpu().numpy()

@@ -84,9 +84,9 @@ def estimate_offsets(
     frames.
     """
     count = len(current)
-    known = np.isfinite(prior.sigma)
-    expected = np.where(known, prior.offset, 0.0) - current
-    sigma = np.maximum(np.where(known, prior.sigma, LOOSE_OFFSET_SIGMA_S), MIN_PRIOR_SIGMA_S)
+    has_prior = np.isfinite(prior.sigma)
+    expected = np.where(has_prior, prior.offset, 0.0) - current
+    sigma = np.maximum(np.where(has_prior, prior.sigma, LOOSE_OFFSET_SIGMA_S), MIN_PRIOR_SIGMA_S)
     precision = np.diag(sigma**-2.0)
     free = np.arange(count) != prior.master
     all_innovations = [found for s in sightings if (found := _Innovations.of(s, times)) is not None]
@@ -160,7 +160,9 @@ class _Innovations:
         return self.weight * geman_mcclure_weight(square, INNOVATION_OUTLIER)
 
     def _without_point_errors(
-        self, residual: np.ndarray, weight: np.ndarray
+        self,
+        residual: np.ndarray,
+        weight: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         weighted = self.by_point * weight[..., None, None]
         matrix = np.einsum("tckdp,tckdq->tkpq", weighted, self.by_point)

@@ -71,7 +71,7 @@ def test_contact_weights_of_a_touching_patch_sum_to_its_probability():
     assert weight[0, 2] < 1e-6
 
 
-def test_a_far_patch_gives_up():
+def test_a_far_patch_is_an_outlier():
     _, near, _ = _contact([[0.005]], [0], [0], [[1.0]])
     _, far, _ = _contact([[0.2]], [0], [0], [[1.0]])
     assert near.sum() > 0.9 and far.sum() < 0.01
@@ -97,7 +97,7 @@ def test_contact_weights_are_the_derivative_of_its_energy():
         assert (weight * residual)[t, n] == pytest.approx(numeric, rel=1e-4, abs=1e-10)
 
 
-def test_only_depth_beyond_the_tolerance_is_paid_for():
+def test_only_depth_beyond_the_tolerance_costs():
     distance = np.array([[0.01, -0.5 * PENETRATION_TOLERANCE, -0.006]])
     residual, weight = penetration.weights(distance, np.full(3, 2.0))
     np.testing.assert_allclose(residual[0], [0, 0, -0.006 + PENETRATION_TOLERANCE])

@@ -231,6 +231,42 @@ def test_gradient_is_the_derivative_of_the_energy(model, box):
     assert np.isfinite(gradient).all()
 
 
+@pytest.mark.parametrize("index", range(2, 10))
+def test_each_term_s_gradient_is_the_derivative_of_its_energy(model, box, index):
+    """Hand and box overlap, and both reach below the floor."""
+    state = _state(model, -0.01)
+    floor = Ground(state.translation[0], np.array([0, 1.0, 0]))
+    data = (_Hold(state, 0.1), ObjectData(_tracked(state, 0.1, np.zeros(FRAMES, bool))))
+    scene = _Scene(model, box, state, data=data, floor=floor, touching=[LEFT_HAND])
+    term = scene.problem.terms[index]
+    rng = np.random.default_rng(index)
+    here = state.moved(rng.normal(scale=0.002, size=(FRAMES, ALL.stop)))
+    direction = rng.normal(size=(FRAMES, ALL.stop))
+    direction /= np.linalg.norm(direction)
+
+    def equations(at: State) -> NormalEquations:
+        found = NormalEquations(FRAMES)
+        term.add(at, found)
+        assert list(found.energy) == [term.name]
+        return found
+
+    step = 1e-3
+    up, down = (equations(here.moved(s * direction)).total for s in (step, -step))
+    slope = float((equations(here).gradient * direction).sum())
+    assert (up - down) / (2 * step) == pytest.approx(slope, rel=0.02)
+
+
+def test_a_term_that_is_left_out_leaves_the_others_as_they_are(model, box):
+    state = _state(model, -0.01)
+    data = (_Hold(state, 0.1), ObjectData(_tracked(state, 0.1, np.zeros(FRAMES, bool))))
+    scene = _Scene(model, box, state, data=data, touching=[LEFT_HAND])
+    whole = scene.problem.equations(state)
+    kept = tuple(term for term in scene.problem.terms if term.name != "penetration")
+    rest = Problem(kept).equations(state)
+    assert whole.energy.pop("penetration") > 0
+    assert rest.energy == whole.energy
+
+
 def test_bridging_takes_the_straight_way():
     rotation = np.tile(np.eye(3), (5, 1, 1))
     translation = np.array([[0.0, 0, 0], [9, 9, 9], [9, 9, 9], [0.3, 0, 0], [9, 9, 9]])
@@ -239,7 +275,7 @@ def test_bridging_takes_the_straight_way():
     np.testing.assert_allclose(moved[:, 0], [0, 0.1, 0.2, 0.3, 0.3])
 
 
-def test_a_passing_pull_does_not_shake_a_steady_track(model, box):
+def test_a_brief_contact_does_not_shake_a_steady_track(model, box):
     """One frame of contact moves the neighbours along instead of kicking its own frame."""
     state = _state(model, 0.010)
     tracked = _tracked(state, 0.01, np.zeros(FRAMES, bool))

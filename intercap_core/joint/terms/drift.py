@@ -27,20 +27,24 @@ from intercap_core.joint.terms.term import Term
 
 
 class BodyDrift(Term):
-    """Drift of the 55 joints between frames that the body fit believes, ``known`` (T,)."""
+    """Drift of the 55 joints between frames in which the body fit is ``trusted`` (T,)."""
 
     name = "body_drift"
 
     def __init__(
-        self, geometry: Geometry, sequential: State, fps: float, known: np.ndarray
+        self,
+        geometry: Geometry,
+        sequential: State,
+        fps: float,
+        trusted: np.ndarray,
     ) -> None:
         self._geometry = geometry
         model = geometry.model
         with torch.no_grad():
             body = model(sequential.parameters(model), vertex_ids=np.array([0]))
         self._sequential = body.joints.double().cpu().numpy()
-        self._sigma = _sigma(self._sequential, known, BODY_DRIFT, fps)
-        self._pairs = known[1:] & known[:-1]
+        self._sigma = _sigma(self._sequential, trusted, BODY_DRIFT, fps)
+        self._pairs = trusted[1:] & trusted[:-1]
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the drift at ``state``."""
@@ -52,7 +56,7 @@ class BodyDrift(Term):
 
 
 class ObjectDrift(Term):
-    """Drift of the object's points between frames that the tracker believes, ``known`` (T,);
+    """Drift of the object's points between frames in which the track is ``trusted`` (T,);
     none over the steps ``still`` (T-1,) in which the object rests."""
 
     name = "object_drift"
@@ -62,13 +66,13 @@ class ObjectDrift(Term):
         geometry: Geometry,
         sequential: State,
         fps: float,
-        known: np.ndarray,
+        trusted: np.ndarray,
         still: np.ndarray,
     ) -> None:
         self._geometry = geometry
         self._sequential, _ = geometry.at(sequential).moments
-        self._sigma = _sigma(self._sequential, known, OBJECT_DRIFT, fps)
-        self._pairs, self._still = known[1:] & known[:-1] & ~still, still
+        self._sigma = _sigma(self._sequential, trusted, OBJECT_DRIFT, fps)
+        self._pairs, self._still = trusted[1:] & trusted[:-1] & ~still, still
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the drift at ``state``."""
@@ -89,9 +93,9 @@ class ObjectDrift(Term):
         )
 
 
-def _sigma(points: np.ndarray, known: np.ndarray, drift: float, fps: float) -> float:
+def _sigma(points: np.ndarray, trusted: np.ndarray, drift: float, fps: float) -> float:
     """Standard deviation, in metres, of the change of corrections from frame to frame."""
-    noise = smoothness.jitter(points, known)
+    noise = smoothness.jitter(points, trusted)
     return np.sqrt(drift**2 / fps + 2 * noise**2)
 
 

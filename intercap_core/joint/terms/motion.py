@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.body.joints import NUM_JOINTS
+from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.energy import smoothness
 from intercap_core.joint.constants import (
     ACCELERATION_OUTLIER,
@@ -22,7 +22,7 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Term
 
-_FIRST_FINGER = 25  # joints from here on are the fingers'
+_FIRST_FINGER = JOINT_INDEX["left_index1"]  # joints from here on are the fingers'
 
 
 class BodyMotion(Term):

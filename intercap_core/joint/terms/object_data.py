@@ -1,4 +1,4 @@
-"""Object data: E_O of equation 6, what the images say of the object's pose in every frame.
+"""Object data: E_O of equation 6, the images' evidence on the object's pose in every frame.
 
 The tracker ends at the minimum of equation 1, and its covariance gives the energy's curvature
 there. E_O is taken as the quadratic form of the two,
