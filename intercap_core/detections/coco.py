@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from intercap_core.camera import masks
+from intercap_core.detections.class_names import label_text, names_of
 from intercap_core.detections.instance import Instance, to_rle
-from intercap_core.detections.label_maps import label_text, names_of
 
 MAX_BYTES = 1 << 29  # parsed JSON takes about six times its size in memory
 HEAD_BYTES = 1 << 18  # of a long file that is looked at before a run

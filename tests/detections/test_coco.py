@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from intercap_core.camera import masks
 from intercap_core.detections import coco
+from intercap_core.detections.class_names import COCO_NAMES, COCO_NAMES_FROM_0
 from intercap_core.detections.coco import ImageKey, UnreadableCandidates, candidates_of, read_json
-from intercap_core.detections.label_maps import COCO_NAMES, COCO_NAMES_FROM_0
 
 HEIGHT, WIDTH = 20, 30
 MASK = np.zeros((HEIGHT, WIDTH), bool)

@@ -13,7 +13,7 @@ import numpy as np
 
 from intercap_core.camera import masks
 from intercap_core.detections.instance import Instance
-from intercap_core.detections.onnx_model import Fit
+from intercap_core.detections.models.onnx_model import Fit
 
 NMS_IOU = 0.7  # what YOLO's predictors use
 MOST_INSTANCES = 100  # of one image, the best; COCO's evaluation counts as many

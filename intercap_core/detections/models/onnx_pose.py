@@ -20,8 +20,8 @@ from intercap_core.body.keypoints import BODY
 from intercap_core.config import DetectionsSettings
 from intercap_core.detections.instance import PERSON_LABEL, Instance
 from intercap_core.detections.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
-from intercap_core.detections.onnx_model import OnnxModel
-from intercap_core.detections.pose_responses import HeatmapGrid, heatmap_points, simcc_points
+from intercap_core.detections.models.onnx_model import OnnxModel
+from intercap_core.detections.models.pose_responses import HeatmapGrid, heatmap_points, simcc_points
 from intercap_core.errors import UserError
 
 PADDING = 1.25  # of a box, as mmpose trains and tests

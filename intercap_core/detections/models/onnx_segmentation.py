@@ -17,16 +17,22 @@ from typing import TypeVar
 import numpy as np
 
 from intercap_core.config import DetectionsSettings
-from intercap_core.detections.instance import Instance
-from intercap_core.detections.label_maps import (
+from intercap_core.detections.class_names import (
     COCO_NAMES,
     COCO_NAMES_FROM_0,
     COCO_NAMES_FROM_1,
     MAX_LABEL,
-    read_label_map,
 )
-from intercap_core.detections.onnx_model import Fit, OnnxModel, PixelValues, fit_within, parse_names
-from intercap_core.detections.onnx_outputs import rcnn_instances, yolo_instances
+from intercap_core.detections.converters.label_maps import read_label_map
+from intercap_core.detections.instance import Instance
+from intercap_core.detections.models.onnx_model import (
+    Fit,
+    OnnxModel,
+    PixelValues,
+    fit_within,
+    parse_names,
+)
+from intercap_core.detections.models.onnx_outputs import rcnn_instances, yolo_instances
 from intercap_core.errors import UserError
 
 Key = TypeVar("Key", bound=Hashable)
