@@ -19,6 +19,7 @@ from intercap_core.detections.coco import (
     candidates_of,
     read_json,
 )
+from intercap_core.detections.constants import FILES_NAMED
 from intercap_core.detections.converters.data_sets import release_masks
 from intercap_core.detections.converters.mask_files import (
     MaskFile,
@@ -32,7 +33,6 @@ from intercap_core.detections.instance import Instance
 Result = TypeVar("Result")
 
 ALL_IMAGES = ("coco_instances_results.json", "predictions.json")  # in the camera's own folder
-FILES_NAMED = 3  # broken files or entries that a note names; more are counted
 
 
 @dataclass

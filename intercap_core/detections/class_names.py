@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from intercap_core.detections.constants import MAX_LABEL
+
 # COCO's 80 classes, and their published ids, which have gaps.
 _CLASSES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
@@ -24,8 +26,6 @@ COCO_NAMES: dict[int, str] = dict(
 )
 COCO_NAMES_FROM_0: dict[int, str] = dict(enumerate(_CLASSES))
 COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
-
-MAX_LABEL = 200  # characters; the artefact keeps all labels at the length of the longest
 
 
 def names_of(content: Any) -> dict[int, str]:

@@ -16,13 +16,13 @@ import numpy as np
 
 from intercap_core.detections import openpose
 from intercap_core.detections.candidate_files import (
-    FILES_NAMED,
     note_absent,
     note_broken,
     short,
     sorted_by_image,
 )
 from intercap_core.detections.coco import UnreadableCandidates, read_json
+from intercap_core.detections.constants import FILES_NAMED
 from intercap_core.detections.converters.data_sets import as_openpose
 from intercap_core.detections.converters.wholebody import people_of
 from intercap_core.detections.image_numbers import CameraImages

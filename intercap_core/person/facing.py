@@ -13,19 +13,21 @@ from itertools import product
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.person.constants import (
+    CHANGE_COST,
+    CROSSED_HANDS_RATIO,
+    DETECTED_COST,
+    HAND_ROOT_APART_M,
+    HEAD_COST,
+    HINGE_COST,
+    LARGEST_STEP_M,
+    MOTION_MEMORY_S,
+    NOSE_COST,
+    SHORT_BONE_M,
+    STEP_M,
+    TWIST_COST,
+)
 from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER
-
-# Costs in units of a negative log likelihood. The body's build is certain, a turned head and a
-# twisted back (each up to some 80 degrees) less so; detectors exchange the sides in most views of
-# about one set in twenty.
-_HINGES, _HEAD, _TWIST, _NOSE, _DETECTED = 8.0, 6.0, 6.0, 3.0, 3.0
-_CHANGE = 1.0
-_STEP_M = 0.04  # motion from set to set that is worth one such unit
-_LARGEST_STEP_M = 0.3
-_MEMORY_S = 0.5  # motion is judged over gaps as long as this
-_SHORT_M = 0.03  # directions of shorter vectors are noise
-_ROOT_APART_M = 0.08  # two detectors' wrists of one arm are no farther apart than this
-_CROSSED = 0.5
 
 _AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 _LIMBS = (ARMS, LEGS, HEAD)
@@ -61,7 +63,7 @@ def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Cost (T, 8) of contradicting the detector, by the share of views."""
     known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)
     wrong = np.where(_STATES, 1 - share[:, None], share[:, None])
-    return _DETECTED * np.where(known[:, None], wrong, 0).sum(2)
+    return DETECTED_COST * np.where(known[:, None], wrong, 0).sum(2)
 
 
 def _build(points: np.ndarray) -> np.ndarray:
@@ -89,21 +91,21 @@ def _build(points: np.ndarray) -> np.ndarray:
     head = _cosine(np.cross(_unit(up), _unit(nose)), ears)
     arms, legs, turned = np.where(_STATES, -1.0, 1.0).T
     return (
-        _HINGES * np.maximum(0, -legs * hinges[:, None])
-        + _TWIST * np.maximum(0, -arms * legs * twist[:, None])
-        + _NOSE * np.maximum(0, -arms * looks[:, None])
-        + _HEAD * np.maximum(0, -turned * head[:, None])
+        HINGE_COST * np.maximum(0, -legs * hinges[:, None])
+        + TWIST_COST * np.maximum(0, -arms * legs * twist[:, None])
+        + NOSE_COST * np.maximum(0, -arms * looks[:, None])
+        + HEAD_COST * np.maximum(0, -turned * head[:, None])
     )
 
 
 def _cheapest(cost: np.ndarray, points: np.ndarray, times: np.ndarray) -> np.ndarray:
     """The states (T,) of least total ``cost`` (T, 8), motion included (Viterbi 1967)."""
-    change = _CHANGE * (_STATES[:, None] != _STATES[None]).sum(2)
+    change = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
     total, came_from = cost[0], []
     last, when = points[0].copy(), np.full(points.shape[1], times[0])
     for t in range(1, len(points)):
         reach = total[:, None] + change + cost[t]
-        last[times[t] - when > _MEMORY_S] = np.nan
+        last[times[t] - when > MOTION_MEMORY_S] = np.nan
         for number, limb in enumerate(_LIMBS):
             straight = _motion(last[limb], points[t, limb])
             crossed = _motion(last[PARTNER[limb]], points[t, limb])
@@ -123,7 +125,7 @@ def _motion(before: np.ndarray, now: np.ndarray) -> float:
     """Cost of moving points (n, 3) so far; 0 where fewer than two are known."""
     step = np.linalg.norm(now - before, axis=1)
     step = step[np.isfinite(step)]
-    return float(np.minimum(step, _LARGEST_STEP_M).mean() / _STEP_M) if len(step) > 1 else 0.0
+    return float(np.minimum(step, LARGEST_STEP_M).mean() / STEP_M) if len(step) > 1 else 0.0
 
 
 def _other_hands(points: np.ndarray) -> np.ndarray:
@@ -135,13 +137,13 @@ def _other_hands(points: np.ndarray) -> np.ndarray:
     both = np.isfinite(own) & np.isfinite(other)
     count = np.maximum(both.sum(1), 1)
     own, other = (np.where(both, d, 0).sum(1) / count for d in (own, other))
-    return both.any(1) & (own > _ROOT_APART_M) & (other < _CROSSED * own)
+    return both.any(1) & (own > HAND_ROOT_APART_M) & (other < CROSSED_HANDS_RATIO * own)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     """Directions (..., 3), NaN for what is too short to have one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > _SHORT_M, vectors / np.maximum(length, _SHORT_M), np.nan)
+    return np.where(length > SHORT_BONE_M, vectors / np.maximum(length, SHORT_BONE_M), np.nan)
 
 
 def _hinge(first: np.ndarray, second: np.ndarray) -> np.ndarray:

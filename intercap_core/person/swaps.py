@@ -18,17 +18,19 @@ from intercap_core.camera.triangulation import (
     triangulate,
 )
 from intercap_core.person.agreement import agree
+from intercap_core.person.constants import (
+    EXCHANGE_ROUNDS,
+    EXCHANGED_PX_AT_1080P,
+    FEW_VIEWS,
+    JUMP_PX_AT_1080P,
+    MIN_LIMB_COST,
+    MIN_LIMB_POINTS,
+    MUCH_BETTER,
+    OPEN_EXCHANGE_PX_AT_1080P,
+    TRUNCATED_AT,
+)
 from intercap_core.person.facing import exchange_points, mirrored
 from intercap_core.person.sides import LIMBS, PARTNER
-
-ROUNDS = 2
-MUCH_BETTER = 0.5  # exchanged cost over cost as detected
-MIN_POINTS = 2
-FEW_VIEWS = 4
-EXCHANGED_PX_AT_1080P = 3.0  # what a set exchanged costs: detectors are mostly right
-# An exchange that the recording begins or ends with shows one jump alone, as a fast turn does.
-OPEN_PX_AT_1080P = 100.0
-JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
 
 
 def triangulate_people(
@@ -60,7 +62,7 @@ def triangulate_people(
             .reshape(part.shape)
             for part in (found.points, found.inlier, found.error, found.view_error)
         ))  # fmt: skip
-    for _ in range(ROUNDS):
+    for _ in range(EXCHANGE_ROUNDS):
         exchanged = exchange(keypoints, found.points.reshape(len(keypoints), -1, 3), rig,
                              min_confidence=min_confidence, max_error_px=max_error_px)  # fmt: skip
         if not exchanged:
@@ -92,7 +94,7 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
     """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
     price = EXCHANGED_PX_AT_1080P * scale
-    open_price = np.array([0.0, OPEN_PX_AT_1080P * scale])
+    open_price = np.array([0.0, OPEN_EXCHANGE_PX_AT_1080P * scale])
     total, came_from = open_price + np.array([0.0, price]), []
     seen = options[..., 2] >= min_confidence
     for t in range(1, options.shape[1]):
@@ -134,8 +136,7 @@ def exchange(
         other = _cost(
             pixels[:, :, limb], keypoints[:, :, partner, :2], own & seen[:, :, partner], limit
         )
-        # A mean truncated cost of a quarter: half of the points are off by the limit or more.
-        wrong = (as_found > 0.25) & (other < MUCH_BETTER * as_found)
+        wrong = (as_found > MIN_LIMB_COST) & (other < MUCH_BETTER * as_found)
         t, c = np.nonzero(wrong)
         keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], partner]
         count += len(t)
@@ -146,11 +147,10 @@ def _cost(
     expected: np.ndarray, found: np.ndarray, valid: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
     """Mean truncated squared error (T, C) in units of the limit; NaN with too few points."""
-    # Truncated well beyond the limit, so that an exchange is told from another mistake.
     error = np.linalg.norm(expected - found, axis=-1) / limit
-    square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
+    square = np.where(valid, np.minimum(error, TRUNCATED_AT) ** 2, 0).sum(-1)
     count = valid.sum(-1)
-    return np.where(count >= MIN_POINTS, square / np.maximum(count, 1), np.nan)
+    return np.where(count >= MIN_LIMB_POINTS, square / np.maximum(count, 1), np.nan)
 
 
 def _triangulate(

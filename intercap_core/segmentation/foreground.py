@@ -15,14 +15,15 @@ import numpy as np
 
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.constants import (
+    BEFORE_MM,
+    BEFORE_PER_DEPTH,
+    EDGE_PX,
+    FLOATING_MM,
+    GONE_SHARE,
+    MAX_DEPTH_SAMPLES,
+)
 
-MAX_SAMPLES = 25  # images looked at for what gives way
-GONE_SHARE = 0.08  # of them in which a pixel must show something else for that to count
-# Nearer than the background by this is before it: five standard deviations of the sensor's random
-# error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
-BEFORE_MM, BEFORE_PER_DEPTH = 15.0, 0.005
-FLOATING_MM = 30.0  # a pixel this far from nearer and from farther neighbours floats between them
-EDGE_PX = 5  # what gives way in narrower strips than this is an edge that measures badly
 _NO_DEPTH = np.float32(65535)
 
 
@@ -92,10 +93,10 @@ def _floating(image: np.ndarray) -> np.ndarray:
 
 
 def sampled_images(frames: Frames, c: int) -> list[np.ndarray]:
-    """Depth images (H, W) uint16 mm of camera ``c``, at most :data:`MAX_SAMPLES`, evenly spread."""
+    """Evenly spread depth images (H, W) uint16 mm of camera ``c``, at most MAX_DEPTH_SAMPLES."""
     sets = np.flatnonzero(frames.depth_available[:, c])
-    if len(sets) > MAX_SAMPLES:
-        sets = sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
+    if len(sets) > MAX_DEPTH_SAMPLES:
+        sets = sets[np.linspace(0, len(sets) - 1, MAX_DEPTH_SAMPLES).round().astype(int)]
     images = (frames.depth(int(t), c) for t in sets)
     return [image for image in images if image is not None]
 

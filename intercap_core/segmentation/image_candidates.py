@@ -17,32 +17,37 @@ from intercap_core.artefacts import Artefact
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.constants import (
+    ABOVE_HEAD_M,
+    AROUND_PATH_M,
+    CELL_M,
+    CLOTHING_MARGINS,
+    FAR,
+    FAR_CUT,
+    FLOOR_M,
+    MAX_COMPONENTS,
+    MAX_HAND_SPEED_M_S,
+    MAX_KEYPOINT_GAP_S,
+    MIN_POINTS,
+    MIN_VIEW_POINTS,
+    NEAR_CUT,
+    NEARBY_CELL_M,
+    ON_TOP_SCORE,
+    PARTLY_MOVED_SCORE,
+    PERSON_MARGINS,
+    PERSON_SAMPLES,
+    SAME_SHARE,
+    STATIC_SCORE,
+    TWO_ENDS_SCORE,
+)
 from intercap_core.segmentation.depth_masks import Cells, Projected
 from intercap_core.segmentation.foreground import DepthBackground, DepthView, sampled_images
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.segmentation.person_volume import FAR, bones_of, outside
+from intercap_core.segmentation.person_volume import bones_of, outside
 from intercap_core.segmentation.see_through import see_through, without_person
 from intercap_core.segmentation.static_things import extent, find_static_things
 from intercap_core.segmentation.voxels import components
 from intercap_core.solve.velocity import limited_velocity
-
-CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
-AROUND_M, ABOVE_HEAD_M = 1.5, 0.7  # of the person's path: where things are looked for
-FLOOR_M = 0.025  # what is lower may be the floor
-SPREAD_M = 0.07  # cells of pieces that may be one thing, with a hand's breadth between
-PERSON_MARGINS = 1.5  # outside the usual build by less is the person
-CLOSE, CLEAR = 1.0, 2.5  # margins at which things are taken off the person
-SHELL = 2.2  # a component that reaches no farther is clothing
-MIN_POINTS = 40  # of a component, over all views
-MIN_VIEW_POINTS = 12
-MAX_PIECES = 6  # components of one kind
-SAME_SHARE = 0.9  # of a component's points: the farther cut shows nothing new
-# How likely a component is a thing that somebody handles, where that says nothing about the size:
-# what moves by how far off the person it reaches; of the static scene little speaks for any.
-STANDING_SCORE, STATIC_SCORE, JOINT_SCORE, SPREAD_SCORE = 0.3, 0.2, 0.4, 0.5
-HAND_SPEED_M_S = 8.0
-PERSON_SAMPLES = 12  # moments at which the person's own traces in the background are sought
-GAP_S = 0.5  # a keypoint lost for less is where it lies between
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +102,14 @@ class DepthSegmenter:
             for c in self.cameras
         }
         joints = apply(zup, joints.reshape(-1, 3)).reshape(joints.shape)
-        self._joints = filled(joints, times)
+        self._joints = fill_short_gaps(joints, times, max_gap_s=MAX_KEYPOINT_GAP_S)
         self._velocity = np.nan_to_num(
-            limited_velocity(self._joints, times, max_speed=HAND_SPEED_M_S)
+            limited_velocity(self._joints, times, max_speed=MAX_HAND_SPEED_M_S)
         )
         everywhere = self._joints[np.isfinite(self._joints).all(-1)]
-        self._low = everywhere.min(0) - AROUND_M
-        above = ABOVE_HEAD_M if upright else AROUND_M
-        self._high = everywhere.max(0) + np.array([AROUND_M, AROUND_M, above])
+        self._low = everywhere.min(0) - AROUND_PATH_M
+        above = ABOVE_HEAD_M if upright else AROUND_PATH_M
+        self._high = everywhere.max(0) + np.array([AROUND_PATH_M, AROUND_PATH_M, above])
         if grounded:
             self._low[2] = FLOOR_M
         views = [self._views[c] for c in self.cameras]
@@ -169,7 +174,7 @@ class DepthSegmenter:
         bones = bones_of(self._joints[t] + self._late[c] * self._velocity[t])
         away = outside(points, bones)
         # what this view does not know as background, another one may
-        rest = np.flatnonzero((away > CLOSE) & (background.depth.ravel()[index] == 0))
+        rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._static.surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
         moving[scene] = False
@@ -198,7 +203,7 @@ class DepthSegmenter:
         return [
             _Piece(
                 [view.of_thing[k] for view in seen],
-                STANDING_SCORE if thing.on_top else STATIC_SCORE,
+                ON_TOP_SCORE if thing.on_top else STATIC_SCORE,
                 thing.extent_m,
             )
             for k, thing in enumerate(self._static.things)
@@ -209,7 +214,7 @@ class DepthSegmenter:
         chosen = []
         touched = False
         for view in seen:
-            moving = np.flatnonzero(view.moving & (view.outside > CLOSE))
+            moving = np.flatnonzero(view.moving & (view.outside > NEAR_CUT))
             parts = [moving]
             for k, thing in enumerate(self._static.things):
                 if not thing.carries:
@@ -222,8 +227,8 @@ class DepthSegmenter:
         for members, points in _grouped(seen, chosen):
             moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
             if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
-                found.append(_Piece(members, JOINT_SCORE, extent(points)))
-        return found[:MAX_PIECES]
+                found.append(_Piece(members, PARTLY_MOVED_SCORE, extent(points)))
+        return found[:MAX_COMPONENTS]
 
 
 def _grouped(
@@ -241,17 +246,17 @@ def _grouped(
 def _moving_pieces(seen: list[_Seen]) -> list[_Piece]:
     """Components of what moves and is not the person, taken off the person at either distance."""
     pieces: list[_Piece] = []
-    for cut in (CLOSE, CLEAR):
+    for cut in (NEAR_CUT, FAR_CUT):
         kept = 0
         chosen = [np.flatnonzero(view.moving & (view.outside > cut)) for view in seen]
         for members, points in _grouped(seen, chosen):
             away = np.concatenate([v.outside[m] for v, m in zip(seen, members, strict=True)])
             reach = float(np.percentile(away, 95))
-            if reach < SHELL or any(_same(members, other.members) for other in pieces):
+            if reach < CLOTHING_MARGINS or any(_same(members, other.members) for other in pieces):
                 continue
-            pieces.append(_Piece(members, 1 - 0.5 ** (reach / SHELL), extent(points)))
+            pieces.append(_Piece(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), extent(points)))
             kept += 1
-            if kept == MAX_PIECES:
+            if kept == MAX_COMPONENTS:
                 break
     return pieces
 
@@ -264,10 +269,10 @@ def _spread_pieces(seen: list[_Seen], pieces: list[_Piece]) -> list[_Piece]:
         np.unique(np.concatenate([piece.members[v] for piece in pieces])) for v in range(len(seen))
     ]
     found: list[_Piece] = []
-    for members, points in _grouped(seen, chosen, SPREAD_M):
+    for members, points in _grouped(seen, chosen, NEARBY_CELL_M):
         parts = components(points, CELL_M, MIN_POINTS)
-        if len(parts) > 1 and len(found) < MAX_PIECES:
-            found.append(_Piece(members, SPREAD_SCORE, extent(points)))
+        if len(parts) > 1 and len(found) < MAX_COMPONENTS:
+            found.append(_Piece(members, TWO_ENDS_SCORE, extent(points)))
     return found
 
 
@@ -295,8 +300,12 @@ def _masks(seen: _Seen, pieces: list[tuple[_Piece, np.ndarray]]) -> ViewSegments
     return ViewSegments(projected.rle(person, things), candidates)
 
 
-def filled(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Keypoints (T, K, 3) with gaps of up to :data:`GAP_S` filled in by straight lines."""
+def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
+    """Keypoints (T, K, 3), NaN = not known, with short gaps filled by linear interpolation.
+
+    A gap is filled up to ``max_gap_s`` from its nearest known time of ``times`` (T,) seconds; at
+    the beginning and the end the nearest known place is held.
+    """
     result = joints.copy()
     for k in range(joints.shape[1]):
         known = np.flatnonzero(np.isfinite(joints[:, k]).all(1))
@@ -305,7 +314,7 @@ def filled(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
         for t in np.flatnonzero(~np.isfinite(joints[:, k]).all(1)):
             after = int(np.searchsorted(known, t))
             around = known[max(after - 1, 0) : after + 1]
-            if np.abs(times[around] - times[t]).min() > GAP_S:
+            if np.abs(times[around] - times[t]).min() > max_gap_s:
                 continue
             result[t, k] = [
                 np.interp(times[t], times[around], joints[around, k, i]) for i in range(3)

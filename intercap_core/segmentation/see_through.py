@@ -13,17 +13,20 @@ import cv2
 import numpy as np
 
 from intercap_core.camera.transforms import apply, invert
+from intercap_core.segmentation.constants import (
+    BEHIND_AROUND_PX,
+    BEHIND_M,
+    BEHIND_PER_DEPTH,
+    MIN_HOLE_PX,
+    MIN_SURFACE_PX,
+    SMOOTH_MM,
+    TRACE_MARGINS,
+    TRACE_SHARE,
+)
 from intercap_core.segmentation.foreground import DepthBackground, DepthView
 from intercap_core.segmentation.person_volume import outside
 
-# The other camera's background is farther by this: calibration and the slope of grazing surfaces.
-BEHIND_M, BEHIND_PER_DEPTH = 0.05, 0.01
-AROUND_PX = 5  # pixels all of which must be so far: edges of the background are uncertain
-MIN_AREA_PX = 5  # across, of what is taken out of a background
 _UNKNOWN = np.uint16(0)
-PATCH_PX = 400  # smooth surfaces of at least so many pixels are no traces of a person
-SMOOTH_MM = 100.0
-INSIDE_MARGINS, INSIDE_SHARE = 1.0, 0.4  # where, and for what share of the moments, a trace lies
 
 
 def see_through(
@@ -34,7 +37,7 @@ def see_through(
 ) -> list[DepthBackground]:
     """The backgrounds without what another camera sees through; the box as elsewhere, z up."""
     nearest = [
-        cv2.erode(background.depth, np.ones((AROUND_PX, AROUND_PX), np.uint8))
+        cv2.erode(background.depth, np.ones((BEHIND_AROUND_PX, BEHIND_AROUND_PX), np.uint8))
         for background in backgrounds
     ]
     result = []
@@ -47,7 +50,7 @@ def see_through(
         for other, far in enumerate(nearest):
             if other != number:
                 gone.ravel()[index[_before(views[other], far, points)]] = 1
-        block = np.ones((MIN_AREA_PX, MIN_AREA_PX), np.uint8)
+        block = np.ones((MIN_HOLE_PX, MIN_HOLE_PX), np.uint8)
         closed = cv2.morphologyEx(gone, cv2.MORPH_CLOSE, block)
         whole = cv2.morphologyEx(closed, cv2.MORPH_OPEN, block)
         result.append(_without(background, whole > 0))
@@ -67,16 +70,16 @@ def without_person(
     farthest = cv2.dilate(depth.astype(np.float32), block)
     smooth = ((nearest > 0) & (farthest - nearest < SMOOTH_MM)).view(np.uint8)
     _, label, stats, _ = cv2.connectedComponentsWithStats(smooth, connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] >= PATCH_PX
+    large = stats[:, cv2.CC_STAT_AREA] >= MIN_SURFACE_PX
     large[0] = False
     surface = cv2.dilate(large[label].view(np.uint8), block) > 0
     index = np.flatnonzero((depth > 0) & ~surface & (depth <= background.reach))
     points, _ = view.points(depth, index)
     inside = np.zeros(len(index))
     for bones in bodies:
-        inside += outside(points, bones) < INSIDE_MARGINS
+        inside += outside(points, bones) < TRACE_MARGINS
     trace = np.zeros(depth.shape, bool)
-    trace.ravel()[index[inside > INSIDE_SHARE * len(bodies)]] = True
+    trace.ravel()[index[inside > TRACE_SHARE * len(bodies)]] = True
     return _without(background, trace)
 
 

@@ -14,6 +14,7 @@ from intercap_core import artefacts
 from intercap_core.config import DetectionsSettings, SequenceEntry, digest
 from intercap_core.detections import candidate_files, keypoint_files
 from intercap_core.detections.candidate_files import Candidates
+from intercap_core.detections.constants import IMAGES_PER_LINE
 from intercap_core.detections.converters.data_sets import BehaveFiles
 from intercap_core.detections.converters.label_maps import class_names
 from intercap_core.detections.image_numbers import CameraImages, camera_images
@@ -25,7 +26,6 @@ from intercap_core.schemas import DETECTIONS, FRAMES
 
 log = logging.getLogger(__name__)
 
-IMAGES_PER_LINE = 100  # seen by a model between two lines of the log
 
 Image = tuple[int, int]  # frame set and camera
 

@@ -157,7 +157,7 @@ def test_wrong_files_are_told(tmp_path, content):
 
 
 def test_huge_files_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(coco, "MAX_BYTES", 100)
+    monkeypatch.setattr(coco, "MAX_JSON_BYTES", 100)
     with pytest.raises(UnreadableCandidates, match="one file an image"):
         read(tmp_path, [ENTRY])
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import yaml
 
 from intercap_core.detections.class_names import COCO_NAMES, COCO_NAMES_FROM_0, names_of
+from intercap_core.detections.constants import MAX_LABELS_BYTES
 from intercap_core.errors import UserError
 
 BUILT_IN = {"coco": COCO_NAMES, "coco80": COCO_NAMES_FROM_0}
-_MAX_BYTES = 1 << 26  # a list of classes is some kB; a whole data set's annotations are not needed
 
 
 def class_names(setting: str | Path) -> dict[int, str]:
@@ -32,7 +32,7 @@ def read_label_map(path: Path) -> dict[int, str]:
     """Read a file of class names. Raises UserError naming what is wrong with it."""
     try:
         size = path.stat().st_size
-        if size > _MAX_BYTES:
+        if size > MAX_LABELS_BYTES:
             raise UserError(
                 f"{path}: has {size / 1e6:.0f} MB, expected a list of classes; keep the data set's "
                 "'categories' alone, as docs/detectors.md shows"

@@ -10,18 +10,20 @@ import cv2
 import numpy as np
 
 from intercap_core.capture.encoded import encoded_size
-from intercap_core.detections.class_names import MAX_LABEL
-from intercap_core.detections.instance import (
+from intercap_core.detections.constants import (
+    MASK_THRESHOLD,
+    MAX_LABEL,
+    MAX_MASK_VALUES,
     MAX_PIXELS,
+)
+from intercap_core.detections.instance import (
     Instance,
     instance_of,
     resized,
     scale_to,
 )
 
-HALF = 128  # of 8 bits; JPEG blurs the two values that a mask has
 WHITE = 255
-MOST_INSTANCES = 1000  # of one image; more values are a photograph or a depth image
 BETWEEN = "__"  # an image's name, a label and a number in the name of a mask
 _AROUND_LABEL = "0123456789_-. "
 
@@ -79,12 +81,12 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
 def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
     """The masks (H, W) bool that a grey image holds."""
     if file.inverted:
-        yield image < HALF
+        yield image < MASK_THRESHOLD
     elif not file.numbered or (image.dtype == np.uint8 and image.max() == WHITE):
-        yield image >= HALF
+        yield image >= MASK_THRESHOLD
     else:
         values = np.unique(image)
-        if len(values) > MOST_INSTANCES:
+        if len(values) > MAX_MASK_VALUES:
             raise UnreadableMask(
                 f"has {len(values)} different values, expected black and white or a number for "
                 "each instance"

@@ -21,7 +21,16 @@ from intercap_core.detections.class_names import (
     COCO_NAMES,
     COCO_NAMES_FROM_0,
     COCO_NAMES_FROM_1,
+)
+from intercap_core.detections.constants import (
     MAX_LABEL,
+    RCNN_LONG,
+    RCNN_SHORT,
+    RCNN_STRIDE,
+    SEGMENTATION_BATCH,
+    YOLO_GREY,
+    YOLO_SIDE,
+    YOLO_STRIDE,
 )
 from intercap_core.detections.converters.label_maps import read_label_map
 from intercap_core.detections.instance import Instance
@@ -37,10 +46,6 @@ from intercap_core.errors import UserError
 
 Key = TypeVar("Key", bound=Hashable)
 
-BATCH = 4  # images at once where the model takes any number
-YOLO_SIDE, YOLO_STRIDE, YOLO_GREY = 640, 32, 114  # as ultralytics trains and pads
-# Size at which detectron2's and maskrcnn-benchmark's configurations test.
-RCNN_SHORT, RCNN_LONG, RCNN_STRIDE = 800, 1333, 32
 _FLOATS = ("tensor(float)", "tensor(float16)")
 
 
@@ -98,7 +103,7 @@ class Segmenter:
         self, pictures: Iterable[tuple[Key, np.ndarray]]
     ) -> Iterator[tuple[Key, list[Instance]]]:
         """Instances of each picture (H, W, 3) uint8 BGR, best first, in the pictures' order."""
-        most = self._model.batch or (BATCH if self._kind.yolo else 1)
+        most = self._model.batch or (SEGMENTATION_BATCH if self._kind.yolo else 1)
         waiting: list[tuple[Key, Fit, np.ndarray]] = []
         for key, picture in pictures:
             fit, values = self._prepared(picture)
