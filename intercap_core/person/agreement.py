@@ -20,7 +20,7 @@ from intercap_core.person.constants import (
     SIDE_GAPS_M,
     UNKNOWN_SIDE_COST,
 )
-from intercap_core.person.sides import LIMBS, PARTNER
+from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb
 
 _LIKE_ARMS = 2  # first of the limbs that are named as the arms are
 
@@ -69,7 +69,7 @@ def agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarr
         chosen = (ways[best] ^ other) & seen
         exchanged[:, order, number] = chosen
         t, c = np.nonzero(exchanged[..., number])
-        keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], PARTNER[limb]]
+        exchange_limb(keypoints, t, c, limb)
     return exchanged
 
 

@@ -27,7 +27,8 @@ from intercap_core.person.constants import (
     STEP_M,
     TWIST_COST,
 )
-from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER
+from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER, exchange_points
+from intercap_core.solve.viterbi import cheapest_sequence
 
 _AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 _LIMBS = (ARMS, LEGS, HEAD)
@@ -44,18 +45,12 @@ def mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | None) ->
     if not len(points):
         return result
     cost = _build(points) + _detected(points, share)
-    states = cost.argmin(1) if times is None else _cheapest(cost, points, times)
+    if times is None:
+        states = cost.argmin(1)
+    else:
+        states = cheapest_sequence(cost[0], _steps(points, times) + cost[1:, None])
     result[:, :3] = _STATES[states]
     result[:, 3] = _other_hands(exchange_points(points, result))
-    return result
-
-
-def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Values (T, 135, ...) with the limbs that ``which`` (T, 4) names exchanged."""
-    result = values.copy()
-    for limb, at in zip(LIMBS, which.T, strict=True):
-        rows = np.flatnonzero(at)[:, None]
-        result[rows, limb] = values[rows, PARTNER[limb]]
     return result
 
 
@@ -98,27 +93,21 @@ def _build(points: np.ndarray) -> np.ndarray:
     )
 
 
-def _cheapest(cost: np.ndarray, points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The states (T,) of least total ``cost`` (T, 8), motion included (Viterbi 1967)."""
-    change = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
-    total, came_from = cost[0], []
+def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Cost (T - 1, 8, 8) of going from one state of the sides to the next: change and motion."""
+    steps = np.empty((len(points) - 1, len(_STATES), len(_STATES)))
+    steps[:] = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
     last, when = points[0].copy(), np.full(points.shape[1], times[0])
-    for t in range(1, len(points)):
-        reach = total[:, None] + change + cost[t]
+    for t, step in enumerate(steps, start=1):
         last[times[t] - when > MOTION_MEMORY_S] = np.nan
         for number, limb in enumerate(_LIMBS):
             straight = _motion(last[limb], points[t, limb])
             crossed = _motion(last[PARTNER[limb]], points[t, limb])
             differ = _STATES[:, None, number] != _STATES[None, :, number]
-            reach = reach + np.where(differ, crossed, straight)
-        came_from.append(reach.argmin(0))
-        total = reach.min(0)
+            step += np.where(differ, crossed, straight)
         known = np.isfinite(points[t, :, 0])
         last[known], when[known] = points[t, known], times[t]
-    chosen = [int(total.argmin())]
-    for back in reversed(came_from):
-        chosen.append(int(back[chosen[-1]]))
-    return np.array(chosen[::-1])
+    return steps
 
 
 def _motion(before: np.ndarray, now: np.ndarray) -> float:

@@ -29,8 +29,9 @@ from intercap_core.person.constants import (
     OPEN_EXCHANGE_PX_AT_1080P,
     TRUNCATED_AT,
 )
-from intercap_core.person.facing import exchange_points, mirrored
-from intercap_core.person.sides import LIMBS, PARTNER
+from intercap_core.person.facing import mirrored
+from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
+from intercap_core.solve.viterbi import cheapest_sequence
 
 
 def triangulate_people(
@@ -87,27 +88,21 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
             options = np.stack([keypoints[sets, c][:, side] for side in (limb, PARTNER[limb])])
             wrong = sets[_least_motion(options, scale, min_confidence)]
             wrong = wrong[few[wrong]]
-            result[wrong[:, None], c, limb] = keypoints[wrong[:, None], c, PARTNER[limb]]
+            exchange_limb(result, wrong, np.full(len(wrong), c), limb)
     return result
 
 
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
     """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
-    price = EXCHANGED_PX_AT_1080P * scale
-    open_price = np.array([0.0, OPEN_EXCHANGE_PX_AT_1080P * scale])
-    total, came_from = open_price + np.array([0.0, price]), []
-    seen = options[..., 2] >= min_confidence
-    for t in range(1, options.shape[1]):
-        both = seen[:, None, t - 1] & seen[None, :, t]  # (before, now, n)
-        moved = np.linalg.norm(options[:, None, t - 1, :, :2] - options[None, :, t, :, :2], axis=-1)
-        moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
-        reach = total[:, None] + moved / np.maximum(both.sum(-1), 1) + [0.0, price]
-        came_from.append(reach.argmin(0))
-        total = reach.min(0)
-    chosen = [int((total + open_price).argmin())]
-    for back in reversed(came_from):
-        chosen.append(int(back[chosen[-1]]))
-    return np.array(chosen[::-1], bool)
+    price = np.array([0.0, EXCHANGED_PX_AT_1080P * scale])
+    at_an_end = np.array([0.0, OPEN_EXCHANGE_PX_AT_1080P * scale])
+    seen, pixels = options[..., 2] >= min_confidence, options[..., :2]
+    # (before, now, S - 1, n)
+    both = seen[:, None, :-1] & seen[None, :, 1:]
+    moved = np.linalg.norm(pixels[:, None, :-1] - pixels[None, :, 1:], axis=-1)
+    moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
+    steps = np.moveaxis(moved / np.maximum(both.sum(-1), 1), 2, 0) + price
+    return cheapest_sequence(at_an_end + price, steps, at_an_end).astype(bool)
 
 
 def exchange(
@@ -138,7 +133,7 @@ def exchange(
         )
         wrong = (as_found > MIN_LIMB_COST) & (other < MUCH_BETTER * as_found)
         t, c = np.nonzero(wrong)
-        keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], partner]
+        exchange_limb(keypoints, t, c, limb)
         count += len(t)
     return count
 
