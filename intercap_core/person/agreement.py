@@ -1,9 +1,10 @@
 """Left and right made to agree over the views of a set.
 
-A detector that takes a back for a front exchanges the sides of a whole view, often of several views
-at once, and points triangulated from half of the views against the other half are no one's. Of all
-ways to exchange a limb in some of the views, the one is taken whose rays meet best. It leaves open
-which of the two sides is the left: see :mod:`.facing`.
+A detector that takes a back for a front exchanges left and right in a whole view, often in several
+views at once; points triangulated from views that disagree are wrong. For each limb all assignments
+of sides to views are tried (exhaustively, 2^(C-1)), and the one of least cost is taken: truncated
+squared gaps between the rays of every pair of views, plus a cost for each view exchanged. Which of
+the two mirrored solutions is true stays open: see :mod:`.facing`.
 """
 
 from __future__ import annotations

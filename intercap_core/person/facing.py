@@ -1,9 +1,9 @@
-"""Which way the body faces where the views agree: whether their left is truly the left.
+"""Which of two mirrored bodies is the true one, where the views agree up to left and right.
 
-Decided for arms, legs and head of all sets together, by dynamic programming over the eight ways of
-exchanging them: knees and ankles bend one way, the nose is in front of the ears and of the chest,
-shoulders and hips face the same way, nobody turns about between two images, and detectors are
-mostly right. A hand belongs to the arm that ends where it begins.
+Decided for arms, legs and head of all sets together, by the Viterbi algorithm over the eight ways
+of exchanging them. Unary costs: knees and ankles bend one way, the nose is in front of the ears and
+of the chest, shoulders and hips face the same way, detectors are mostly right. Pairwise costs:
+motion from set to set, and a change of sides. A hand belongs to the arm whose wrist is its own.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def _build(points: np.ndarray) -> np.ndarray:
-    """Cost (T, 8) of a body that could not be built so."""
+    """Cost (T, 8) of anatomically impossible bodies, for each way of exchanging limbs."""
 
     def between(start: str, end: str) -> np.ndarray:
         return points[:, _AT[end]] - points[:, _AT[start]]

@@ -1,9 +1,9 @@
 """Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
 
-Depth measures the skin, a keypoint is a joint: the point lies deeper on the pixel's ray by how
-thick the body is there. What covers a joint would put it too near: the room, which the scene knows,
-is looked past, and where a view from the side shows that one shoulder or hip must be covered, it
-and its limb are left out.
+Depth measures the skin, a keypoint is a joint inside the body: the point lies deeper on the pixel's
+ray by an inset of its own. An occluded joint would be placed too near or too far: pixels of the
+scene's background are skipped, and where a side view shows both shoulders or hips in one place, the
+one that the detector trusts less is occluded and left out with its limb.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Limbs whose left and right a detector exchanged.
 
-The views of each set are brought to agree (:mod:`.agreement`), and all sets together tell which
-side is the left (:mod:`.facing`). After that a view's limb counts as exchanged when the points that
-the views agree on fit it much better with the sides exchanged. A view that stands alone has its
-limb's motion in the image, which an exchange makes jump and jump back.
+The views of each set are made to agree (:mod:`.agreement`), then all sets together tell which side
+is the left (:mod:`.facing`). After that a view's limb counts as exchanged where its reprojection
+error is much smaller with the sides exchanged. With few views there is no agreement to rely on:
+the sides of least motion in the image are taken, since an exchange jumps there and back.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The person's mask and candidates of the object from colour images, where a camera has no depth.
 
-What differs in colour from the median of the recording stands before the scene. The person is what
-of it lies around the projected keypoints. Nothing measures how far a thing is, so what covers the
-person in the image is taken for the person, and what rests for most of a recording is not seen.
+Background subtraction: a pixel that differs in colour from the recording's median is foreground.
+Foreground around the projected keypoints is the person. Without depth, a thing that occludes the
+person in the image counts as the person, and a thing that rests for most of a recording is part of
+the background.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""What stands before the static scene in a depth image, and what of the scene never gave way.
+"""Background subtraction in depth images: foreground, and the background it is measured against.
 
 The scene's background is the farthest depth that a pixel holds steadily. Where nothing behind can
-be measured, or a thing leaves its place for a short while only, that is the thing itself: such a
-pixel sometimes shows something farther, or nothing at all. It is not background then.
+be measured, or a thing leaves its place for a short while only, that depth is of the thing itself:
+the pixel then sometimes shows something farther, or nothing at all. Such pixels are taken out of
+the background.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _NO_DEPTH = np.float32(65535)
 class DepthBackground:
     """The static scene of one depth camera.
 
-    ``depth`` (H, W) uint16 mm of what never gave way, 0 = unknown; ``reach`` (H, W) uint16 mm, the
+    ``depth`` (H, W) uint16 mm of the background, 0 = unknown; ``reach`` (H, W) uint16 mm, the
     farthest that is of interest; ``limit`` (H, W) uint16 mm: what is measured nearer stands before
     the background.
     """
@@ -56,8 +57,8 @@ class DepthBackground:
             gone += cv2.medianBlur(absent, 5)  # single pixels fail now and then
         often = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
         # along the edges of furniture, pixels fail for most of a recording
-        gave_way = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
-        depth = np.where(gave_way > 0, 0, background).astype(np.uint16)
+        not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+        depth = np.where(not_static > 0, 0, background).astype(np.uint16)
         near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
         limit = np.where(depth > 0, near, reach_mm)
         return cls(depth, reach_mm, np.minimum(limit, reach_mm).astype(np.uint16))

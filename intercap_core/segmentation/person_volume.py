@@ -1,8 +1,8 @@
-"""How far points lie outside a person of usual build around the triangulated keypoints.
+"""Signed distance of points from a person of average build around the triangulated keypoints.
 
-The person is the union of cones with round ends around the bones. Where that ends is known only so
-well: clothing and build make a trunk uncertain by centimetres, fingers are told within millimetres.
-So the distance is given in units of that uncertainty, bone by bone.
+The person is a union of capsules with two radii, one a bone. Where its surface lies is uncertain by
+centimetres at the trunk (clothing, build), by millimetres at the fingers. The distance is given in
+units of that uncertainty, one margin, bone by bone.
 """
 
 from __future__ import annotations

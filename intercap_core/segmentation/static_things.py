@@ -1,8 +1,8 @@
 """Things that never move: components of the static scene above the floor, near the person's path.
 
-A chair that is sat on, a mug left on its table: no background tells them apart from furniture, so
-every component that somebody comes near is a candidate. What stands on a level surface is taken off
-it.
+A chair that is sat on, a mug left on its table: nothing tells them apart from furniture, so every
+connected component of the background that the person comes near is a candidate. What stands on a
+level surface (a table) is segmented from it by height.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""Background that is none: what was steady for one camera, but is no furniture.
+"""False background removed: free space seen by another camera, and traces of the person.
 
-A suitcase that stands for most of a recording where one camera can measure nothing behind it looks
-like furniture to that camera. Another one that holds farther depth on the same line of sight as its
-background saw it gone. And somebody who stands still leaves traces in small patches.
+A thing that stands in one place for most of a recording becomes background for a camera that never
+measures anything behind it. Where the background of another camera lies farther on the same line of
+sight, that camera has seen free space there (as in space carving), so the first one's background
+cannot be part of the static scene. A person who stands still leaves false background in small
+patches that lie inside the body for many moments.
 """
 
 from __future__ import annotations
@@ -29,13 +31,17 @@ from intercap_core.segmentation.person_volume import outside
 _UNKNOWN = np.uint16(0)
 
 
-def see_through(
+def without_free_space(
     views: list[DepthView],
     backgrounds: list[DepthBackground],
     low: np.ndarray,
     high: np.ndarray,
 ) -> list[DepthBackground]:
-    """The backgrounds without what another camera sees through; the box as elsewhere, z up."""
+    """The backgrounds without pixels whose points lie in free space of another camera.
+
+    Only points in the box ``low`` to ``high`` (3,), metres, z up, are tested. A pixel becomes
+    unknown where the point lies clearly before the other background, in patches of several pixels.
+    """
     nearest = [
         cv2.erode(background.depth, np.ones((BEHIND_AROUND_PX, BEHIND_AROUND_PX), np.uint8))
         for background in backgrounds
@@ -49,18 +55,18 @@ def see_through(
         gone: np.ndarray = np.zeros(background.depth.shape, np.uint8)
         for other, far in enumerate(nearest):
             if other != number:
-                gone.ravel()[index[_before(views[other], far, points)]] = 1
+                gone.ravel()[index[_occludes_background(views[other], far, points)]] = 1
         block = np.ones((MIN_HOLE_PX, MIN_HOLE_PX), np.uint8)
         closed = cv2.morphologyEx(gone, cv2.MORPH_CLOSE, block)
         whole = cv2.morphologyEx(closed, cv2.MORPH_OPEN, block)
-        result.append(_without(background, whole > 0))
+        result.append(_with_unknown(background, whole > 0))
     return result
 
 
-def without_person(
+def without_person_traces(
     view: DepthView, background: DepthBackground, bodies: list[np.ndarray]
 ) -> DepthBackground:
-    """The background without small patches that the person was in for much of the time.
+    """The background without small patches that lay inside the person for much of the time.
 
     ``bodies``: bones (B, 9) of :func:`.person_volume.bones_of` at some moments, view's frame.
     """
@@ -80,18 +86,19 @@ def without_person(
         inside += outside(points, bones) < TRACE_MARGINS
     trace = np.zeros(depth.shape, bool)
     trace.ravel()[index[inside > TRACE_SHARE * len(bodies)]] = True
-    return _without(background, trace)
+    return _with_unknown(background, trace)
 
 
-def _without(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
+def _with_unknown(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
     taken = gone & (background.depth > 0)
     depth = np.where(taken, _UNKNOWN, background.depth)
     limit = np.where(taken, background.reach, background.limit)
     return replace(background, depth=depth, limit=limit)
 
 
-def _before(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points (N, 3) lie clearly before the background ``nearest`` (H, W) mm of a view."""
+def _occludes_background(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether points (N, 3) lie clearly nearer than the background ``nearest`` (H, W) mm of a view:
+    (N,) bool."""
     lens = view.camera.depth
     assert lens is not None
     local = apply(invert(view.target_from_depth), points)

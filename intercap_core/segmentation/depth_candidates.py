@@ -1,9 +1,16 @@
 """The person's mask and candidates of the object from depth images alone, one moment at a time.
 
-What stands before the static scene is the person, where it lies inside a body of usual build around
-the triangulated keypoints, and else a thing. Things of all views are joined in space, and each
-component is a candidate in every view that shows it. How close to the person a thing begins is
-uncertain: it is tried at two distances, the track decides.
+Background subtraction: depth before the static background is foreground. Foreground within a body
+of average build around the triangulated keypoints is the person, the rest are things. Their points
+of all views are clustered in space into connected components, and each component is a candidate in
+every view that shows it. Four kinds of component are proposed, the object's track chooses:
+
+- moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
+  ``FAR_CUT``), since where hand ends and thing begins is uncertain;
+- merged: neighbouring moving components, for a thing whose middle the hand occludes;
+- static: components of the background near the person's path, for a thing that does not move now;
+- partly moved: a static component with foreground beside it, for a thing that moved by less than
+  its size, so that part of it still coincides with the background.
 """
 
 from __future__ import annotations
@@ -42,17 +49,17 @@ from intercap_core.segmentation.constants import (
 )
 from intercap_core.segmentation.depth_masks import Cells, Projected
 from intercap_core.segmentation.foreground import DepthBackground, DepthView, sampled_images
+from intercap_core.segmentation.free_space import without_free_space, without_person_traces
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
 from intercap_core.segmentation.person_volume import bones_of, outside
-from intercap_core.segmentation.see_through import see_through, without_person
 from intercap_core.segmentation.static_things import extent, find_static_things
 from intercap_core.segmentation.voxels import components
 from intercap_core.solve.velocity import limited_velocity
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """Points (N, 3), z up, that one view sees of person and things, and their colour ``cells``.
+class _ViewPoints:
+    """Foreground and static things of one view: points (N, 3), z up, and their colour ``cells``.
 
     ``outside`` (N,) margins outside the person; ``moving`` (N,) bool: before the static scene;
     ``of_thing``: indices of the points of every static thing.
@@ -66,8 +73,8 @@ class _Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
-    """A component: indices of its points in each view, how likely it is a thing, its size."""
+class _Component:
+    """A connected component: indices of its points in each view, score (0 to 1), size."""
 
     members: list[np.ndarray]
     score: float
@@ -121,11 +128,11 @@ class DepthSegmenter:
             )
             for c in self.cameras
         ]
-        backgrounds = see_through(views, backgrounds, self._low, self._high)
+        backgrounds = without_free_space(views, backgrounds, self._low, self._high)
         some = self._joints[:: max(1, len(times) // PERSON_SAMPLES)]
         bodies = [bones_of(joints) for joints in some]
         backgrounds = [
-            without_person(view, background, bodies)
+            without_person_traces(view, background, bodies)
             for view, background in zip(views, backgrounds, strict=True)
         ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
@@ -152,20 +159,20 @@ class DepthSegmenter:
         }
         if not images:
             return {}
-        seen = [self._look(t, c, image) for c, image in images.items()]
-        moving = _moving_pieces(seen)
-        pieces = [
+        seen = [self._view_points(t, c, image) for c, image in images.items()]
+        moving = _moving_components(seen)
+        proposed = [
             *moving,
-            *_spread_pieces(seen, moving),
-            *self._static_pieces(seen),
-            *self._joint_pieces(seen),
+            *_merged_neighbours(seen, moving),
+            *self._static_components(seen),
+            *self._partly_moved(seen),
         ]
         return {
-            c: _masks(view, [(piece, piece.members[number]) for piece in pieces])
+            c: _masks(view, [(one, one.members[number]) for one in proposed])
             for number, (c, view) in enumerate(zip(images, seen, strict=True))
         }
 
-    def _look(self, t: int, c: int, image: np.ndarray) -> _Seen:
+    def _view_points(self, t: int, c: int, image: np.ndarray) -> _ViewPoints:
         view, background = self._views[c], self._background[c]
         index = background.before(image)
         points, local = view.points(image, index)
@@ -191,7 +198,7 @@ class DepthSegmenter:
             of_thing.append(np.concatenate([own, count + np.arange(here.sum())]))
             count += int(here.sum())
         more = count - len(points)
-        return _Seen(
+        return _ViewPoints(
             np.concatenate(parts),
             Cells.joined(cells),
             np.concatenate([away, np.full(more, FAR, np.float32)]),
@@ -199,9 +206,9 @@ class DepthSegmenter:
             of_thing,
         )
 
-    def _static_pieces(self, seen: list[_Seen]) -> list[_Piece]:
+    def _static_components(self, seen: list[_ViewPoints]) -> list[_Component]:
         return [
-            _Piece(
+            _Component(
                 [view.of_thing[k] for view in seen],
                 ON_TOP_SCORE if thing.on_top else STATIC_SCORE,
                 thing.extent_m,
@@ -209,8 +216,12 @@ class DepthSegmenter:
             for k, thing in enumerate(self._static.things)
         ]
 
-    def _joint_pieces(self, seen: list[_Seen]) -> list[_Piece]:
-        """Static things together with what moves beside them: a chair that was pushed a little."""
+    def _partly_moved(self, seen: list[_ViewPoints]) -> list[_Component]:
+        """Components of static things together with foreground that touches them.
+
+        For a thing that moved by less than its size, such as a chair that was pushed: part of it
+        coincides with its place in the background, the rest is foreground.
+        """
         chosen = []
         touched = False
         for view in seen:
@@ -224,15 +235,15 @@ class DepthSegmenter:
         if not touched:
             return []
         found = []
-        for members, points in _grouped(seen, chosen):
+        for members, points in _connected(seen, chosen):
             moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
             if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
-                found.append(_Piece(members, PARTLY_MOVED_SCORE, extent(points)))
+                found.append(_Component(members, PARTLY_MOVED_SCORE, extent(points)))
         return found[:MAX_COMPONENTS]
 
 
-def _grouped(
-    seen: list[_Seen], chosen: list[np.ndarray], cell_m: float = CELL_M
+def _connected(
+    seen: list[_ViewPoints], chosen: list[np.ndarray], cell_m: float = CELL_M
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
     """Components of the points ``chosen`` in each view: their indices by view, and points."""
     ends = np.cumsum([0, *map(len, chosen)])
@@ -243,60 +254,67 @@ def _grouped(
         yield members, points[group]
 
 
-def _moving_pieces(seen: list[_Seen]) -> list[_Piece]:
-    """Components of what moves and is not the person, taken off the person at either distance."""
-    pieces: list[_Piece] = []
+def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
+    """Components of the foreground farther from the person than either cut; clothing left out."""
+    proposed: list[_Component] = []
     for cut in (NEAR_CUT, FAR_CUT):
         kept = 0
         chosen = [np.flatnonzero(view.moving & (view.outside > cut)) for view in seen]
-        for members, points in _grouped(seen, chosen):
+        for members, points in _connected(seen, chosen):
             away = np.concatenate([v.outside[m] for v, m in zip(seen, members, strict=True)])
             reach = float(np.percentile(away, 95))
-            if reach < CLOTHING_MARGINS or any(_same(members, other.members) for other in pieces):
+            if reach < CLOTHING_MARGINS or any(
+                _is_same(members, other.members) for other in proposed
+            ):
                 continue
-            pieces.append(_Piece(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), extent(points)))
+            proposed.append(
+                _Component(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), extent(points))
+            )
             kept += 1
             if kept == MAX_COMPONENTS:
                 break
-    return pieces
+    return proposed
 
 
-def _spread_pieces(seen: list[_Seen], pieces: list[_Piece]) -> list[_Piece]:
-    """``pieces`` that lie close together: both ends of what a hand holds in its middle."""
-    if len(pieces) < 2:
+def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> list[_Component]:
+    """Unions of components less than a hand's breadth apart.
+
+    For a thing that a hand holds in its middle: both ends are components of their own.
+    """
+    if len(proposed) < 2:
         return []
     chosen = [
-        np.unique(np.concatenate([piece.members[v] for piece in pieces])) for v in range(len(seen))
+        np.unique(np.concatenate([one.members[v] for one in proposed])) for v in range(len(seen))
     ]
-    found: list[_Piece] = []
-    for members, points in _grouped(seen, chosen, NEARBY_CELL_M):
+    found: list[_Component] = []
+    for members, points in _connected(seen, chosen, NEARBY_CELL_M):
         parts = components(points, CELL_M, MIN_POINTS)
         if len(parts) > 1 and len(found) < MAX_COMPONENTS:
-            found.append(_Piece(members, TWO_ENDS_SCORE, extent(points)))
+            found.append(_Component(members, TWO_ENDS_SCORE, extent(points)))
     return found
 
 
-def _same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    """Whether a component holds nearly all points of another one that it is part of."""
+def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    """Whether ``own``, a subset of ``other``, holds nearly all of its points."""
     size = sum(map(len, other))
     return sum(map(len, own)) > SAME_SHARE * size and any(
         len(a) and len(b) and a[0] in b for a, b in zip(own, other, strict=True)
     )
 
 
-def _masks(seen: _Seen, pieces: list[tuple[_Piece, np.ndarray]]) -> ViewSegments:
+def _masks(seen: _ViewPoints, proposed: list[tuple[_Component, np.ndarray]]) -> ViewSegments:
     projected = Projected.of(seen.cells)
     person = seen.moving & (seen.outside < PERSON_MARGINS)
     things = ~person
     candidates = []
-    for component, (piece, members) in enumerate(pieces):
+    for component, (one, members) in enumerate(proposed):
         if len(members) < MIN_VIEW_POINTS:
             continue
         chosen = np.zeros(len(person), bool)
         chosen[members] = True
         rle = projected.rle(chosen, person & ~chosen)
         if rle:
-            candidates.append(ImageCandidate(rle, piece.score, piece.extent_m, component))
+            candidates.append(ImageCandidate(rle, one.score, one.extent_m, component))
     return ViewSegments(projected.rle(person, things), candidates)
 
 
