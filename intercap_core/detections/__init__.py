@@ -8,6 +8,7 @@ In the order of a run:
   the 135 of ``body.keypoints``
 - ``candidate_files``: the files of one camera's masks, sorted by image
 - ``models``: ONNX models, for images of which no file says anything
+- ``constants``: all numbers, by kind
 - ``read``: the artefact that is written, opened for the stages that follow
 - ``keypoint_check``, ``candidate_check``: the beginning of each camera's files, for ``check``
 

@@ -48,10 +48,17 @@ def agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarr
         for i, j in combinations(range(len(order)), 2):
             a, b = order[i], order[j]
             same, other = (
-                _cost(rays[a][:, limb], rays[b][:, side], weight[:, a, limb], weight[:, b, side],
-                      centres[a], centres[b], gap)
+                _cost(
+                    rays[a][:, limb],
+                    rays[b][:, side],
+                    weight[:, a, limb],
+                    weight[:, b, side],
+                    centres[a],
+                    centres[b],
+                    gap,
+                )
                 for side in (limb, PARTNER[limb])
-            )  # fmt: skip
+            )
             apart = ways[:, i] != ways[:, j]
             cost += np.where(apart, (other - same)[:, None], 0)
         seen = np.asarray((weight[:, order][:, :, limb] > 0).any(2))

@@ -58,14 +58,22 @@ def triangulate_people(
     turned = mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
     if turned.any():
         keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
-        found = Triangulation(*(
-            exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned)
-            .reshape(part.shape)
-            for part in (found.points, found.inlier, found.error, found.view_error)
-        ))  # fmt: skip
+        found = Triangulation(
+            *(
+                exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned).reshape(
+                    part.shape
+                )
+                for part in (found.points, found.inlier, found.error, found.view_error)
+            )
+        )
     for _ in range(EXCHANGE_ROUNDS):
-        exchanged = exchange(keypoints, found.points.reshape(len(keypoints), -1, 3), rig,
-                             min_confidence=min_confidence, max_error_px=max_error_px)  # fmt: skip
+        exchanged = exchange(
+            keypoints,
+            found.points.reshape(len(keypoints), -1, 3),
+            rig,
+            min_confidence=min_confidence,
+            max_error_px=max_error_px,
+        )
         if not exchanged:
             break
         found = _triangulate(keypoints, rig, min_confidence, max_error_px)

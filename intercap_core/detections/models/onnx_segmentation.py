@@ -149,9 +149,13 @@ class Segmenter:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         try:
             return yolo_instances(
-                rows[index], prototypes[index], fit, size,
-                min_score=self._min_score, names=self._kind.names,
-            )  # fmt: skip
+                rows[index],
+                prototypes[index],
+                fit,
+                size,
+                min_score=self._min_score,
+                names=self._kind.names,
+            )
         except ValueError:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs]) from None
 
@@ -168,9 +172,15 @@ class Segmenter:
         if len(counts) != 1 or boxes.shape[1:] != (4,) or soft.ndim != 3 or classes.ndim != 1:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         return rcnn_instances(
-            boxes, classes, scores, soft, fit, size,
-            min_score=self._min_score, names=self._kind.names,
-        )  # fmt: skip
+            boxes,
+            classes,
+            scores,
+            soft,
+            fit,
+            size,
+            min_score=self._min_score,
+            names=self._kind.names,
+        )
 
 
 def _yolo_outputs(model: OnnxModel) -> dict[str, int] | None:
