@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
-from intercap_core.detections.label_maps import read_label_map
+from intercap_core.detections.converters.label_maps import read_label_map
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
 

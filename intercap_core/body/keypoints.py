@@ -6,6 +6,7 @@ to 16, taken for a head seen from the front; as a camera sees it: `contour`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,35 @@ KEYPOINT_NAMES: tuple[str, ...] = (
 NUM_KEYPOINTS = len(KEYPOINT_NAMES)
 BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)
 FACE, CONTOUR = slice(67, 118), slice(118, 135)
+
+# Bones between body keypoints by name: of an arm, leg and foot of one side; of both sides at once.
+ARM_BONES = (("shoulder", "elbow"), ("elbow", "wrist"))
+LEG_BONES = (("hip", "knee"), ("knee", "ankle"))
+FOOT_BONES = (("ankle", "big_toe"), ("ankle", "heel"))
+LIMB_BONES = (*ARM_BONES, *LEG_BONES, *FOOT_BONES)
+
+
+def of_side(side: str, bones: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """The bones of one side of the body, "left" or "right", from names without a side."""
+    return tuple((f"{side}_{first}", f"{side}_{second}") for first, second in bones)
+
+
+# The tree that OpenPose draws, without eyes and ears: trunk, arms, legs and nose; then the feet.
+SKELETON: tuple[tuple[str, str], ...] = (
+    ("neck", "mid_hip"),
+    *(("neck", "right_shoulder"), *of_side("right", ARM_BONES)),
+    *(("neck", "left_shoulder"), *of_side("left", ARM_BONES)),
+    *(("mid_hip", "right_hip"), *of_side("right", LEG_BONES)),
+    *(("mid_hip", "left_hip"), *of_side("left", LEG_BONES)),
+    ("neck", "nose"),
+)
+FEET = (*of_side("right", FOOT_BONES), *of_side("left", FOOT_BONES))
+
+
+def keypoint_pairs(bones: Iterable[tuple[str, str]]) -> np.ndarray:
+    """Indices (B, 2) of both ends of bones among the 135 keypoints."""
+    ends = [[KEYPOINT_NAMES.index(first), KEYPOINT_NAMES.index(second)] for first, second in bones]
+    return np.array(ends, int).reshape(-1, 2)
 
 
 @dataclass(frozen=True)

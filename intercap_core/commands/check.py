@@ -54,12 +54,12 @@ def check_detector(project: Project) -> list[Fault]:
     """
     settings = project.config.detections
     if settings.keypoint_model is not None:
-        from intercap_core.detections.onnx_pose import PoseModel
+        from intercap_core.detections.models.onnx_pose import PoseModel
 
         PoseModel.load(settings)
     if settings.segmentation_model is None:
         return []
-    from intercap_core.detections.onnx_segmentation import Segmenter
+    from intercap_core.detections.models.onnx_segmentation import Segmenter
 
     classes = Segmenter.load(settings).classes
     return [
@@ -198,7 +198,7 @@ def _notes_of_candidates(
 ) -> list[str]:
     """What a look at the first results of each camera shows: their form, size and labels."""
     from intercap_core.detections.candidate_check import look_at_candidates
-    from intercap_core.detections.label_maps import class_names
+    from intercap_core.detections.converters.label_maps import class_names
 
     assert row.candidates is not None
     settings = project.config.detections

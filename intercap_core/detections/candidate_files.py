@@ -19,20 +19,20 @@ from intercap_core.detections.coco import (
     candidates_of,
     read_json,
 )
-from intercap_core.detections.image_numbers import CameraImages
-from intercap_core.detections.instance import Instance
-from intercap_core.detections.mask_files import (
+from intercap_core.detections.constants import FILES_NAMED
+from intercap_core.detections.converters.data_sets import release_masks
+from intercap_core.detections.converters.mask_files import (
     MaskFile,
     UnreadableMask,
     instance_masks,
     read_masks,
-    release_masks,
 )
+from intercap_core.detections.image_numbers import CameraImages
+from intercap_core.detections.instance import Instance
 
 Result = TypeVar("Result")
 
 ALL_IMAGES = ("coco_instances_results.json", "predictions.json")  # in the camera's own folder
-FILES_NAMED = 3  # broken files or entries that a note names; more are counted
 
 
 @dataclass

@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from intercap_core.camera import masks
+from intercap_core.detections.class_names import label_text, names_of
+from intercap_core.detections.constants import (
+    HEAD_BYTES,
+    MAX_JSON_BYTES,
+)
 from intercap_core.detections.instance import Instance, to_rle
-from intercap_core.detections.label_maps import label_text, names_of
 
-MAX_BYTES = 1 << 29  # parsed JSON takes about six times its size in memory
-HEAD_BYTES = 1 << 18  # of a long file that is looked at before a run
 _LARGEST_ID = 2**31 - 1
 _NAME_KEYS = ("category_name", "category", "class_name", "class", "label", "name")
 _NUMBER_KEYS = ("category_id", "class", "class_id", "label")
@@ -129,7 +131,7 @@ def read_head(path: Path) -> Any:
             text = file.read(HEAD_BYTES).decode("utf-8", errors="ignore").lstrip()
     except OSError as error:
         raise UnreadableCandidates(f"cannot be read ({error.strerror})") from None
-    if size <= HEAD_BYTES or size > MAX_BYTES:
+    if size <= HEAD_BYTES or size > MAX_JSON_BYTES:
         return read_json(path)
     if not text.startswith("["):
         return None
@@ -149,10 +151,10 @@ def read_json(path: Path) -> Any:
     """Parse a file; raises :class:`UnreadableCandidates` where it is no JSON or too large."""
     try:
         size = path.stat().st_size
-        if size > MAX_BYTES:
+        if size > MAX_JSON_BYTES:
             raise UnreadableCandidates(
-                f"has {size / 1e6:.0f} MB, at most {MAX_BYTES / 1e6:.0f} are read; write masks as "
-                "compressed RLE, or one file an image"
+                f"has {size / 1e6:.0f} MB, at most {MAX_JSON_BYTES / 1e6:.0f} are read; "
+                "write masks as compressed RLE, or one file an image"
             )
         return json.loads(path.read_bytes())
     except OSError as error:

@@ -13,10 +13,13 @@ import cv2
 import numpy as np
 
 from intercap_core.camera import masks
+from intercap_core.detections.constants import (
+    MASK_THRESHOLD,
+    MAX_PIXELS,
+    SAME_SHAPE_PX,
+)
 
 PERSON_LABEL = "person"  # what every detector's list of classes calls people
-MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth
-SAME_SHAPE_PX = 1.0  # rounding of one side of an image that was reduced
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, floa
 def resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A mask (h, w) at ``size`` (width, height): (H, W) bool, edges midway between pixels."""
     grey = np.where(mask, np.uint8(255), np.uint8(0))
-    return cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR) >= 128
+    return cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR) >= MASK_THRESHOLD
 
 
 def to_rle(

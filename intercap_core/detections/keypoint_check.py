@@ -8,9 +8,10 @@ import numpy as np
 
 from intercap_core.detections import openpose
 from intercap_core.detections.coco import UnreadableCandidates, read_head
+from intercap_core.detections.converters.data_sets import as_openpose
+from intercap_core.detections.converters.wholebody import people_of
 from intercap_core.detections.keypoint_files import camera_file, image_files
 from intercap_core.detections.keypoint_values import NOBODY, Values
-from intercap_core.detections.wholebody import people_of
 from intercap_core.errors import UserError
 
 
@@ -30,6 +31,8 @@ def look_at_keypoints(
         content = read_head(path)
         if content is None:
             return []
+        if whole is None:
+            content = as_openpose(content)
         if whole is None and openpose.is_openpose(content):
             people = openpose.people_of(content, str(path))
         else:

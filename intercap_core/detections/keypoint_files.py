@@ -16,16 +16,17 @@ import numpy as np
 
 from intercap_core.detections import openpose
 from intercap_core.detections.candidate_files import (
-    FILES_NAMED,
     note_absent,
     note_broken,
     short,
     sorted_by_image,
 )
 from intercap_core.detections.coco import UnreadableCandidates, read_json
+from intercap_core.detections.constants import FILES_NAMED
+from intercap_core.detections.converters.data_sets import as_openpose
+from intercap_core.detections.converters.wholebody import people_of
 from intercap_core.detections.image_numbers import CameraImages
 from intercap_core.detections.keypoint_values import NOBODY, Values
-from intercap_core.detections.wholebody import people_of
 from intercap_core.errors import UserError
 
 RESULTS = "results_"  # what mmpose's demo puts before the name of an image or a video
@@ -191,6 +192,7 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None]) -> None:
 
 def _people_of_image(reading: _Reading, content: Any, path: Path) -> np.ndarray | None:
     """People (P, 135, 3) of a file of one image, None = all of them are of no use."""
+    content = as_openpose(content)
     if openpose.is_openpose(content):
         return openpose.people_of(content, short(path))
     found = people_of(content, one_image=True)

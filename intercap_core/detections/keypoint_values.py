@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
+from intercap_core.detections.constants import (
+    EDGE_PX,
+    SHARES_UP_TO,
+)
 
 NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
-SHARES_UP_TO = 2.0  # coordinates from 0 to 1, some beyond the image: pixels of nobody
-EDGE_PX = 0.5  # pixels' middles are whole numbers
 
 
 @dataclass

@@ -29,13 +29,6 @@ _LISTS = {
     "hand_right_keypoints_2d": 21,
     "face_keypoints_2d": 70,
 }
-# BEHAVE keeps the lists of one person at the top, under names of its own.
-_BEHAVE_LISTS = {
-    "pose_keypoints_2d": "body_joints",
-    "hand_left_keypoints_2d": "left_hand_joints",
-    "hand_right_keypoints_2d": "right_hand_joints",
-    "face_keypoints_2d": "face_joints",
-}
 _JAW_LINE, _INNER_FACE = slice(0, 17), slice(17, 68)
 _FILE_NAME = re.compile(r"(?!\.)(?:.*?_)?(\d+)_keypoints\.json")
 
@@ -67,20 +60,18 @@ def named_keypoint_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
 
 
 def is_openpose(content: Any) -> bool:
-    """Whether parsed JSON is OpenPose's, or BEHAVE's with its lists of one person."""
-    return isinstance(content, dict) and ("people" in content or "body_joints" in content)
+    """Whether parsed JSON is OpenPose's."""
+    return isinstance(content, dict) and "people" in content
 
 
 def people_of(content: dict[str, Any], name: str) -> np.ndarray:
     """The people of one file's parsed JSON: (P, 135, 3) float64 of x, y (px) and confidence.
 
     Numbers are as written. A hand or face that the detector did not look for (an empty list) has
-    confidence 0. BEHAVE's files hold one person. P may be 0. Raises UserError where a list is not
-    of its length; ``name`` of the file is in it.
+    confidence 0. P may be 0. Raises UserError where a list is not of its length; ``name`` of the
+    file is in it.
     """
     people = content.get("people")
-    if "people" not in content:
-        people = [{key: content.get(theirs, []) for key, theirs in _BEHAVE_LISTS.items()}]
     if not isinstance(people, list):
         raise UserError(f"{name}: has no list 'people'; expected a file as OpenPose writes it")
     result = np.zeros((len(people), NUM_KEYPOINTS, 3))

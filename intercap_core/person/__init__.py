@@ -1,0 +1,17 @@
+"""Stage ``person``: which detections are the subject, left and right put right, points in space.
+
+In the order of a run:
+
+- ``subject``: people of one set matched over views by geometry, tracked; the subject's track chosen
+- ``lifting``: keypoints of a single view placed by the depth beside them
+- ``swaps``: sides exchanged by the detector: steadied over time in each view, then triangulated and
+  corrected; ``agreement`` decides set by set which views disagree, ``facing`` which of two mirrored
+  bodies is the true one, by the body's build and its motion
+- ``sides``: which keypoints are left and right of each other
+- ``exposure``: keypoints moved from each camera's exposure to the set's time
+- ``middles``: neck and middle of the hips from shoulders and hips
+- ``masks``: the detector's candidate that is the subject
+- ``constants``: all numbers, by kind
+
+Images that no detector segmented are segmented by the room ``segmentation``.
+"""

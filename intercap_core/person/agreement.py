@@ -1,9 +1,10 @@
 """Left and right made to agree over the views of a set.
 
-A detector that takes a back for a front exchanges the sides of a whole view, often of several views
-at once, and points triangulated from half of the views against the other half are no one's. Of all
-ways to exchange a limb in some of the views, the one is taken whose rays meet best. It leaves open
-which of the two sides is the left: see :mod:`.facing`.
+A detector that takes a back for a front exchanges left and right in a whole view, often in several
+views at once; points triangulated from views that disagree are wrong. For each limb all assignments
+of sides to views are tried (exhaustively, 2^(C-1)), and the one of least cost is taken: truncated
+squared gaps between the rays of every pair of views, plus a cost for each view exchanged. Which of
+the two mirrored solutions is true stays open: see :mod:`.facing`.
 """
 
 from __future__ import annotations
@@ -14,16 +15,15 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import midpoints, rays_of
-from intercap_core.person.sides import LIMBS, PARTNER
+from intercap_core.person.constants import (
+    EXCHANGED_VIEW_COST,
+    MAX_AGREEING_VIEWS,
+    SIDE_GAPS_M,
+    UNKNOWN_SIDE_COST,
+)
+from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb
 
-# Rays of one point pass each other by a few centimetres (detectors' biases, calibration), those of
-# a left and a right point by up to a body's breadth, or a face's. Beyond this a pair says nothing
-# more. Arms, legs, head, hands.
-_GAPS_M = (0.12, 0.12, 0.05, 0.12)
-_UNKNOWN = 0.25  # squared share of that gap, where a point has nothing to be compared with
-_PRICE = 0.5  # of each view exchanged: more than errors alone gain with a small limb
 _LIKE_ARMS = 2  # first of the limbs that are named as the arms are
-_MOST_VIEWS = 10  # of which all 2^(C-1) ways are tried; further ones are left as they are
 
 
 def agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
@@ -36,22 +36,29 @@ def agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarr
     sets, views = keypoints.shape[:2]
     exchanged = np.zeros((sets, views, len(LIMBS)), bool)
     weight = np.where(keypoints[..., 2] >= min_confidence, keypoints[..., 2], 0)
-    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:_MOST_VIEWS]
+    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:MAX_AGREEING_VIEWS]
     order = np.sort(seeing[(weight[:, seeing] > 0).any((0, 2))])
     if len(order) < 2:
         return exchanged
     rays = np.swapaxes(rays_of(keypoints[..., :2], rig), 0, 1)
     centres = rig.master_from_colour[:, :3, 3]
     ways = np.array([(False, *rest) for rest in product((False, True), repeat=len(order) - 1)])
-    for number, (limb, gap) in enumerate(zip(LIMBS, _GAPS_M, strict=True)):
+    for number, (limb, gap) in enumerate(zip(LIMBS, SIDE_GAPS_M, strict=True)):
         cost = np.zeros((sets, len(ways)))
         for i, j in combinations(range(len(order)), 2):
             a, b = order[i], order[j]
             same, other = (
-                _cost(rays[a][:, limb], rays[b][:, side], weight[:, a, limb], weight[:, b, side],
-                      centres[a], centres[b], gap)
+                _cost(
+                    rays[a][:, limb],
+                    rays[b][:, side],
+                    weight[:, a, limb],
+                    weight[:, b, side],
+                    centres[a],
+                    centres[b],
+                    gap,
+                )
                 for side in (limb, PARTNER[limb])
-            )  # fmt: skip
+            )
             apart = ways[:, i] != ways[:, j]
             cost += np.where(apart, (other - same)[:, None], 0)
         seen = np.asarray((weight[:, order][:, :, limb] > 0).any(2))
@@ -64,13 +71,13 @@ def agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarr
             unlike = ((ways[None] ^ arms[:, None]) & seen[:, None]).sum(2)
             unusual = np.minimum(unusual, unlike)
             mirrored = np.minimum(mirrored, count - unlike)
-        best = (cost + _PRICE * np.minimum(unusual, mirrored)).argmin(1)
+        best = (cost + EXCHANGED_VIEW_COST * np.minimum(unusual, mirrored)).argmin(1)
         sets_at = (np.arange(sets), best)
         other = (mirrored[sets_at] < unusual[sets_at])[:, None]
         chosen = (ways[best] ^ other) & seen
         exchanged[:, order, number] = chosen
         t, c = np.nonzero(exchanged[..., number])
-        keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], PARTNER[limb]]
+        exchange_limb(keypoints, t, c, limb)
     return exchanged
 
 
@@ -87,4 +94,4 @@ def _cost(
     _, gap = midpoints(first, second, from_first, from_second)
     square = np.minimum(np.nan_to_num(gap, nan=limit) / limit, 1.0) ** 2
     weight = first_weight * second_weight
-    return (weight * (square - _UNKNOWN)).sum(1)
+    return (weight * (square - UNKNOWN_SIDE_COST)).sum(1)

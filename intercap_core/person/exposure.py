@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.camera.rig import Rig
+from intercap_core.person.constants import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.solve.velocity import limited_velocity
-
-# Hands reach some 5 m/s in everyday tasks, and people stand two metres from a capture ring's
-# cameras: what moves faster in an image is another detection.
-MAX_SPEED_RAD_S = 2.5
 
 
 def at_set_times(
@@ -28,7 +25,7 @@ def at_set_times(
     result = keypoints.copy()
     known = keypoints[..., 2] >= min_confidence
     for c in np.flatnonzero(time_offset):
-        speed = MAX_SPEED_RAD_S * rig[int(c)].colour.fx
+        speed = MAX_IMAGE_SPEED_RAD_S * rig[int(c)].colour.fx
         seen = keypoints[:, c, :, :2]
         velocity = limited_velocity(seen, times, max_speed=speed, known=known[:, c])
         result[:, c, :, :2] = seen - time_offset[c] * velocity

@@ -1,9 +1,9 @@
-"""Which way the body faces where the views agree: whether their left is truly the left.
+"""Which of two mirrored bodies is the true one, where the views agree up to left and right.
 
-Decided for arms, legs and head of all sets together, by dynamic programming over the eight ways of
-exchanging them: knees and ankles bend one way, the nose is in front of the ears and of the chest,
-shoulders and hips face the same way, nobody turns about between two images, and detectors are
-mostly right. A hand belongs to the arm that ends where it begins.
+Decided for arms, legs and head of all sets together, by the Viterbi algorithm over the eight ways
+of exchanging them. Unary costs: knees and ankles bend one way, the nose is in front of the ears and
+of the chest, shoulders and hips face the same way, detectors are mostly right. Pairwise costs:
+motion from set to set, and a change of sides. A hand belongs to the arm whose wrist is its own.
 """
 
 from __future__ import annotations
@@ -13,19 +13,22 @@ from itertools import product
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER
-
-# Costs in units of a negative log likelihood. The body's build is certain, a turned head and a
-# twisted back (each up to some 80 degrees) less so; detectors exchange the sides in most views of
-# about one set in twenty.
-_HINGES, _HEAD, _TWIST, _NOSE, _DETECTED = 8.0, 6.0, 6.0, 3.0, 3.0
-_CHANGE = 1.0
-_STEP_M = 0.04  # motion from set to set that is worth one such unit
-_LARGEST_STEP_M = 0.3
-_MEMORY_S = 0.5  # motion is judged over gaps as long as this
-_SHORT_M = 0.03  # directions of shorter vectors are noise
-_ROOT_APART_M = 0.08  # two detectors' wrists of one arm are no farther apart than this
-_CROSSED = 0.5
+from intercap_core.person.constants import (
+    CHANGE_COST,
+    CROSSED_HANDS_RATIO,
+    DETECTED_COST,
+    HAND_ROOT_APART_M,
+    HEAD_COST,
+    HINGE_COST,
+    LARGEST_STEP_M,
+    MOTION_MEMORY_S,
+    NOSE_COST,
+    SHORT_BONE_M,
+    STEP_M,
+    TWIST_COST,
+)
+from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER, exchange_points
+from intercap_core.solve.viterbi import cheapest_sequence
 
 _AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 _LIMBS = (ARMS, LEGS, HEAD)
@@ -42,18 +45,12 @@ def mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | None) ->
     if not len(points):
         return result
     cost = _build(points) + _detected(points, share)
-    states = cost.argmin(1) if times is None else _cheapest(cost, points, times)
+    if times is None:
+        states = cost.argmin(1)
+    else:
+        states = cheapest_sequence(cost[0], _steps(points, times) + cost[1:, None])
     result[:, :3] = _STATES[states]
     result[:, 3] = _other_hands(exchange_points(points, result))
-    return result
-
-
-def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Values (T, 135, ...) with the limbs that ``which`` (T, 4) names exchanged."""
-    result = values.copy()
-    for limb, at in zip(LIMBS, which.T, strict=True):
-        rows = np.flatnonzero(at)[:, None]
-        result[rows, limb] = values[rows, PARTNER[limb]]
     return result
 
 
@@ -61,11 +58,11 @@ def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Cost (T, 8) of contradicting the detector, by the share of views."""
     known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)
     wrong = np.where(_STATES, 1 - share[:, None], share[:, None])
-    return _DETECTED * np.where(known[:, None], wrong, 0).sum(2)
+    return DETECTED_COST * np.where(known[:, None], wrong, 0).sum(2)
 
 
 def _build(points: np.ndarray) -> np.ndarray:
-    """Cost (T, 8) of a body that could not be built so."""
+    """Cost (T, 8) of anatomically impossible bodies, for each way of exchanging limbs."""
 
     def between(start: str, end: str) -> np.ndarray:
         return points[:, _AT[end]] - points[:, _AT[start]]
@@ -89,41 +86,35 @@ def _build(points: np.ndarray) -> np.ndarray:
     head = _cosine(np.cross(_unit(up), _unit(nose)), ears)
     arms, legs, turned = np.where(_STATES, -1.0, 1.0).T
     return (
-        _HINGES * np.maximum(0, -legs * hinges[:, None])
-        + _TWIST * np.maximum(0, -arms * legs * twist[:, None])
-        + _NOSE * np.maximum(0, -arms * looks[:, None])
-        + _HEAD * np.maximum(0, -turned * head[:, None])
+        HINGE_COST * np.maximum(0, -legs * hinges[:, None])
+        + TWIST_COST * np.maximum(0, -arms * legs * twist[:, None])
+        + NOSE_COST * np.maximum(0, -arms * looks[:, None])
+        + HEAD_COST * np.maximum(0, -turned * head[:, None])
     )
 
 
-def _cheapest(cost: np.ndarray, points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The states (T,) of least total ``cost`` (T, 8), motion included (Viterbi 1967)."""
-    change = _CHANGE * (_STATES[:, None] != _STATES[None]).sum(2)
-    total, came_from = cost[0], []
+def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Cost (T - 1, 8, 8) of going from one state of the sides to the next: change and motion."""
+    steps = np.empty((len(points) - 1, len(_STATES), len(_STATES)))
+    steps[:] = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
     last, when = points[0].copy(), np.full(points.shape[1], times[0])
-    for t in range(1, len(points)):
-        reach = total[:, None] + change + cost[t]
-        last[times[t] - when > _MEMORY_S] = np.nan
+    for t, step in enumerate(steps, start=1):
+        last[times[t] - when > MOTION_MEMORY_S] = np.nan
         for number, limb in enumerate(_LIMBS):
             straight = _motion(last[limb], points[t, limb])
             crossed = _motion(last[PARTNER[limb]], points[t, limb])
             differ = _STATES[:, None, number] != _STATES[None, :, number]
-            reach = reach + np.where(differ, crossed, straight)
-        came_from.append(reach.argmin(0))
-        total = reach.min(0)
+            step += np.where(differ, crossed, straight)
         known = np.isfinite(points[t, :, 0])
         last[known], when[known] = points[t, known], times[t]
-    chosen = [int(total.argmin())]
-    for back in reversed(came_from):
-        chosen.append(int(back[chosen[-1]]))
-    return np.array(chosen[::-1])
+    return steps
 
 
 def _motion(before: np.ndarray, now: np.ndarray) -> float:
     """Cost of moving points (n, 3) so far; 0 where fewer than two are known."""
     step = np.linalg.norm(now - before, axis=1)
     step = step[np.isfinite(step)]
-    return float(np.minimum(step, _LARGEST_STEP_M).mean() / _STEP_M) if len(step) > 1 else 0.0
+    return float(np.minimum(step, LARGEST_STEP_M).mean() / STEP_M) if len(step) > 1 else 0.0
 
 
 def _other_hands(points: np.ndarray) -> np.ndarray:
@@ -135,13 +126,13 @@ def _other_hands(points: np.ndarray) -> np.ndarray:
     both = np.isfinite(own) & np.isfinite(other)
     count = np.maximum(both.sum(1), 1)
     own, other = (np.where(both, d, 0).sum(1) / count for d in (own, other))
-    return both.any(1) & (own > _ROOT_APART_M) & (other < _CROSSED * own)
+    return both.any(1) & (own > HAND_ROOT_APART_M) & (other < CROSSED_HANDS_RATIO * own)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     """Directions (..., 3), NaN for what is too short to have one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > _SHORT_M, vectors / np.maximum(length, _SHORT_M), np.nan)
+    return np.where(length > SHORT_BONE_M, vectors / np.maximum(length, SHORT_BONE_M), np.nan)
 
 
 def _hinge(first: np.ndarray, second: np.ndarray) -> np.ndarray:

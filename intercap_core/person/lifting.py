@@ -1,9 +1,9 @@
 """Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
 
-Depth measures the skin, a keypoint is a joint: the point lies deeper on the pixel's ray by how
-thick the body is there. What covers a joint would put it too near: the room, which the scene knows,
-is looked past, and where a view from the side shows that one shoulder or hip must be covered, it
-and its limb are left out.
+Depth measures the skin, a keypoint is a joint inside the body: the point lies deeper on the pixel's
+ray by an inset of its own. An occluded joint would be placed too near or too far: pixels of the
+scene's background are skipped, and where a side view shows both shoulders or hips in one place, the
+one that the detector trusts less is occluded and left out with its limb.
 """
 
 from __future__ import annotations
@@ -21,33 +21,29 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.camera.triangulation import Triangulation
 from intercap_core.capture.frames import Frames
+from intercap_core.person.constants import (
+    AT_BACKGROUND_MM,
+    BODY_DEPTH_M,
+    DEPTH_STRIDE,
+    ENOUGH_TRIANGULATED,
+    HAND_INSET_M,
+    INSET_M,
+    KEYPOINT_REACH_M,
+    MIN_DEPTH_SAMPLES,
+    MIN_MOVING_POINTS,
+    NEAREST_QUANTILE,
+    OCCLUDED_BREADTH_M,
+    SURFACE_M,
+)
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
 from intercap_core.person.subject import NOBODY
-
-# How deep a keypoint lies under the skin, metres: the open body's, standing, its median over all
-# horizontal directions. What is not named lies on the skin.
-_INSET_M = {
-    "neck": 0.065, "shoulder": 0.060, "elbow": 0.046, "wrist": 0.026, "mid_hip": 0.13,
-    "hip": 0.106, "knee": 0.059, "ankle": 0.040,
-}  # fmt: skip
-_HAND_INSET_M = 0.008  # half a finger
-_REACH_M = 0.03  # around a keypoint, across: where its depth is read
-_MIN_SAMPLES = 4
-_NEAREST_SHARE = 0.2  # of the samples: nearer ones may float
-_SURFACE_M = 0.05  # samples this far behind the nearest are another surface
-# Shoulders, hips nearer to each other than this, half of an adult's breadth: one hides the other.
-_BREADTH_M = (0.18, 0.09)
-_AT_BACKGROUND_MM = 40  # of the room's depth: the room
-_ENOUGH_BODY = 6  # points before the room; with fewer, the person is taken for part of it
-_BODY_DEPTH_M = 0.25  # of the room's points from the middle of the others: the body, standing still
-_ENOUGH_POINTS = 8  # of the body: a set with so many triangulated needs no lifting
 
 
 def _insets() -> np.ndarray:
     """(135,) metres."""
     parts = [name.removeprefix("left_").removeprefix("right_") for name in KEYPOINT_NAMES]
-    inset = np.array([_INSET_M.get(part, 0.0) for part in parts])
-    inset[LEFT_HAND] = inset[RIGHT_HAND] = _HAND_INSET_M
+    inset = np.array([INSET_M.get(part, 0.0) for part in parts])
+    inset[LEFT_HAND] = inset[RIGHT_HAND] = HAND_INSET_M
     return inset
 
 
@@ -76,12 +72,13 @@ class Relief:
         ``bias_m`` is subtracted from the depth. ``background`` (H, W) of the scene, None = unknown.
         """
         thinned = np.zeros_like(depth)
-        thinned[::2, ::2] = depth[::2, ::2]
+        some = np.s_[::DEPTH_STRIDE, ::DEPTH_STRIDE]
+        thinned[some] = depth[some]
         points, index = depth_points(thinned, camera)
         room = np.zeros(len(index), bool)
         if background is not None:
             behind, here = background.ravel()[index].astype(int), depth.ravel()[index].astype(int)
-            room = (behind > 0) & (here > behind - _AT_BACKGROUND_MM)
+            room = (behind > 0) & (here > behind - AT_BACKGROUND_MM)
         if bias_m:
             points = points * (1 - np.float32(bias_m) / points[:, 2:])
         assert camera.colour_from_depth is not None
@@ -104,24 +101,24 @@ class Relief:
         wanted = np.flatnonzero(seen & np.isfinite(rays).all(1))
         if not len(wanted) or not len(self.distance):
             return result
-        reach = self.camera.colour.fx * _REACH_M / self.distance
+        reach = self.camera.colour.fx * KEYPOINT_REACH_M / self.distance
         around = self._tree.query_ball_point(pixels[wanted], reach.max(), p=np.inf)
         for k, near in zip(wanted, around, strict=True):
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
             around_it = np.asarray(near, int)[away < reach[near]]
             before = around_it[~self.room[around_it]]
-            of_room[k] = len(before) < _MIN_SAMPLES
+            of_room[k] = len(before) < MIN_DEPTH_SAMPLES
             found = self.distance[around_it if of_room[k] else before]
-            if len(found) < _MIN_SAMPLES:
+            if len(found) < MIN_DEPTH_SAMPLES:
                 continue
-            nearest = np.quantile(found, _NEAREST_SHARE)
-            surface = np.median(found[found < nearest + _SURFACE_M])
+            nearest = np.quantile(found, NEAREST_QUANTILE)
+            surface = np.median(found[found < nearest + SURFACE_M])
             result[k] = rays[k] * (surface + inset_m[k])
         away = np.linalg.norm(result, axis=1)
         body = np.isfinite(away) & ~of_room
-        if body.sum() >= _ENOUGH_BODY:
+        if body.sum() >= MIN_MOVING_POINTS:
             apart = np.abs(away - np.median(away[body]))
-            result[of_room & ~(apart < _BODY_DEPTH_M)] = np.nan
+            result[of_room & ~(apart < BODY_DEPTH_M)] = np.nan
         return apply(self.camera.master_from_colour, result)
 
     @cached_property
@@ -175,7 +172,7 @@ class Lifter:
         inlier = found.inlier.reshape(sets, -1, views)
         triangulated = np.isfinite(points[:, BODY_POINTS, 0]).sum(1)
         lifted = np.zeros(sets, bool)
-        for t in np.flatnonzero(triangulated < _ENOUGH_POINTS):
+        for t in np.flatnonzero(triangulated < ENOUGH_TRIANGULATED):
             best, best_view = np.full(points.shape[1:], np.nan), -1
             for c in np.flatnonzero(person[t] != NOBODY):
                 relief = self._relief(int(t), int(c))
@@ -198,7 +195,7 @@ def _hidden_side(points: np.ndarray, confidence: np.ndarray) -> np.ndarray:
     Of a shoulder or hip that coincides with the other one, the limb that the detector trusts less.
     """
     hidden = np.zeros(len(points), bool)
-    for limb, breadth in zip((ARMS, LEGS), _BREADTH_M, strict=True):
+    for limb, breadth in zip((ARMS, LEGS), OCCLUDED_BREADTH_M, strict=True):
         left, right = np.split(limb, 2)
         if np.linalg.norm(points[left[0]] - points[right[0]]) < breadth:
             sure = confidence[left] > confidence[right]

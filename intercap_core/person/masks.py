@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.body.keypoints import SKELETON, keypoint_pairs
 from intercap_core.camera.masks import Runs
 from intercap_core.detections.instance import PERSON_LABEL
 from intercap_core.detections.read import Candidate
 from intercap_core.errors import UserError
+from intercap_core.person.constants import (
+    BOX_MARGIN,
+    LABEL_BONUS,
+    MIN_INSIDE_SHARE,
+    MIN_MASK_POINTS,
+    OUTSIDE_COST,
+    OUTSIDE_GRID,
+)
 
-MIN_SHARE = 0.5  # of the subject's points inside the mask
-LABEL_BONUS = 0.15  # labels are mostly right; one that fits much better still wins
-OUTSIDE_COST = 0.5  # for a mask that lies wholly outside the subject's box
-BOX_MARGIN = 0.25  # of the box of the points, for what has none: hair, soles, clothes
-MIN_POINTS = 4
 # Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
-# Pairs of the 25 body points.
-BONES = np.array([
-    (0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (1, 8), (8, 9), (9, 10), (10, 11),
-    (8, 12), (12, 13), (13, 14),
-])  # fmt: skip
+BONES = keypoint_pairs(SKELETON)  # (14, 2) of the 25 body points
 
 
 def choose_mask(
@@ -31,7 +31,7 @@ def choose_mask(
     ``where``, for a candidate whose RLE does not decode.
     """
     samples = _samples(points, seen)
-    if len(samples) < MIN_POINTS:
+    if len(samples) < MIN_MASK_POINTS:
         return b""
     x, y = np.rint(samples).astype(np.int64).T
     best, best_score = b"", 0.0
@@ -44,7 +44,7 @@ def choose_mask(
                 "'detections' for this sequence"
             ) from None
         share = float(runs.sample(x, y).mean())
-        if share < MIN_SHARE:
+        if share < MIN_INSIDE_SHARE:
             continue
         score = share - OUTSIDE_COST * _share_outside(runs, samples)
         score += LABEL_BONUS * (candidate.label == PERSON_LABEL)
@@ -65,7 +65,7 @@ def _share_outside(runs: Runs, samples: np.ndarray) -> float:
     x0, y0, width, height = runs.box
     if not width or not height:
         return 1.0
-    step = max(1, int(max(width, height) / 64))
+    step = max(1, int(max(width, height) / OUTSIDE_GRID))
     y, x = np.mgrid[y0 : y0 + height : step, x0 : x0 + width : step]
     inside = runs.sample(x, y)
     grid = np.stack([x, y], -1)

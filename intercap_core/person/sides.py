@@ -39,3 +39,18 @@ def swapped(keypoints: np.ndarray, limb: np.ndarray | None = None) -> np.ndarray
     chosen = order if limb is None else limb
     order[chosen] = PARTNER[chosen]
     return keypoints[..., order, :]
+
+
+def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Values (T, 135, ...) with the limbs that ``which`` (T, 4) names exchanged."""
+    result = values.copy()
+    for limb, at in zip(LIMBS, which.T, strict=True):
+        rows = np.flatnonzero(at)[:, None]
+        result[rows, limb] = values[rows, PARTNER[limb]]
+    return result
+
+
+def exchange_limb(keypoints: np.ndarray, t: np.ndarray, c: np.ndarray, limb: np.ndarray) -> None:
+    """Exchange in place left and right of ``limb`` in images (t, c) (N,) of ``keypoints``
+    (T, C, 135, n)."""
+    keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], PARTNER[limb]]

@@ -16,19 +16,22 @@ import numpy as np
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import midpoints, pixel_scale, reproject, view_pairs
 from intercap_core.detections.read import Detections
+from intercap_core.person.constants import (
+    CENTRE_RANGE_M,
+    LIFTED_SUPPORT,
+    LINK_SLACK_M,
+    MAX_BODY_SPEED_M_S,
+    MAX_LINK_GAP_S,
+    MIN_AXES_EIGENVALUE,
+    MIN_COMMON_POINTS,
+    MOVED_PX_FACTOR,
+    PARALLEL_AXES_DISTANCE_M,
+    SAME_PERSON_GAP_M,
+    SAME_PERSON_PX_AT_1080P,
+)
 from intercap_core.person.sides import BODY_POINTS, PARTNER
 
 NOBODY = -1
-MIN_COMMON_POINTS = 5  # fewer body points do not tell two people apart
-# Of the body's points the median view must see within this: detectors' biases and calibration
-# stay well under it, another person half a metre away (160 px at 2.6 m) well over.
-SAME_PERSON_PX_AT_1080P = 60.0
-SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays
-MAX_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
-LINK_SLACK_M = 0.25  # scatter of a group's centre
-CENTRE_RANGE_M = 1.5  # support counts half as much this far from the ring's middle
-MAX_GAP_S = 2.0  # tracks are joined over at most this long
-LIFTED_SUPPORT = 0.5  # of a point that one view sees, with depth; two views give about two
 
 _MIRRORED = PARTNER[BODY_POINTS]  # the body's points with left and right exchanged
 _Proposal = tuple[float, np.ndarray, tuple[int, int], tuple[int, int]]
@@ -92,8 +95,8 @@ def ring_centre(rig: Rig) -> np.ndarray:
     axes, centres = poses[:, :3, 2], poses[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(0)
-    if np.linalg.eigvalsh(normal)[0] < 0.05 * len(rig):
-        return (centres + 2 * axes).mean(0)
+    if np.linalg.eigvalsh(normal)[0] < MIN_AXES_EIGENVALUE * len(rig):
+        return (centres + PARALLEL_AXES_DISTANCE_M * axes).mean(0)
     return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))
 
 
@@ -221,7 +224,9 @@ def _subject_track(
     """Link groups over time; return the subject's group of every set that has one."""
     tracks: list[_Track] = []
     for t, in_set in enumerate(groups):
-        free = [k for k in tracks if k.sets[-1] < t and times[t] - times[k.sets[-1]] <= MAX_GAP_S]
+        free = [
+            k for k in tracks if k.sets[-1] < t and times[t] - times[k.sets[-1]] <= MAX_LINK_GAP_S
+        ]
         pairs = sorted(
             (float(np.linalg.norm(group.centre - track.groups[-1].centre)), g, k)
             for g, group in enumerate(in_set)
@@ -230,7 +235,7 @@ def _subject_track(
         used_groups: set[int] = set()
         used_tracks: set[int] = set()
         for distance, g, k in pairs:
-            reach = LINK_SLACK_M + MAX_SPEED_M_S * (times[t] - times[free[k].sets[-1]])
+            reach = LINK_SLACK_M + MAX_BODY_SPEED_M_S * (times[t] - times[free[k].sets[-1]])
             if g in used_groups or k in used_tracks or distance > reach:
                 continue
             used_groups.add(g)
@@ -265,7 +270,7 @@ def _compatible(track: _Track, chosen: dict[int, Group], times: np.ndarray) -> b
     for t, group in ((track.sets[0], track.groups[0]), (track.sets[-1], track.groups[-1])):
         for neighbour in (known[known < t][-1:], known[known > t][:1]):
             for other in neighbour:
-                reach = LINK_SLACK_M + MAX_SPEED_M_S * abs(times[t] - times[other])
+                reach = LINK_SLACK_M + MAX_BODY_SPEED_M_S * abs(times[t] - times[other])
                 if np.linalg.norm(group.centre - chosen[int(other)].centre) > reach:
                     return False
     return True
@@ -288,12 +293,12 @@ def _add_single_views(
         if t in chosen:
             continue
         nearest = int(known[np.argmin(np.abs(known - t))])
-        if abs(times[t] - times[nearest]) > MAX_GAP_S:
+        if abs(times[t] - times[nearest]) > MAX_LINK_GAP_S:
             continue
         points = chosen[nearest].points
         pixels = reproject(np.nan_to_num(points), rig)
         for c in range(len(rig)):
-            best = 2 * limits[c]  # the subject has moved since
+            best = MOVED_PX_FACTOR * limits[c]  # the subject has moved since
             for i, person in enumerate(detections.people(t, c)):
                 body = person[BODY_POINTS]
                 seen = body[:, 2] >= min_confidence

@@ -1,9 +1,9 @@
 """Limbs whose left and right a detector exchanged.
 
-The views of each set are brought to agree (:mod:`.agreement`), and all sets together tell which
-side is the left (:mod:`.facing`). After that a view's limb counts as exchanged when the points that
-the views agree on fit it much better with the sides exchanged. A view that stands alone has its
-limb's motion in the image, which an exchange makes jump and jump back.
+The views of each set are made to agree (:mod:`.agreement`), then all sets together tell which side
+is the left (:mod:`.facing`). After that a view's limb counts as exchanged where its reprojection
+error is much smaller with the sides exchanged. With few views there is no agreement to rely on:
+the sides of least motion in the image are taken, since an exchange jumps there and back.
 """
 
 from __future__ import annotations
@@ -18,17 +18,20 @@ from intercap_core.camera.triangulation import (
     triangulate,
 )
 from intercap_core.person.agreement import agree
-from intercap_core.person.facing import exchange_points, mirrored
-from intercap_core.person.sides import LIMBS, PARTNER
-
-ROUNDS = 2
-MUCH_BETTER = 0.5  # exchanged cost over cost as detected
-MIN_POINTS = 2
-FEW_VIEWS = 4
-EXCHANGED_PX_AT_1080P = 3.0  # what a set exchanged costs: detectors are mostly right
-# An exchange that the recording begins or ends with shows one jump alone, as a fast turn does.
-OPEN_PX_AT_1080P = 100.0
-JUMP_PX_AT_1080P = 120.0  # motion beyond counts as this much
+from intercap_core.person.constants import (
+    EXCHANGE_ROUNDS,
+    EXCHANGED_PX_AT_1080P,
+    FEW_VIEWS,
+    JUMP_PX_AT_1080P,
+    MIN_LIMB_COST,
+    MIN_LIMB_POINTS,
+    MUCH_BETTER,
+    OPEN_EXCHANGE_PX_AT_1080P,
+    TRUNCATED_AT,
+)
+from intercap_core.person.facing import mirrored
+from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
+from intercap_core.solve.viterbi import cheapest_sequence
 
 
 def triangulate_people(
@@ -55,14 +58,22 @@ def triangulate_people(
     turned = mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
     if turned.any():
         keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
-        found = Triangulation(*(
-            exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned)
-            .reshape(part.shape)
-            for part in (found.points, found.inlier, found.error, found.view_error)
-        ))  # fmt: skip
-    for _ in range(ROUNDS):
-        exchanged = exchange(keypoints, found.points.reshape(len(keypoints), -1, 3), rig,
-                             min_confidence=min_confidence, max_error_px=max_error_px)  # fmt: skip
+        found = Triangulation(
+            *(
+                exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned).reshape(
+                    part.shape
+                )
+                for part in (found.points, found.inlier, found.error, found.view_error)
+            )
+        )
+    for _ in range(EXCHANGE_ROUNDS):
+        exchanged = exchange(
+            keypoints,
+            found.points.reshape(len(keypoints), -1, 3),
+            rig,
+            min_confidence=min_confidence,
+            max_error_px=max_error_px,
+        )
         if not exchanged:
             break
         found = _triangulate(keypoints, rig, min_confidence, max_error_px)
@@ -85,27 +96,21 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
             options = np.stack([keypoints[sets, c][:, side] for side in (limb, PARTNER[limb])])
             wrong = sets[_least_motion(options, scale, min_confidence)]
             wrong = wrong[few[wrong]]
-            result[wrong[:, None], c, limb] = keypoints[wrong[:, None], c, PARTNER[limb]]
+            exchange_limb(result, wrong, np.full(len(wrong), c), limb)
     return result
 
 
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
     """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
-    price = EXCHANGED_PX_AT_1080P * scale
-    open_price = np.array([0.0, OPEN_PX_AT_1080P * scale])
-    total, came_from = open_price + np.array([0.0, price]), []
-    seen = options[..., 2] >= min_confidence
-    for t in range(1, options.shape[1]):
-        both = seen[:, None, t - 1] & seen[None, :, t]  # (before, now, n)
-        moved = np.linalg.norm(options[:, None, t - 1, :, :2] - options[None, :, t, :, :2], axis=-1)
-        moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
-        reach = total[:, None] + moved / np.maximum(both.sum(-1), 1) + [0.0, price]
-        came_from.append(reach.argmin(0))
-        total = reach.min(0)
-    chosen = [int((total + open_price).argmin())]
-    for back in reversed(came_from):
-        chosen.append(int(back[chosen[-1]]))
-    return np.array(chosen[::-1], bool)
+    price = np.array([0.0, EXCHANGED_PX_AT_1080P * scale])
+    at_an_end = np.array([0.0, OPEN_EXCHANGE_PX_AT_1080P * scale])
+    seen, pixels = options[..., 2] >= min_confidence, options[..., :2]
+    # (before, now, S - 1, n)
+    both = seen[:, None, :-1] & seen[None, :, 1:]
+    moved = np.linalg.norm(pixels[:, None, :-1] - pixels[None, :, 1:], axis=-1)
+    moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
+    steps = np.moveaxis(moved / np.maximum(both.sum(-1), 1), 2, 0) + price
+    return cheapest_sequence(at_an_end + price, steps, at_an_end).astype(bool)
 
 
 def exchange(
@@ -134,10 +139,9 @@ def exchange(
         other = _cost(
             pixels[:, :, limb], keypoints[:, :, partner, :2], own & seen[:, :, partner], limit
         )
-        # A mean truncated cost of a quarter: half of the points are off by the limit or more.
-        wrong = (as_found > 0.25) & (other < MUCH_BETTER * as_found)
+        wrong = (as_found > MIN_LIMB_COST) & (other < MUCH_BETTER * as_found)
         t, c = np.nonzero(wrong)
-        keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], partner]
+        exchange_limb(keypoints, t, c, limb)
         count += len(t)
     return count
 
@@ -146,11 +150,10 @@ def _cost(
     expected: np.ndarray, found: np.ndarray, valid: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
     """Mean truncated squared error (T, C) in units of the limit; NaN with too few points."""
-    # Truncated well beyond the limit, so that an exchange is told from another mistake.
     error = np.linalg.norm(expected - found, axis=-1) / limit
-    square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
+    square = np.where(valid, np.minimum(error, TRUNCATED_AT) ** 2, 0).sum(-1)
     count = valid.sum(-1)
-    return np.where(count >= MIN_POINTS, square / np.maximum(count, 1), np.nan)
+    return np.where(count >= MIN_LIMB_POINTS, square / np.maximum(count, 1), np.nan)
 
 
 def _triangulate(

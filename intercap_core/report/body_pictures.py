@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from intercap_core.body.keypoints import BODY
+from intercap_core.body.keypoints import BODY, FEET, SKELETON, keypoint_pairs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
@@ -19,11 +19,8 @@ FIT_COLOUR, KEYPOINT_COLOUR = (107, 168, 235), (255, 210, 64)  # RGB
 _CELL_PX = 220
 _MARGIN = 0.06  # of the body's box, around it
 _CONFIDENT = 0.3
-# Bones between OpenPose's body points: trunk, arms, legs and feet; its face is in the outline.
-_BONES = (
-    (1, 8), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12),
-    (12, 13), (13, 14), (11, 22), (11, 24), (14, 19), (14, 21), (1, 0),
-)  # fmt: skip
+# Trunk, arms, legs, feet and nose; the rest of the face is in the outline.
+_BONES = keypoint_pairs([*SKELETON, *FEET]).tolist()
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,26 +9,28 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import LIMB_BONES, keypoint_pairs, of_side
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.transforms import apply
 
 REDUCTION = 8  # the mask is worked out on every eighth pixel
-# Bones and how far from them skin, clothing and hair reach, metres; hands reach past the wrist.
-BONES = (
-    ("neck", "mid_hip", 0.26), ("right_shoulder", "right_hip", 0.20),
-    ("left_shoulder", "left_hip", 0.20), ("nose", "neck", 0.22), ("left_ear", "right_ear", 0.20),
-    ("right_hip", "right_knee", 0.18), ("left_hip", "left_knee", 0.18),
-    ("right_knee", "right_ankle", 0.15), ("left_knee", "left_ankle", 0.15),
-    ("right_ankle", "right_big_toe", 0.14), ("left_ankle", "left_big_toe", 0.14),
-    ("right_ankle", "right_heel", 0.14), ("left_ankle", "left_heel", 0.14),
-    ("right_shoulder", "right_elbow", 0.16), ("left_shoulder", "left_elbow", 0.16),
-    ("right_elbow", "right_wrist", 0.14), ("left_elbow", "left_wrist", 0.14),
-    ("right_wrist", "right_wrist", 0.24), ("left_wrist", "left_wrist", 0.24),
-)  # fmt: skip
-_FIRST = np.array([KEYPOINT_NAMES.index(a) for a, _, _ in BONES])
-_SECOND = np.array([KEYPOINT_NAMES.index(b) for _, b, _ in BONES])
-_REACH = np.array([reach for _, _, reach in BONES])
+# How far from a bone skin, clothing and hair reach, metres: wider than the body's own radii
+# (`segmentation.constants`), since what is left out of the background only has to hold the person.
+# Of the limbs, in the order of LIMB_BONES; tuned on the studio.
+LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
+# Of trunk and head, which have no bones of their own in the skeleton; hands reach past the wrist.
+TRUNK_REACH_M: dict[tuple[str, str], float] = {
+    ("neck", "mid_hip"): 0.26,
+    ("right_shoulder", "right_hip"): 0.20,
+    ("left_shoulder", "left_hip"): 0.20,
+    ("nose", "neck"): 0.22,
+    ("left_ear", "right_ear"): 0.20,
+    ("right_wrist", "right_wrist"): 0.24,
+    ("left_wrist", "left_wrist"): 0.24,
+}
+_BONES = (*TRUNK_REACH_M, *of_side("right", LIMB_BONES), *of_side("left", LIMB_BONES))
+_FIRST, _SECOND = keypoint_pairs(_BONES).T
+_REACH = np.array([*TRUNK_REACH_M.values(), *LIMB_REACH_M, *LIMB_REACH_M])
 
 
 def person_pixels(

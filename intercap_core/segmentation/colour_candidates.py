@@ -1,8 +1,9 @@
 """The person's mask and candidates of the object from colour images, where a camera has no depth.
 
-What differs in colour from the median of the recording stands before the scene. The person is what
-of it lies around the projected keypoints. Nothing measures how far a thing is, so what covers the
-person in the image is taken for the person, and what rests for most of a recording is not seen.
+Background subtraction: a pixel that differs in colour from the recording's median is foreground.
+Foreground around the projected keypoints is the person. Without depth, a thing that occludes the
+person in the image counts as the person, and a thing that rests for most of a recording is part of
+the background.
 """
 
 from __future__ import annotations
@@ -15,23 +16,27 @@ from intercap_core.artefacts import Artefact
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.constants import (
+    COLOUR_SCALE,
+    COLOUR_SCORE,
+    DARK,
+    DARK_CHANGE,
+    GAIN_STRIDE,
+    HIGHLIGHT,
+    MASK_MARGINS,
+    MAX_COLOUR_CANDIDATES,
+    MAX_COLOUR_SAMPLES,
+    MIN_COLOUR_CELLS,
+    MIN_COLOUR_SAMPLES,
+    OFF_COLOUR,
+    SAMPLE_MARGINS,
+    SATURATED,
+    SHADOW,
+    THING_MARGINS,
+)
 from intercap_core.segmentation.depth_masks import encode_window
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
 from intercap_core.segmentation.person_volume import bones_of
-
-SCALE = 2  # images are decoded at half their size, which JPEG does in a quarter of the time
-MAX_SAMPLES = 15
-MIN_SAMPLES = 3  # of a pixel without the person: fewer tell no background
-# Horprasert, Harwood and Davis (1999): a pixel is split into brightness along the background's
-# colour and what is off it. A shadow is darker, of the same colour.
-OFF_COLOUR, SHADOW, HIGHLIGHT = 14.0, 0.5, 1.4  # grey levels, share, share
-DARK = 40.0  # colours of the background below this have no direction
-DARK_CHANGE = 30.0
-GAIN_STRIDE = 16  # exposure is compared at every so many pixels
-MIN_CELLS = 60  # of a candidate, at the reduced size
-MAX_CANDIDATES = 5
-SAMPLE_MARGINS, PERSON_MARGINS, THING_MARGINS = 5.0, 2.0, 1.0  # around the person's usual build
-COLOUR_SCORE = 0.5
 
 
 class ColourSegmenter:
@@ -60,16 +65,16 @@ class ColourSegmenter:
         moved = before(image, *background)
         # clothes of the wall's colour, or a place that the person never left: the body is there
         person = drawn(bones, camera, moved.shape, 0)
-        person |= moved & drawn(bones, camera, moved.shape, PERSON_MARGINS)
+        person |= moved & drawn(bones, camera, moved.shape, MASK_MARGINS)
         things = moved & ~drawn(bones, camera, moved.shape, THING_MARGINS)
         block = np.ones((3, 3), np.uint8)
         rest = cv2.morphologyEx(things.view(np.uint8), cv2.MORPH_OPEN, block)
         _, label, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=8)
         areas = stats[:, cv2.CC_STAT_AREA]
-        large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= MIN_CELLS]
+        large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= MIN_COLOUR_CELLS]
         candidates = [
             ImageCandidate(self._rle(label == k, camera), COLOUR_SCORE, float("nan"), -1)
-            for k in large[:MAX_CANDIDATES]
+            for k in large[:MAX_COLOUR_CANDIDATES]
         ]
         return ViewSegments(self._rle(person, camera) if person.any() else b"", candidates)
 
@@ -79,20 +84,20 @@ class ColourSegmenter:
             return None
         image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
         lens = self._rig[c].colour
-        size = (-(-lens.height // SCALE), -(-lens.width // SCALE), 3)
+        size = (-(-lens.height // COLOUR_SCALE), -(-lens.width // COLOUR_SCALE), 3)
         return image if image is not None and image.shape == size else None
 
     def _background(self, c: int) -> tuple[np.ndarray, np.ndarray] | None:
         sets = np.flatnonzero(self._frames.colour_available[:, c])
-        if len(sets) > MAX_SAMPLES:
-            sets = sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
+        if len(sets) > MAX_COLOUR_SAMPLES:
+            sets = sets[np.linspace(0, len(sets) - 1, MAX_COLOUR_SAMPLES).round().astype(int)]
         images, people = [], []
         for t in sets:
             image, bones = self._image(int(t), c), bones_of(self._joints[t])
             if image is not None:
                 images.append(image)
                 people.append(drawn(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))
-        if len(images) < MIN_SAMPLES:
+        if len(images) < MIN_COLOUR_SAMPLES:
             return None
         return median_without(np.stack(images), np.stack(people))
 
@@ -101,7 +106,7 @@ class ColourSegmenter:
         top, left = int(rows[0]), int(columns[0])
         window = mask[top : rows[-1] + 1, left : columns[-1] + 1].astype(np.uint8)
         lens = camera.colour
-        return encode_window(window, left, top, SCALE, lens.width, lens.height)
+        return encode_window(window, left, top, COLOUR_SCALE, lens.width, lens.height)
 
 
 def median_without(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +117,7 @@ def median_without(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, 
     """
     gains = np.stack([_gain(image, images[0]) for image in images])
     seen = len(images) - people.sum(0)
-    return _median(images, people, gains), seen >= MIN_SAMPLES
+    return _median(images, people, gains), seen >= MIN_COLOUR_SAMPLES
 
 
 @numba.njit(cache=True)
@@ -177,7 +182,7 @@ def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Factors (3,) float32 that bring an image's exposure to the reference's."""
     few = np.s_[::GAIN_STRIDE, ::GAIN_STRIDE]
     a, b = image[few].astype(np.float32), reference[few].astype(np.float32)
-    good = (a > DARK / 2) & (a < 250) & (b > DARK / 2) & (b < 250)
+    good = (a > DARK / 2) & (a < SATURATED) & (b > DARK / 2) & (b < SATURATED)
     gains = np.ones(3, np.float32)
     for channel in range(3):
         use = good[..., channel]
@@ -195,12 +200,12 @@ def drawn(bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: fl
     if not len(bones):
         return mask > 0
     ends = apply(camera.colour_from_master, bones[:, :6].astype(np.float64).reshape(-1, 3))
-    pixels = (camera.colour.project(ends) / SCALE).reshape(-1, 4)
+    pixels = (camera.colour.project(ends) / COLOUR_SCALE).reshape(-1, 4)
     radius = bones[:, 6:8].mean(1) + margins * bones[:, 8]
     distance = ends[:, 2].reshape(-1, 2).mean(1)
     shown = camera.colour.inside_model(ends).reshape(-1, 2).all(1)
     shown &= np.abs(pixels).max(1) < 1e4  # False for what is not a number
-    width = 2 * radius[shown] * camera.colour.fx / distance[shown] / SCALE
+    width = 2 * radius[shown] * camera.colour.fx / distance[shown] / COLOUR_SCALE
     for (x0, y0, x1, y1), thick in zip(
         np.rint(pixels[shown]).astype(int).tolist(),
         np.rint(width).astype(int).tolist(),

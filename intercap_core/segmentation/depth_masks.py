@@ -10,6 +10,7 @@ import numpy as np
 
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
+from intercap_core.segmentation.constants import OCCLUDED_BEHIND_M
 
 _CLOSING = np.ones((3, 3), np.uint8)
 
@@ -124,7 +125,7 @@ def _hidden(cell: np.ndarray, z: np.ndarray, cells: int) -> np.ndarray:
             nearest[cell[i]] = z[i]
     hidden = np.zeros(len(cell), np.bool_)
     for i in range(len(cell)):
-        hidden[i] = cell[i] >= 0 and z[i] > nearest[cell[i]] + np.float32(0.03)
+        hidden[i] = cell[i] >= 0 and z[i] > nearest[cell[i]] + np.float32(OCCLUDED_BEHIND_M)
     return hidden
 
 

@@ -1,8 +1,9 @@
-"""What stands before the static scene in a depth image, and what of the scene never gave way.
+"""Background subtraction in depth images: foreground, and the background it is measured against.
 
 The scene's background is the farthest depth that a pixel holds steadily. Where nothing behind can
-be measured, or a thing leaves its place for a short while only, that is the thing itself: such a
-pixel sometimes shows something farther, or nothing at all. It is not background then.
+be measured, or a thing leaves its place for a short while only, that depth is of the thing itself:
+the pixel then sometimes shows something farther, or nothing at all. Such pixels are taken out of
+the background.
 """
 
 from __future__ import annotations
@@ -15,14 +16,15 @@ import numpy as np
 
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.constants import (
+    BEFORE_MM,
+    BEFORE_PER_DEPTH,
+    EDGE_PX,
+    FLOATING_MM,
+    GONE_SHARE,
+    MAX_DEPTH_SAMPLES,
+)
 
-MAX_SAMPLES = 25  # images looked at for what gives way
-GONE_SHARE = 0.08  # of them in which a pixel must show something else for that to count
-# Nearer than the background by this is before it: five standard deviations of the sensor's random
-# error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
-BEFORE_MM, BEFORE_PER_DEPTH = 15.0, 0.005
-FLOATING_MM = 30.0  # a pixel this far from nearer and from farther neighbours floats between them
-EDGE_PX = 5  # what gives way in narrower strips than this is an edge that measures badly
 _NO_DEPTH = np.float32(65535)
 
 
@@ -30,7 +32,7 @@ _NO_DEPTH = np.float32(65535)
 class DepthBackground:
     """The static scene of one depth camera.
 
-    ``depth`` (H, W) uint16 mm of what never gave way, 0 = unknown; ``reach`` (H, W) uint16 mm, the
+    ``depth`` (H, W) uint16 mm of the background, 0 = unknown; ``reach`` (H, W) uint16 mm, the
     farthest that is of interest; ``limit`` (H, W) uint16 mm: what is measured nearer stands before
     the background.
     """
@@ -55,8 +57,8 @@ class DepthBackground:
             gone += cv2.medianBlur(absent, 5)  # single pixels fail now and then
         often = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
         # along the edges of furniture, pixels fail for most of a recording
-        gave_way = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
-        depth = np.where(gave_way > 0, 0, background).astype(np.uint16)
+        not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+        depth = np.where(not_static > 0, 0, background).astype(np.uint16)
         near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
         limit = np.where(depth > 0, near, reach_mm)
         return cls(depth, reach_mm, np.minimum(limit, reach_mm).astype(np.uint16))
@@ -92,10 +94,10 @@ def _floating(image: np.ndarray) -> np.ndarray:
 
 
 def sampled_images(frames: Frames, c: int) -> list[np.ndarray]:
-    """Depth images (H, W) uint16 mm of camera ``c``, at most :data:`MAX_SAMPLES`, evenly spread."""
+    """Evenly spread depth images (H, W) uint16 mm of camera ``c``, at most MAX_DEPTH_SAMPLES."""
     sets = np.flatnonzero(frames.depth_available[:, c])
-    if len(sets) > MAX_SAMPLES:
-        sets = sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
+    if len(sets) > MAX_DEPTH_SAMPLES:
+        sets = sets[np.linspace(0, len(sets) - 1, MAX_DEPTH_SAMPLES).round().astype(int)]
     images = (frames.depth(int(t), c) for t in sets)
     return [image for image in images if image is not None]
 

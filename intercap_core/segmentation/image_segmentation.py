@@ -7,7 +7,7 @@ import numpy as np
 from intercap_core.artefacts import Artefact
 from intercap_core.capture.frames import Frames
 from intercap_core.segmentation.colour_candidates import ColourSegmenter
-from intercap_core.segmentation.image_candidates import DepthSegmenter
+from intercap_core.segmentation.depth_candidates import DepthSegmenter
 from intercap_core.segmentation.image_segments import ViewSegments
 
 

@@ -1,8 +1,8 @@
-"""How far points lie outside a person of usual build around the triangulated keypoints.
+"""Signed distance of points from a person of average build around the triangulated keypoints.
 
-The person is the union of cones with round ends around the bones. Where that ends is known only so
-well: clothing and build make a trunk uncertain by centimetres, fingers are told within millimetres.
-So the distance is given in units of that uncertainty, bone by bone.
+The person is a union of capsules with two radii, one a bone. Where its surface lies is uncertain by
+centimetres at the trunk (clothing, build), by millimetres at the fingers. The distance is given in
+units of that uncertainty, one margin, bone by bone.
 """
 
 from __future__ import annotations
@@ -10,36 +10,27 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
-
-# Bones: keypoints at both ends, radii there, how uncertain the surface is, metres. Radii are those
-# of adults of middle build (half breadths and girths over 2 pi of NASA-STD-3000, section 3.3).
-# "middle_ear" is half way between the ears.
-_BODY: tuple[tuple[str, str, float, float, float], ...] = (
-    ("neck", "mid_hip", 0.130, 0.130, 0.035),
-    ("left_shoulder", "left_hip", 0.100, 0.110, 0.035),
-    ("right_shoulder", "right_hip", 0.100, 0.110, 0.035),
-    ("left_hip", "right_hip", 0.115, 0.115, 0.035),
-    ("left_shoulder", "right_shoulder", 0.075, 0.075, 0.035),
-    ("neck", "middle_ear", 0.075, 0.080, 0.030),
-    ("middle_ear", "middle_ear", 0.125, 0.125, 0.025),
-    ("nose", "middle_ear", 0.045, 0.105, 0.025),
+from intercap_core.body.keypoints import KEYPOINT_NAMES, LIMB_BONES, of_side
+from intercap_core.segmentation.constants import (
+    BLIND_HAND_LENGTH_M,
+    BLIND_HAND_MARGIN_M,
+    BLIND_HAND_RADIUS_M,
+    BONES_PER_GROUP,
+    FAR,
+    FINGER_RADII_M,
+    HAND_MARGIN_M,
+    LARGEST_BUILD,
+    LIMB_RADII_M,
+    MIN_FINGERS,
+    PALM_RADII_M,
+    SMALLEST_BUILD,
+    SOLE_RADII_M,
+    TRUNK_RADII_M,
+    USUAL_TRUNK_M,
 )
-_LIMBS: tuple[tuple[str, str, float, float, float], ...] = (
-    ("shoulder", "elbow", 0.065, 0.048, 0.025), ("elbow", "wrist", 0.048, 0.034, 0.018),
-    ("hip", "knee", 0.105, 0.070, 0.030), ("knee", "ankle", 0.068, 0.045, 0.022),
-    ("ankle", "heel", 0.050, 0.045, 0.022), ("ankle", "big_toe", 0.048, 0.035, 0.022),
-    ("heel", "small_toe", 0.040, 0.035, 0.022), ("heel", "big_toe", 0.040, 0.035, 0.022),
-)  # fmt: skip
-_FINGER = (0.012, 0.010, 0.009)  # radius at the knuckle, middle, tip
-_PALM = (0.024, 0.016)  # at the wrist, at the knuckles
-_HAND_MARGIN = 0.012
-# A hand whose fingers nobody saw goes on from the wrist along the forearm by this much.
-_HAND_LENGTH, _HAND_RADIUS, _BLIND_MARGIN = 0.15, 0.045, 0.02
-_USUAL_TRUNK_M = 0.50  # neck to middle of the hips, of the people whose radii these are
-_SMALLEST, _LARGEST = 0.6, 1.25  # children to the tallest
-_GROUP = 5  # bones that are passed over together where a point is far from all of them
-FAR = 20.0  # the distance that is given to whatever is farther than this
+
+# Name -> radii at both ends and margin, metres: trunk and head, limbs and soles of either side.
+_SIDE_RADII_M = {bone: LIMB_RADII_M[bone] for bone in LIMB_BONES} | SOLE_RADII_M
 
 
 def bones_of(joints: np.ndarray) -> np.ndarray:
@@ -49,16 +40,17 @@ def bones_of(joints: np.ndarray) -> np.ndarray:
     """
     at = {name: joints[i] for i, name in enumerate(KEYPOINT_NAMES[:67])}
     at["middle_ear"] = _middle(at["left_ear"], at["right_ear"])
-    size = float(np.linalg.norm(at["neck"] - at["mid_hip"])) / _USUAL_TRUNK_M
-    size = float(np.clip(size, _SMALLEST, _LARGEST)) if np.isfinite(size) else 1.0
-    rows = [(at[a], at[b], size * ra, size * rb, margin) for a, b, ra, rb, margin in _BODY]
+    size = float(np.linalg.norm(at["neck"] - at["mid_hip"])) / USUAL_TRUNK_M
+    size = float(np.clip(size, SMALLEST_BUILD, LARGEST_BUILD)) if np.isfinite(size) else 1.0
+    radii = list(TRUNK_RADII_M.items())
     for side in ("left", "right"):
-        for a, b, ra, rb, margin in _LIMBS:
-            rows.append((at[f"{side}_{a}"], at[f"{side}_{b}"], size * ra, size * rb, margin))
+        bones = of_side(side, _SIDE_RADII_M)
+        radii += zip(bones, _SIDE_RADII_M.values(), strict=True)
+    rows = [(at[a], at[b], size * ra, size * rb, margin) for (a, b), (ra, rb, margin) in radii]
     for side in ("left", "right"):
         rows += _hand(at, side)
-    bones = np.array([[*a, *b, ra, rb, margin] for a, b, ra, rb, margin in rows], np.float32)
-    return bones[np.isfinite(bones).all(1)].reshape(-1, 9)
+    found = np.array([[*a, *b, ra, rb, margin] for a, b, ra, rb, margin in rows], np.float32)
+    return found[np.isfinite(found).all(1)].reshape(-1, 9)
 
 
 def _hand(
@@ -72,14 +64,14 @@ def _hand(
     for finger in ("thumb", "index", "middle", "ring", "pinky"):
         chain = [at[f"{side}_{finger}{i}"] for i in (1, 2, 3)] + [at[f"{side}_{finger}_tip"]]
         known += int(np.isfinite(chain[0]).all())
-        rows.append((wrist, chain[0], *_PALM, _HAND_MARGIN))
-        radii = (_PALM[1], *_FINGER)
-        rows += [(chain[i], chain[i + 1], radii[i], radii[i + 1], _HAND_MARGIN) for i in range(3)]
-    if known >= 3:
+        rows.append((wrist, chain[0], *PALM_RADII_M, HAND_MARGIN_M))
+        radii = (PALM_RADII_M[1], *FINGER_RADII_M)
+        rows += [(chain[i], chain[i + 1], radii[i], radii[i + 1], HAND_MARGIN_M) for i in range(3)]
+    if known >= MIN_FINGERS:
         return rows
     along = wrist - at[f"{side}_elbow"]
-    along = along / max(float(np.linalg.norm(along)), 1e-6) * _HAND_LENGTH
-    return [(wrist, wrist + along, _HAND_RADIUS, _HAND_RADIUS, _BLIND_MARGIN)]
+    along = along / max(float(np.linalg.norm(along)), 1e-6) * BLIND_HAND_LENGTH_M
+    return [(wrist, wrist + along, BLIND_HAND_RADIUS_M, BLIND_HAND_RADIUS_M, BLIND_HAND_MARGIN_M)]
 
 
 def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -91,12 +83,12 @@ def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
     """How far points (N, 3) float32 lie outside the person, in margins, (N,) float32.
 
-    Negative inside, at most :data:`FAR`; ``bones`` (B, 9) of :func:`bones_of`.
+    Negative inside, at most ``FAR``; ``bones`` (B, 9) of :func:`bones_of`.
     """
-    groups = range(0, len(bones), _GROUP)
+    groups = range(0, len(bones), BONES_PER_GROUP)
     balls = np.zeros((len(groups), 5), np.float32)  # around every group of bones, largest margin
     for row, first in zip(balls, groups, strict=True):
-        some = bones[first : first + _GROUP]
+        some = bones[first : first + BONES_PER_GROUP]
         ends = some[:, :6].reshape(-1, 3)
         row[:3] = (ends.min(0) + ends.max(0)) / 2
         row[3] = np.linalg.norm(ends - row[:3], axis=1).max() + some[:, 6:8].max()
@@ -112,8 +104,8 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.nda
         nearest = np.float32(FAR)
         near = True
         for b in range(len(bones)):
-            if b % _GROUP == 0:
-                g = b // _GROUP
+            if b % BONES_PER_GROUP == 0:
+                g = b // BONES_PER_GROUP
                 ux, uy, uz = px - balls[g, 0], py - balls[g, 1], pz - balls[g, 2]
                 reach = balls[g, 3] + max(nearest, np.float32(0)) * balls[g, 4]
                 near = ux * ux + uy * uy + uz * uz < reach * reach

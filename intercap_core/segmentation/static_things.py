@@ -1,8 +1,8 @@
 """Things that never move: components of the static scene above the floor, near the person's path.
 
-A chair that is sat on, a mug left on its table: no background tells them apart from furniture, so
-every component that somebody comes near is a candidate. What stands on a level surface is taken off
-it.
+A chair that is sat on, a mug left on its table: nothing tells them apart from furniture, so every
+connected component of the background that the person comes near is a candidate. What stands on a
+level surface (a table) is segmented from it by height.
 """
 
 from __future__ import annotations
@@ -11,19 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.segmentation.constants import (
+    ABOVE_M,
+    LARGEST_M,
+    LAYER_M,
+    LEVEL_SHARE,
+    MAX_DISTANCE_POINTS,
+    MAX_STATIC_THINGS,
+    MIN_STATIC_POINTS,
+    STATIC_CELL_M,
+    SURFACE_CELL_M,
+    SURFACE_POINTS,
+    VISITED_CELL_M,
+    WITHIN_REACH_M,
+)
 from intercap_core.segmentation.foreground import DepthBackground, DepthView
 from intercap_core.segmentation.voxels import Occupied, components
-
-CELL_M = 0.025
-MIN_POINTS = 60  # of all views
-SURFACE_CELL_M, SURFACE_POINTS = 0.02, 2
-LARGEST_M = 2.2  # anything larger is no thing that one person handles
-WITHIN_REACH_M = 0.35  # of a keypoint of the person at some time
-# A level surface: this share of a component's points within a layer; what stands on it is at least
-# so high above.
-LAYER_M, LEVEL_SHARE, ABOVE_M = 0.02, 0.12, 0.012
-MAX_THINGS = 8
-JOINT_CELL_M = 0.10
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,7 @@ def find_static_things(
     points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
     pixel = np.concatenate(index) if index else np.zeros(0, np.int64)
     view_of = np.concatenate(owner) if owner else np.zeros(0, np.int32)
-    walked = np.unique(np.round(joints / JOINT_CELL_M), axis=0) * JOINT_CELL_M
+    walked = np.unique(np.round(joints / VISITED_CELL_M), axis=0) * VISITED_CELL_M
     surface = Occupied(points, SURFACE_CELL_M, SURFACE_POINTS)
     things: list[Thing] = []
 
@@ -85,21 +88,21 @@ def find_static_things(
             cells = Occupied(own, SURFACE_CELL_M, SURFACE_POINTS)
             things.append(Thing(size, away, on_top, carries, pixels, cells))
 
-    for members in components(points, CELL_M, MIN_POINTS):
+    for members in components(points, STATIC_CELL_M, MIN_STATIC_POINTS):
         top = _above_level(points, members)
-        above = [top[own] for own in components(points[top], CELL_M, MIN_POINTS)]
+        above = [top[own] for own in components(points[top], STATIC_CELL_M, MIN_STATIC_POINTS)]
         add(members, False, bool(above))
         for standing in above:
             add(standing, True, False)
     things.sort(key=lambda thing: thing.away_m)
-    return StaticScene(things[:MAX_THINGS], surface)
+    return StaticScene(things[:MAX_STATIC_THINGS], surface)
 
 
 def _away(points: np.ndarray, places: np.ndarray) -> float:
     """Smallest distance, metres, of points (N, 3) from places (M, 3)."""
     from scipy.spatial import cKDTree
 
-    sample = points[:: max(1, len(points) // 2000)]
+    sample = points[:: max(1, len(points) // MAX_DISTANCE_POINTS)]
     return float(cKDTree(places).query(sample)[0].min()) if len(places) else np.inf
 
 

@@ -14,18 +14,18 @@ from intercap_core import artefacts
 from intercap_core.config import DetectionsSettings, SequenceEntry, digest
 from intercap_core.detections import candidate_files, keypoint_files
 from intercap_core.detections.candidate_files import Candidates
+from intercap_core.detections.constants import IMAGES_PER_LINE
+from intercap_core.detections.converters.data_sets import BehaveFiles
+from intercap_core.detections.converters.label_maps import class_names
 from intercap_core.detections.image_numbers import CameraImages, camera_images
 from intercap_core.detections.instance import Instance, boxes_of
 from intercap_core.detections.keypoint_files import People
 from intercap_core.detections.keypoint_values import NOBODY, Values
-from intercap_core.detections.label_maps import class_names
-from intercap_core.detections.mask_files import BehaveFiles
 from intercap_core.errors import UserError
 from intercap_core.schemas import DETECTIONS, FRAMES
 
 log = logging.getLogger(__name__)
 
-IMAGES_PER_LINE = 100  # seen by a model between two lines of the log
 
 Image = tuple[int, int]  # frame set and camera
 
@@ -198,7 +198,7 @@ def _segment(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find instances in the images of which no file says anything."""
-    from intercap_core.detections.onnx_segmentation import Segmenter
+    from intercap_core.detections.models.onnx_segmentation import Segmenter
 
     wanted = _unknown(images, [d.candidates_found for d in found])
     if not wanted:
@@ -222,7 +222,7 @@ def _find_people(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find keypoints in the images of which no file says anything."""
-    from intercap_core.detections.onnx_pose import PoseModel
+    from intercap_core.detections.models.onnx_pose import PoseModel
 
     wanted = _unknown(images, [d.keypoints_found for d in found])
     if not wanted:

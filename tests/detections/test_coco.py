@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from intercap_core.camera import masks
 from intercap_core.detections import coco
+from intercap_core.detections.class_names import COCO_NAMES, COCO_NAMES_FROM_0
 from intercap_core.detections.coco import ImageKey, UnreadableCandidates, candidates_of, read_json
-from intercap_core.detections.label_maps import COCO_NAMES, COCO_NAMES_FROM_0
 
 HEIGHT, WIDTH = 20, 30
 MASK = np.zeros((HEIGHT, WIDTH), bool)
@@ -157,7 +157,7 @@ def test_wrong_files_are_told(tmp_path, content):
 
 
 def test_huge_files_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(coco, "MAX_BYTES", 100)
+    monkeypatch.setattr(coco, "MAX_JSON_BYTES", 100)
     with pytest.raises(UnreadableCandidates, match="one file an image"):
         read(tmp_path, [ENTRY])
 

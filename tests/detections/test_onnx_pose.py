@@ -14,7 +14,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
 from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.detections.instance import Instance  # noqa: E402
 from intercap_core.detections.keypoint_layouts import LAYOUTS  # noqa: E402
-from intercap_core.detections.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
+from intercap_core.detections.models.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 
 SIZE = (640, 360)

@@ -14,9 +14,9 @@ tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
 
 from intercap_core.camera import masks  # noqa: E402
 from intercap_core.config import DetectionsSettings  # noqa: E402
-from intercap_core.detections.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
-from intercap_core.detections.onnx_outputs import suppressed  # noqa: E402
-from intercap_core.detections.onnx_segmentation import Segmenter  # noqa: E402
+from intercap_core.detections.models.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
+from intercap_core.detections.models.onnx_outputs import suppressed  # noqa: E402
+from intercap_core.detections.models.onnx_segmentation import Segmenter  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 
 WIDTH, HEIGHT = 320, 180
@@ -199,7 +199,7 @@ def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
     ],
 )
 def test_label_maps(tmp_path, name, text, names):
-    from intercap_core.detections.label_maps import read_label_map
+    from intercap_core.detections.converters.label_maps import read_label_map
 
     (tmp_path / name).write_text(text)
     assert read_label_map(tmp_path / name) == names
@@ -220,7 +220,7 @@ def test_label_maps(tmp_path, name, text, names):
     ],
 )
 def test_wrong_label_maps_are_named(tmp_path, name, text):
-    from intercap_core.detections.label_maps import read_label_map
+    from intercap_core.detections.converters.label_maps import read_label_map
 
     (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match="is no list of classes"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.detections.converters.data_sets import as_openpose
 from intercap_core.detections.openpose import is_openpose, keypoint_files, people_of
 from intercap_core.errors import UserError
 
@@ -64,7 +65,9 @@ def test_nobody_and_parts_that_were_not_looked_for():
 def test_behaves_lists_are_one_person():
     names = ("body_joints", "left_hand_joints", "right_hand_joints", "face_joints")
     content = dict(zip(names, person().values(), strict=True))
-    np.testing.assert_array_equal(read_people(content), read_people({"people": [person()]}))
+    people = read_people(as_openpose(content))
+    np.testing.assert_array_equal(people, read_people({"people": [person()]}))
+    assert as_openpose({"people": []}) == {"people": []}
 
 
 @pytest.mark.parametrize(

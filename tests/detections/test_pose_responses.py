@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.detections.pose_responses import heatmap_points, peaks, simcc_points
+from intercap_core.detections.models.pose_responses import heatmap_points, peaks, simcc_points
 
 
 def _gaussians(places: np.ndarray, size: tuple[int, int], sigma: float = 2.0) -> np.ndarray:

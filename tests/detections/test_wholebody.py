@@ -7,8 +7,8 @@ import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.detections.coco import ImageKey, UnreadableCandidates
+from intercap_core.detections.converters.wholebody import people_of
 from intercap_core.detections.keypoint_layouts import LAYOUTS, WHOLE_BODY, to_shared
-from intercap_core.detections.wholebody import people_of
 
 AT = KEYPOINT_NAMES.index
 # Numbers of COCO-WholeBody's points as its paper's figure and mmpose's data set file count them.

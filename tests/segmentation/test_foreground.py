@@ -11,8 +11,8 @@ from intercap_core.camera.transforms import apply, invert
 from intercap_core.segmentation.colour_candidates import before, drawn, median_without
 from intercap_core.segmentation.depth_masks import Cells, Projected, encode_window
 from intercap_core.segmentation.foreground import DepthBackground, DepthView
+from intercap_core.segmentation.free_space import without_free_space
 from intercap_core.segmentation.person_volume import FAR, bones_of, outside
-from intercap_core.segmentation.see_through import see_through
 from intercap_core.segmentation.static_things import find_static_things
 from intercap_core.segmentation.voxels import Occupied, components, connected
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
@@ -148,7 +148,7 @@ def test_what_another_camera_sees_through_is_no_background():
         backgrounds.append(DepthBackground.of(image, [image] * 3, reach))
     points, _ = views[0].points(backgrounds[0].depth, np.arange(backgrounds[0].depth.size))
     on_box = ((points > box[0, 0] - 0.02) & (points < box[0, 1] + 0.02)).all(1)
-    found = see_through(views, backgrounds, LOW, HIGH)
+    found = without_free_space(views, backgrounds, LOW, HIGH)
     assert on_box.sum() > 300
     assert (found[0].depth.ravel()[on_box] == 0).mean() > 0.85
     assert (found[0].limit.ravel()[on_box & (found[0].depth.ravel() == 0)] > 0).all()

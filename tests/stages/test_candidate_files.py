@@ -110,7 +110,7 @@ def test_one_cameras_file_never_fails_the_sequence(candidates, content, words, f
 
 def test_a_huge_file_is_told(candidates, monkeypatch):
     (candidates / "k1.json").write_text(json.dumps(GOOD * 3))
-    monkeypatch.setattr(coco, "MAX_BYTES", (candidates / "k2.json").stat().st_size)
+    monkeypatch.setattr(coco, "MAX_JSON_BYTES", (candidates / "k2.json").stat().st_size)
     read = run(candidates)
     assert "one file an image" in read.notes[0] and not read.candidates_found[:, 0].any()
 

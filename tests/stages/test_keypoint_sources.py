@@ -113,7 +113,7 @@ def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
 def test_without_a_model_nothing_is_loaded():
     words = (
         "import sys, intercap_core.stages.detections; "
-        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.onnx_pose' "
+        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.models.onnx_pose' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

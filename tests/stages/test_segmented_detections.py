@@ -85,7 +85,7 @@ def test_without_a_model_nothing_is_loaded(capture):
     detect(capture, "detections.h5")
     words = (
         "import sys, intercap_core.stages.detections; "
-        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.onnx_model' "
+        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.models.onnx_model' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

@@ -18,22 +18,22 @@ import numpy as np
 
 from intercap_core.body.keypoints import BODY
 from intercap_core.config import DetectionsSettings
+from intercap_core.detections.constants import (
+    BOX_PADDING,
+    FOUND_CONFIDENCE,
+    FOUND_POINTS,
+    MAX_PEOPLE,
+    MIN_BOX_SCORE,
+    POSE_BATCH,
+    SAME_PERSON_SHARE,
+    SAME_POINT_SHARE,
+)
 from intercap_core.detections.instance import PERSON_LABEL, Instance
 from intercap_core.detections.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
-from intercap_core.detections.onnx_model import OnnxModel
-from intercap_core.detections.pose_responses import HeatmapGrid, heatmap_points, simcc_points
+from intercap_core.detections.models.onnx_model import OnnxModel
+from intercap_core.detections.models.pose_responses import HeatmapGrid, heatmap_points, simcc_points
 from intercap_core.errors import UserError
 
-PADDING = 1.25  # of a box, as mmpose trains and tests
-BATCH = 8  # people at once where the model takes any number
-MIN_BOX_SCORE = 0.3  # of a detector's person; mmpose's default
-MOST_PEOPLE = 10  # of one image
-# Where no detector gave a box, the whole image is looked through. A person counts with this many
-# points of the body at this confidence.
-FOUND_CONFIDENCE, FOUND_POINTS = 0.3, 6
-# Somebody is in several tiles, or a mixture of two people in one: this share of the points is
-# already a better one's, within a share of the person's size.
-SAME_PERSON, SAME_POINT = 0.5, 0.05
 _FLOATS = ("tensor(float)", "tensor(float16)")
 
 
@@ -110,10 +110,10 @@ class PoseModel:
         size = (picture.shape[1], picture.shape[0])
         boxes = person_boxes(instances)
         if len(boxes):
-            return self._look(picture, boxes, PADDING)
+            return self._look(picture, boxes, BOX_PADDING)
         people, boxes = self._found(self._look(picture, tiles(size, self._size), 1.0))
         if len(boxes):
-            people, _ = self._found(self._look(picture, boxes, PADDING))
+            people, _ = self._found(self._look(picture, boxes, BOX_PADDING))
         return people
 
     def _found(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,12 +129,12 @@ class PoseModel:
         best_first = np.argsort(-people[:, BODY, 2].mean(1), kind="stable")
         kept: list[int] = []
         for i in best_first.tolist():
-            near = SAME_POINT * np.linalg.norm(high[i] - low[i])
+            near = SAME_POINT_SHARE * np.linalg.norm(high[i] - low[i])
             apart = np.linalg.norm(people[kept, :, :2] - people[i, :, :2], axis=-1)
             taken = ((apart < near) & sure[kept]).any(0)
-            if taken[sure[i]].mean() < SAME_PERSON:
+            if taken[sure[i]].mean() < SAME_PERSON_SHARE:
                 kept.append(i)
-        return people[kept][:MOST_PEOPLE], np.concatenate([low, high - low], 1)[kept][:MOST_PEOPLE]
+        return people[kept][:MAX_PEOPLE], np.concatenate([low, high - low], 1)[kept][:MAX_PEOPLE]
 
     def _look(self, picture: np.ndarray, boxes: np.ndarray, padding: float) -> np.ndarray:
         """People (N, 135, 3) in boxes (N, 4) of x, y, width, height; confidence as the model's."""
@@ -146,7 +146,7 @@ class PoseModel:
 
     def _batches(self, picture: np.ndarray, crops: list[Crop]) -> Iterator[np.ndarray]:
         """Points (B, K, 3) in the input's pixels."""
-        most = self._model.batch or BATCH
+        most = self._model.batch or POSE_BATCH
         for start in range(0, len(crops), most):
             part = crops[start : start + most]
             images = np.stack(
@@ -177,7 +177,7 @@ def person_boxes(instances: list[Instance]) -> np.ndarray:
     """Boxes (N, 4) of x, y, width, height of the people among instances, best first."""
     people = [i for i in instances if i.label == PERSON_LABEL and i.score >= MIN_BOX_SCORE]
     people.sort(key=lambda instance: -instance.score)
-    return np.array([person.box for person in people[:MOST_PEOPLE]]).reshape(-1, 4)
+    return np.array([person.box for person in people[:MAX_PEOPLE]]).reshape(-1, 4)
 
 
 def tiles(size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:

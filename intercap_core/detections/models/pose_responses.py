@@ -13,9 +13,10 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from intercap_core.detections.constants import HEATMAP_BLUR
+
 HeatmapGrid = Literal["msra", "udp"]
 
-_SMOOTH = 11 / 48  # width of the blur to that of the map; mmpose: 11 cells of 48, 17 of 72
 _EDGE = 2  # cells from the border within which no second difference is there
 _TINY = 1e-10  # a response whose logarithm is taken, at least
 
@@ -81,7 +82,7 @@ def _smooth_around(maps: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.
 
     The blur makes one hill of what noise made several; zero beyond the border, as mmpose has it.
     """
-    reach = max(1, round(_SMOOTH * min(maps.shape[1:]) / 2 - 0.5))
+    reach = max(1, round(HEATMAP_BLUR * min(maps.shape[1:]) / 2 - 0.5))
     kernel = cv2.getGaussianKernel(2 * reach + 1, 0)[:, 0]  # OpenCV's own deviation for the width
     side = np.arange(2 * (reach + _EDGE) + 1)
     padded = np.pad(maps, ((0, 0), (reach + _EDGE,) * 2, (reach + _EDGE,) * 2))

@@ -17,24 +17,35 @@ from typing import TypeVar
 import numpy as np
 
 from intercap_core.config import DetectionsSettings
-from intercap_core.detections.instance import Instance
-from intercap_core.detections.label_maps import (
+from intercap_core.detections.class_names import (
     COCO_NAMES,
     COCO_NAMES_FROM_0,
     COCO_NAMES_FROM_1,
-    MAX_LABEL,
-    read_label_map,
 )
-from intercap_core.detections.onnx_model import Fit, OnnxModel, PixelValues, fit_within, parse_names
-from intercap_core.detections.onnx_outputs import rcnn_instances, yolo_instances
+from intercap_core.detections.constants import (
+    MAX_LABEL,
+    RCNN_LONG,
+    RCNN_SHORT,
+    RCNN_STRIDE,
+    SEGMENTATION_BATCH,
+    YOLO_GREY,
+    YOLO_SIDE,
+    YOLO_STRIDE,
+)
+from intercap_core.detections.converters.label_maps import read_label_map
+from intercap_core.detections.instance import Instance
+from intercap_core.detections.models.onnx_model import (
+    Fit,
+    OnnxModel,
+    PixelValues,
+    fit_within,
+    parse_names,
+)
+from intercap_core.detections.models.onnx_outputs import rcnn_instances, yolo_instances
 from intercap_core.errors import UserError
 
 Key = TypeVar("Key", bound=Hashable)
 
-BATCH = 4  # images at once where the model takes any number
-YOLO_SIDE, YOLO_STRIDE, YOLO_GREY = 640, 32, 114  # as ultralytics trains and pads
-# Size at which detectron2's and maskrcnn-benchmark's configurations test.
-RCNN_SHORT, RCNN_LONG, RCNN_STRIDE = 800, 1333, 32
 _FLOATS = ("tensor(float)", "tensor(float16)")
 
 
@@ -92,7 +103,7 @@ class Segmenter:
         self, pictures: Iterable[tuple[Key, np.ndarray]]
     ) -> Iterator[tuple[Key, list[Instance]]]:
         """Instances of each picture (H, W, 3) uint8 BGR, best first, in the pictures' order."""
-        most = self._model.batch or (BATCH if self._kind.yolo else 1)
+        most = self._model.batch or (SEGMENTATION_BATCH if self._kind.yolo else 1)
         waiting: list[tuple[Key, Fit, np.ndarray]] = []
         for key, picture in pictures:
             fit, values = self._prepared(picture)
@@ -138,9 +149,13 @@ class Segmenter:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         try:
             return yolo_instances(
-                rows[index], prototypes[index], fit, size,
-                min_score=self._min_score, names=self._kind.names,
-            )  # fmt: skip
+                rows[index],
+                prototypes[index],
+                fit,
+                size,
+                min_score=self._min_score,
+                names=self._kind.names,
+            )
         except ValueError:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs]) from None
 
@@ -157,9 +172,15 @@ class Segmenter:
         if len(counts) != 1 or boxes.shape[1:] != (4,) or soft.ndim != 3 or classes.ndim != 1:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         return rcnn_instances(
-            boxes, classes, scores, soft, fit, size,
-            min_score=self._min_score, names=self._kind.names,
-        )  # fmt: skip
+            boxes,
+            classes,
+            scores,
+            soft,
+            fit,
+            size,
+            min_score=self._min_score,
+            names=self._kind.names,
+        )
 
 
 def _yolo_outputs(model: OnnxModel) -> dict[str, int] | None:

@@ -1,8 +1,7 @@
-"""Masks that data sets and detectors keep as images: an instance a file, or several numbered."""
+"""Masks that detectors keep as image files: an instance a file, or several numbered in one."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,26 +9,22 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from intercap_core.capture.behave import frame_folders
 from intercap_core.capture.encoded import encoded_size
-from intercap_core.detections.instance import (
+from intercap_core.detections.constants import (
+    MASK_THRESHOLD,
+    MAX_LABEL,
+    MAX_MASK_VALUES,
     MAX_PIXELS,
-    PERSON_LABEL,
+)
+from intercap_core.detections.instance import (
     Instance,
     instance_of,
     resized,
     scale_to,
 )
-from intercap_core.detections.label_maps import MAX_LABEL
 
-HALF = 128  # of 8 bits; JPEG blurs the two values that a mask has
 WHITE = 255
-MOST_INSTANCES = 1000  # of one image; more values are a photograph or a depth image
-BEHAVE_PERSON = ("person_mask",)
-BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second where the first is not there
-SUFFIXES = ("png", "jpg")  # without loss first
 BETWEEN = "__"  # an image's name, a label and a number in the name of a mask
-_NUMBERED = re.compile(r"\D*(\d{1,9})\.(?:png|jpe?g)", re.IGNORECASE)
 _AROUND_LABEL = "0123456789_-. "
 
 
@@ -86,34 +81,18 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
 def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
     """The masks (H, W) bool that a grey image holds."""
     if file.inverted:
-        yield image < HALF
+        yield image < MASK_THRESHOLD
     elif not file.numbered or (image.dtype == np.uint8 and image.max() == WHITE):
-        yield image >= HALF
+        yield image >= MASK_THRESHOLD
     else:
         values = np.unique(image)
-        if len(values) > MOST_INSTANCES:
+        if len(values) > MAX_MASK_VALUES:
             raise UnreadableMask(
                 f"has {len(values)} different values, expected black and white or a number for "
                 "each instance"
             )
         for value in values[values != 0]:
             yield image == value
-
-
-def release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
-    """Person masks of one camera as the InterCap release's tools keep them, by image number.
-
-    ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png``, without ``_<n>`` for camera 1,
-    with 0 for the person and 255 for the background; None where there is no such folder.
-    """
-    number = camera[1:]
-    names = [camera, f"BodyIndexColor_{number}", *(["BodyIndexColor"] if number == "1" else [])]
-    for name in names:
-        folder = candidates / name
-        if folder.is_dir():
-            matches = ((path, _NUMBERED.fullmatch(path.name)) for path in sorted(folder.iterdir()))
-            return {int(m.group(1)): MaskFile(path, PERSON_LABEL, True) for path, m in matches if m}
-    return None
 
 
 def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
@@ -140,37 +119,3 @@ def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
 
 def _is_png(path: Path) -> bool:
     return path.suffix.lower() == ".png" and not path.name.startswith(".") and path.is_file()
-
-
-class BehaveFiles:
-    """Keypoints and masks beside BEHAVE's images, by the time of the image, microseconds.
-
-    The masks are of one person and of the sequence's object, which is given ``object_label``.
-    """
-
-    def __init__(self, recordings: Path, object_label: str) -> None:
-        self._folders = frame_folders(recordings) if recordings.is_dir() else {}
-        self._labels = {BEHAVE_PERSON: PERSON_LABEL, BEHAVE_OBJECT: object_label}
-
-    def keypoints(self, time_us: int, camera: str) -> Path | None:
-        """The keypoint file of one image, None = there is none."""
-        return self._existing(time_us, f"{camera}.color.json")
-
-    def masks(self, time_us: int, camera: str) -> list[MaskFile]:
-        """The masks of one image."""
-        found = []
-        for kinds, label in self._labels.items():
-            paths = (
-                self._existing(time_us, f"{camera}.{kind}.{suffix}")
-                for kind in kinds
-                for suffix in SUFFIXES
-            )
-            path = next((path for path in paths if path is not None), None)
-            if path is not None:
-                found.append(MaskFile(path, label))
-        return found
-
-    def _existing(self, time_us: int, name: str) -> Path | None:
-        folder = self._folders.get(time_us)
-        path = folder / name if folder is not None else None
-        return path if path is not None and path.is_file() else None

@@ -1,8 +1,10 @@
-"""Background that is none: what was steady for one camera, but is no furniture.
+"""False background removed: free space seen by another camera, and traces of the person.
 
-A suitcase that stands for most of a recording where one camera can measure nothing behind it looks
-like furniture to that camera. Another one that holds farther depth on the same line of sight as its
-background saw it gone. And somebody who stands still leaves traces in small patches.
+A thing that stands in one place for most of a recording becomes background for a camera that never
+measures anything behind it. Where the background of another camera lies farther on the same line of
+sight, that camera has seen free space there (as in space carving), so the first one's background
+cannot be part of the static scene. A person who stands still leaves false background in small
+patches that lie inside the body for many moments.
 """
 
 from __future__ import annotations
@@ -13,28 +15,35 @@ import cv2
 import numpy as np
 
 from intercap_core.camera.transforms import apply, invert
+from intercap_core.segmentation.constants import (
+    BEHIND_AROUND_PX,
+    BEHIND_M,
+    BEHIND_PER_DEPTH,
+    MIN_HOLE_PX,
+    MIN_SURFACE_PX,
+    SMOOTH_MM,
+    TRACE_MARGINS,
+    TRACE_SHARE,
+)
 from intercap_core.segmentation.foreground import DepthBackground, DepthView
 from intercap_core.segmentation.person_volume import outside
 
-# The other camera's background is farther by this: calibration and the slope of grazing surfaces.
-BEHIND_M, BEHIND_PER_DEPTH = 0.05, 0.01
-AROUND_PX = 5  # pixels all of which must be so far: edges of the background are uncertain
-MIN_AREA_PX = 5  # across, of what is taken out of a background
 _UNKNOWN = np.uint16(0)
-PATCH_PX = 400  # smooth surfaces of at least so many pixels are no traces of a person
-SMOOTH_MM = 100.0
-INSIDE_MARGINS, INSIDE_SHARE = 1.0, 0.4  # where, and for what share of the moments, a trace lies
 
 
-def see_through(
+def without_free_space(
     views: list[DepthView],
     backgrounds: list[DepthBackground],
     low: np.ndarray,
     high: np.ndarray,
 ) -> list[DepthBackground]:
-    """The backgrounds without what another camera sees through; the box as elsewhere, z up."""
+    """The backgrounds without pixels whose points lie in free space of another camera.
+
+    Only points in the box ``low`` to ``high`` (3,), metres, z up, are tested. A pixel becomes
+    unknown where the point lies clearly before the other background, in patches of several pixels.
+    """
     nearest = [
-        cv2.erode(background.depth, np.ones((AROUND_PX, AROUND_PX), np.uint8))
+        cv2.erode(background.depth, np.ones((BEHIND_AROUND_PX, BEHIND_AROUND_PX), np.uint8))
         for background in backgrounds
     ]
     result = []
@@ -46,18 +55,18 @@ def see_through(
         gone: np.ndarray = np.zeros(background.depth.shape, np.uint8)
         for other, far in enumerate(nearest):
             if other != number:
-                gone.ravel()[index[_before(views[other], far, points)]] = 1
-        block = np.ones((MIN_AREA_PX, MIN_AREA_PX), np.uint8)
+                gone.ravel()[index[_occludes_background(views[other], far, points)]] = 1
+        block = np.ones((MIN_HOLE_PX, MIN_HOLE_PX), np.uint8)
         closed = cv2.morphologyEx(gone, cv2.MORPH_CLOSE, block)
         whole = cv2.morphologyEx(closed, cv2.MORPH_OPEN, block)
-        result.append(_without(background, whole > 0))
+        result.append(_with_unknown(background, whole > 0))
     return result
 
 
-def without_person(
+def without_person_traces(
     view: DepthView, background: DepthBackground, bodies: list[np.ndarray]
 ) -> DepthBackground:
-    """The background without small patches that the person was in for much of the time.
+    """The background without small patches that lay inside the person for much of the time.
 
     ``bodies``: bones (B, 9) of :func:`.person_volume.bones_of` at some moments, view's frame.
     """
@@ -67,28 +76,29 @@ def without_person(
     farthest = cv2.dilate(depth.astype(np.float32), block)
     smooth = ((nearest > 0) & (farthest - nearest < SMOOTH_MM)).view(np.uint8)
     _, label, stats, _ = cv2.connectedComponentsWithStats(smooth, connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] >= PATCH_PX
+    large = stats[:, cv2.CC_STAT_AREA] >= MIN_SURFACE_PX
     large[0] = False
     surface = cv2.dilate(large[label].view(np.uint8), block) > 0
     index = np.flatnonzero((depth > 0) & ~surface & (depth <= background.reach))
     points, _ = view.points(depth, index)
     inside = np.zeros(len(index))
     for bones in bodies:
-        inside += outside(points, bones) < INSIDE_MARGINS
+        inside += outside(points, bones) < TRACE_MARGINS
     trace = np.zeros(depth.shape, bool)
-    trace.ravel()[index[inside > INSIDE_SHARE * len(bodies)]] = True
-    return _without(background, trace)
+    trace.ravel()[index[inside > TRACE_SHARE * len(bodies)]] = True
+    return _with_unknown(background, trace)
 
 
-def _without(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
+def _with_unknown(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
     taken = gone & (background.depth > 0)
     depth = np.where(taken, _UNKNOWN, background.depth)
     limit = np.where(taken, background.reach, background.limit)
     return replace(background, depth=depth, limit=limit)
 
 
-def _before(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points (N, 3) lie clearly before the background ``nearest`` (H, W) mm of a view."""
+def _occludes_background(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether points (N, 3) lie clearly nearer than the background ``nearest`` (H, W) mm of a view:
+    (N,) bool."""
     lens = view.camera.depth
     assert lens is not None
     local = apply(invert(view.target_from_depth), points)

@@ -15,15 +15,15 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from intercap_core.detections.constants import (
+    CAFFE_MEAN_BGR,
+    IMAGENET_DEVIATION_RGB,
+    IMAGENET_MEAN_RGB,
+)
 from intercap_core.errors import UserError
 
 PixelValues = Literal["rgb", "bgr255", "bgr_mean", "imagenet"]
 
-# Mean of ImageNet as Caffe's models have it, blue first: what maskrcnn-benchmark subtracts.
-CAFFE_MEAN_BGR = np.array([102.9801, 115.9465, 122.7717], np.float32)
-# Mean and deviation of ImageNet's pixels, red first: what torchvision and mmpose normalise by.
-IMAGENET_MEAN_RGB = np.array([123.675, 116.28, 103.53], np.float32)
-IMAGENET_DEVIATION_RGB = np.array([58.395, 57.12, 57.375], np.float32)
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 

@@ -1,9 +1,16 @@
 """The person's mask and candidates of the object from depth images alone, one moment at a time.
 
-What stands before the static scene is the person, where it lies inside a body of usual build around
-the triangulated keypoints, and else a thing. Things of all views are joined in space, and each
-component is a candidate in every view that shows it. How close to the person a thing begins is
-uncertain: it is tried at two distances, the track decides.
+Background subtraction: depth before the static background is foreground. Foreground within a body
+of average build around the triangulated keypoints is the person, the rest are things. Their points
+of all views are clustered in space into connected components, and each component is a candidate in
+every view that shows it. Four kinds of component are proposed, the object's track chooses:
+
+- moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
+  ``FAR_CUT``), since where hand ends and thing begins is uncertain;
+- merged: neighbouring moving components, for a thing whose middle the hand occludes;
+- static: components of the background near the person's path, for a thing that does not move now;
+- partly moved: a static component with foreground beside it, for a thing that moved by less than
+  its size, so that part of it still coincides with the background.
 """
 
 from __future__ import annotations
@@ -17,37 +24,42 @@ from intercap_core.artefacts import Artefact
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
+from intercap_core.segmentation.constants import (
+    ABOVE_HEAD_M,
+    AROUND_PATH_M,
+    CELL_M,
+    CLOTHING_MARGINS,
+    FAR,
+    FAR_CUT,
+    FLOOR_M,
+    MAX_COMPONENTS,
+    MAX_HAND_SPEED_M_S,
+    MAX_KEYPOINT_GAP_S,
+    MIN_POINTS,
+    MIN_VIEW_POINTS,
+    NEAR_CUT,
+    NEARBY_CELL_M,
+    ON_TOP_SCORE,
+    PARTLY_MOVED_SCORE,
+    PERSON_MARGINS,
+    PERSON_SAMPLES,
+    SAME_SHARE,
+    STATIC_SCORE,
+    TWO_ENDS_SCORE,
+)
 from intercap_core.segmentation.depth_masks import Cells, Projected
 from intercap_core.segmentation.foreground import DepthBackground, DepthView, sampled_images
+from intercap_core.segmentation.free_space import without_free_space, without_person_traces
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.segmentation.person_volume import FAR, bones_of, outside
-from intercap_core.segmentation.see_through import see_through, without_person
+from intercap_core.segmentation.person_volume import bones_of, outside
 from intercap_core.segmentation.static_things import extent, find_static_things
 from intercap_core.segmentation.voxels import components
 from intercap_core.solve.velocity import limited_velocity
 
-CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
-AROUND_M, ABOVE_HEAD_M = 1.5, 0.7  # of the person's path: where things are looked for
-FLOOR_M = 0.025  # what is lower may be the floor
-SPREAD_M = 0.07  # cells of pieces that may be one thing, with a hand's breadth between
-PERSON_MARGINS = 1.5  # outside the usual build by less is the person
-CLOSE, CLEAR = 1.0, 2.5  # margins at which things are taken off the person
-SHELL = 2.2  # a component that reaches no farther is clothing
-MIN_POINTS = 40  # of a component, over all views
-MIN_VIEW_POINTS = 12
-MAX_PIECES = 6  # components of one kind
-SAME_SHARE = 0.9  # of a component's points: the farther cut shows nothing new
-# How likely a component is a thing that somebody handles, where that says nothing about the size:
-# what moves by how far off the person it reaches; of the static scene little speaks for any.
-STANDING_SCORE, STATIC_SCORE, JOINT_SCORE, SPREAD_SCORE = 0.3, 0.2, 0.4, 0.5
-HAND_SPEED_M_S = 8.0
-PERSON_SAMPLES = 12  # moments at which the person's own traces in the background are sought
-GAP_S = 0.5  # a keypoint lost for less is where it lies between
-
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """Points (N, 3), z up, that one view sees of person and things, and their colour ``cells``.
+class _ViewPoints:
+    """Foreground and static things of one view: points (N, 3), z up, and their colour ``cells``.
 
     ``outside`` (N,) margins outside the person; ``moving`` (N,) bool: before the static scene;
     ``of_thing``: indices of the points of every static thing.
@@ -61,8 +73,8 @@ class _Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
-    """A component: indices of its points in each view, how likely it is a thing, its size."""
+class _Component:
+    """A connected component: indices of its points in each view, score (0 to 1), size."""
 
     members: list[np.ndarray]
     score: float
@@ -97,14 +109,14 @@ class DepthSegmenter:
             for c in self.cameras
         }
         joints = apply(zup, joints.reshape(-1, 3)).reshape(joints.shape)
-        self._joints = filled(joints, times)
+        self._joints = fill_short_gaps(joints, times, max_gap_s=MAX_KEYPOINT_GAP_S)
         self._velocity = np.nan_to_num(
-            limited_velocity(self._joints, times, max_speed=HAND_SPEED_M_S)
+            limited_velocity(self._joints, times, max_speed=MAX_HAND_SPEED_M_S)
         )
         everywhere = self._joints[np.isfinite(self._joints).all(-1)]
-        self._low = everywhere.min(0) - AROUND_M
-        above = ABOVE_HEAD_M if upright else AROUND_M
-        self._high = everywhere.max(0) + np.array([AROUND_M, AROUND_M, above])
+        self._low = everywhere.min(0) - AROUND_PATH_M
+        above = ABOVE_HEAD_M if upright else AROUND_PATH_M
+        self._high = everywhere.max(0) + np.array([AROUND_PATH_M, AROUND_PATH_M, above])
         if grounded:
             self._low[2] = FLOOR_M
         views = [self._views[c] for c in self.cameras]
@@ -116,11 +128,11 @@ class DepthSegmenter:
             )
             for c in self.cameras
         ]
-        backgrounds = see_through(views, backgrounds, self._low, self._high)
+        backgrounds = without_free_space(views, backgrounds, self._low, self._high)
         some = self._joints[:: max(1, len(times) // PERSON_SAMPLES)]
         bodies = [bones_of(joints) for joints in some]
         backgrounds = [
-            without_person(view, background, bodies)
+            without_person_traces(view, background, bodies)
             for view, background in zip(views, backgrounds, strict=True)
         ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
@@ -147,20 +159,20 @@ class DepthSegmenter:
         }
         if not images:
             return {}
-        seen = [self._look(t, c, image) for c, image in images.items()]
-        moving = _moving_pieces(seen)
-        pieces = [
+        seen = [self._view_points(t, c, image) for c, image in images.items()]
+        moving = _moving_components(seen)
+        proposed = [
             *moving,
-            *_spread_pieces(seen, moving),
-            *self._static_pieces(seen),
-            *self._joint_pieces(seen),
+            *_merged_neighbours(seen, moving),
+            *self._static_components(seen),
+            *self._partly_moved(seen),
         ]
         return {
-            c: _masks(view, [(piece, piece.members[number]) for piece in pieces])
+            c: _masks(view, [(one, one.members[number]) for one in proposed])
             for number, (c, view) in enumerate(zip(images, seen, strict=True))
         }
 
-    def _look(self, t: int, c: int, image: np.ndarray) -> _Seen:
+    def _view_points(self, t: int, c: int, image: np.ndarray) -> _ViewPoints:
         view, background = self._views[c], self._background[c]
         index = background.before(image)
         points, local = view.points(image, index)
@@ -169,7 +181,7 @@ class DepthSegmenter:
         bones = bones_of(self._joints[t] + self._late[c] * self._velocity[t])
         away = outside(points, bones)
         # what this view does not know as background, another one may
-        rest = np.flatnonzero((away > CLOSE) & (background.depth.ravel()[index] == 0))
+        rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._static.surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
         moving[scene] = False
@@ -186,7 +198,7 @@ class DepthSegmenter:
             of_thing.append(np.concatenate([own, count + np.arange(here.sum())]))
             count += int(here.sum())
         more = count - len(points)
-        return _Seen(
+        return _ViewPoints(
             np.concatenate(parts),
             Cells.joined(cells),
             np.concatenate([away, np.full(more, FAR, np.float32)]),
@@ -194,22 +206,26 @@ class DepthSegmenter:
             of_thing,
         )
 
-    def _static_pieces(self, seen: list[_Seen]) -> list[_Piece]:
+    def _static_components(self, seen: list[_ViewPoints]) -> list[_Component]:
         return [
-            _Piece(
+            _Component(
                 [view.of_thing[k] for view in seen],
-                STANDING_SCORE if thing.on_top else STATIC_SCORE,
+                ON_TOP_SCORE if thing.on_top else STATIC_SCORE,
                 thing.extent_m,
             )
             for k, thing in enumerate(self._static.things)
         ]
 
-    def _joint_pieces(self, seen: list[_Seen]) -> list[_Piece]:
-        """Static things together with what moves beside them: a chair that was pushed a little."""
+    def _partly_moved(self, seen: list[_ViewPoints]) -> list[_Component]:
+        """Components of static things together with foreground that touches them.
+
+        For a thing that moved by less than its size, such as a chair that was pushed: part of it
+        coincides with its place in the background, the rest is foreground.
+        """
         chosen = []
         touched = False
         for view in seen:
-            moving = np.flatnonzero(view.moving & (view.outside > CLOSE))
+            moving = np.flatnonzero(view.moving & (view.outside > NEAR_CUT))
             parts = [moving]
             for k, thing in enumerate(self._static.things):
                 if not thing.carries:
@@ -219,15 +235,15 @@ class DepthSegmenter:
         if not touched:
             return []
         found = []
-        for members, points in _grouped(seen, chosen):
+        for members, points in _connected(seen, chosen):
             moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
             if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
-                found.append(_Piece(members, JOINT_SCORE, extent(points)))
-        return found[:MAX_PIECES]
+                found.append(_Component(members, PARTLY_MOVED_SCORE, extent(points)))
+        return found[:MAX_COMPONENTS]
 
 
-def _grouped(
-    seen: list[_Seen], chosen: list[np.ndarray], cell_m: float = CELL_M
+def _connected(
+    seen: list[_ViewPoints], chosen: list[np.ndarray], cell_m: float = CELL_M
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
     """Components of the points ``chosen`` in each view: their indices by view, and points."""
     ends = np.cumsum([0, *map(len, chosen)])
@@ -238,65 +254,76 @@ def _grouped(
         yield members, points[group]
 
 
-def _moving_pieces(seen: list[_Seen]) -> list[_Piece]:
-    """Components of what moves and is not the person, taken off the person at either distance."""
-    pieces: list[_Piece] = []
-    for cut in (CLOSE, CLEAR):
+def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
+    """Components of the foreground farther from the person than either cut; clothing left out."""
+    proposed: list[_Component] = []
+    for cut in (NEAR_CUT, FAR_CUT):
         kept = 0
         chosen = [np.flatnonzero(view.moving & (view.outside > cut)) for view in seen]
-        for members, points in _grouped(seen, chosen):
+        for members, points in _connected(seen, chosen):
             away = np.concatenate([v.outside[m] for v, m in zip(seen, members, strict=True)])
             reach = float(np.percentile(away, 95))
-            if reach < SHELL or any(_same(members, other.members) for other in pieces):
+            if reach < CLOTHING_MARGINS or any(
+                _is_same(members, other.members) for other in proposed
+            ):
                 continue
-            pieces.append(_Piece(members, 1 - 0.5 ** (reach / SHELL), extent(points)))
+            proposed.append(
+                _Component(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), extent(points))
+            )
             kept += 1
-            if kept == MAX_PIECES:
+            if kept == MAX_COMPONENTS:
                 break
-    return pieces
+    return proposed
 
 
-def _spread_pieces(seen: list[_Seen], pieces: list[_Piece]) -> list[_Piece]:
-    """``pieces`` that lie close together: both ends of what a hand holds in its middle."""
-    if len(pieces) < 2:
+def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> list[_Component]:
+    """Unions of components less than a hand's breadth apart.
+
+    For a thing that a hand holds in its middle: both ends are components of their own.
+    """
+    if len(proposed) < 2:
         return []
     chosen = [
-        np.unique(np.concatenate([piece.members[v] for piece in pieces])) for v in range(len(seen))
+        np.unique(np.concatenate([one.members[v] for one in proposed])) for v in range(len(seen))
     ]
-    found: list[_Piece] = []
-    for members, points in _grouped(seen, chosen, SPREAD_M):
+    found: list[_Component] = []
+    for members, points in _connected(seen, chosen, NEARBY_CELL_M):
         parts = components(points, CELL_M, MIN_POINTS)
-        if len(parts) > 1 and len(found) < MAX_PIECES:
-            found.append(_Piece(members, SPREAD_SCORE, extent(points)))
+        if len(parts) > 1 and len(found) < MAX_COMPONENTS:
+            found.append(_Component(members, TWO_ENDS_SCORE, extent(points)))
     return found
 
 
-def _same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    """Whether a component holds nearly all points of another one that it is part of."""
+def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    """Whether ``own``, a subset of ``other``, holds nearly all of its points."""
     size = sum(map(len, other))
     return sum(map(len, own)) > SAME_SHARE * size and any(
         len(a) and len(b) and a[0] in b for a, b in zip(own, other, strict=True)
     )
 
 
-def _masks(seen: _Seen, pieces: list[tuple[_Piece, np.ndarray]]) -> ViewSegments:
+def _masks(seen: _ViewPoints, proposed: list[tuple[_Component, np.ndarray]]) -> ViewSegments:
     projected = Projected.of(seen.cells)
     person = seen.moving & (seen.outside < PERSON_MARGINS)
     things = ~person
     candidates = []
-    for component, (piece, members) in enumerate(pieces):
+    for component, (one, members) in enumerate(proposed):
         if len(members) < MIN_VIEW_POINTS:
             continue
         chosen = np.zeros(len(person), bool)
         chosen[members] = True
         rle = projected.rle(chosen, person & ~chosen)
         if rle:
-            candidates.append(ImageCandidate(rle, piece.score, piece.extent_m, component))
+            candidates.append(ImageCandidate(rle, one.score, one.extent_m, component))
     return ViewSegments(projected.rle(person, things), candidates)
 
 
-def filled(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Keypoints (T, K, 3) with gaps of up to :data:`GAP_S` filled in by straight lines."""
+def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
+    """Keypoints (T, K, 3), NaN = not known, with short gaps filled by linear interpolation.
+
+    A gap is filled up to ``max_gap_s`` from its nearest known time of ``times`` (T,) seconds; at
+    the beginning and the end the nearest known place is held.
+    """
     result = joints.copy()
     for k in range(joints.shape[1]):
         known = np.flatnonzero(np.isfinite(joints[:, k]).all(1))
@@ -305,7 +332,7 @@ def filled(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
         for t in np.flatnonzero(~np.isfinite(joints[:, k]).all(1)):
             after = int(np.searchsorted(known, t))
             around = known[max(after - 1, 0) : after + 1]
-            if np.abs(times[around] - times[t]).min() > GAP_S:
+            if np.abs(times[around] - times[t]).min() > max_gap_s:
                 continue
             result[t, k] = [
                 np.interp(times[t], times[around], joints[around, k, i]) for i in range(3)

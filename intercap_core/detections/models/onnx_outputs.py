@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 
 from intercap_core.camera import masks
+from intercap_core.detections.constants import (
+    MASK_PROBABILITY,
+    MAX_BOXES,
+    MAX_INSTANCES,
+    NMS_IOU,
+)
 from intercap_core.detections.instance import Instance
-from intercap_core.detections.onnx_model import Fit
-
-NMS_IOU = 0.7  # what YOLO's predictors use
-MOST_INSTANCES = 100  # of one image, the best; COCO's evaluation counts as many
-MOST_BOXES = 3000  # that take part in the suppression
-HALF = 0.5  # probability of a mask's edge
+from intercap_core.detections.models.onnx_model import Fit
 
 
 def yolo_instances(
@@ -56,7 +57,7 @@ def yolo_instances(
         corners = np.concatenate([rows[:, :2] - half, rows[:, :2] + half], 1)
         kept = np.flatnonzero(scores >= min_score)
         kept = kept[suppressed(corners[kept], scores[kept], classes[kept])]
-    kept = kept[:MOST_INSTANCES]
+    kept = kept[:MAX_INSTANCES]
     boxes = fit.to_image(corners[kept])
     logits = np.tensordot(coefficients[kept], prototypes, 1)
     steps = input_size[0] / prototypes.shape[2], input_size[1] / prototypes.shape[1]
@@ -87,7 +88,7 @@ def rcnn_instances(
     over the whole input where they have its size, else over the box.
     """
     kept = np.flatnonzero(scores >= min_score)
-    kept = kept[np.argsort(-scores[kept], kind="stable")][:MOST_INSTANCES]
+    kept = kept[np.argsort(-scores[kept], kind="stable")][:MAX_INSTANCES]
     whole = probabilities.shape[1:] == input_size[::-1]
     boxes = fit.to_image(corners[kept])
     found = []
@@ -108,7 +109,9 @@ def rcnn_instances(
             across = (width / (x1 - x0), -x0 * width / (x1 - x0))
             down = (height / (y1 - y0), -y0 * height / (y1 - y0))
         label = names.get(int(classes[k]), f"category {int(classes[k])}")
-        found.append(_instance(label, float(scores[k]), box, mask, across, down, fit.size, HALF))
+        found.append(
+            _instance(label, float(scores[k]), box, mask, across, down, fit.size, MASK_PROBABILITY)
+        )
     return [instance for instance in found if instance is not None]
 
 
@@ -159,7 +162,7 @@ def suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> 
 
     A box goes where a better one of its own class overlaps it by more than ``NMS_IOU``.
     """
-    order = np.argsort(-scores, kind="stable")[:MOST_BOXES]
+    order = np.argsort(-scores, kind="stable")[:MAX_BOXES]
     boxes, kinds = corners[order], classes[order]
     area = np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0), 1)
     alive, kept = np.ones(len(order), bool), []

@@ -1,19 +1,11 @@
-"""Which class a detector's number means: COCO's two numberings, or a file that lists the classes.
-
-A file is a COCO or LVIS data set (its ``categories``), a mapping of numbers to names, a list of
-names from 0 (JSON, or YAML, also under ``names`` as YOLO keeps it), or text with a name a line.
-"""
+"""Names of classes by number: COCO's numberings, and lists of classes in parsed files."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import yaml
-
-from intercap_core.errors import UserError
+from intercap_core.detections.constants import MAX_LABEL
 
 # COCO's 80 classes, and their published ids, which have gaps.
 _CLASSES = (
@@ -34,49 +26,6 @@ COCO_NAMES: dict[int, str] = dict(
 )
 COCO_NAMES_FROM_0: dict[int, str] = dict(enumerate(_CLASSES))
 COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
-BUILT_IN = {"coco": COCO_NAMES, "coco80": COCO_NAMES_FROM_0}
-
-MAX_LABEL = 200  # characters; the artefact keeps all labels at the length of the longest
-_MAX_BYTES = 1 << 26  # a list of classes is some kB; a whole data set's annotations are not needed
-
-
-def class_names(setting: str | Path) -> dict[int, str]:
-    """Names by number of the setting ``category_names``: a built-in numbering or a file.
-
-    Raises UserError as :func:`read_label_map` does.
-    """
-    if isinstance(setting, str) and setting in BUILT_IN:
-        return BUILT_IN[setting]
-    return read_label_map(Path(setting))
-
-
-def read_label_map(path: Path) -> dict[int, str]:
-    """Read a file of class names. Raises UserError naming what is wrong with it."""
-    try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise UserError(
-                f"{path}: has {size / 1e6:.0f} MB, expected a list of classes; keep the data set's "
-                "'categories' alone, as docs/detectors.md shows"
-            )
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: is no text in UTF-8; write the class names again") from None
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".json":
-            return names_of(json.loads(text))
-        if suffix in (".yaml", ".yml"):
-            return names_of(yaml.safe_load(text))
-        return names_of([line.strip() for line in text.strip().splitlines()])
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
-        words = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-        raise UserError(
-            f"{path}: is no list of classes ({words}); expected 'categories' as COCO has them, a "
-            "mapping of numbers to names, or names in order"
-        ) from None
 
 
 def names_of(content: Any) -> dict[int, str]:
