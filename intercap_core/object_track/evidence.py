@@ -11,14 +11,13 @@ import numpy as np
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
 from intercap_core.object_track.blobs import without_person
+from intercap_core.object_track.constants import (
+    MAX_REDUCTION,
+    REDUCED_DEPTH_PX,
+    REDUCED_SILHOUETTE_PX,
+    TYPICAL_DISTANCE_M,
+)
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, decode, reduced_lens
-
-# The object is compared at about this many pixels: more cost time and carry no more information,
-# since neighbouring pixels of a mask or a depth image err together.
-SILHOUETTE_PX = 110
-DEPTH_PX = 80
-TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, where nothing tells
-MAX_STEP = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +49,8 @@ class ViewGeometry:
         Metres: ``diameter_m`` of the object, ``distance_m`` of it from the camera.
         """
         angle = diameter_m / distance_m
-        step = _step(camera.colour.fx, angle, SILHOUETTE_PX)
-        depth_step = _step(camera.depth.fx, angle, DEPTH_PX) if camera.depth else 1
+        step = _step(camera.colour.fx, angle, REDUCED_SILHOUETTE_PX)
+        depth_step = _step(camera.depth.fx, angle, REDUCED_DEPTH_PX) if camera.depth else 1
         return cls(
             camera,
             reduced_lens(camera.colour, step),
@@ -101,7 +100,7 @@ def distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
 
 
 def _step(focal_px: float, angle: float, wanted_px: int) -> int:
-    return int(np.clip(round(focal_px * angle / wanted_px), 1, MAX_STEP))
+    return int(np.clip(round(focal_px * angle / wanted_px), 1, MAX_REDUCTION))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,25 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.object_track.candidates import MIN_PIXELS
+from intercap_core.object_track.constants import (
+    CONTOUR_SCALES_PX,
+    DEPTH_SCALES_M,
+    FIT_CONVERGED_M,
+    FIT_CONVERGED_RAD,
+    FIT_DAMPING,
+    FIT_MAX_STEP_M,
+    FIT_MAX_STEP_RAD,
+    FIT_ROUNDS,
+    MIN_RENDERED_PX,
+    PRIOR_SIGMA_M,
+    PRIOR_SIGMA_RAD,
+    REDRAWN_M,
+    REDRAWN_RAD,
+    REPORT_CONTOUR_SCALE,
+    SCALE_SHRINKAGE,
+    SUPPORTING_AGREEMENT,
+    SUPPORTING_PX,
+)
 from intercap_core.object_track.evidence import View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
 from intercap_core.object_track.view_report import ViewReport, quick_report
@@ -21,25 +39,14 @@ from intercap_core.rigid.render import Renderer, default_renderer
 from intercap_core.rigid.shots import Rendering, Surface
 from intercap_core.rigid.twist import moved
 
-DEPTH_SCALES_M = (0.050, 0.012)  # Geman-McClure scale: first, last
-CONTOUR_SCALES_PX = (30.0, 6.0)  # at full resolution
-SHRINK = 0.5  # of the scales from step to step
-MAX_STEP_M, MAX_STEP_RAD = 0.06, np.radians(20)
-CONVERGED_M, CONVERGED_RAD = 5e-4, np.radians(0.1)
-# A pose this near to the one drawn last is a quarter of a pixel off: steps on from the same
-# renderings, whose residuals are linear in so small a motion.
-REDRAWN_M, REDRAWN_RAD = 1.5e-3, np.radians(0.3)
-DAMPING = 1e-3  # of the diagonal
-REPORT_SCALE = 4.0  # times the last contour scale: residuals that a report counts
-
 
 @dataclass(frozen=True)
 class MotionPrior:
     """Where the object is expected: keeps motions that nothing shows (a bottle's spin) at rest."""
 
     pose: np.ndarray  # (4, 4) master_from_object
-    sigma_m: float = 0.06
-    sigma_rad: float = float(np.radians(15))
+    sigma_m: float = PRIOR_SIGMA_M
+    sigma_rad: float = PRIOR_SIGMA_RAD
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,7 @@ class Fit:
         """
         total, weight = 0.0, 0.0
         for view in self.views:
-            if view.visible_px < MIN_PIXELS:
+            if view.visible_px < MIN_RENDERED_PX:
                 continue
             overlap = 0.0 if np.isnan(view.overlap) else view.overlap
             agreement = overlap if np.isnan(view.depth_agreement) else view.depth_agreement
@@ -87,7 +94,7 @@ class Fit:
         """Number of views with a candidate, or whose depth agrees with what is visible."""
         return sum(
             not np.isnan(view.overlap)
-            or (view.visible_px >= 3 * MIN_PIXELS and view.depth_agreement > 0.5)
+            or (view.visible_px >= SUPPORTING_PX and view.depth_agreement > SUPPORTING_AGREEMENT)
             for view in self.views
         )
 
@@ -101,7 +108,7 @@ def fit_pose(
     min_overlap: float,
     background_term: bool,
     labels: tuple[str, ...] = (),
-    rounds: tuple[int, ...] = (4, 5),
+    rounds: tuple[int, ...] = FIT_ROUNDS,
     start_scale: float = 1.0,
     twist: np.ndarray | None = None,
     renderer: Renderer | None = None,
@@ -138,9 +145,9 @@ def fit_pose(
             )
             pose = moved(drawn_pose, step)
             settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
-            depth_scale = max(depth_scale * SHRINK, DEPTH_SCALES_M[1])
-            contour_scale = max(contour_scale * SHRINK, CONTOUR_SCALES_PX[1])
-            done = settled and _below(step - last, CONVERGED_M, CONVERGED_RAD)
+            depth_scale = max(depth_scale * SCALE_SHRINKAGE, DEPTH_SCALES_M[1])
+            contour_scale = max(contour_scale * SCALE_SHRINKAGE, CONTOUR_SCALES_PX[1])
+            done = settled and _below(step - last, FIT_CONVERGED_M, FIT_CONVERGED_RAD)
             if done:
                 break
             if _below(step, REDRAWN_M, REDRAWN_RAD):
@@ -148,7 +155,7 @@ def fit_pose(
             else:
                 last, drawn_pose = np.zeros(6), pose
                 _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
-    report_scale = REPORT_SCALE * CONTOUR_SCALES_PX[1]
+    report_scale = REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1]
     reports = renderer.crew.map(lambda fit: fit.report(report_scale), fits)
     return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), tuple(reports))
 
@@ -171,7 +178,7 @@ def _step(
     for h, g in renderer.crew.map(terms, fits):
         hessian += h
         gradient += g
-    damped = hessian + np.diag(DAMPING * np.diag(hessian) + 1e-9)
+    damped = hessian + np.diag(FIT_DAMPING * np.diag(hessian) + 1e-9)
     return hessian, _limited(-np.linalg.solve(damped, gradient))
 
 
@@ -231,7 +238,7 @@ def evidence_at(
     def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
         fit.choose()
         found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
-        return found, fit.report(REPORT_SCALE * CONTOUR_SCALES_PX[1])
+        return found, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
 
     found = renderer.crew.map(terms, fits)
     return Evidence(
@@ -296,7 +303,7 @@ def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarra
 
 def _limited(step: np.ndarray) -> np.ndarray:
     turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
-    return step / max(1.0, turn / MAX_STEP_RAD, shift / MAX_STEP_M)
+    return step / max(1.0, turn / FIT_MAX_STEP_RAD, shift / FIT_MAX_STEP_M)
 
 
 def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:

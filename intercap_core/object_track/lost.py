@@ -7,15 +7,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.constants import (
+    DECIDED_FRAME,
+    DECIDED_RUN,
+    LOST_SCORE,
+    UNNAMED_FRAMES,
+    UNNAMED_M,
+    UNSURE_M,
+    UNSURE_RAD,
+)
 from intercap_core.object_track.fit import Fit
 from intercap_core.rigid.mesh import ObjectMesh
-
-LOST_SCORE = 0.20
-# By how much the mean score of one pose has to be better than another's, over all frames of a run
-# and over one: errors of masks last several frames and agree over views.
-DECIDED, DECIDED_ONE = 0.01, 0.03
-UNSURE_M, UNSURE_RAD = 0.03, np.radians(15)  # standard deviations that are as good as lost
-UNNAMED_FRAMES, UNNAMED_M = 4, 0.05  # that the object is followed without any candidate
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
 def decided(gain: np.ndarray) -> bool:
     """Whether the images decide between two poses by the differences (N,) of their scores."""
     return bool(
-        len(gain) and abs(gain.mean()) > DECIDED + (DECIDED_ONE - DECIDED) / np.sqrt(len(gain))
+        len(gain)
+        and abs(gain.mean()) > DECIDED_RUN + (DECIDED_FRAME - DECIDED_RUN) / np.sqrt(len(gain))
     )
 
 

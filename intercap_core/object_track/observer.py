@@ -9,6 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.constants import ASSESS_MIN_OVERLAP, PASS_ROUNDS, PASS_SCALE
 from intercap_core.object_track.evidence import View
 from intercap_core.object_track.fit import (
     Evidence,
@@ -23,10 +24,6 @@ from intercap_core.object_track.search import plausibility, rank_frames, search
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer, open_renderer
-
-PASS_ROUNDS = (3, 3)
-PASS_SCALE = 0.5
-LOOK_OVERLAP = 0.1  # of a candidate that a pose is compared with, before it is fitted
 
 
 @dataclass(eq=False)
@@ -141,7 +138,7 @@ class Observer:
             self.mesh,
             self.views(t),
             poses,
-            min_overlap=LOOK_OVERLAP,
+            min_overlap=ASSESS_MIN_OVERLAP,
             labels=self.labels,
             renderer=self.renderer,
         )

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.rigid.constants import MAX_SPEED_M_S, MAX_TURN_RAD_S
 from intercap_core.solve.velocity import limited_rate
-
-# A thrown or kicked object; what is faster is a track that jumps.
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
 
 
 def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
