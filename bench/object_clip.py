@@ -18,9 +18,9 @@ from intercap_core.errors import UserError
 from intercap_core.metrics import object_pose
 from intercap_core.metrics.truth import Truth
 from intercap_core.object_track.constants import TRACKING_FACES
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.passes import Tracker
+from intercap_core.object_track.view import View
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.twist import moved

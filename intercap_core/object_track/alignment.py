@@ -23,8 +23,8 @@ from intercap_core.object_track.constants import (
     ICP_STEPS,
     OUTLINE_ALIGNED_VIEWS,
 )
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.groups import Group, centre_of
+from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 

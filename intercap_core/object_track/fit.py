@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.constants import (
     CONTOUR_SCALES_PX,
@@ -31,13 +30,13 @@ from intercap_core.object_track.constants import (
     SUPPORTING_AGREEMENT,
     SUPPORTING_PX,
 )
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.view import View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
 from intercap_core.object_track.view_report import ViewReport, quick_report
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer, default_renderer
 from intercap_core.rigid.shots import Rendering, Surface
-from intercap_core.rigid.twist import moved
+from intercap_core.rigid.twist import moved, step_between
 
 
 @dataclass(frozen=True)
@@ -127,9 +126,8 @@ def fit_pose(
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
     depth_scale = max(depth_scale * start_scale, DEPTH_SCALES_M[1])
     contour_scale = max(contour_scale * start_scale, CONTOUR_SCALES_PX[1])
-    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
     drawn_pose = pose  # what the fits look at
-    _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
+    fits = view_fits(renderer, mesh, views, drawn_pose, min_overlap, labels, twist)
     information = np.eye(6)
     done = False
     for number, steps in enumerate(rounds):
@@ -186,6 +184,23 @@ def _below(step: np.ndarray, metres: float, radians: float) -> bool:
     return bool(np.abs(step[3:]).max() < metres and np.abs(step[:3]).max() < radians)
 
 
+def view_fits(
+    renderer: Renderer,
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    min_overlap: float,
+    labels: tuple[str, ...],
+    twist: np.ndarray | None,
+) -> list[ViewFit]:
+    """Every view's fit, looking at ``pose`` (4, 4) as its camera sees it; see :func:`fit_pose`."""
+    seen = _seen(pose, views, twist)
+    return [
+        ViewFit(mesh, view, min_overlap, labels, own, drawn)
+        for view, own, drawn in zip(views, seen, _draw(renderer, mesh, views, seen), strict=True)
+    ]
+
+
 def _look(
     renderer: Renderer,
     mesh: ObjectMesh,
@@ -205,47 +220,6 @@ def _draw(
     shots = [shots_of(view, pose) for view, pose in zip(views, seen, strict=True)]
     drawn = iter(renderer.draw(Surface.of(mesh), [shot for group in shots for shot in group]))
     return [[next(drawn) for _ in group] for group in shots]
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What each view of a frame set says about small motions of a pose: the weighted J'J
-    ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
-    one standard deviation; zero from a view that says nothing. No prior is in them. ``reports`` is
-    how each view agrees with the pose."""
-
-    information: np.ndarray
-    gradient: np.ndarray
-    reports: tuple[ViewReport, ...]
-
-
-def evidence_at(
-    mesh: ObjectMesh,
-    views: list[View],
-    pose: np.ndarray,
-    *,
-    min_overlap: float,
-    background_term: bool,
-    labels: tuple[str, ...] = (),
-    twist: np.ndarray | None = None,
-    renderer: Renderer | None = None,
-) -> Evidence:
-    """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
-    renderer = renderer or default_renderer()
-    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
-    _look(renderer, mesh, views, fits, _seen(pose, views, twist))
-
-    def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
-        fit.choose()
-        found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
-        return found, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
-
-    found = renderer.crew.map(terms, fits)
-    return Evidence(
-        np.array([h for (h, _), _ in found]),
-        np.array([g for (_, g), _ in found]),
-        tuple(report for _, report in found),
-    )
 
 
 def assess(
@@ -295,8 +269,7 @@ def assess_all(
 def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if prior is None:
         return np.eye(6), np.zeros(6)
-    turn = Rotation.from_matrix(pose[:3, :3] @ prior.pose[:3, :3].T).as_rotvec()
-    away = np.concatenate([turn, pose[:3, 3] - prior.pose[:3, 3]])
+    away = step_between(prior.pose, pose)
     weight = np.repeat([prior.sigma_rad**-2, prior.sigma_m**-2], 3)
     return np.diag(weight), weight * away
 

@@ -32,8 +32,8 @@ from intercap_core.object_track.constants import (
     SHARED_SIGHTINGS,
     SIGHTING_MIN_POINTS,
 )
-from intercap_core.object_track.evidence import Candidate, View
 from intercap_core.object_track.outlines import Outline
+from intercap_core.object_track.view import Candidate, View
 from intercap_core.rigid.mesh import ObjectMesh
 
 

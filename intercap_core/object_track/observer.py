@@ -10,17 +10,16 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.constants import ASSESS_MIN_OVERLAP, PASS_ROUNDS, PASS_SCALE
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.evidence import PoseEvidence, evidence_at
 from intercap_core.object_track.fit import (
-    Evidence,
     Fit,
     MotionPrior,
     assess_all,
-    evidence_at,
     fit_pose,
 )
 from intercap_core.object_track.places import Places
 from intercap_core.object_track.search import plausibility, rank_frames, search
+from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer, open_renderer
@@ -115,7 +114,7 @@ class Observer:
             renderer=self.renderer,
         )
 
-    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> Evidence:
+    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
         """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,)."""
         return evidence_at(
             self.mesh,

@@ -18,7 +18,7 @@ from intercap_core.object_track.constants import (
     OUTLINE_DIRECTIONS,
     OUTLINE_MIN_DEPTH_M,
 )
-from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.object_track.view import Candidate, View
 from intercap_core.rigid.mesh import ObjectMesh
 
 _ANGLES = 2 * np.pi * np.arange(OUTLINE_DIRECTIONS) / OUTLINE_DIRECTIONS

@@ -15,12 +15,12 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.audit import audited
 from intercap_core.object_track.constants import JUMP_DEG, JUMP_M, PASSES_AGREE_DEG, PASSES_AGREE_M
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.follow import follow
 from intercap_core.object_track.lost import FrameResult, decided, doubted, judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.seed import annotated_seed, find_seed
+from intercap_core.object_track.view import View
 from intercap_core.object_track.whole import WholeTrack
 from intercap_core.rigid.mesh import ObjectMesh
 

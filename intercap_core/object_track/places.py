@@ -27,8 +27,8 @@ from intercap_core.object_track.constants import (
     SURVEYED_FRAMES,
     SURVEYED_GROUPS,
 )
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.groups import centre_of, find_groups
+from intercap_core.object_track.view import View
 from intercap_core.rigid.mesh import ObjectMesh
 
 _BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what the mouth does

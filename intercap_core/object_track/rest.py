@@ -25,7 +25,9 @@ from intercap_core.object_track.constants import (
     REST_VARIANCE_BOUNDS,
     UNSEEN_MOVING_COST,
 )
-from intercap_core.object_track.smooth import Looks, between
+from intercap_core.object_track.smooth import Looks
+from intercap_core.rigid.pose import rotation_exp
+from intercap_core.rigid.twist import step_between
 
 
 def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -37,7 +39,7 @@ def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
     count = len(times)
     own = looks.own
     poses = looks.poses.copy()
-    poses[:, :3, :3] = _turned(own[:, :3]) @ poses[:, :3, :3]
+    poses[:, :3, :3] = rotation_exp(own[:, :3]) @ poses[:, :3, :3]
     poses[:, :3, 3] += own[:, 3:]
     information = _without_blips(poses, looks.information)
     seen = np.trace(information, axis1=1, axis2=2) > 0
@@ -106,7 +108,7 @@ def _partition(
 
 def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Squared normalised distances (L,) of the first 1, 2, ... frames from their common pose."""
-    away = between(np.broadcast_to(poses[0], poses.shape), poses)
+    away = step_between(np.broadcast_to(poses[0], poses.shape), poses)
     away[~seen] = 0
     far = (np.abs(away) > REST_MAX_DISTANCE).any(1)
     count = int(far.argmax()) if far.any() else len(poses)
@@ -125,7 +127,7 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
     result = segments.copy()
     for number in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == number)
-        away = between(poses[rest[[len(rest) // 2]]], poses[rest])
+        away = step_between(poses[rest[[len(rest) // 2]]], poses[rest])
         pull = np.einsum("tij,tj->i", information[rest], away)
         common = np.linalg.solve(information[rest].sum(0) + 1e-9 * np.eye(6), pull)
         off = (
@@ -182,12 +184,6 @@ def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
 
 def _distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
     """Squared distances (N,) of frames a and b in the evidence of the one that says less."""
-    away = between(poses[a], poses[b])
+    away = step_between(poses[a], poses[b])
     both = [np.einsum("ni,nij,nj->n", away, information[i], away) for i in (a, b)]
     return np.minimum(*both)
-
-
-def _turned(turns: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(turns).as_matrix()

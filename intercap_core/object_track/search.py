@@ -31,9 +31,9 @@ from intercap_core.object_track.constants import (
     TURNS_FITTED,
     UPRIGHT_TURNS,
 )
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.fit import Fit, assess_all, fit_pose
 from intercap_core.object_track.groups import find_groups
+from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.constants import (
     ACCELERATION_M_S2,
@@ -28,7 +27,8 @@ from intercap_core.object_track.constants import (
     SMOOTH_STEPS,
     UNKNOWN_SIGMA,
 )
-from intercap_core.rigid.twist import moved
+from intercap_core.rigid.pose import rotation_log
+from intercap_core.rigid.twist import moved, step_between
 
 BAND = 2  # nodes that an acceleration couples to the one before
 
@@ -84,7 +84,7 @@ def smooth(
     state = _without_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
     for _ in range(SMOOTH_STEPS):
-        away = between(looks.poses, state[node])
+        away = step_between(looks.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", away - own, information, away - own)
         weight = share / (1 + distance / OUTLIER_SIGMAS**2) ** 2
         bands = np.zeros((BAND + 1, count, 6, 6))
@@ -121,14 +121,14 @@ def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
     if len(poses) < 5:
         return result
     step = np.diff(times)[:, None]
-    rate = between(poses[:-1], poses[1:]) / step
+    rate = step_between(poses[:-1], poses[1:]) / step
     change = 2 * np.diff(rate, axis=0) / (step[1:] + step[:-1])  # of frame t + 1
     for part, limit in ((np.s_[:, :3], ACCELERATION_RAD_S2), (np.s_[:, 3:], ACCELERATION_M_S2)):
         kick = change[part]
         size = np.linalg.norm(kick, axis=1)
         back = -(kick[1:-1] * (kick[:-2] + kick[2:])).sum(1) > 0.5 * size[1:-1] ** 2
         for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * IMPACT_SIGMAS * limit)):
-            past = between(poses[t - 1], poses[t + 1])
+            past = step_between(poses[t - 1], poses[t + 1])
             ends = np.diff([rate[t - 2], past / (times[t + 1] - times[t - 1]), rate[t + 1]], axis=0)
             ends = 2 * ends / (times[[t, t + 2]] - times[[t - 2, t]])[:, None]
             # without a wrong frame the motion is smooth; between two places it never is
@@ -152,8 +152,8 @@ def _add_motion(
     place, turn = state[:, :3, 3], state[:, :3, :3]
     to_b, to_c = turn[b] @ turn[a].transpose(0, 2, 1), turn[c] @ turn[b].transpose(0, 2, 1)
     shift = (place[c] - place[b]) / after - (place[b] - place[a]) / before
-    spin = Rotation.from_matrix(to_c).as_rotvec() / after
-    spin -= Rotation.from_matrix(to_b).as_rotvec() / before
+    spin = rotation_log(to_c) / after
+    spin -= rotation_log(to_b) / before
     residual = np.concatenate(
         [spin / mean / ACCELERATION_RAD_S2, shift / mean / ACCELERATION_M_S2], axis=1
     )
@@ -213,14 +213,6 @@ def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
         index = np.arange(stop - start)
         found[start:stop] = blocks[index, :, index]
     return found
-
-
-def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Steps (..., 6) that take poses a to b (..., 4, 4): turn on the left, shift."""
-    turn = b[..., :3, :3] @ np.swapaxes(a[..., :3, :3], -1, -2)
-    shape = turn.shape[:-2]
-    turn = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*shape, 3)
-    return np.concatenate([turn, b[..., :3, 3] - a[..., :3, 3]], axis=-1)
 
 
 def with_turn(arms: np.ndarray) -> np.ndarray:

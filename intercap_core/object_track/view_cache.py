@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 from intercap_core.object_track.constants import VIEW_CACHE_BYTES
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.view import View
 
 
 class ViewCache:

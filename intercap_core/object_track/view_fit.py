@@ -21,9 +21,9 @@ from intercap_core.object_track.constants import (
     MIN_RENDERED_PX,
     REPORT_DEPTH_M,
 )
-from intercap_core.object_track.evidence import Candidate, View
 from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
+from intercap_core.object_track.view import Candidate, View
 from intercap_core.object_track.view_report import ViewReport, depth_agreement, unhidden
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.shots import Rendering, Shot
@@ -44,12 +44,19 @@ def shots_of(view: View, pose: np.ndarray) -> list[Shot]:
 class ViewFit:
     """One view while a pose is fitted: its chosen candidate and the measured points around.
 
-    It looks at one pose at a time, given with its renderings by :meth:`see`, and thus may run
-    beside the other views' on another thread.
+    It looks at one pose at a time, (4, 4) with its renderings: that of the constructor, then those
+    of :meth:`see`. Before :meth:`choose` no candidate counts. It may run beside the other views'
+    on another thread.
     """
 
     def __init__(
-        self, mesh: ObjectMesh, view: View, min_overlap: float, labels: tuple[str, ...]
+        self,
+        mesh: ObjectMesh,
+        view: View,
+        min_overlap: float,
+        labels: tuple[str, ...],
+        pose: np.ndarray,
+        drawn: list[Rendering],
     ) -> None:
         self._mesh = mesh
         self._view = view
@@ -58,6 +65,7 @@ class ViewFit:
         self._candidate: Candidate | None = None
         self._contour_patch: ContourPatch | None = None
         self._depth_patch: DepthPatch | None = None
+        self.see(pose, drawn)
 
     def see(self, pose: np.ndarray, drawn: list[Rendering]) -> None:
         """Look at a pose (4, 4) whose renderings are ``drawn``, in the order of :func:`shots_of`"""

@@ -7,7 +7,6 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.choices import best_sequence, other_fits, weak_frames
 from intercap_core.object_track.constants import (
@@ -25,12 +24,14 @@ from intercap_core.object_track.constants import (
     UNKNOWN_SIGMA,
     UNSURE_M,
 )
-from intercap_core.object_track.fit import Evidence, Fit, MotionPrior
+from intercap_core.object_track.evidence import PoseEvidence
+from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.lost import FrameResult, judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import Looks, smooth
 from intercap_core.object_track.turns import angle_between, choose_turns, near_turns
+from intercap_core.rigid.pose import rotation_log
 from intercap_core.rigid.pose_interpolation import bridge_poses
 from intercap_core.rigid.twist import twists
 
@@ -127,8 +128,7 @@ class WholeTrack:
         far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
         other = np.where(far[of_frame], probability[nearest], 0.0)
         kept, rivals = turns[of_frame][:, None, :3, :3], turns[None, :, :3, :3]
-        relative = (kept.transpose(0, 1, 3, 2) @ rivals).reshape(-1, 3, 3)
-        away = Rotation.from_matrix(relative).as_rotvec().reshape(*other.shape, 3)
+        away = rotation_log(kept.transpose(0, 1, 3, 2) @ rivals)
         doubt = other.sum(1) > AMBIGUOUS_PROBABILITY
         spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], away, away)
         return result, doubt, spread
@@ -199,7 +199,7 @@ class WholeTrack:
         return np.linalg.norm(away, axis=-1) > UNSURE_M
 
     def _solved(
-        self, looked: np.ndarray, found: list[Evidence | None], start: np.ndarray
+        self, looked: np.ndarray, found: list[PoseEvidence | None], start: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
         rests."""
@@ -283,7 +283,7 @@ class WholeTrack:
         return axes
 
 
-def _noise(found: list[Evidence]) -> float:
+def _noise(found: list[PoseEvidence]) -> float:
     """Variance of the evidence over what it states, from how far the views' pulls disagree.
 
     At the minimum each view v of a frame still pulls by g_v; if it errs independently with s^2
@@ -304,5 +304,5 @@ def _noise(found: list[Evidence]) -> float:
     )
 
 
-def _score(evidence: Evidence) -> float:
+def _score(evidence: PoseEvidence) -> float:
     return Fit(np.eye(4), np.eye(6), evidence.reports).score

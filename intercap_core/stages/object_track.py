@@ -22,10 +22,10 @@ from intercap_core.object_track.constants import (
     TOLD_SHARE,
     TRACKING_FACES,
 )
-from intercap_core.object_track.evidence import View, ViewGeometry, distances
 from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.object_track.passes import Track, Tracker
 from intercap_core.object_track.seed import NotFound
+from intercap_core.object_track.view import View, ViewGeometry, distances
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
 
