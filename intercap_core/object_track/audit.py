@@ -28,7 +28,7 @@ from intercap_core.object_track.constants import (
     SOUND_VIEWS,
 )
 from intercap_core.object_track.fit import Fit
-from intercap_core.object_track.follow import follow, value_to_believe
+from intercap_core.object_track.follow import follow, min_value
 from intercap_core.object_track.lost import FrameResult, decided
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.search import same_pose
@@ -80,8 +80,8 @@ def _may_be_there(observer: Observer, t: int, own: FrameResult, fit: Fit) -> boo
     away = float(np.linalg.norm(there - observer.mesh.centre_at(own.fit.pose)))
     if not own.lost and away < NEAR_LAST_PLACE_M:
         return True
-    sure = observer.value(t, fit) >= value_to_believe(observer, t)
-    return sure and observer.places.worth(t, there) > MIN_PLACE_PRIOR
+    sure = observer.value(t, fit) >= min_value(observer, t)
+    return sure and observer.places.prior(t, there) > MIN_PLACE_PRIOR
 
 
 def _undecided(

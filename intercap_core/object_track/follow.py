@@ -111,13 +111,13 @@ def _recovered(
     )
     if same_pose(observer.mesh, best.pose, result.fit.pose):
         return None
-    needed = max(value_to_believe(observer, t), CLEARLY_BETTER * observer.value(t, result.fit))
+    needed = max(min_value(observer, t), CLEARLY_BETTER * observer.value(t, result.fit))
     if observer.value(t, best) < needed or judged(best, observer.settings).lost:
         return None
     return FrameResult(best, False)
 
 
-def value_to_believe(observer: Observer, t: int) -> float:
+def min_value(observer: Observer, t: int) -> float:
     """The value from which a pose that was searched for in frame t may be the object."""
     # few cameras can never be as sure as a ring
     surest = min(1.0, (1 - 0.5 ** len(observer.views(t))) / (1 - 0.5**RING_VIEWS))
@@ -135,7 +135,7 @@ def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
 
 
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:
-    """How implausible a jump is, in units of confidence: a tie goes to the nearer pose."""
+    """How implausible a jump is, in units of value: a tie goes to the nearer pose."""
     distance = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
     angle = float(mesh.symmetry.rotation_error_deg(pose[:3, :3], last[:3, :3]))
     return min(LEAP_COST_PER_M * distance, LEAP_MAX_COST_M) + min(

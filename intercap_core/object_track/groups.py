@@ -41,11 +41,11 @@ from intercap_core.rigid.mesh import ObjectMesh
 class Sighting:
     """One candidate of one image: its ``outline`` (None where all of it is cut off) and, where the
     view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,).
-    ``value``: 1 where its label is one of the object's, less else."""
+    ``label_prior``: 1 where its label is one of the object's, less else."""
 
     view: int
     candidate: Candidate
-    value: float
+    label_prior: float
     points: np.ndarray
     centre: np.ndarray | None
     outline: Outline | None
@@ -78,14 +78,14 @@ def find_groups(
     mesh: ObjectMesh,
     views: list[View],
     labels: tuple[str, ...],
-    worth: Callable[[np.ndarray], float] | None = None,
+    place_prior: Callable[[np.ndarray], float] | None = None,
     near: np.ndarray | None = None,
     limit: int = MAX_GROUPS,
 ) -> list[Group]:
     """The first ``limit`` groups of candidates that may be the object, the most likely first.
 
-    ``labels`` are the classes that the object may be given; ``worth`` says of a place (3,) how
-    likely what is there is the object; ``near`` (3,) prefers candidates near a place.
+    ``labels`` are the classes that the object may be given; ``place_prior`` says of a place (3,)
+    how likely what is there is the object; ``near`` (3,) prefers candidates near a place.
     """
     measured = _measured(views, mesh.diameter, labels)
     outlined = _outlined(views, labels)
@@ -101,9 +101,9 @@ def find_groups(
             nearest = int(np.argmin(away))
             if away[nearest] < 1:
                 group.append(others[nearest])
-        value = sum(s.value for s in group)
-        if worth is not None:
-            value *= worth(centre_of(group))
+        value = sum(s.label_prior for s in group)
+        if place_prior is not None:
+            value *= place_prior(centre_of(group))
         if near is not None:
             value -= NEAR_COST_PER_M * float(np.linalg.norm(place - near))
         groups.append((value, group))
@@ -165,7 +165,7 @@ def _could_be(view: View) -> list[Candidate]:
     return found
 
 
-def _value(label: str, labels: tuple[str, ...]) -> float:
+def _label_prior(label: str, labels: tuple[str, ...]) -> float:
     if label == "":
         return NO_LABEL_PRIOR
     return 1.0 if label in labels or (not labels and label != PERSON_LABEL) else OTHER_LABEL_PRIOR
@@ -180,9 +180,9 @@ def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
                 Outline.of(view, candidate) if candidate.mask.area >= SIGHTING_MIN_POINTS else None
             )
             if outline is not None:
-                value = _value(candidate.label, labels)
+                label_prior = _label_prior(candidate.label, labels)
                 nothing = np.zeros((0, 3))
-                found.append(Sighting(number, candidate, value, nothing, None, outline))
+                found.append(Sighting(number, candidate, label_prior, nothing, None, outline))
     return found
 
 
@@ -218,7 +218,7 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
             spread = np.percentile(np.linalg.norm(points - centre, axis=1), CLOUD_PERCENTILE)
             if spread > CLOUD_MAX_SPREAD * diameter:
                 continue
-            value = _value(candidate.label, labels)
+            label_prior = _label_prior(candidate.label, labels)
             outline = Outline.of(view, candidate)
-            found.append(Sighting(number, candidate, value, points, centre, outline))
+            found.append(Sighting(number, candidate, label_prior, points, centre, outline))
     return found

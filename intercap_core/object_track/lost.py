@@ -47,7 +47,7 @@ class FrameResult:
 
 
 def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
-    """A fit, lost where the images do not bear it out."""
+    """A fit, lost where the images do not support it."""
     lost = fit.support == 0 or fit.score < LOST_SCORE
     lost |= 0 < fit.mean_overlap < settings.lost_overlap
     return FrameResult(fit, lost)
@@ -62,7 +62,7 @@ def decided(gain: np.ndarray) -> bool:
 
 
 class Named:
-    """Where a candidate last bore the track out: depth alone fits the floor as well as a box.
+    """The last place where a detection supported the track: depth alone also matches a floor.
 
     ``place`` (3,), metres, is where the track starts.
     """
@@ -84,7 +84,7 @@ class Named:
 
 
 def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
-    """The frames (T) of a final track, those flagged that nothing bears out for long or that may be
+    """The frames (T) of a final track, those flagged that nothing supports for long or that may be
     elsewhere by their covariance: lost where the place is not known, ambiguous where the turn is
     not."""
     later = _unnamed(mesh, frames)
@@ -99,7 +99,7 @@ def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
 
 
 def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
-    """Which frames (T) no candidate bears out, seen from those before."""
+    """Which frames (T) no candidate supports, seen from those before."""
     places = [mesh.centre_at(frame.fit.pose) for frame in frames]
     named = Named(places[0])
     believed = [named.believes(at, frame.fit) for at, frame in zip(places, frames, strict=True)]

@@ -85,7 +85,7 @@ class Observer:
             up=self.up,
             min_overlap=self.settings.min_overlap,
             background_term=self.settings.background_term,
-            worth=partial(self.places.worth, t),
+            place_prior=partial(self.places.prior, t),
             near=near,
             renderer=self.renderer,
         )
@@ -148,4 +148,4 @@ class Observer:
 
     def value(self, t: int, fit: Fit) -> float:
         """:meth:`plausibility`, less where what is there in frame t is hardly the object."""
-        return self.plausibility(fit) * self.places.worth(t, self.mesh.centre_at(fit.pose))
+        return self.plausibility(fit) * self.places.prior(t, self.mesh.centre_at(fit.pose))

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Track:
     """All frames (T), the frame that the track started from and how its pose was found:
-    ``borne_out``, whether the images agree with the annotation."""
+    ``borne_out``, whether the images support the annotation."""
 
     frames: list[FrameResult]
     seed_frame: int

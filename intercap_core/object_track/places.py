@@ -46,7 +46,7 @@ class Standing:
 
 
 class Places:
-    """What was seen where, and how much it is worth to look there.
+    """What was seen where, and how likely what is there is the object.
 
     ``joints`` (T, K, 3) of the person, NaN unknown, metres, master frame; None where no person is
     known.
@@ -58,7 +58,7 @@ class Places:
         self._reach = 0.5 * mesh.radius
         self._same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
         self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
-        self._standing = [(s, self._standing_worth(s)) for s in standing]
+        self._standing = [(s, self._standing_prior(s)) for s in standing]
 
     @classmethod
     def survey(
@@ -74,23 +74,23 @@ class Places:
         seen = []
         for t in frames:
             groups = find_groups(mesh, load(t), labels, limit=SURVEYED_GROUPS)
-            seen.append([(centre_of(g), sum(s.value for s in g)) for g in groups])
+            seen.append([(centre_of(g), sum(s.label_prior for s in g)) for g in groups])
         same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
         places = cls(mesh, _clusters(frames, seen, same), joints)
         best = [
-            max((value * places.worth(t, place) for place, value in here), default=0.0)
+            max((value * places.prior(t, place) for place, value in here), default=0.0)
             for t, here in zip(frames, seen, strict=True)
         ]
         order = np.argsort(-np.array(best), kind="stable")
         return places, [frames[i] for i in order if best[i] > 0]
 
-    def worth(self, t: int, place: np.ndarray) -> float:
+    def prior(self, t: int, place: np.ndarray) -> float:
         """How likely what is at ``place`` (3,) in frame t is the object: 0.1 to 1."""
         found = self._nearest(place)
         if found is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
-        standing, worth = found
-        return MIN_PLACE_PRIOR if len(standing.beside) >= BESIDE_FRAMES else worth
+        standing, place_prior = found
+        return MIN_PLACE_PRIOR if len(standing.beside) >= BESIDE_FRAMES else place_prior
 
     def taken(self, place: np.ndarray) -> bool:
         """Whether another thing stands at ``place`` (3,): the object was elsewhere meanwhile."""
@@ -98,7 +98,7 @@ class Places:
         return found is not None and len(found[0].beside) >= BESIDE_FRAMES
 
     def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
-        """What stands at ``place`` (3,) and what it is worth."""
+        """What stands at ``place`` (3,) and its prior."""
         away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
         nearest = int(np.argmin(away)) if away else 0
         return self._standing[nearest] if away and away[nearest] < self._same else None
@@ -106,8 +106,8 @@ class Places:
     def claim(self, place: np.ndarray) -> None:
         """What is at ``place`` (3,) is the object, whoever comes near."""
         self._standing = [
-            (s, worth)
-            for s, worth in self._standing
+            (s, place_prior)
+            for s, place_prior in self._standing
             if np.linalg.norm(s.place - place) >= self._same
         ]
 
@@ -117,7 +117,7 @@ class Places:
             if t in s.frames and np.linalg.norm(s.place - place) >= self._same:
                 s.beside.add(t)
 
-    def _standing_worth(self, standing: Standing) -> float:
+    def _standing_prior(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
         left = MOVED_PRIOR * min(
             (ALWAYS_PRESENT - standing.share) / (ALWAYS_PRESENT - SOMETIMES_PRESENT), 1.0

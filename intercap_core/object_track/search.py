@@ -48,7 +48,7 @@ def search(
     up: np.ndarray | None,
     min_overlap: float,
     background_term: bool,
-    worth: Callable[[np.ndarray], float] | None = None,
+    place_prior: Callable[[np.ndarray], float] | None = None,
     near: np.ndarray | None = None,
     renderer: Renderer | None = None,
 ) -> list[Fit]:
@@ -56,12 +56,15 @@ def search(
 
     ``labels`` are the detector classes that the object may be given (empty: any but a person);
     ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
-    ``worth`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near`` (3,)
-    prefers candidates near a place where the object was seen; ``renderer`` draws, None = the CPU.
+    ``place_prior`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near``
+    (3,) prefers candidates near a place where the object was seen; ``renderer`` draws, None = the
+    CPU.
     """
 
     def value(fit: Fit) -> float:
-        return plausibility(fit, up) * (1.0 if worth is None else worth(mesh.centre_at(fit.pose)))
+        return plausibility(fit, up) * (
+            1.0 if place_prior is None else place_prior(mesh.centre_at(fit.pose))
+        )
 
     def fitted(starts: list[Fit]) -> list[Fit]:
         return [
@@ -83,7 +86,7 @@ def search(
             mesh, views, poses, min_overlap=ASSESS_MIN_OVERLAP, labels=labels, renderer=renderer
         )
 
-    groups = find_groups(mesh, views, labels, worth, near)
+    groups = find_groups(mesh, views, labels, place_prior, near)
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
     rotations = rotation_grid(mesh.symmetry, up)
     found: list[Fit] = []

@@ -18,7 +18,7 @@ from intercap_core.object_track.constants import (
     SEED_SURE_VALUE,
 )
 from intercap_core.object_track.fit import Fit, MotionPrior
-from intercap_core.object_track.follow import follow, value_to_believe
+from intercap_core.object_track.follow import follow, min_value
 from intercap_core.object_track.lost import judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.search import same_pose
@@ -44,8 +44,8 @@ def find_seed(observer: Observer) -> tuple[int, Fit]:
     if not seen:
         raise NotFound
     t, found = max(seen, key=lambda one: observer.value(one[0], one[1][0]))
-    if observer.value(t, found[0]) < value_to_believe(observer, t):
-        # nobody is at anything that looks like it: then it is what looks like it most
+    if observer.value(t, found[0]) < min_value(observer, t):
+        # no match near the person: take the best match, wherever it is
         t, fit = max(
             ((t, fit) for t, found in seen for fit in found),
             key=lambda one: observer.plausibility(one[1]),
@@ -58,7 +58,7 @@ def find_seed(observer: Observer) -> tuple[int, Fit]:
 
 def annotated_seed(observer: Observer, frame: int, pose: np.ndarray) -> tuple[int, Fit, bool]:
     """The frame and the pose to start from, near an annotated ``pose`` (4, 4) of ``frame``, and
-    whether the images bear the annotation out.
+    whether the images support the annotation.
 
     Where they do not, the frames beside it are tried, then what a search finds; a pose near the
     annotation that is not lost goes before a better one elsewhere.

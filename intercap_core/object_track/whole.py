@@ -54,8 +54,8 @@ class WholeTrack:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
         A lost frame's pose is a guess: it is found again where its neighbours lead to a pose that
-        the images bear out. Where they pull a frame far from what it shows, it is lost unless the
-        images bear that out.
+        the images support. Where they pull a frame far from what it shows, it is lost unless the
+        images support that.
         """
         lost = np.array([frame.lost for frame in frames])
         if lost.all():
