@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from bench.soft_rasteriser import OverdrawRasteriser, Pixels, Rasteriser, SoftRasteriser
 from intercap_core.camera.projection import project_with_jacobian
 from intercap_core.camera.transforms import apply
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.object_track.view import View
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import render
 from intercap_core.rigid.shots import Rendering

@@ -17,13 +17,14 @@ from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.metrics import object_pose
 from intercap_core.metrics.truth import Truth
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.passes import Tracker
+from intercap_core.object_track.view import View
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.twist import moved
-from intercap_core.stages.object_track import TRACKING_FACES, ObjectRecording
+from intercap_core.stages.object_track import ObjectRecording
 
 # Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
 ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)

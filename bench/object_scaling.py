@@ -29,9 +29,9 @@ from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import rigid
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.object_track.evidence import Candidate, View, ViewGeometry
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, reduced_lens
+from intercap_core.object_track.view import Candidate, View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import CpuRenderer, Renderer, open_renderer
 from intercap_core.rigid.shots import Shot, Surface

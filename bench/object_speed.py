@@ -29,11 +29,11 @@ from bench.object_clip import ObjectClip
 from bench.object_convergence import draw_convergence
 from bench.object_scaling import tracking_scaling
 from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.fit import MotionPrior
 from intercap_core.object_track.follow import follow
 from intercap_core.object_track.lost import judged
 from intercap_core.object_track.motion import extrapolated
+from intercap_core.object_track.view import View
 from intercap_core.project import load_project
 
 THREADS = int(os.environ["OMP_NUM_THREADS"])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi
 
 from intercap_core.metrics.body import MEDIAN_CHI_3
+from intercap_core.rigid.pose import rotation_log
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 LOST_TRANSLATION_M = 0.050
@@ -87,7 +87,7 @@ def normalised_rotation_error(
     where all are.
     """
     truly = symmetry.nearest_equivalent(true_rotation, rotation)
-    error = Rotation.from_matrix(rotation @ np.swapaxes(truly, 1, 2)).as_rotvec()
+    error = rotation_log(rotation @ np.swapaxes(truly, 1, 2))
     result = np.full(len(error), np.nan)
     for t, block in enumerate(covariance[:, :3, :3]):
         if not np.isfinite(block).all():

@@ -11,17 +11,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track import outlines
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import (
+    ALIGNED_POINTS,
+    FACING_AWAY_MIN_M,
+    FACING_AWAY_WEIGHT,
+    ICP_DAMPING,
+    ICP_MAX_RESIDUAL_M,
+    ICP_MAX_SHIFT_M,
+    ICP_MAX_TURN_RAD,
+    ICP_SCALES_M,
+    ICP_STEPS,
+    OUTLINE_ALIGNED_VIEWS,
+)
 from intercap_core.object_track.groups import Group, centre_of
+from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
-
-CLOUD_POINTS = 150
-ICP_STEPS = 6
-ICP_SCALES_M = (0.08, 0.015)
-FEW_VIEWS = 2
-FARTHEST_M = 0.05  # residuals beyond count as this much
-_MAX_TURN, _MAX_SHIFT_M = np.radians(15), 0.05  # of a step
 
 
 def align(
@@ -34,7 +39,7 @@ def align(
     """Align every rotation (N, 3, 3): poses (N, 4, 4) and robust mean residual (N,) in metres."""
     count = len(rotations)
     cloud, eyes = _cloud(group, views)
-    few = len(group) <= FEW_VIEWS
+    few = len(group) <= OUTLINE_ALIGNED_VIEWS
     shapes = [s.outline for s in group if s.outline and (few or s.centre is None)]
     hull = outlines.hull_vertices(mesh) if shapes else np.zeros((0, 3))
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
@@ -57,12 +62,12 @@ def align(
             weighted = jacobian * weight[..., None]
             hessian += np.einsum("ndi,ndj->nij", weighted, jacobian)
             gradient -= np.einsum("ndi,nd->ni", weighted, gap)
-            costs.append(np.minimum(np.abs(gap[:, shape.known]), FARTHEST_M))
+            costs.append(np.minimum(np.abs(gap[:, shape.known]), ICP_MAX_RESIDUAL_M))
         residual = np.concatenate(costs, 1).mean(1)
-        hessian += 1e-3 * np.einsum("nii,ij->nij", hessian, np.eye(6)) + 1e-6 * np.eye(6)
+        hessian += ICP_DAMPING * np.einsum("nii,ij->nij", hessian, np.eye(6)) + 1e-6 * np.eye(6)
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        limit = np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1) / _MAX_TURN)
-        limit = np.maximum(limit, np.linalg.norm(step[:, 3:], axis=1) / _MAX_SHIFT_M)
+        limit = np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1) / ICP_MAX_TURN_RAD)
+        limit = np.maximum(limit, np.linalg.norm(step[:, 3:], axis=1) / ICP_MAX_SHIFT_M)
         step /= limit[:, None]
         # the step moves the object in its own frame: pose <- pose * exp(step)
         translation = translation + np.einsum("nij,nj->ni", rotation, step[:, 3:])
@@ -78,7 +83,7 @@ def _cloud(group: Group, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
     measured = [s for s in group if len(s.points)]
     if not measured:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    share = CLOUD_POINTS // len(measured)
+    share = ALIGNED_POINTS // len(measured)
     parts = [
         s.points[np.linspace(0, len(s.points) - 1, min(share, len(s.points))).astype(int)]
         for s in measured
@@ -108,8 +113,10 @@ def _to_points(
     # a measured point cannot lie on a face that looks away from the camera
     to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
     facing = (to_eye * normals).sum(-1) > 0
-    weight = (scale**2 / (scale**2 + distance**2)) ** 2 * np.where(facing, 1.0, 0.1)
-    cost = np.minimum(np.where(facing, distance, np.maximum(distance, 0.01)), FARTHEST_M)
+    weight = (scale**2 / (scale**2 + distance**2)) ** 2 * np.where(facing, 1.0, FACING_AWAY_WEIGHT)
+    cost = np.minimum(
+        np.where(facing, distance, np.maximum(distance, FACING_AWAY_MIN_M)), ICP_MAX_RESIDUAL_M
+    )
     jacobian = np.concatenate([np.cross(local, normals), normals], -1)
     weighted = jacobian * weight[..., None]
     hessian = np.einsum("npi,npj->nij", weighted, jacobian)

@@ -12,22 +12,27 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.object_track.choices import best_sequence
-from intercap_core.object_track.fit import MIN_PIXELS, Fit
-from intercap_core.object_track.follow import NEAR_M, follow, value_to_believe
+from intercap_core.object_track.constants import (
+    AUDIT_DIFFERENT_DEG,
+    AUDIT_DIFFERENT_M,
+    AUDIT_EVERY_FRAMES,
+    AUDIT_NEAR_TURN_DEG,
+    AUDIT_NEIGHBOURS,
+    AUDIT_RIVAL_MARGIN,
+    AUDIT_WINDOW_FRAMES,
+    AUDITS_MIN,
+    MIN_PLACE_PRIOR,
+    MIN_RENDERED_PX,
+    NEAR_LAST_PLACE_M,
+    SOUND_AGREEMENT,
+    SOUND_VIEWS,
+)
+from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.follow import follow, min_value
 from intercap_core.object_track.lost import FrameResult, decided
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.places import LEAST
 from intercap_core.object_track.search import same_pose
 from intercap_core.object_track.turns import near_turns
-
-EVERY = 12  # frames
-SOUND_VIEWS, SOUND = 3, 0.8  # views that agree this well, in mask and depth: no need to look
-NEARLY = 0.03  # of the confidence: a found pose this much worse is a rival
-TURN_DEG = 20.0  # from a turn that hardly changes the object
-DIFFERENT_M, DIFFERENT_DEG = 0.05, 30.0
-AROUND = 3  # frames on each side, whose images decide together
-# Audits of a recording, the least sound windows first; of a long one, one in so many frames.
-AUDITS_MAX, AUDIT_EVERY = 8, 45
 
 
 def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> list[FrameResult]:
@@ -35,12 +40,12 @@ def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> 
     that it explains as well; ``times`` (T,) seconds."""
     result = list(track)
     windows = [
-        range(start, min(start + EVERY, observer.count))
-        for start in range(0, observer.count, EVERY)
+        range(start, min(start + AUDIT_WINDOW_FRAMES, observer.count))
+        for start in range(0, observer.count, AUDIT_WINDOW_FRAMES)
     ]
     doubtful = [frames for frames in windows if not any(_sound(track[t]) for t in frames)]
     doubtful.sort(key=lambda frames: max(_evidence(track[t].fit) for t in frames))
-    most = max(AUDITS_MAX, observer.count // AUDIT_EVERY)
+    most = max(AUDITS_MIN, observer.count // AUDIT_EVERY_FRAMES)
     for frames in doubtful[:most]:
         t = max(frames, key=observer.promise)
         _look(observer, result, t, times)
@@ -54,7 +59,7 @@ def _look(observer: Observer, track: list[FrameResult], t: int, times: np.ndarra
     others = [
         fit
         for fit in observer.search(t)
-        if observer.value(t, fit) > value - NEARLY
+        if observer.value(t, fit) > value - AUDIT_RIVAL_MARGIN
         and not same_pose(observer.mesh, fit.pose, own.fit.pose)
         and _may_be_there(observer, t, own, fit)
     ]
@@ -73,10 +78,10 @@ def _may_be_there(observer: Observer, t: int, own: FrameResult, fit: Fit) -> boo
     sight to the object in a hand."""
     there = observer.mesh.centre_at(fit.pose)
     away = float(np.linalg.norm(there - observer.mesh.centre_at(own.fit.pose)))
-    if not own.lost and away < NEAR_M:
+    if not own.lost and away < NEAR_LAST_PLACE_M:
         return True
-    sure = observer.value(t, fit) >= value_to_believe(observer, t)
-    return sure and observer.places.worth(t, there) > LEAST
+    sure = observer.value(t, fit) >= min_value(observer, t)
+    return sure and observer.places.prior(t, there) > MIN_PLACE_PRIOR
 
 
 def _undecided(
@@ -91,8 +96,8 @@ def _undecided(
         own, other = track[u].fit.pose, rival[u].fit.pose
         apart = float(np.linalg.norm(observer.mesh.centre_at(own) - observer.mesh.centre_at(other)))
         turn = float(symmetry.rotation_error_deg(own[:3, :3], other[:3, :3]))
-        around = gain[max(i - AROUND, 0) : i + AROUND + 1]
-        if (apart > DIFFERENT_M or turn > DIFFERENT_DEG) and not decided(around):
+        around = gain[max(i - AUDIT_NEIGHBOURS, 0) : i + AUDIT_NEIGHBOURS + 1]
+        if (apart > AUDIT_DIFFERENT_M or turn > AUDIT_DIFFERENT_DEG) and not decided(around):
             found.append(u)
     return found
 
@@ -121,7 +126,7 @@ def _is_turn(observer: Observer, own: Fit, other: Fit) -> bool:
     all frames of the track decide together."""
     turned = own.pose[:3, :3] @ near_turns(observer.mesh)[:, :3, :3]
     error = observer.mesh.symmetry.rotation_error_deg(turned, other.pose[:3, :3])
-    return bool(np.min(error) < TURN_DEG)
+    return bool(np.min(error) < AUDIT_NEAR_TURN_DEG)
 
 
 def _followed(
@@ -147,6 +152,8 @@ def _sound(frame: FrameResult) -> bool:
 def _evidence(fit: Fit) -> int:
     """Views whose candidate and, where there is any, depth agree well with the pose."""
     return sum(
-        view.visible_px >= MIN_PIXELS and view.overlap > SOUND and not view.depth_agreement < SOUND
+        view.visible_px >= MIN_RENDERED_PX
+        and view.overlap > SOUND_AGREEMENT
+        and not view.depth_agreement < SOUND_AGREEMENT
         for view in fit.views
     )

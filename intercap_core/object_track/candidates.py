@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numba
 
-from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.object_track.constants import LIKELY_LABEL_BONUS, MIN_RENDERED_PX
 from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.object_track.view import Candidate, View
 from intercap_core.rigid.shots import Rendering
-
-LIKELY_LABEL_BONUS = 0.05  # of overlap: breaks ties between candidates
-MIN_PIXELS = 12  # fewer rendered pixels say nothing
 
 
 def choose(
@@ -20,7 +18,7 @@ def choose(
     The paper's render-compare-and-preserve; None where no overlap reaches ``min_overlap``.
     """
     best, best_rank = None, 0.0
-    if predicted.area < MIN_PIXELS:
+    if predicted.area < MIN_RENDERED_PX:
         return None
     for candidate in view.candidates:
         overlap = mask_overlap(predicted, candidate.mask, view.person)

@@ -12,22 +12,24 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.object_track.constants import (
+    SEQUENCE_MAX_MOTION_COST,
+    SEQUENCE_SCORE_SIGMA,
+    SEQUENCE_SPEED_M_S,
+    SEQUENCE_SPEED_RAD_S,
+    WEAK_FRAME_FITS,
+    WEAK_FRAME_TURN_RAD,
+    WEAK_SCORE,
+)
 from intercap_core.object_track.fit import Fit
 from intercap_core.rigid.mesh import ObjectMesh
-
-WEAK = 0.8  # of the usual score
-STARTS_RAD = np.radians(25)
-FITTED = 2
-SCORE_SIGMA = 0.02  # of a frame's score
-SPEED_RAD_S, SPEED_M_S = 4.0, 1.5
-CHANGE_COST = 6.0  # of a motion that is none
 
 
 def weak_frames(scores: np.ndarray, lost: np.ndarray) -> np.ndarray:
     """Which frames (T,) agree much less with the images than is usual in this track."""
     if lost.all():
         return np.zeros(len(scores), bool)
-    return ~lost & (scores < WEAK * np.median(scores[~lost]))
+    return ~lost & (scores < WEAK_SCORE * np.median(scores[~lost]))
 
 
 def other_fits(
@@ -40,13 +42,13 @@ def other_fits(
     centre = mesh.centre_of_mass
     turns = []
     for axis in np.eye(3):
-        for angle in (STARTS_RAD, -STARTS_RAD):
+        for angle in (WEAK_FRAME_TURN_RAD, -WEAK_FRAME_TURN_RAD):
             turn = np.eye(4)
             turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
             turn[:3, 3] = centre - turn[:3, :3] @ centre
             turns.append(turn)
     starts = sorted(assess_all(pose @ np.array(turns)), key=lambda found: -found.score)
-    return [fit(pose), *(fit(start.pose) for start in starts[:FITTED])]
+    return [fit(pose), *(fit(start.pose) for start in starts[:WEAK_FRAME_FITS])]
 
 
 def best_sequence(mesh: ObjectMesh, options: list[list[Fit]], times: np.ndarray) -> list[int]:
@@ -69,12 +71,14 @@ def _values(options: list[Fit], usual: float) -> np.ndarray:
     """What each pose explains (N,); a frame that no pose explains well says little."""
     scores = np.array([fit.score for fit in options])
     trust = min(scores.max() / max(usual, 1e-6), 1.0) ** 2
-    return scores * trust / SCORE_SIGMA
+    return scores * trust / SEQUENCE_SCORE_SIGMA
 
 
 def _motion(mesh: ObjectMesh, a: Fit, b: Fit, gap: float) -> float:
     turn = np.radians(float(mesh.symmetry.rotation_error_deg(a.pose[:3, :3], b.pose[:3, :3])))
     centre = mesh.centre_of_mass
     shift = (b.pose[:3, :3] - a.pose[:3, :3]) @ centre + b.pose[:3, 3] - a.pose[:3, 3]
-    speed = (turn / (SPEED_RAD_S * gap)) ** 2 + (np.linalg.norm(shift) / (SPEED_M_S * gap)) ** 2
-    return float(min(0.5 * speed, CHANGE_COST))
+    speed = (turn / (SEQUENCE_SPEED_RAD_S * gap)) ** 2 + (
+        np.linalg.norm(shift) / (SEQUENCE_SPEED_M_S * gap)
+    ) ** 2
+    return float(min(0.5 * speed, SEQUENCE_MAX_MOTION_COST))

@@ -1,170 +1,59 @@
-"""What one frame set shows of the object: reduced masks and depth of every view."""
+"""What the views of one frame set say about small motions of a pose, each view for itself."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera
-from intercap_core.object_track.blobs import without_person
-from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, decode, reduced_lens
-
-# The object is compared at about this many pixels: more cost time and carry no more information,
-# since neighbouring pixels of a mask or a depth image err together.
-SILHOUETTE_PX = 110
-DEPTH_PX = 80
-TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, where nothing tells
-MAX_STEP = 4
-
-
-@dataclass(frozen=True, eq=False)
-class ViewGeometry:
-    """A camera with its reduced lenses; pixel (i, j) of a reduced image is (i, j) * step.
-
-    It exposes ``time_offset_s`` later than the frame set's time.
-    """
-
-    camera: Camera
-    lens: Intrinsics
-    step: int
-    depth_lens: Intrinsics | None
-    depth_step: int
-    depth_bias_m: float = 0.0
-    time_offset_s: float = 0.0
-
-    @classmethod
-    def for_object(
-        cls,
-        camera: Camera,
-        diameter_m: float,
-        depth_bias_m: float = 0.0,
-        time_offset_s: float = 0.0,
-        distance_m: float = TYPICAL_DISTANCE_M,
-    ) -> ViewGeometry:
-        """Choose the reduction by how large the object appears where it mostly is.
-
-        Metres: ``diameter_m`` of the object, ``distance_m`` of it from the camera.
-        """
-        angle = diameter_m / distance_m
-        step = _step(camera.colour.fx, angle, SILHOUETTE_PX)
-        depth_step = _step(camera.depth.fx, angle, DEPTH_PX) if camera.depth else 1
-        return cls(
-            camera,
-            reduced_lens(camera.colour, step),
-            step,
-            reduced_lens(camera.depth, depth_step) if camera.depth else None,
-            depth_step,
-            depth_bias_m,
-            time_offset_s,
-        )
-
-    # Computed once: a fit asks for them thousands of times.
-
-    @cached_property
-    def colour_from_master(self) -> np.ndarray:
-        """(4, 4) of the camera."""
-        return np.ascontiguousarray(self.camera.colour_from_master)
-
-    @cached_property
-    def master_from_colour(self) -> np.ndarray:
-        """(4, 4) of the camera."""
-        return np.ascontiguousarray(self.camera.master_from_colour)
-
-    @cached_property
-    def master_from_depth(self) -> np.ndarray:
-        """(4, 4) of the camera, which has depth."""
-        return np.ascontiguousarray(self.camera.master_from_depth)
-
-    @cached_property
-    def depth_from_master(self) -> np.ndarray:
-        """(4, 4) of the camera, which has depth."""
-        return np.ascontiguousarray(self.camera.depth_from_master)
-
-    @cached_property
-    def depth_from_colour(self) -> np.ndarray:
-        """(4, 4) of the camera, which has depth."""
-        return self.depth_from_master @ self.master_from_colour
+from intercap_core.object_track.constants import (
+    CONTOUR_SCALES_PX,
+    DEPTH_SCALES_M,
+    REPORT_CONTOUR_SCALE,
+)
+from intercap_core.object_track.fit import view_fits
+from intercap_core.object_track.view import View
+from intercap_core.object_track.view_fit import NormalEquations, ViewFit
+from intercap_core.object_track.view_report import ViewReport
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import Renderer, default_renderer
 
 
-def distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
-    """How far (metres) each camera is from what happens: from the person's joints (T, K, 3),
-    master frame, NaN where unknown; :data:`TYPICAL_DISTANCE_M` where no joint is known."""
-    places = joints[np.isfinite(joints).all(-1)]
-    if not len(places):
-        return [TYPICAL_DISTANCE_M] * len(cameras)
-    eyes = [camera.master_from_colour[:3, 3] for camera in cameras]
-    return [float(np.median(np.linalg.norm(places - eye, axis=1))) for eye in eyes]
+@dataclass(frozen=True)
+class PoseEvidence:
+    """What each view of a frame set says about small motions of a pose: the weighted J'J
+    ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
+    one standard deviation; zero from a view that says nothing. No prior is in them. ``reports`` is
+    how each view agrees with the pose."""
+
+    information: np.ndarray
+    gradient: np.ndarray
+    reports: tuple[ViewReport, ...]
 
 
-def _step(focal_px: float, angle: float, wanted_px: int) -> int:
-    return int(np.clip(round(focal_px * angle / wanted_px), 1, MAX_STEP))
+def evidence_at(
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    *,
+    min_overlap: float,
+    background_term: bool,
+    labels: tuple[str, ...] = (),
+    twist: np.ndarray | None = None,
+    renderer: Renderer | None = None,
+) -> PoseEvidence:
+    """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
+    renderer = renderer or default_renderer()
+    fits = view_fits(renderer, mesh, views, pose, min_overlap, labels, twist)
 
+    def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
+        fit.choose()
+        found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
+        return found, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """One segmentation candidate of an image; ``index`` is its place in the detections."""
-
-    index: int
-    label: str
-    score: float
-    mask: ReducedMask
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """One image of a frame set: what the tracker uses of it.
-
-    ``depth`` (h, w) float32 metres on the reduced depth grid, bias removed, 0 where invalid; None
-    where there is no depth image. ``detected``: whether candidates are known for this image.
-    """
-
-    geometry: ViewGeometry
-    depth: np.ndarray | None
-    person: ReducedMask
-    candidates: tuple[Candidate, ...]
-    detected: bool = True
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the images."""
-        masks = [self.person, *(candidate.mask for candidate in self.candidates)]
-        depth = 0 if self.depth is None else self.depth.nbytes
-        return depth + sum(mask.mask.nbytes for mask in masks)
-
-    @classmethod
-    def build(
-        cls,
-        geometry: ViewGeometry,
-        depth_mm: np.ndarray | None,
-        person_rle: bytes,
-        candidates: list[tuple[int, str, float, bytes]],
-        detected: bool = True,
-    ) -> View:
-        """Reduce one image's depth (H, W) uint16 mm, person mask and candidates.
-
-        A candidate is (index, label, score, RLE); one that holds the person beside something else
-        is there a second time without the person. Raises ValueError where a mask does not fit the
-        image.
-        """
-        depth = None
-        if depth_mm is not None:
-            step = geometry.depth_step
-            raw = depth_mm[::step, ::step]
-            depth = raw * np.float32(1e-3) - np.float32(geometry.depth_bias_m)
-            depth[raw == 0] = 0
-        colour, step = geometry.camera.colour, geometry.step
-        found = tuple(
-            Candidate(index, label, score, decode(rle, colour, step))
-            for index, label, score, rle in candidates
-        )
-        person = decode(person_rle, colour, step) if person_rle else EMPTY
-        parts = tuple(
-            replace(candidate, mask=part)
-            for candidate in found
-            if (part := without_person(candidate.mask, person, step)) is not None
-        )
-        return cls(geometry, depth, person, found + parts, detected)
+    found = renderer.crew.map(terms, fits)
+    return PoseEvidence(
+        np.array([h for (h, _), _ in found]),
+        np.array([g for (_, g), _ in found]),
+        tuple(report for _, report in found),
+    )

@@ -10,27 +10,33 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from intercap_core.object_track.candidates import MIN_PIXELS
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import (
+    CONTOUR_SCALES_PX,
+    DEPTH_SCALES_M,
+    FIT_CONVERGED_M,
+    FIT_CONVERGED_RAD,
+    FIT_DAMPING,
+    FIT_MAX_STEP_M,
+    FIT_MAX_STEP_RAD,
+    FIT_ROUNDS,
+    MIN_RENDERED_PX,
+    PRIOR_SIGMA_M,
+    PRIOR_SIGMA_RAD,
+    REDRAWN_M,
+    REDRAWN_RAD,
+    REPORT_CONTOUR_SCALE,
+    SCALE_SHRINKAGE,
+    SUPPORTING_AGREEMENT,
+    SUPPORTING_PX,
+)
+from intercap_core.object_track.view import View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
 from intercap_core.object_track.view_report import ViewReport, quick_report
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer, default_renderer
 from intercap_core.rigid.shots import Rendering, Surface
-from intercap_core.rigid.twist import moved
-
-DEPTH_SCALES_M = (0.050, 0.012)  # Geman-McClure scale: first, last
-CONTOUR_SCALES_PX = (30.0, 6.0)  # at full resolution
-SHRINK = 0.5  # of the scales from step to step
-MAX_STEP_M, MAX_STEP_RAD = 0.06, np.radians(20)
-CONVERGED_M, CONVERGED_RAD = 5e-4, np.radians(0.1)
-# A pose this near to the one drawn last is a quarter of a pixel off: steps on from the same
-# renderings, whose residuals are linear in so small a motion.
-REDRAWN_M, REDRAWN_RAD = 1.5e-3, np.radians(0.3)
-DAMPING = 1e-3  # of the diagonal
-REPORT_SCALE = 4.0  # times the last contour scale: residuals that a report counts
+from intercap_core.rigid.twist import moved, step_between
 
 
 @dataclass(frozen=True)
@@ -38,8 +44,8 @@ class MotionPrior:
     """Where the object is expected: keeps motions that nothing shows (a bottle's spin) at rest."""
 
     pose: np.ndarray  # (4, 4) master_from_object
-    sigma_m: float = 0.06
-    sigma_rad: float = float(np.radians(15))
+    sigma_m: float = PRIOR_SIGMA_M
+    sigma_rad: float = PRIOR_SIGMA_RAD
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ class Fit:
         """
         total, weight = 0.0, 0.0
         for view in self.views:
-            if view.visible_px < MIN_PIXELS:
+            if view.visible_px < MIN_RENDERED_PX:
                 continue
             overlap = 0.0 if np.isnan(view.overlap) else view.overlap
             agreement = overlap if np.isnan(view.depth_agreement) else view.depth_agreement
@@ -87,7 +93,7 @@ class Fit:
         """Number of views with a candidate, or whose depth agrees with what is visible."""
         return sum(
             not np.isnan(view.overlap)
-            or (view.visible_px >= 3 * MIN_PIXELS and view.depth_agreement > 0.5)
+            or (view.visible_px >= SUPPORTING_PX and view.depth_agreement > SUPPORTING_AGREEMENT)
             for view in self.views
         )
 
@@ -101,7 +107,7 @@ def fit_pose(
     min_overlap: float,
     background_term: bool,
     labels: tuple[str, ...] = (),
-    rounds: tuple[int, ...] = (4, 5),
+    rounds: tuple[int, ...] = FIT_ROUNDS,
     start_scale: float = 1.0,
     twist: np.ndarray | None = None,
     renderer: Renderer | None = None,
@@ -120,9 +126,8 @@ def fit_pose(
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
     depth_scale = max(depth_scale * start_scale, DEPTH_SCALES_M[1])
     contour_scale = max(contour_scale * start_scale, CONTOUR_SCALES_PX[1])
-    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
     drawn_pose = pose  # what the fits look at
-    _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
+    fits = view_fits(renderer, mesh, views, drawn_pose, min_overlap, labels, twist)
     information = np.eye(6)
     done = False
     for number, steps in enumerate(rounds):
@@ -138,9 +143,9 @@ def fit_pose(
             )
             pose = moved(drawn_pose, step)
             settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
-            depth_scale = max(depth_scale * SHRINK, DEPTH_SCALES_M[1])
-            contour_scale = max(contour_scale * SHRINK, CONTOUR_SCALES_PX[1])
-            done = settled and _below(step - last, CONVERGED_M, CONVERGED_RAD)
+            depth_scale = max(depth_scale * SCALE_SHRINKAGE, DEPTH_SCALES_M[1])
+            contour_scale = max(contour_scale * SCALE_SHRINKAGE, CONTOUR_SCALES_PX[1])
+            done = settled and _below(step - last, FIT_CONVERGED_M, FIT_CONVERGED_RAD)
             if done:
                 break
             if _below(step, REDRAWN_M, REDRAWN_RAD):
@@ -148,7 +153,7 @@ def fit_pose(
             else:
                 last, drawn_pose = np.zeros(6), pose
                 _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
-    report_scale = REPORT_SCALE * CONTOUR_SCALES_PX[1]
+    report_scale = REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1]
     reports = renderer.crew.map(lambda fit: fit.report(report_scale), fits)
     return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), tuple(reports))
 
@@ -171,12 +176,29 @@ def _step(
     for h, g in renderer.crew.map(terms, fits):
         hessian += h
         gradient += g
-    damped = hessian + np.diag(DAMPING * np.diag(hessian) + 1e-9)
+    damped = hessian + np.diag(FIT_DAMPING * np.diag(hessian) + 1e-9)
     return hessian, _limited(-np.linalg.solve(damped, gradient))
 
 
 def _below(step: np.ndarray, metres: float, radians: float) -> bool:
     return bool(np.abs(step[3:]).max() < metres and np.abs(step[:3]).max() < radians)
+
+
+def view_fits(
+    renderer: Renderer,
+    mesh: ObjectMesh,
+    views: list[View],
+    pose: np.ndarray,
+    min_overlap: float,
+    labels: tuple[str, ...],
+    twist: np.ndarray | None,
+) -> list[ViewFit]:
+    """Every view's fit, looking at ``pose`` (4, 4) as its camera sees it; see :func:`fit_pose`."""
+    seen = _seen(pose, views, twist)
+    return [
+        ViewFit(mesh, view, min_overlap, labels, own, drawn)
+        for view, own, drawn in zip(views, seen, _draw(renderer, mesh, views, seen), strict=True)
+    ]
 
 
 def _look(
@@ -198,47 +220,6 @@ def _draw(
     shots = [shots_of(view, pose) for view, pose in zip(views, seen, strict=True)]
     drawn = iter(renderer.draw(Surface.of(mesh), [shot for group in shots for shot in group]))
     return [[next(drawn) for _ in group] for group in shots]
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What each view of a frame set says about small motions of a pose: the weighted J'J
-    ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
-    one standard deviation; zero from a view that says nothing. No prior is in them. ``reports`` is
-    how each view agrees with the pose."""
-
-    information: np.ndarray
-    gradient: np.ndarray
-    reports: tuple[ViewReport, ...]
-
-
-def evidence_at(
-    mesh: ObjectMesh,
-    views: list[View],
-    pose: np.ndarray,
-    *,
-    min_overlap: float,
-    background_term: bool,
-    labels: tuple[str, ...] = (),
-    twist: np.ndarray | None = None,
-    renderer: Renderer | None = None,
-) -> Evidence:
-    """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
-    renderer = renderer or default_renderer()
-    fits = [ViewFit(mesh, view, min_overlap, labels) for view in views]
-    _look(renderer, mesh, views, fits, _seen(pose, views, twist))
-
-    def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
-        fit.choose()
-        found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
-        return found, fit.report(REPORT_SCALE * CONTOUR_SCALES_PX[1])
-
-    found = renderer.crew.map(terms, fits)
-    return Evidence(
-        np.array([h for (h, _), _ in found]),
-        np.array([g for (_, g), _ in found]),
-        tuple(report for _, report in found),
-    )
 
 
 def assess(
@@ -288,15 +269,14 @@ def assess_all(
 def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if prior is None:
         return np.eye(6), np.zeros(6)
-    turn = Rotation.from_matrix(pose[:3, :3] @ prior.pose[:3, :3].T).as_rotvec()
-    away = np.concatenate([turn, pose[:3, 3] - prior.pose[:3, 3]])
+    away = step_between(prior.pose, pose)
     weight = np.repeat([prior.sigma_rad**-2, prior.sigma_m**-2], 3)
     return np.diag(weight), weight * away
 
 
 def _limited(step: np.ndarray) -> np.ndarray:
     turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
-    return step / max(1.0, turn / MAX_STEP_RAD, shift / MAX_STEP_M)
+    return step / max(1.0, turn / FIT_MAX_STEP_RAD, shift / FIT_MAX_STEP_M)
 
 
 def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:

@@ -7,23 +7,30 @@ from dataclasses import replace
 
 import numpy as np
 
+from intercap_core.object_track.constants import (
+    CLEARLY_BETTER,
+    DOUBTFUL_SCORE,
+    LEAP_COST_HALF_TURN,
+    LEAP_COST_PER_M,
+    LEAP_MAX_COST_M,
+    LEAP_MAX_COST_TURN,
+    LOST_SCORE,
+    NEAR_LAST_PLACE_M,
+    RECOVERY_NAMED_VIEWS,
+    RECOVERY_VALUE,
+    RECOVERY_VIEWS_EACH,
+    RECOVERY_WAIT_FRAMES,
+    RING_VIEWS,
+    SEARCH_EVERY_FRAMES,
+    SEARCHES_MAX,
+    USUAL_SCORE_RATE,
+)
 from intercap_core.object_track.fit import Fit
-from intercap_core.object_track.lost import LOST_SCORE, FrameResult, Named, judged
+from intercap_core.object_track.lost import FrameResult, Named, judged
 from intercap_core.object_track.motion import expected, extrapolated, loose
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.search import same_pose
 from intercap_core.rigid.mesh import ObjectMesh
-
-DOUBT = 0.55  # of the usual score: below, a search may find better
-RECOVERY_CONFIDENCE = 0.40  # with a ring of cameras
-RING = 6
-# After so many frames in doubt a search is due, later now and then.
-RECOVERY_WAIT = (0, 2, 5, 9, 14, 20, 30, 45, 60)
-SEARCH_EVERY = 30
-SEARCHES_MAX = 12  # that find nothing, and one more in SEARCH_EVERY frames: a pass must end
-NAMED_VIEWS, VIEWS_EACH = 2, 3  # views with a candidate, of so many each, for a searched pose
-NEAR_M = 0.4
-CLEARLY_BETTER = 1.15  # a searched pose's confidence over the tracked one's
 
 
 def follow(
@@ -43,7 +50,7 @@ def follow(
     lost_for = 1 if start.lost else 0
     named = Named(observer.mesh.centre_at(now))
     searches = doubted_for = 0
-    most = SEARCHES_MAX + len(frames) // SEARCH_EVERY
+    most = SEARCHES_MAX + len(frames) // SEARCH_EVERY_FRAMES
     for t in frames:
         predicted = now if lost_for else extrapolated(before, now)
         prior = expected(before, now, predicted, lost_for)
@@ -55,7 +62,7 @@ def follow(
         if not named.believes(observer.mesh.centre_at(result.fit.pose), result.fit):
             result = replace(result, lost=True)
         leapt = False
-        doubtful = result.lost or result.fit.score < DOUBT * usual
+        doubtful = result.lost or result.fit.score < DOUBTFUL_SCORE * usual
         if may_search and doubtful and _is_due(doubted_for) and searches < most:
             again = _recovered(observer, t, now, result)
             leapt = again is not None
@@ -72,15 +79,15 @@ def follow(
             result = replace(result, leapt=leapt)
             before, now = (result.fit.pose if broken else now), result.fit.pose
             lost_for = 0
-            if result.fit.score > DOUBT * usual:
+            if result.fit.score > DOUBTFUL_SCORE * usual:
                 observer.places.tracked(t, observer.mesh.centre_at(result.fit.pose))
-            usual += 0.1 * (result.fit.score - usual)
+            usual += USUAL_SCORE_RATE * (result.fit.score - usual)
         yield t, result
 
 
 def _is_due(doubted_for: int) -> bool:
-    late = doubted_for > RECOVERY_WAIT[-1] and doubted_for % SEARCH_EVERY == 0
-    return late or doubted_for in RECOVERY_WAIT
+    late = doubted_for > RECOVERY_WAIT_FRAMES[-1] and doubted_for % SEARCH_EVERY_FRAMES == 0
+    return late or doubted_for in RECOVERY_WAIT_FRAMES
 
 
 def _better_start(observer: Observer, t: int, predicted: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -104,17 +111,17 @@ def _recovered(
     )
     if same_pose(observer.mesh, best.pose, result.fit.pose):
         return None
-    needed = max(value_to_believe(observer, t), CLEARLY_BETTER * observer.value(t, result.fit))
+    needed = max(min_value(observer, t), CLEARLY_BETTER * observer.value(t, result.fit))
     if observer.value(t, best) < needed or judged(best, observer.settings).lost:
         return None
     return FrameResult(best, False)
 
 
-def value_to_believe(observer: Observer, t: int) -> float:
+def min_value(observer: Observer, t: int) -> float:
     """The value from which a pose that was searched for in frame t may be the object."""
     # few cameras can never be as sure as a ring
-    surest = min(1.0, (1 - 0.5 ** len(observer.views(t))) / (1 - 0.5**RING))
-    return RECOVERY_CONFIDENCE * surest
+    surest = min(1.0, (1 - 0.5 ** len(observer.views(t))) / (1 - 0.5**RING_VIEWS))
+    return RECOVERY_VALUE * surest
 
 
 def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
@@ -123,12 +130,14 @@ def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
     looked = sum(view.detected for view in fit.views)
     named = sum(view.candidate >= 0 for view in fit.views)
     away = float(np.linalg.norm(observer.mesh.centre_at(fit.pose) - observer.mesh.centre_at(last)))
-    far = away > NEAR_M
-    return named >= min(NAMED_VIEWS if far else 1, -(-looked // VIEWS_EACH))
+    far = away > NEAR_LAST_PLACE_M
+    return named >= min(RECOVERY_NAMED_VIEWS if far else 1, -(-looked // RECOVERY_VIEWS_EACH))
 
 
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:
-    """How implausible a jump is, in units of confidence: a tie goes to the nearer pose."""
+    """How implausible a jump is, in units of value: a tie goes to the nearer pose."""
     distance = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
     angle = float(mesh.symmetry.rotation_error_deg(pose[:3, :3], last[:3, :3]))
-    return min(0.1 * distance, 0.1) + min(0.05 * angle / 180, 0.05)
+    return min(LEAP_COST_PER_M * distance, LEAP_MAX_COST_M) + min(
+        LEAP_COST_HALF_TURN * angle / 180, LEAP_MAX_COST_TURN
+    )

@@ -14,32 +14,38 @@ import numpy as np
 
 from intercap_core.camera.transforms import apply
 from intercap_core.camera.triangulation import midpoints
-from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.detections.instance import PERSON_LABEL
+from intercap_core.object_track.constants import (
+    CLOUD_MAX_SPREAD,
+    CLOUD_PERCENTILE,
+    GROUP_SLACK_M,
+    MAX_GROUPS,
+    NEAR_COST_PER_M,
+    NO_LABEL_PRIOR,
+    ON_PERSON_SHARE,
+    OTHER_LABEL_PRIOR,
+    OUTLINE_MAX_WIDTH,
+    OUTLINE_MIN_WIDTH,
+    PERSON_SIZED_SHARE,
+    RAY_MISS_SHARE,
+    SAME_OBJECT_SHARE,
+    SHARED_SIGHTINGS,
+    SIGHTING_MIN_POINTS,
+)
 from intercap_core.object_track.outlines import Outline
+from intercap_core.object_track.view import Candidate, View
 from intercap_core.rigid.mesh import ObjectMesh
-
-PERSON_LABELS = frozenset({"person"})
-MIN_POINTS = 15  # of a candidate's cloud, or pixels of its mask
-MAX_GROUPS = 3
-TOGETHER, APART_M = 0.6, 0.03  # of the diameter: measured centres of one object's two sides
-CROSSING = 0.35  # of the diameter: a ray through a mask's middle from the object's
-# Width of a mask over the diameter, in the object's place: seen end on, half hidden; smeared.
-SMALLEST, LARGEST = 0.12, 1.25
-UNLIKELY = 0.5  # what a sighting with another class's label counts; detectors err
-UNNAMED = 0.8  # one that no detector named
-MOST = 0.3  # share of the person's pixels
-OF_PERSON = 0.6  # share of a candidate's pixels on the person, from which it is the person
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """One candidate of one image: its ``outline`` (None where all of it is cut off) and, where the
     view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,).
-    ``value``: 1 where its label is one of the object's, less else."""
+    ``label_prior``: 1 where its label is one of the object's, less else."""
 
     view: int
     candidate: Candidate
-    value: float
+    label_prior: float
     points: np.ndarray
     centre: np.ndarray | None
     outline: Outline | None
@@ -47,15 +53,21 @@ class Sighting:
     def away(self, point: np.ndarray, diameter: float) -> float:
         """How far the candidate is from a place (3,), in units of what still is one object."""
         if self.centre is not None:
-            return float(np.linalg.norm(self.centre - point)) / (TOGETHER * diameter + APART_M)
+            return float(np.linalg.norm(self.centre - point)) / (
+                SAME_OBJECT_SHARE * diameter + GROUP_SLACK_M
+            )
         outline = self.outline
         assert outline is not None
         towards = point - outline.eye
         along = float(towards @ outline.ray)
-        if not SMALLEST * diameter < outline.extent * along < LARGEST * diameter + APART_M:
+        if (
+            not OUTLINE_MIN_WIDTH * diameter
+            < outline.extent * along
+            < OUTLINE_MAX_WIDTH * diameter + GROUP_SLACK_M
+        ):
             return np.inf
         across = float(np.linalg.norm(towards - along * outline.ray))
-        return across / (CROSSING * diameter + APART_M)
+        return across / (RAY_MISS_SHARE * diameter + GROUP_SLACK_M)
 
 
 Group = list[Sighting]
@@ -66,14 +78,14 @@ def find_groups(
     mesh: ObjectMesh,
     views: list[View],
     labels: tuple[str, ...],
-    worth: Callable[[np.ndarray], float] | None = None,
+    place_prior: Callable[[np.ndarray], float] | None = None,
     near: np.ndarray | None = None,
     limit: int = MAX_GROUPS,
 ) -> list[Group]:
     """The first ``limit`` groups of candidates that may be the object, the most likely first.
 
-    ``labels`` are the classes that the object may be given; ``worth`` says of a place (3,) how
-    likely what is there is the object; ``near`` (3,) prefers candidates near a place.
+    ``labels`` are the classes that the object may be given; ``place_prior`` says of a place (3,)
+    how likely what is there is the object; ``near`` (3,) prefers candidates near a place.
     """
     measured = _measured(views, mesh.diameter, labels)
     outlined = _outlined(views, labels)
@@ -89,11 +101,11 @@ def find_groups(
             nearest = int(np.argmin(away))
             if away[nearest] < 1:
                 group.append(others[nearest])
-        value = sum(s.value for s in group)
-        if worth is not None:
-            value *= worth(centre_of(group))
+        value = sum(s.label_prior for s in group)
+        if place_prior is not None:
+            value *= place_prior(centre_of(group))
         if near is not None:
-            value -= 2.0 * float(np.linalg.norm(place - near))
+            value -= NEAR_COST_PER_M * float(np.linalg.norm(place - near))
         groups.append((value, group))
     groups.sort(key=lambda item: -item[0])
     return _different([group for _, group in groups], limit)
@@ -119,7 +131,7 @@ def _different(groups: list[Group], limit: int) -> list[Group]:
             break
         members = {(s.view, s.candidate.index) for s in group}
         known = [{(s.view, s.candidate.index) for s in other} for other in kept]
-        if all(len(members & other) <= 0.5 * len(members) for other in known):
+        if all(len(members & other) <= SHARED_SIGHTINGS * len(members) for other in known):
             kept.append(group)
     return kept
 
@@ -144,17 +156,19 @@ def _could_be(view: View) -> list[Candidate]:
         mask = candidate.mask
         if mask.area:
             person = view.person.window(mask.x0, mask.y0, *mask.mask.shape)
-            on_person = (person & mask.mask).sum() > OF_PERSON * mask.area
-            large = candidate.label in PERSON_LABELS or mask.area > MOST * view.person.area
+            on_person = (person & mask.mask).sum() > ON_PERSON_SHARE * mask.area
+            large = (
+                candidate.label == PERSON_LABEL or mask.area > PERSON_SIZED_SHARE * view.person.area
+            )
             if not (on_person and large):  # what is held before the body may lie in its mask
                 found.append(candidate)
     return found
 
 
-def _value(label: str, labels: tuple[str, ...]) -> float:
+def _label_prior(label: str, labels: tuple[str, ...]) -> float:
     if label == "":
-        return UNNAMED
-    return 1.0 if label in labels or (not labels and label not in PERSON_LABELS) else UNLIKELY
+        return NO_LABEL_PRIOR
+    return 1.0 if label in labels or (not labels and label != PERSON_LABEL) else OTHER_LABEL_PRIOR
 
 
 def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
@@ -162,11 +176,13 @@ def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
     found = []
     for number, view in enumerate(views):
         for candidate in _could_be(view) if view.depth is None else ():
-            outline = Outline.of(view, candidate) if candidate.mask.area >= MIN_POINTS else None
+            outline = (
+                Outline.of(view, candidate) if candidate.mask.area >= SIGHTING_MIN_POINTS else None
+            )
             if outline is not None:
-                value = _value(candidate.label, labels)
+                label_prior = _label_prior(candidate.label, labels)
                 nothing = np.zeros((0, 3))
-                found.append(Sighting(number, candidate, value, nothing, None, outline))
+                found.append(Sighting(number, candidate, label_prior, nothing, None, outline))
     return found
 
 
@@ -191,18 +207,18 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
         pixel = np.rint(geometry.lens.project(apply(camera.colour_from_depth, local))).astype(int)
         for candidate in candidates:
             inside = np.flatnonzero(candidate.mask.sample(pixel[:, 0], pixel[:, 1]))
-            if len(inside) < MIN_POINTS:
+            if len(inside) < SIGHTING_MIN_POINTS:
                 continue
             z = depth[inside]
-            inside = inside[np.abs(z - np.median(z)) < 0.75 * diameter]
-            if len(inside) < MIN_POINTS:
+            inside = inside[np.abs(z - np.median(z)) < CLOUD_MAX_SPREAD * diameter]
+            if len(inside) < SIGHTING_MIN_POINTS:
                 continue  # two surfaces, with the middle between them
             points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
             centre = np.median(points, axis=0)
-            spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
-            if spread > 0.75 * diameter:
+            spread = np.percentile(np.linalg.norm(points - centre, axis=1), CLOUD_PERCENTILE)
+            if spread > CLOUD_MAX_SPREAD * diameter:
                 continue
-            value = _value(candidate.label, labels)
+            label_prior = _label_prior(candidate.label, labels)
             outline = Outline.of(view, candidate)
-            found.append(Sighting(number, candidate, value, points, centre, outline))
+            found.append(Sighting(number, candidate, label_prior, points, centre, outline))
     return found

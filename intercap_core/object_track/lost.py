@@ -7,15 +7,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.constants import (
+    DECIDED_FRAME,
+    DECIDED_RUN,
+    LOST_SCORE,
+    UNNAMED_FRAMES,
+    UNNAMED_M,
+    UNSURE_M,
+    UNSURE_RAD,
+)
 from intercap_core.object_track.fit import Fit
 from intercap_core.rigid.mesh import ObjectMesh
-
-LOST_SCORE = 0.20
-# By how much the mean score of one pose has to be better than another's, over all frames of a run
-# and over one: errors of masks last several frames and agree over views.
-DECIDED, DECIDED_ONE = 0.01, 0.03
-UNSURE_M, UNSURE_RAD = 0.03, np.radians(15)  # standard deviations that are as good as lost
-UNNAMED_FRAMES, UNNAMED_M = 4, 0.05  # that the object is followed without any candidate
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class FrameResult:
 
 
 def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
-    """A fit, lost where the images do not bear it out."""
+    """A fit, lost where the images do not support it."""
     lost = fit.support == 0 or fit.score < LOST_SCORE
     lost |= 0 < fit.mean_overlap < settings.lost_overlap
     return FrameResult(fit, lost)
@@ -54,12 +56,13 @@ def judged(fit: Fit, settings: ObjectTrackSettings) -> FrameResult:
 def decided(gain: np.ndarray) -> bool:
     """Whether the images decide between two poses by the differences (N,) of their scores."""
     return bool(
-        len(gain) and abs(gain.mean()) > DECIDED + (DECIDED_ONE - DECIDED) / np.sqrt(len(gain))
+        len(gain)
+        and abs(gain.mean()) > DECIDED_RUN + (DECIDED_FRAME - DECIDED_RUN) / np.sqrt(len(gain))
     )
 
 
 class Named:
-    """Where a candidate last bore the track out: depth alone fits the floor as well as a box.
+    """The last place where a detection supported the track: depth alone also matches a floor.
 
     ``place`` (3,), metres, is where the track starts.
     """
@@ -81,7 +84,7 @@ class Named:
 
 
 def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
-    """The frames (T) of a final track, those flagged that nothing bears out for long or that may be
+    """The frames (T) of a final track, those flagged that nothing supports for long or that may be
     elsewhere by their covariance: lost where the place is not known, ambiguous where the turn is
     not."""
     later = _unnamed(mesh, frames)
@@ -96,7 +99,7 @@ def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
 
 
 def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
-    """Which frames (T) no candidate bears out, seen from those before."""
+    """Which frames (T) no candidate supports, seen from those before."""
     places = [mesh.centre_at(frame.fit.pose) for frame in frames]
     named = Named(places[0])
     believed = [named.believes(at, frame.fit) for at, frame in zip(places, frames, strict=True)]

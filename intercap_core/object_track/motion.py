@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.object_track.constants import (
+    GROWTH_LOST_M,
+    GROWTH_LOST_RAD,
+    ONSET_M,
+    ONSET_RAD,
+    ONSET_STEP_SHARE,
+    STILL_M,
+    STILL_RAD,
+)
 from intercap_core.object_track.fit import MotionPrior
-
-STILL_M, STILL_RAD = 0.004, np.radians(1.5)  # slower than this: no motion is predicted
-ONSET_M, ONSET_RAD = 0.02, np.radians(5)  # in one frame, from rest
-GROWTH_LOST_M, GROWTH_LOST_RAD = 0.04, np.radians(8)  # standard deviation added a lost frame
 
 
 def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -36,8 +41,8 @@ def expected(
     turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())
     return MotionPrior(
         predicted,
-        ONSET_M + 0.5 * shift + lost_for * GROWTH_LOST_M,
-        ONSET_RAD + 0.5 * turn + lost_for * GROWTH_LOST_RAD,
+        ONSET_M + ONSET_STEP_SHARE * shift + lost_for * GROWTH_LOST_M,
+        ONSET_RAD + ONSET_STEP_SHARE * turn + lost_for * GROWTH_LOST_RAD,
     )
 
 

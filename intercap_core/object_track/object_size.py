@@ -15,16 +15,16 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.detections.read import Detections
-
-LABELS_TOLD = 8
-SETS = 6  # that are looked at, spread over the recording
-STRIDE = 3  # of the depth pixels
-MIN_POINTS = 8  # of them under a mask
-MIN_SIGHTINGS = 5
-# A mask is smaller than the object where that is seen end on or hidden by a hand, and larger where
-# it also covers the person; most are neither, and a wrong unit is a factor of ten.
-DOUBTFUL = 4.0
-MOST, LEAST = 90, 25  # percentiles of the extents that say how large and how small it may be
+from intercap_core.object_track.constants import (
+    LABELS_TOLD,
+    SIZE_CHECK_MIN_MASKS,
+    SIZE_CHECK_MIN_POINTS,
+    SIZE_CHECK_SETS,
+    SIZE_CHECK_STRIDE,
+    SIZE_DOUBTFUL_RATIO,
+    SIZE_LARGEST_PERCENTILE,
+    SIZE_SMALLEST_PERCENTILE,
+)
 
 
 def label_doubt(detections: Detections, labels: tuple[str, ...]) -> str | None:
@@ -61,14 +61,16 @@ def size_doubt(
     """
     extents = [
         extent
-        for t in np.unique(np.linspace(0, frames.num_sets - 1, SETS).round().astype(int)).tolist()
+        for t in np.unique(
+            np.linspace(0, frames.num_sets - 1, SIZE_CHECK_SETS).round().astype(int)
+        ).tolist()
         for c in range(len(rig))
         for extent in _extents(frames, detections, rig[c], t, c, labels)
     ]
-    if len(extents) < MIN_SIGHTINGS:
+    if len(extents) < SIZE_CHECK_MIN_MASKS:
         return None
-    largest, smallest = np.percentile(extents, [MOST, LEAST])
-    if smallest <= DOUBTFUL * diameter_m and diameter_m <= DOUBTFUL * largest:
+    largest, smallest = np.percentile(extents, [SIZE_LARGEST_PERCENTILE, SIZE_SMALLEST_PERCENTILE])
+    if smallest <= SIZE_DOUBTFUL_RATIO * diameter_m and diameter_m <= SIZE_DOUBTFUL_RATIO * largest:
         return None
     typical = float(np.median(extents))
     word = "large" if diameter_m > typical else "small"
@@ -95,8 +97,8 @@ def _extents(
     depth = frames.depth(t, c)
     if depth is None:
         return []
-    z = depth[::STRIDE, ::STRIDE] * np.float32(1e-3)
-    rays = camera.depth.rays[::STRIDE, ::STRIDE]
+    z = depth[::SIZE_CHECK_STRIDE, ::SIZE_CHECK_STRIDE] * np.float32(1e-3)
+    rays = camera.depth.rays[::SIZE_CHECK_STRIDE, ::SIZE_CHECK_STRIDE]
     valid = (z > 0) & np.isfinite(rays[..., 0])
     local = np.column_stack([rays[valid] * z[valid][:, None], z[valid]])
     points = apply(camera.colour_from_depth, local)
@@ -105,7 +107,7 @@ def _extents(
     for candidate in candidates:
         runs: Runs = candidate.runs
         under = runs.sample(pixels[:, 0], pixels[:, 1])
-        if under.sum() >= MIN_POINTS:
+        if under.sum() >= SIZE_CHECK_MIN_POINTS:
             _, _, width, height = runs.box
             away = float(np.median(points[under, 2]))
             found.append(

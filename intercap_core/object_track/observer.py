@@ -9,24 +9,20 @@ from functools import cached_property, partial
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import ASSESS_MIN_OVERLAP, PASS_ROUNDS, PASS_SCALE
+from intercap_core.object_track.evidence import PoseEvidence, evidence_at
 from intercap_core.object_track.fit import (
-    Evidence,
     Fit,
     MotionPrior,
     assess_all,
-    evidence_at,
     fit_pose,
 )
 from intercap_core.object_track.places import Places
 from intercap_core.object_track.search import plausibility, rank_frames, search
+from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer, open_renderer
-
-PASS_ROUNDS = (3, 3)
-PASS_SCALE = 0.5
-LOOK_OVERLAP = 0.1  # of a candidate that a pose is compared with, before it is fitted
 
 
 @dataclass(eq=False)
@@ -89,7 +85,7 @@ class Observer:
             up=self.up,
             min_overlap=self.settings.min_overlap,
             background_term=self.settings.background_term,
-            worth=partial(self.places.worth, t),
+            place_prior=partial(self.places.prior, t),
             near=near,
             renderer=self.renderer,
         )
@@ -118,7 +114,7 @@ class Observer:
             renderer=self.renderer,
         )
 
-    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> Evidence:
+    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
         """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,)."""
         return evidence_at(
             self.mesh,
@@ -141,7 +137,7 @@ class Observer:
             self.mesh,
             self.views(t),
             poses,
-            min_overlap=LOOK_OVERLAP,
+            min_overlap=ASSESS_MIN_OVERLAP,
             labels=self.labels,
             renderer=self.renderer,
         )
@@ -152,4 +148,4 @@ class Observer:
 
     def value(self, t: int, fit: Fit) -> float:
         """:meth:`plausibility`, less where what is there in frame t is hardly the object."""
-        return self.plausibility(fit) * self.places.worth(t, self.mesh.centre_at(fit.pose))
+        return self.plausibility(fit) * self.places.prior(t, self.mesh.centre_at(fit.pose))

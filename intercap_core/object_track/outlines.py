@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.energy.object_silhouette import rim
-from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.object_track.constants import (
+    OUTLINE_CUT_PX,
+    OUTLINE_DIRECTIONS,
+    OUTLINE_MIN_DEPTH_M,
+)
+from intercap_core.object_track.view import Candidate, View
 from intercap_core.rigid.mesh import ObjectMesh
 
-DIRECTIONS = 16
-CUT_PX = 2  # a silhouette's pixel this close to a person or the image's edge is no end of it
-_ANGLES = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+_ANGLES = 2 * np.pi * np.arange(OUTLINE_DIRECTIONS) / OUTLINE_DIRECTIONS
 _COMPASS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
 
 
@@ -49,12 +52,12 @@ class Outline:
             return None
         reach = rays @ _COMPASS.T
         ends = reach.argmax(0)
-        support = reach[ends, np.arange(DIRECTIONS)]
-        width = support + np.roll(support, DIRECTIONS // 2)
+        support = reach[ends, np.arange(OUTLINE_DIRECTIONS)]
+        width = support + np.roll(support, OUTLINE_DIRECTIONS // 2)
         known = ~_cut(view, candidate, x[ends], y[ends])
         if not known.any():
             return None
-        middle = (support[:, None] * _COMPASS).sum(0) * 2 / DIRECTIONS
+        middle = (support[:, None] * _COMPASS).sum(0) * 2 / OUTLINE_DIRECTIONS
         pose = view.geometry.camera.colour_from_master
         return cls(support, known, middle, float(width.max()), pose)
 
@@ -73,10 +76,10 @@ class Outline:
 def _cut(view: View, candidate: Candidate, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the mask's pixels x, y (N,) lie beside a person or the image's edge."""
     lens = view.geometry.lens
-    cut = (x < CUT_PX) | (y < CUT_PX)
-    cut |= (x >= lens.width - CUT_PX) | (y >= lens.height - CUT_PX)
-    for dx in range(-CUT_PX, CUT_PX + 1):
-        for dy in range(-CUT_PX, CUT_PX + 1):
+    cut = (x < OUTLINE_CUT_PX) | (y < OUTLINE_CUT_PX)
+    cut |= (x >= lens.width - OUTLINE_CUT_PX) | (y >= lens.height - OUTLINE_CUT_PX)
+    for dx in range(-OUTLINE_CUT_PX, OUTLINE_CUT_PX + 1):
+        for dy in range(-OUTLINE_CUT_PX, OUTLINE_CUT_PX + 1):
             other = view.person.sample(x + dx, y + dy)
             cut |= other & ~candidate.mask.sample(x + dx, y + dy)
     return cut
@@ -102,14 +105,14 @@ def residuals(
     turned = pose[:3, :3] @ rotation
     placed = translation @ pose[:3, :3].T + pose[:3, 3]
     points = np.einsum("nij,hj->nhi", turned, hull) + placed[:, None]
-    z = np.maximum(points[..., 2], 0.1)
+    z = np.maximum(points[..., 2], OUTLINE_MIN_DEPTH_M)
     flat = points[..., :2] / z[..., None]
     reach = flat @ _COMPASS.T  # (N, H, D)
     ends = reach.argmax(1)
     number = np.arange(len(rotation))[:, None]
-    distance = np.maximum(placed[:, 2], 0.1)[:, None]
+    distance = np.maximum(placed[:, 2], OUTLINE_MIN_DEPTH_M)[:, None]
     residual = (np.take_along_axis(reach, ends[:, None], 1)[:, 0] - outline.support) * distance
-    towards = np.broadcast_to(_COMPASS, (len(rotation), DIRECTIONS, 2))
+    towards = np.broadcast_to(_COMPASS, (len(rotation), OUTLINE_DIRECTIONS, 2))
     along = -(towards * flat[number, ends]).sum(-1, keepdims=True)
     by_camera = np.concatenate([towards, along], -1) * (distance / z[number, ends])[..., None]
     by_shift = by_camera @ turned

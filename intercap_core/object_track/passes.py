@@ -14,25 +14,23 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.audit import audited
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import JUMP_DEG, JUMP_M, PASSES_AGREE_DEG, PASSES_AGREE_M
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.follow import follow
 from intercap_core.object_track.lost import FrameResult, decided, doubted, judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.seed import annotated_seed, find_seed
+from intercap_core.object_track.view import View
 from intercap_core.object_track.whole import WholeTrack
 from intercap_core.rigid.mesh import ObjectMesh
 
 log = logging.getLogger(__name__)
 
-AGREE_M, AGREE_DEG = 0.02, 10.0
-JUMP_M, JUMP_DEG = 0.15, 45.0
-
 
 @dataclass(frozen=True)
 class Track:
     """All frames (T), the frame that the track started from and how its pose was found:
-    ``borne_out``, whether the images agree with the annotation."""
+    ``borne_out``, whether the images support the annotation."""
 
     frames: list[FrameResult]
     seed_frame: int
@@ -142,7 +140,7 @@ class Tracker:
         apart = np.linalg.norm(
             self._mesh.centre_at(one.fit.pose) - self._mesh.centre_at(two.fit.pose)
         )
-        return bool(apart > AGREE_M or angle > AGREE_DEG)
+        return bool(apart > PASSES_AGREE_M or angle > PASSES_AGREE_DEG)
 
 
 def _better_run(one: list[FrameResult], two: list[FrameResult]) -> list[FrameResult]:

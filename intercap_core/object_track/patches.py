@@ -12,12 +12,10 @@ import numpy as np
 
 from intercap_core.camera.projection_kernels import project_point
 from intercap_core.energy.object_silhouette_kernel import rim
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import OUTSIDE_MASK_WEIGHT, PATCH_MARGIN_M
 from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.object_track.view import View
 from intercap_core.rigid.shots import Rendering
-
-PATCH_MARGIN_M = 0.08  # the pose may move this far before measured points leave the patch
-OUTSIDE_MASK_WEIGHT = 0.3  # of a depth pixel at the rendered depth that the candidate leaves out
 
 
 @dataclass(frozen=True, eq=False)

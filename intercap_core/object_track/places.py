@@ -13,19 +13,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import (
+    ALWAYS_PRESENT,
+    AT_HAND_M,
+    BESIDE_FRAMES,
+    MIN_PLACE_PRIOR,
+    MOVED_PRIOR,
+    NEAREST_QUANTILE,
+    OUT_OF_REACH_M,
+    SAME_PLACE_M,
+    SAME_PLACE_SHARE,
+    SOMETIMES_PRESENT,
+    SURVEYED_FRAMES,
+    SURVEYED_GROUPS,
+)
 from intercap_core.object_track.groups import centre_of, find_groups
+from intercap_core.object_track.view import View
 from intercap_core.rigid.mesh import ObjectMesh
 
-SURVEYED = 12  # frames looked at, spread over the recording
-GROUPS = 6  # of each frame
-SAME_PLACE, SAME_PLACE_M = 0.3, 0.05  # of the diameter: views see now one side, now another
-PRESENT, ABSENT = 0.85, 0.5  # shares of the frames: always there, there for a while only
-AT_HAND_M, FAR_M = 0.10, 0.45  # from the nearest joint to the object, about
-NEAREST = 0.1  # quantile of the frames: a person is not at the object all the time
-MOVED = 0.8  # worth of what was not in this place all the time, wherever the person is
-LEAST = 0.1  # worth of what stands apart all the time
-BESIDE = 2  # frames in which something stands there while the object is elsewhere: another thing
 _BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what the mouth does
 
 
@@ -41,7 +46,7 @@ class Standing:
 
 
 class Places:
-    """What was seen where, and how much it is worth to look there.
+    """What was seen where, and how likely what is there is the object.
 
     ``joints`` (T, K, 3) of the person, NaN unknown, metres, master frame; None where no person is
     known.
@@ -51,9 +56,9 @@ class Places:
         self, mesh: ObjectMesh, standing: list[Standing], joints: np.ndarray | None
     ) -> None:
         self._reach = 0.5 * mesh.radius
-        self._same = SAME_PLACE * mesh.diameter + SAME_PLACE_M
+        self._same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
         self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
-        self._standing = [(s, self._standing_worth(s)) for s in standing]
+        self._standing = [(s, self._standing_prior(s)) for s in standing]
 
     @classmethod
     def survey(
@@ -65,35 +70,35 @@ class Places:
         joints: np.ndarray | None,
     ) -> tuple[Places, list[int]]:
         """Look at a few of ``count`` frames; also those frames, the most promising first."""
-        frames = sorted({int(t) for t in np.linspace(0, count - 1, SURVEYED).round()})
+        frames = sorted({int(t) for t in np.linspace(0, count - 1, SURVEYED_FRAMES).round()})
         seen = []
         for t in frames:
-            groups = find_groups(mesh, load(t), labels, limit=GROUPS)
-            seen.append([(centre_of(g), sum(s.value for s in g)) for g in groups])
-        same = SAME_PLACE * mesh.diameter + SAME_PLACE_M
+            groups = find_groups(mesh, load(t), labels, limit=SURVEYED_GROUPS)
+            seen.append([(centre_of(g), sum(s.label_prior for s in g)) for g in groups])
+        same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
         places = cls(mesh, _clusters(frames, seen, same), joints)
         best = [
-            max((value * places.worth(t, place) for place, value in here), default=0.0)
+            max((value * places.prior(t, place) for place, value in here), default=0.0)
             for t, here in zip(frames, seen, strict=True)
         ]
         order = np.argsort(-np.array(best), kind="stable")
         return places, [frames[i] for i in order if best[i] > 0]
 
-    def worth(self, t: int, place: np.ndarray) -> float:
+    def prior(self, t: int, place: np.ndarray) -> float:
         """How likely what is at ``place`` (3,) in frame t is the object: 0.1 to 1."""
         found = self._nearest(place)
         if found is None:
-            return max(MOVED, _closeness(self._gaps(place, slice(t, t + 1))))
-        standing, worth = found
-        return LEAST if len(standing.beside) >= BESIDE else worth
+            return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
+        standing, place_prior = found
+        return MIN_PLACE_PRIOR if len(standing.beside) >= BESIDE_FRAMES else place_prior
 
     def taken(self, place: np.ndarray) -> bool:
         """Whether another thing stands at ``place`` (3,): the object was elsewhere meanwhile."""
         found = self._nearest(place)
-        return found is not None and len(found[0].beside) >= BESIDE
+        return found is not None and len(found[0].beside) >= BESIDE_FRAMES
 
     def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
-        """What stands at ``place`` (3,) and what it is worth."""
+        """What stands at ``place`` (3,) and its prior."""
         away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
         nearest = int(np.argmin(away)) if away else 0
         return self._standing[nearest] if away and away[nearest] < self._same else None
@@ -101,8 +106,8 @@ class Places:
     def claim(self, place: np.ndarray) -> None:
         """What is at ``place`` (3,) is the object, whoever comes near."""
         self._standing = [
-            (s, worth)
-            for s, worth in self._standing
+            (s, place_prior)
+            for s, place_prior in self._standing
             if np.linalg.norm(s.place - place) >= self._same
         ]
 
@@ -112,10 +117,12 @@ class Places:
             if t in s.frames and np.linalg.norm(s.place - place) >= self._same:
                 s.beside.add(t)
 
-    def _standing_worth(self, standing: Standing) -> float:
+    def _standing_prior(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
-        left = MOVED * min((PRESENT - standing.share) / (PRESENT - ABSENT), 1.0)
-        return max(handled, left, LEAST)
+        left = MOVED_PRIOR * min(
+            (ALWAYS_PRESENT - standing.share) / (ALWAYS_PRESENT - SOMETIMES_PRESENT), 1.0
+        )
+        return max(handled, left, MIN_PLACE_PRIOR)
 
     def _gaps(self, place: np.ndarray, frames: slice) -> np.ndarray:
         """About how far (N,) the person is from an object there, metres, where that is known."""
@@ -128,8 +135,10 @@ class Places:
 
 def _closeness(gaps: np.ndarray) -> float:
     """From the nearest of the gaps (N,), metres: 1 at hand, 0.1 far away or unknown."""
-    gap = float(np.quantile(gaps, NEAREST)) if len(gaps) else np.inf
-    return float(np.clip((FAR_M - gap) / (FAR_M - AT_HAND_M), LEAST, 1.0))
+    gap = float(np.quantile(gaps, NEAREST_QUANTILE)) if len(gaps) else np.inf
+    return float(
+        np.clip((OUT_OF_REACH_M - gap) / (OUT_OF_REACH_M - AT_HAND_M), MIN_PLACE_PRIOR, 1.0)
+    )
 
 
 def _clusters(

@@ -11,18 +11,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.object_track.smooth import Looks, between
-
-LASTING_S = 0.3  # errors of masks last about so long: frames closer than that are one observation
-MOVING = 9.0  # cost of one observation's own pose: six numbers, each to be told from noise
-SEGMENT = 8.0  # cost of one more rest: its pose and where it begins and ends
-MIN_REST_S = 0.25
-MAX_REST = 900  # frames tested against one pose
-LIMIT = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away nothing is tested
-WANDER = (0.5, 2.0)  # bounds of the measured variance of resting estimates, times the stated one
-BLIP = 2  # frames that an object cannot use to go somewhere and come back
-EDGE = 9.0  # squared normalised distance of a rest's first or last frame that has set out
-SAME, APART = 10.0, 25.0  # squared normalised distances of poses that are one, and that are not
+from intercap_core.object_track.constants import (
+    BLIP_APART_SQUARED,
+    BLIP_FRAMES,
+    BLIP_SAME_SQUARED,
+    ERROR_LASTING_S,
+    MAX_REST_FRAMES,
+    MIN_REST_S,
+    MOVING_COST,
+    REST_COST,
+    REST_EDGE_SQUARED,
+    REST_MAX_DISTANCE,
+    REST_VARIANCE_BOUNDS,
+    UNSEEN_MOVING_COST,
+)
+from intercap_core.object_track.smooth import Looks
+from intercap_core.rigid.pose import rotation_exp
+from intercap_core.rigid.twist import step_between
 
 
 def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -34,12 +39,12 @@ def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
     count = len(times)
     own = looks.own
     poses = looks.poses.copy()
-    poses[:, :3, :3] = _turned(own[:, :3]) @ poses[:, :3, :3]
+    poses[:, :3, :3] = rotation_exp(own[:, :3]) @ poses[:, :3, :3]
     poses[:, :3, 3] += own[:, 3:]
     information = _without_blips(poses, looks.information)
     seen = np.trace(information, axis1=1, axis2=2) > 0
-    step = float(np.median(np.diff(times))) if count > 1 else LASTING_S
-    share = min(1.0, step / LASTING_S)
+    step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
+    share = min(1.0, step / ERROR_LASTING_S)
     shortest = max(3, round(MIN_REST_S / step))
     wander = 1.0
     segments = np.full(count, -1)
@@ -47,7 +52,7 @@ def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
         segments, spread = _partition(poses, information, seen, share / wander, share, shortest)
         if spread is None:
             break
-        wander = float(np.clip(wander * spread, *WANDER))
+        wander = float(np.clip(wander * spread, *REST_VARIANCE_BOUNDS))
     information = information / wander
     return _joined(_trimmed(segments, poses, information), poses, information * share, seen)
 
@@ -62,7 +67,7 @@ def _partition(
 ) -> tuple[np.ndarray, float | None]:
     """Segments (T,), and the mean squared residual of a degree of freedom at rest."""
     count = len(poses)
-    moving = np.where(seen, MOVING, 1.0) * share
+    moving = np.where(seen, MOVING_COST, UNSEEN_MOVING_COST) * share
     best_rest, best_move = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     best_rest[0] = best_move[0] = 0.0
     began = np.zeros(count + 1, int)
@@ -74,10 +79,10 @@ def _partition(
             stay, go = best_move[a - 1], best_rest[a - 1]
             best_move[a] = min(stay, go) + moving[a - 1]
             rested_before[a] = go < stay
-        until = min(a + MAX_REST, count)
+        until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        cost = best_move[a] + SEGMENT + 0.5 * weight * spread
+        cost = best_move[a] + REST_COST + 0.5 * weight * spread
         better = (cost < best_rest[ends]) & (ends - a >= shortest)
         best_rest[ends[better]] = cost[better]
         began[ends[better]] = a
@@ -103,9 +108,9 @@ def _partition(
 
 def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Squared normalised distances (L,) of the first 1, 2, ... frames from their common pose."""
-    away = between(np.broadcast_to(poses[0], poses.shape), poses)
+    away = step_between(np.broadcast_to(poses[0], poses.shape), poses)
     away[~seen] = 0
-    far = (np.abs(away) > LIMIT).any(1)
+    far = (np.abs(away) > REST_MAX_DISTANCE).any(1)
     count = int(far.argmax()) if far.any() else len(poses)
     away, information = away[:count], information[:count]
     pulled = np.einsum("tij,tj->ti", information, away)
@@ -122,10 +127,13 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
     result = segments.copy()
     for number in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == number)
-        away = between(poses[rest[[len(rest) // 2]]], poses[rest])
+        away = step_between(poses[rest[[len(rest) // 2]]], poses[rest])
         pull = np.einsum("tij,tj->i", information[rest], away)
         common = np.linalg.solve(information[rest].sum(0) + 1e-9 * np.eye(6), pull)
-        off = np.einsum("ti,tij,tj->t", away - common, information[rest], away - common) > EDGE
+        off = (
+            np.einsum("ti,tij,tj->t", away - common, information[rest], away - common)
+            > REST_EDGE_SQUARED
+        )
         if off.all():
             continue
         inside = np.flatnonzero(~off)
@@ -145,11 +153,11 @@ def _joined(
     number, last = -1, np.zeros(0, int)
     for old in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == old)
-        if len(last) and rest[0] - last[-1] <= BLIP + 1:
+        if len(last) and rest[0] - last[-1] <= BLIP_FRAMES + 1:
             both = np.concatenate([last, rest])
             spreads = [_spread(poses[i], information[i], seen[i]) for i in (both, last, rest)]
             apart = 0.5 * (spreads[0][-1] - spreads[1][-1] - spreads[2][-1])
-            if len(spreads[0]) == len(both) and apart < SEGMENT:
+            if len(spreads[0]) == len(both) and apart < REST_COST:
                 result[last[0] : rest[-1] + 1] = number
                 last = both
                 continue
@@ -161,14 +169,14 @@ def _joined(
 def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
     """The information (T, 6, 6), none where a frame or two are elsewhere between equal ones."""
     result = information.copy()
-    for width in range(1, BLIP + 1):
+    for width in range(1, BLIP_FRAMES + 1):
         inner = np.arange(1, len(poses) - width)
         if not len(inner):
             break
         before, after = inner - 1, inner + width
-        same = _distance(poses, information, before, after) < SAME
+        same = _distance(poses, information, before, after) < BLIP_SAME_SQUARED
         for k in range(width):
-            same &= _distance(poses, information, before, inner + k) > APART
+            same &= _distance(poses, information, before, inner + k) > BLIP_APART_SQUARED
         for k in range(width):
             result[inner[same] + k] = 0
     return result
@@ -176,12 +184,6 @@ def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
 
 def _distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
     """Squared distances (N,) of frames a and b in the evidence of the one that says less."""
-    away = between(poses[a], poses[b])
+    away = step_between(poses[a], poses[b])
     both = [np.einsum("ni,nij,nj->n", away, information[i], away) for i in (a, b)]
     return np.minimum(*both)
-
-
-def _turned(turns: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(turns).as_matrix()

@@ -12,26 +12,32 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.detections.instance import PERSON_LABEL
 from intercap_core.object_track.alignment import align
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.constants import (
+    ASSESS_MIN_OVERLAP,
+    GRID_ROTATIONS,
+    GRID_SPACING_DEG,
+    OWN_TURN_STEPS,
+    SAME_AXIS_COSINE,
+    SAME_POSE_DEG,
+    SAME_POSE_M,
+    SEARCH_COMPARED,
+    SEARCH_FITTED,
+    SEARCH_GOOD_VALUE,
+    SEARCH_MIN_OVERLAP,
+    STANDING_BONUS,
+    STANDING_COSINE,
+    TURNS_FITTED,
+    UPRIGHT_TURNS,
+)
 from intercap_core.object_track.fit import Fit, assess_all, fit_pose
-from intercap_core.object_track.groups import PERSON_LABELS, find_groups
+from intercap_core.object_track.groups import find_groups
+from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer
 from intercap_core.rigid.symmetry import SymmetryGroup
-
-GRID = 240  # rotations of a trivial group: about 40 degrees apart, inside the fit's basin
-UPRIGHT = 24  # turns about the vertical of the standing pose, 15 degrees apart
-COMPARED = 16  # poses rendered after ICP
-FITTED = 6  # poses fitted after rendering
-GOOD_ENOUGH = 0.55  # confidence above which less likely groups are not searched
-NEAR_TURNS = 12  # turns about each axis of the best pose that are compared with it
-TURNS_FITTED = 4
-SAME_AXIS_COSINE = float(np.cos(np.radians(10)))
-STANDING_BONUS = 0.03  # of confidence
-STANDING_COSINE = float(np.cos(np.radians(12)))
-SAME_POSE_M, SAME_POSE_DEG = 0.02, 12.0
 
 
 def search(
@@ -42,7 +48,7 @@ def search(
     up: np.ndarray | None,
     min_overlap: float,
     background_term: bool,
-    worth: Callable[[np.ndarray], float] | None = None,
+    place_prior: Callable[[np.ndarray], float] | None = None,
     near: np.ndarray | None = None,
     renderer: Renderer | None = None,
 ) -> list[Fit]:
@@ -50,12 +56,15 @@ def search(
 
     ``labels`` are the detector classes that the object may be given (empty: any but a person);
     ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
-    ``worth`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near`` (3,)
-    prefers candidates near a place where the object was seen; ``renderer`` draws, None = the CPU.
+    ``place_prior`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near``
+    (3,) prefers candidates near a place where the object was seen; ``renderer`` draws, None = the
+    CPU.
     """
 
     def value(fit: Fit) -> float:
-        return plausibility(fit, up) * (1.0 if worth is None else worth(mesh.centre_at(fit.pose)))
+        return plausibility(fit, up) * (
+            1.0 if place_prior is None else place_prior(mesh.centre_at(fit.pose))
+        )
 
     def fitted(starts: list[Fit]) -> list[Fit]:
         return [
@@ -64,7 +73,7 @@ def search(
                 views,
                 start.pose,
                 prior=None,
-                min_overlap=min(min_overlap, 0.2),
+                min_overlap=min(min_overlap, SEARCH_MIN_OVERLAP),
                 background_term=background_term,
                 labels=labels,
                 renderer=renderer,
@@ -73,23 +82,25 @@ def search(
         ]
 
     def compared(poses: np.ndarray) -> list[Fit]:
-        return assess_all(mesh, views, poses, min_overlap=0.1, labels=labels, renderer=renderer)
+        return assess_all(
+            mesh, views, poses, min_overlap=ASSESS_MIN_OVERLAP, labels=labels, renderer=renderer
+        )
 
-    groups = find_groups(mesh, views, labels, worth, near)
+    groups = find_groups(mesh, views, labels, place_prior, near)
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
     rotations = rotation_grid(mesh.symmetry, up)
     found: list[Fit] = []
     for group in groups:
-        if found and max(map(value, found)) > GOOD_ENOUGH:
+        if found and max(map(value, found)) > SEARCH_GOOD_VALUE:
             break
         poses, residual = align(mesh, field, group, views, rotations)
-        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), COMPARED)
+        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), SEARCH_COMPARED)
         likely = sorted(compared(poses[distinct]), key=lambda fit: -fit.confidence)
-        found += fitted(likely[:FITTED])
+        found += fitted(likely[:SEARCH_FITTED])
     found.sort(key=lambda fit: -value(fit))
     if found and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
-        turned = compared(found[0].pose @ own_turns(mesh, NEAR_TURNS))
+        turned = compared(found[0].pose @ own_turns(mesh, OWN_TURN_STEPS))
         found += fitted(sorted(turned, key=lambda fit: -fit.score)[:TURNS_FITTED])
         found.sort(key=lambda fit: -value(fit))
     kept: list[Fit] = []
@@ -134,7 +145,7 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
     support = np.array(
         [
             sum(
-                any((label in labels) if labels else (label not in PERSON_LABELS) for label in view)
+                any((label in labels) if labels else (label != PERSON_LABEL) for label in view)
                 for view in frame
             )
             for frame in labels_by_view
@@ -169,15 +180,15 @@ def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
     if symmetry.sphere:
         return np.eye(3)[None]
     spread = 2 if symmetry.axis is not None else 1
-    grid = _super_fibonacci(GRID)
+    grid = _super_fibonacci(GRID_ROTATIONS)
     if up is not None:
         turns = Rotation.from_rotvec(
-            np.outer(2 * np.pi * np.arange(UPRIGHT) / UPRIGHT, (0, 0, 1))
+            np.outer(2 * np.pi * np.arange(UPRIGHT_TURNS) / UPRIGHT_TURNS, (0, 0, 1))
         ).as_matrix()
         grid = np.concatenate([_standing(up) @ turns, grid])
     # one of each set of equivalent rotations: those nearest to what was kept already
     kept: list[np.ndarray] = []
-    spacing = 12.0 * spread
+    spacing = GRID_SPACING_DEG * spread
     for rotation in grid:
         if (
             symmetry.trivial

@@ -6,23 +6,24 @@ import logging
 
 import numpy as np
 
+from intercap_core.object_track.constants import (
+    ANNOTATION_FRAMES,
+    CLEARLY_BETTER,
+    FIT_ROUNDS,
+    SEED_RIVAL_FRAMES,
+    SEED_RIVAL_SHARE,
+    SEED_RIVALS,
+    SEED_SEARCHES,
+    SEED_SEARCHES_MAX,
+    SEED_SURE_VALUE,
+)
 from intercap_core.object_track.fit import Fit, MotionPrior
-from intercap_core.object_track.follow import follow, value_to_believe
+from intercap_core.object_track.follow import follow, min_value
 from intercap_core.object_track.lost import judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.search import same_pose
 
 log = logging.getLogger(__name__)
-
-SURE = 0.65  # confidence that is good enough to stop looking for a better seed frame
-SEARCHED = 3  # frames searched for the seed, more while nothing is found
-SEARCHED_MAX = 10
-RIVALS = 5  # hypotheses of the seed frame, compared over its neighbours
-RIVAL_MARGIN = 0.80  # of the best confidence
-RIVAL_FRAMES = 3  # on each side
-ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
-ANNOTATION_ROUNDS = (4, 5)
-CLEARLY_BETTER = 1.15  # of the value, for which another frame or pose is preferred
 
 
 class NotFound(Exception):
@@ -33,18 +34,18 @@ def find_seed(observer: Observer) -> tuple[int, Fit]:
     """The frame to start from and the pose there. Raises NotFound where there is none."""
     seen: list[tuple[int, list[Fit]]] = []
     for tried, t in enumerate(observer.frames_to_search()):
-        if tried >= SEARCHED_MAX or (tried >= SEARCHED and seen):
+        if tried >= SEED_SEARCHES_MAX or (tried >= SEED_SEARCHES and seen):
             break
         found = observer.search(t)
         if found:
             seen.append((t, found))
-            if observer.value(t, found[0]) > SURE:
+            if observer.value(t, found[0]) > SEED_SURE_VALUE:
                 break
     if not seen:
         raise NotFound
     t, found = max(seen, key=lambda one: observer.value(one[0], one[1][0]))
-    if observer.value(t, found[0]) < value_to_believe(observer, t):
-        # nobody is at anything that looks like it: then it is what looks like it most
+    if observer.value(t, found[0]) < min_value(observer, t):
+        # no match near the person: take the best match, wherever it is
         t, fit = max(
             ((t, fit) for t, found in seen for fit in found),
             key=lambda one: observer.plausibility(one[1]),
@@ -57,7 +58,7 @@ def find_seed(observer: Observer) -> tuple[int, Fit]:
 
 def annotated_seed(observer: Observer, frame: int, pose: np.ndarray) -> tuple[int, Fit, bool]:
     """The frame and the pose to start from, near an annotated ``pose`` (4, 4) of ``frame``, and
-    whether the images bear the annotation out.
+    whether the images support the annotation.
 
     Where they do not, the frames beside it are tried, then what a search finds; a pose near the
     annotation that is not lost goes before a better one elsewhere.
@@ -67,10 +68,10 @@ def annotated_seed(observer: Observer, frame: int, pose: np.ndarray) -> tuple[in
     )
     best: tuple[int, Fit] | None = None
     for t in sorted(frames, key=lambda t: abs(t - frame)):
-        fit = observer.fit(t, pose, MotionPrior(pose), rounds=ANNOTATION_ROUNDS, scale=1.0)
+        fit = observer.fit(t, pose, MotionPrior(pose), rounds=FIT_ROUNDS, scale=1.0)
         if best is None or observer.value(t, fit) > CLEARLY_BETTER * observer.value(*best):
             best = (t, fit)
-        if observer.value(*best) > SURE:
+        if observer.value(*best) > SEED_SURE_VALUE:
             return *best, True
     assert best is not None
     t, fit = best
@@ -92,16 +93,16 @@ def annotated_seed(observer: Observer, frame: int, pose: np.ndarray) -> tuple[in
 
 def _settled(observer: Observer, seed_frame: int, found: list[Fit]) -> Fit:
     """The hypothesis that stays best over the neighbouring frames."""
-    least = RIVAL_MARGIN * observer.value(seed_frame, found[0])
-    rivals = [fit for fit in found if observer.value(seed_frame, fit) > least][:RIVALS]
+    least = SEED_RIVAL_SHARE * observer.value(seed_frame, found[0])
+    rivals = [fit for fit in found if observer.value(seed_frame, fit) > least][:SEED_RIVALS]
     if len(rivals) == 1:
         return rivals[0]
     totals = []
     for rival in rivals:
         total = [observer.value(seed_frame, rival)]
         for frames in (
-            range(seed_frame + 1, min(seed_frame + 1 + RIVAL_FRAMES, observer.count)),
-            range(seed_frame - 1, max(seed_frame - 1 - RIVAL_FRAMES, -1), -1),
+            range(seed_frame + 1, min(seed_frame + 1 + SEED_RIVAL_FRAMES, observer.count)),
+            range(seed_frame - 1, max(seed_frame - 1 - SEED_RIVAL_FRAMES, -1), -1),
         ):
             start = judged(rival, observer.settings)
             following = follow(observer, frames, start, may_search=False)

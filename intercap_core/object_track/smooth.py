@@ -13,20 +13,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.spatial.transform import Rotation
 
-from intercap_core.rigid.twist import moved
+from intercap_core.object_track.constants import (
+    ACCELERATION_M_S2,
+    ACCELERATION_RAD_S2,
+    IMPACT_SIGMAS,
+    INVERTED_MARGIN,
+    INVERTED_NODES,
+    OUTLIER_SIGMAS,
+    REST_SAMPLES,
+    SMOOTH_CONVERGED,
+    SMOOTH_MAX_TURN_RAD,
+    SMOOTH_STEPS,
+    UNKNOWN_SIGMA,
+)
+from intercap_core.rigid.pose import rotation_log
+from intercap_core.rigid.twist import moved, step_between
 
-ACCELERATION_M_S2 = 6.0  # of carried objects; a kick is an outlier
-ACCELERATION_RAD_S2 = 20.0
-IMPACT = 3.0  # accelerations beyond so many standard deviations count as an impact
-OUTLIER = 5.0  # evidence this many standard deviations away counts half
-STEPS = 12
-CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
-SAMPLES_AT_REST = 1.0  # independent looks at an object at rest, however long: errors last
-UNKNOWN = np.repeat([np.pi / np.sqrt(3), 1.0], 3)  # standard deviations of what nothing shows
 BAND = 2  # nodes that an acceleration couples to the one before
-INVERTED, MARGIN = 64, 40  # nodes inverted at once, and how far a frame's neighbours matter
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Looks:
     @property
     def own(self) -> np.ndarray:
         """Steps (T, 6) to where each frame's evidence alone would have the object."""
-        damped = self.information + np.diag(UNKNOWN**-2)
+        damped = self.information + np.diag(UNKNOWN_SIGMA**-2)
         return -np.linalg.solve(damped, self.gradient[..., None])[..., 0]
 
 
@@ -74,28 +78,30 @@ def smooth(
     # of the frames of a rest the start is the one that knows most, not a guess
     order = np.lexsort((-np.trace(information, axis1=1, axis2=2), node))
     first = order[np.unique(node[order], return_index=True)[1]]
-    share = np.minimum(1.0, SAMPLES_AT_REST / size)[node]
+    share = np.minimum(1.0, REST_SAMPLES / size)[node]
     state = start.copy()
     state[:, :3, 3] += state[:, :3, :3] @ centre
     state = _without_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
-    for _ in range(STEPS):
-        away = between(looks.poses, state[node])
+    for _ in range(SMOOTH_STEPS):
+        away = step_between(looks.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", away - own, information, away - own)
-        weight = share / (1 + distance / OUTLIER**2) ** 2
+        weight = share / (1 + distance / OUTLIER_SIGMAS**2) ** 2
         bands = np.zeros((BAND + 1, count, 6, 6))
         pull = np.zeros((count, 6))
         np.add.at(bands[0], node, weight[:, None, None] * information)
-        bands[0] += np.diag(UNKNOWN**-2)
+        bands[0] += np.diag(UNKNOWN_SIGMA**-2)
         force = looks.gradient + np.einsum("tij,tj->ti", information, away)
         np.add.at(pull, node, weight[:, None] * force)
-        pull += away[first] * UNKNOWN**-2
+        pull += away[first] * UNKNOWN_SIGMA**-2
         _add_motion(state, node, times, bands, pull)
         matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
         step = -cho_solve_banded((matrix, True), pull.ravel(), check_finite=False).reshape(-1, 6)
-        step /= np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / 0.5)
+        step /= np.maximum(
+            1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / SMOOTH_MAX_TURN_RAD
+        )
         state = moved(state, step)
-        if (np.abs(step) < CONVERGED).all():
+        if (np.abs(step) < SMOOTH_CONVERGED).all():
             break
     covariance = _covariance(_banded(bands), count)[node]
     poses = state[node]
@@ -115,18 +121,18 @@ def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
     if len(poses) < 5:
         return result
     step = np.diff(times)[:, None]
-    rate = between(poses[:-1], poses[1:]) / step
+    rate = step_between(poses[:-1], poses[1:]) / step
     change = 2 * np.diff(rate, axis=0) / (step[1:] + step[:-1])  # of frame t + 1
     for part, limit in ((np.s_[:, :3], ACCELERATION_RAD_S2), (np.s_[:, 3:], ACCELERATION_M_S2)):
         kick = change[part]
         size = np.linalg.norm(kick, axis=1)
         back = -(kick[1:-1] * (kick[:-2] + kick[2:])).sum(1) > 0.5 * size[1:-1] ** 2
-        for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * IMPACT * limit)):
-            past = between(poses[t - 1], poses[t + 1])
+        for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * IMPACT_SIGMAS * limit)):
+            past = step_between(poses[t - 1], poses[t + 1])
             ends = np.diff([rate[t - 2], past / (times[t + 1] - times[t - 1]), rate[t + 1]], axis=0)
             ends = 2 * ends / (times[[t, t + 2]] - times[[t - 2, t]])[:, None]
             # without a wrong frame the motion is smooth; between two places it never is
-            if (np.linalg.norm(ends[part], axis=1) < IMPACT * limit).all():
+            if (np.linalg.norm(ends[part], axis=1) < IMPACT_SIGMAS * limit).all():
                 share = (times[t] - times[t - 1]) / (times[t + 1] - times[t - 1])
                 result[t] = moved(poses[t - 1], share * past)
     return result
@@ -146,8 +152,8 @@ def _add_motion(
     place, turn = state[:, :3, 3], state[:, :3, :3]
     to_b, to_c = turn[b] @ turn[a].transpose(0, 2, 1), turn[c] @ turn[b].transpose(0, 2, 1)
     shift = (place[c] - place[b]) / after - (place[b] - place[a]) / before
-    spin = Rotation.from_matrix(to_c).as_rotvec() / after
-    spin -= Rotation.from_matrix(to_b).as_rotvec() / before
+    spin = rotation_log(to_c) / after
+    spin -= rotation_log(to_b) / before
     residual = np.concatenate(
         [spin / mean / ACCELERATION_RAD_S2, shift / mean / ACCELERATION_M_S2], axis=1
     )
@@ -165,7 +171,7 @@ def _add_motion(
     weight = np.ones_like(residual)
     for part in (np.s_[:, :3], np.s_[:, 3:]):
         size = (residual[part] ** 2).sum(1, keepdims=True)
-        weight[part] = 1 / (1 + size / IMPACT**2)
+        weight[part] = 1 / (1 + size / IMPACT_SIGMAS**2)
     for i, row in enumerate((a, b, c)):
         weighted = parts[i].transpose(0, 2, 1) * weight[:, None]
         np.add.at(pull, row, np.einsum("tij,tj->ti", weighted, residual))
@@ -192,9 +198,9 @@ def _banded(bands: np.ndarray) -> np.ndarray:
 def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
     """Diagonal blocks (N, 6, 6) of the inverse; far frames do not matter to each other."""
     found = np.zeros((count, 6, 6))
-    for start in range(0, count, INVERTED):
-        stop = min(start + INVERTED, count)
-        low, high = max(start - MARGIN, 0), min(stop + MARGIN, count)
+    for start in range(0, count, INVERTED_NODES):
+        stop = min(start + INVERTED_NODES, count)
+        low, high = max(start - INVERTED_MARGIN, 0), min(stop + INVERTED_MARGIN, count)
         part = banded[:, 6 * low : 6 * high].copy()
         for diagonal in range(1, len(part)):
             part[diagonal, part.shape[1] - diagonal :] = 0
@@ -207,14 +213,6 @@ def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
         index = np.arange(stop - start)
         found[start:stop] = blocks[index, :, index]
     return found
-
-
-def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Steps (..., 6) that take poses a to b (..., 4, 4): turn on the left, shift."""
-    turn = b[..., :3, :3] @ np.swapaxes(a[..., :3, :3], -1, -2)
-    shape = turn.shape[:-2]
-    turn = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*shape, 3)
-    return np.concatenate([turn, b[..., :3, 3] - a[..., :3, 3]], axis=-1)
 
 
 def with_turn(arms: np.ndarray) -> np.ndarray:

@@ -14,24 +14,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
+from intercap_core.object_track.constants import (
+    NEAR_TURN_CHANGED_SHARE,
+    NEAR_TURN_DISTINCT_DEG,
+    NEAR_TURN_FAR_M,
+    NEAR_TURN_FAR_SHARE,
+    NEAR_TURN_FINE_RAD,
+    NEAR_TURN_ICP_START,
+    NEAR_TURN_ICP_STEPS,
+    NEAR_TURN_POINT_WEIGHT,
+    NEAR_TURN_POINTS,
+    NEAR_TURN_STEPS,
+    SLIDE_RAD_S,
+    TURN_APART_FACTOR,
+    TURN_BROKEN_COST,
+    TURN_JUMP_COST,
+    TURN_SCORE_SIGMA,
+)
 from intercap_core.object_track.search import own_axes
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
-
-STEPS = 12  # angles of a full turn
-FINE = np.pi / STEPS  # beside no turn, where a slow slide is caught first
-SURFACE_POINTS = 500
-PLACE_STEPS = 8
-PLACE_START = 6.0  # robust scale that placing starts from, over the last
-FAR_M, FAR_SHARE = 0.003, 0.01  # a point moved farther, also of the diameter, could be noticed
-CHANGED = 0.3  # share of such points, below which a turn is hard to see
-DISTINCT_DEG = 45.0  # flips nearer than this are one
-SCORE_SIGMA = 0.01  # of the score's difference from no turn, a key frame
-# To turn the track by a right angle or more takes so much more than to doubt it: images of poses
-# far apart err apart, and for longer than a key frame.
-APART = 2.5
-SLIDE_RAD_S = np.radians(80)  # by which a tracked turn drifts from the true one in a second
-JUMP_COST, BROKEN_COST = 10.0, 1.0  # of any other change: in a sound track, and where it was lost
 
 
 def near_turns(mesh: ObjectMesh) -> np.ndarray:
@@ -45,25 +47,31 @@ def near_turns(mesh: ObjectMesh) -> np.ndarray:
         return found[0][None]
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
     points = _surface(mesh)
-    far = max(FAR_M, FAR_SHARE * mesh.diameter)
-    angles = 2 * np.pi * np.arange(STEPS) / STEPS
+    far = max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
+    angles = 2 * np.pi * np.arange(NEAR_TURN_STEPS) / NEAR_TURN_STEPS
     flips = []
     for axis in own_axes(mesh):
-        half = [_placed(field, points, _about(axis, a), far) for a in angles[: STEPS // 2 + 1]]
+        half = [
+            _placed(field, points, _about(axis, a), far) for a in angles[: NEAR_TURN_STEPS // 2 + 1]
+        ]
         # turned back as much it has moved as much
         placed = half + [(np.linalg.inv(turn), share) for turn, share in half[-2:0:-1]]
         moved = np.array([share for _, share in placed])
-        if moved.max() < CHANGED and mesh.symmetry.axis is None:
-            fine, _ = _placed(field, points, _about(axis, FINE), far)
+        if moved.max() < NEAR_TURN_CHANGED_SHARE and mesh.symmetry.axis is None:
+            fine, _ = _placed(field, points, _about(axis, NEAR_TURN_FINE_RAD), far)
             found += [fine, np.linalg.inv(fine)]
             found += [turn for turn, _ in placed[1:]]
             continue
-        least = (moved <= np.roll(moved, 1)) & (moved <= np.roll(moved, -1)) & (moved < CHANGED)
-        flips += [placed[i][0] for i in range(1, STEPS) if least[i]]
+        least = (
+            (moved <= np.roll(moved, 1))
+            & (moved <= np.roll(moved, -1))
+            & (moved < NEAR_TURN_CHANGED_SHARE)
+        )
+        flips += [placed[i][0] for i in range(1, NEAR_TURN_STEPS) if least[i]]
     kept = found
     for turn in flips:
         known = np.array(kept)[:, :3, :3]
-        if mesh.symmetry.rotation_error_deg(known, turn[:3, :3]).min() > DISTINCT_DEG:
+        if mesh.symmetry.rotation_error_deg(known, turn[:3, :3]).min() > NEAR_TURN_DISTINCT_DEG:
             kept.append(turn)
     return np.array(kept)
 
@@ -81,11 +89,15 @@ def choose_turns(
     usual = max(float(np.nanmedian(scores.max(1))), 1e-6)
     trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
     between = angle_between(turns[:, None], turns[None])
-    sigma = SCORE_SIGMA * (1 + (APART - 1) * np.minimum(between[0] / (np.pi / 2), 1.0))
-    likely = np.nan_to_num((scores - scores[:, :1]) * trust / SCORE_SIGMA)
-    value = likely * SCORE_SIGMA / sigma
+    sigma = TURN_SCORE_SIGMA * (
+        1 + (TURN_APART_FACTOR - 1) * np.minimum(between[0] / (np.pi / 2), 1.0)
+    )
+    likely = np.nan_to_num((scores - scores[:, :1]) * trust / TURN_SCORE_SIGMA)
+    value = likely * TURN_SCORE_SIGMA / sigma
     costs = [
-        np.minimum(0.5 * (between / (SLIDE_RAD_S * gap)) ** 2, BROKEN_COST if gone else JUMP_COST)
+        np.minimum(
+            0.5 * (between / (SLIDE_RAD_S * gap)) ** 2, TURN_BROKEN_COST if gone else TURN_JUMP_COST
+        )
         for gap, gone in zip(gaps, broken, strict=True)
     ]
     best, ahead, came = [value[0]], [likely[0]], []
@@ -122,15 +134,15 @@ def _placed(
     the share of ``points`` (N, 3) that stay farther than ``far``."""
     turned = points @ rotation.T
     shift = points.mean(0) - turned.mean(0)
-    for scale in far * np.geomspace(PLACE_START, 1, PLACE_STEPS):
+    for scale in far * np.geomspace(NEAR_TURN_ICP_START, 1, NEAR_TURN_ICP_STEPS):
         at = turned + shift
         closest = field.closest(at)
         gap = closest.points - at
         weight = 1 / (1 + (gap**2).sum(1) / scale**2) ** 2
         weighted = closest.normals * weight[:, None]
         # point to plane, a little to the point where no plane holds it
-        matrix = weighted.T @ closest.normals + 0.05 * weight.sum() * np.eye(3)
-        pull = weighted.T @ (closest.normals * gap).sum(1) + 0.05 * weight @ gap
+        matrix = weighted.T @ closest.normals + NEAR_TURN_POINT_WEIGHT * weight.sum() * np.eye(3)
+        pull = weighted.T @ (closest.normals * gap).sum(1) + NEAR_TURN_POINT_WEIGHT * weight @ gap
         shift = shift + np.linalg.solve(matrix, pull)
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = rotation, shift
@@ -142,8 +154,8 @@ def _surface(mesh: ObjectMesh) -> np.ndarray:
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
     rng = np.random.default_rng(0)
-    at = (np.arange(SURFACE_POINTS) + 0.5) / SURFACE_POINTS * area[-1]
+    at = (np.arange(NEAR_TURN_POINTS) + 0.5) / NEAR_TURN_POINTS * area[-1]
     face = np.searchsorted(area, at)
-    u, v = rng.random((2, SURFACE_POINTS, 1))
+    u, v = rng.random((2, NEAR_TURN_POINTS, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face]

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 
-from intercap_core.object_track.evidence import View
-
-MAX_BYTES = 800_000_000  # 90 frame sets of six unreduced depth images, 360 of a suitcase's
+from intercap_core.object_track.constants import VIEW_CACHE_BYTES
+from intercap_core.object_track.view import View
 
 
 class ViewCache:
     """Calls ``load(t)`` for the views of frame t, and again only when others took its place."""
 
-    def __init__(self, load: Callable[[int], list[View]], max_bytes: int = MAX_BYTES) -> None:
+    def __init__(
+        self, load: Callable[[int], list[View]], max_bytes: int = VIEW_CACHE_BYTES
+    ) -> None:
         self._load = load
         self._max_bytes = max_bytes
         self._kept: OrderedDict[int, list[View]] = OrderedDict()

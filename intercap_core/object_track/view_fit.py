@@ -5,27 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.energy import object_depth_kernel, object_silhouette_kernel
-from intercap_core.object_track.candidates import MIN_PIXELS, choose, mask_overlap, visible_pixels
-from intercap_core.object_track.evidence import Candidate, View
+from intercap_core.object_track.candidates import choose, mask_overlap, visible_pixels
+from intercap_core.object_track.constants import (
+    CONTOUR_SAMPLES,
+    CONTOUR_SIGMA_PX,
+    CONTOUR_TRUST_MIN,
+    CONTOUR_TRUST_OVERLAP,
+    CONTOUR_TRUST_RANGE,
+    DEPTH_HALF_SAMPLES_PX,
+    DEPTH_SAMPLES,
+    DEPTH_SIGMA_M,
+    FREE_SPACE_M,
+    GATE_SCALES,
+    MIN_CONTOUR_MATCHES,
+    MIN_RENDERED_PX,
+    REPORT_DEPTH_M,
+)
 from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
-from intercap_core.object_track.view_report import (
-    FREE_SPACE_M,
-    ViewReport,
-    depth_agreement,
-    unhidden,
-)
+from intercap_core.object_track.view import Candidate, View
+from intercap_core.object_track.view_report import ViewReport, depth_agreement, unhidden
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.shots import Rendering, Shot
-
-DEPTH_SIGMA_M = 0.005  # of one view: ranging bias and calibration rather than pixel noise
-CONTOUR_SIGMA_PX = 2.0  # of a detector's contour at full resolution
-# A view's pixels err together, so each term of a view counts as few independent samples.
-DEPTH_SAMPLES = 4.0
-CONTOUR_SAMPLES = 3.0
-GATE = 2.5  # correspondences farther than this many robust scales are left out
-MIN_MATCHES = 3  # of a contour
-REPORT_DEPTH_M = 0.1  # a pixel measured farther from the render shows something else
 
 NormalEquations = tuple[np.ndarray, np.ndarray]
 """J'WJ (6, 6) and J'Wr (6,), in units of one standard deviation."""
@@ -43,12 +44,19 @@ def shots_of(view: View, pose: np.ndarray) -> list[Shot]:
 class ViewFit:
     """One view while a pose is fitted: its chosen candidate and the measured points around.
 
-    It looks at one pose at a time, given with its renderings by :meth:`see`, and thus may run
-    beside the other views' on another thread.
+    It looks at one pose at a time, (4, 4) with its renderings: that of the constructor, then those
+    of :meth:`see`. Before :meth:`choose` no candidate counts. It may run beside the other views'
+    on another thread.
     """
 
     def __init__(
-        self, mesh: ObjectMesh, view: View, min_overlap: float, labels: tuple[str, ...]
+        self,
+        mesh: ObjectMesh,
+        view: View,
+        min_overlap: float,
+        labels: tuple[str, ...],
+        pose: np.ndarray,
+        drawn: list[Rendering],
     ) -> None:
         self._mesh = mesh
         self._view = view
@@ -57,6 +65,7 @@ class ViewFit:
         self._candidate: Candidate | None = None
         self._contour_patch: ContourPatch | None = None
         self._depth_patch: DepthPatch | None = None
+        self.see(pose, drawn)
 
     def see(self, pose: np.ndarray, drawn: list[Rendering]) -> None:
         """Look at a pose (4, 4) whose renderings are ``drawn``, in the order of :func:`shots_of`"""
@@ -83,7 +92,9 @@ class ViewFit:
     def _cut(self) -> None:
         mask = self._candidate.mask if self._candidate else EMPTY
         overlap = mask_overlap(self._silhouette, mask, self._view.person)
-        self._contour_trust = float(np.clip((overlap - 0.3) / 0.4, 0.1, 1.0))
+        self._contour_trust = float(
+            np.clip((overlap - CONTOUR_TRUST_OVERLAP) / CONTOUR_TRUST_RANGE, CONTOUR_TRUST_MIN, 1.0)
+        )
         self._contour_patch = self._depth_patch = None
         if self._candidate is not None:
             self._contour_patch = ContourPatch.cut(self._view, mask, self._silhouette)
@@ -115,12 +126,12 @@ class ViewFit:
             self._pose[:3, :3],
             self._pose[:3, 3],
             self._view.geometry.master_from_depth[:3, 3],
-            GATE * scale_m,
+            GATE_SCALES * scale_m,
             scale_m,
         )
-        if count < MIN_PIXELS:
+        if count < MIN_RENDERED_PX:
             return np.zeros((6, 6)), np.zeros(6)
-        samples = DEPTH_SAMPLES * count / (count + 10 * MIN_PIXELS)
+        samples = DEPTH_SAMPLES * count / (count + DEPTH_HALF_SAMPLES_PX)
         weight = samples / count / DEPTH_SIGMA_M**2
         return weight * hessian, weight * gradient
 
@@ -145,8 +156,8 @@ class ViewFit:
             patch.rim,
             patch.starts,
             background,
-            GATE * scale,
-            MIN_PIXELS,
+            GATE_SCALES * scale,
+            MIN_RENDERED_PX,
         )
         measured, lens = self._depth_patch, geometry.depth_lens
         if measured is not None and lens is not None and missed < len(at):
@@ -163,7 +174,7 @@ class ViewFit:
             )
             kept = np.concatenate([np.ones(missed, bool), clear])
             at, target = at[kept], target[kept]
-        if len(at) < MIN_MATCHES:
+        if len(at) < MIN_CONTOUR_MATCHES:
             return nothing
         hessian, gradient, residuals = object_silhouette_kernel.normal_equations(
             at,
@@ -208,7 +219,7 @@ class ViewFit:
             )
             column, row = where.T
             mine = (patch.trust[row, column] == 1.0) & (np.abs(gap) < REPORT_DEPTH_M)
-            if mine.sum() >= MIN_PIXELS:
+            if mine.sum() >= MIN_RENDERED_PX:
                 depth_residual = float(np.median(across[mine]))
             agreement, free = depth_agreement(gap, across, patch.on_person[row, column])
             visible = unhidden(image, visible, free, len(gap))

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.energy import object_depth_kernel
-from intercap_core.object_track.candidates import MIN_PIXELS, choose, mask_overlap, visible_pixels
-from intercap_core.object_track.evidence import View
+from intercap_core.object_track.candidates import choose, mask_overlap, visible_pixels
+from intercap_core.object_track.constants import AGREEMENT_SCALE_M, FREE_SPACE_M, MIN_RENDERED_PX
+from intercap_core.object_track.view import View
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.shots import Rendering
-
-FREE_SPACE_M = 0.03  # measured this much behind the render: known background
-AGREEMENT_SCALE_M = 0.010  # a depth pixel off by this counts half
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ def quick_report(
             FREE_SPACE_M,
             AGREEMENT_SCALE_M,
         )
-        if free >= MIN_PIXELS:
+        if free >= MIN_RENDERED_PX:
             agreement = total / free
         visible = unhidden(silhouette, visible, free, compared)
     number = candidate.index if candidate else -1
@@ -81,7 +79,7 @@ def depth_agreement(
     """
     free = ~on_person & (gap > -FREE_SPACE_M)
     count = int(free.sum())
-    if count < MIN_PIXELS:
+    if count < MIN_RENDERED_PX:
         return float("nan"), count
     scale = AGREEMENT_SCALE_M**2
     return float((scale / (scale + across[free] ** 2)).mean()), count
@@ -90,8 +88,8 @@ def depth_agreement(
 def unhidden(silhouette: Rendering, visible: int, free: int, compared: int) -> int:
     """Pixels of a rendered silhouette that nothing hides: of those that no person's mask covers
     (``visible``) at most the share ``free`` of ``compared`` before which depth finds nothing."""
-    if compared <= MIN_PIXELS:
+    if compared <= MIN_RENDERED_PX:
         return visible
-    if free < MIN_PIXELS:
+    if free < MIN_RENDERED_PX:
         return 0
     return min(visible, round(int(silhouette.mask.sum()) * free / compared))

@@ -7,30 +7,35 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.choices import best_sequence, other_fits, weak_frames
-from intercap_core.object_track.fit import Evidence, Fit, MotionPrior
-from intercap_core.object_track.lost import UNSURE_M, FrameResult, judged
+from intercap_core.object_track.constants import (
+    AMBIGUOUS_PROBABILITY,
+    COMMON_ERROR_VARIANCE,
+    COMMON_TURN_VARIANCE,
+    FOUND_AGAIN_SCORE,
+    FREE_AXIS_SIGMA_RAD,
+    KEY_FRAME_S,
+    MIN_NOISE_VARIANCE,
+    QUITE_DIFFERENT_RAD,
+    RELOOK_MIN_SCORE,
+    REST_FRAMES_SEEN_AGAIN,
+    TURN_MAX_LOSS,
+    UNKNOWN_SIGMA,
+    UNSURE_M,
+)
+from intercap_core.object_track.evidence import PoseEvidence
+from intercap_core.object_track.fit import Fit, MotionPrior
+from intercap_core.object_track.lost import FrameResult, judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
-from intercap_core.object_track.smooth import UNKNOWN, Looks, smooth
+from intercap_core.object_track.smooth import Looks, smooth
 from intercap_core.object_track.turns import angle_between, choose_turns, near_turns
+from intercap_core.rigid.pose import rotation_log
 from intercap_core.rigid.pose_interpolation import bridge_poses
 from intercap_core.rigid.twist import twists
 
-TURNS_EVERY_S = 0.2
-QUITE_DIFFERENT_RAD = np.radians(20)
-DOUBT = 0.35  # probability of quite different turns, from which a frame is ambiguous
-TURN_LOSS = 0.01  # of the score, that a turn may cost a run of frames which others decide
-SAME_ERRORS = 4.0  # variance of what views err together and apart over what they err apart ...
-SAME_TURNS = 1.5  # ... of turns: what all have in common (calibration, large masks) rather shifts
-LEAST_NOISE = 0.05  # variance of the views' errors over the stated one: they cannot know better
-LOOKED_AT = 12  # frames of a rest that are looked at again
-WORSE = 0.97  # of the score, below which a smoothed pose is not where to look again
-FOUND = 0.7  # of the usual score, with which a lost frame is found between its neighbours
-FREE_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
-_TURNS_LESS = np.repeat([np.sqrt(SAME_TURNS / SAME_ERRORS), 1.0], 3)
+_TURNS_LESS = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
 
 
 class WholeTrack:
@@ -49,8 +54,8 @@ class WholeTrack:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
         A lost frame's pose is a guess: it is found again where its neighbours lead to a pose that
-        the images bear out. Where they pull a frame far from what it shows, it is lost unless the
-        images bear that out.
+        the images support. Where they pull a frame far from what it shows, it is lost unless the
+        images support that.
         """
         lost = np.array([frame.lost for frame in frames])
         if lost.all():
@@ -61,7 +66,7 @@ class WholeTrack:
         fits, segment, free_axis, pulled = self._smoothed(fits, lost, spread)
         guessed = lost | pulled
         known = [fit.score for fit, unknown in zip(fits, lost, strict=True) if not unknown]
-        enough = FOUND * float(np.median(known))
+        enough = FOUND_AGAIN_SCORE * float(np.median(known))
         return [
             replace(
                 frame,
@@ -90,8 +95,8 @@ class WholeTrack:
         turns = near_turns(self._mesh)
         if len(turns) == 1:
             return fits, doubt, spread
-        step = float(np.median(np.diff(self._times))) if count > 1 else TURNS_EVERY_S
-        keys = np.arange(0, count, max(1, round(TURNS_EVERY_S / step)))
+        step = float(np.median(np.diff(self._times))) if count > 1 else KEY_FRAME_S
+        keys = np.arange(0, count, max(1, round(KEY_FRAME_S / step)))
         if self._sure is not None:
             keys = np.union1d(keys, self._sure)
         scores = np.full((len(keys), len(turns)), np.nan)
@@ -115,7 +120,7 @@ class WholeTrack:
                 turn = turns[of_frame[run[0]]]
                 found = [self._fit_near(int(t), fits[t].pose @ turn) for t in run]
                 gain = [fit.score - fits[t].score for fit, t in zip(found, run, strict=True)]
-                if np.mean(gain) > -TURN_LOSS:
+                if np.mean(gain) > -TURN_MAX_LOSS:
                     result[run[0] : run[-1] + 1] = found
                 else:
                     of_frame[run] = 0
@@ -123,9 +128,8 @@ class WholeTrack:
         far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
         other = np.where(far[of_frame], probability[nearest], 0.0)
         kept, rivals = turns[of_frame][:, None, :3, :3], turns[None, :, :3, :3]
-        relative = (kept.transpose(0, 1, 3, 2) @ rivals).reshape(-1, 3, 3)
-        away = Rotation.from_matrix(relative).as_rotvec().reshape(*other.shape, 3)
-        doubt = other.sum(1) > DOUBT
+        away = rotation_log(kept.transpose(0, 1, 3, 2) @ rivals)
+        doubt = other.sum(1) > AMBIGUOUS_PROBABILITY
         spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], away, away)
         return result, doubt, spread
 
@@ -173,7 +177,7 @@ class WholeTrack:
         for t in reversed(self._worth_a_look(segment)):  # what was read last is still there
             again = self._observer.evidence(t, track[t], motion[t])
             before = found[t]
-            if before is None or _score(again) >= WORSE * _score(before):
+            if before is None or _score(again) >= RELOOK_MIN_SCORE * _score(before):
                 found[t], looked[t] = again, track[t]
         track, covariance, segment = self._solved(looked, found, track)
         covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
@@ -195,7 +199,7 @@ class WholeTrack:
         return np.linalg.norm(away, axis=-1) > UNSURE_M
 
     def _solved(
-        self, looked: np.ndarray, found: list[Evidence | None], start: np.ndarray
+        self, looked: np.ndarray, found: list[PoseEvidence | None], start: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
         rests."""
@@ -219,7 +223,11 @@ class WholeTrack:
         frames = list(np.flatnonzero(segment < 0))
         for number in range(segment.max(initial=-1) + 1):
             rest = np.flatnonzero(segment == number)
-            some = np.linspace(0, len(rest) - 1, min(LOOKED_AT, len(rest))).round().astype(int)
+            some = (
+                np.linspace(0, len(rest) - 1, min(REST_FRAMES_SEEN_AGAIN, len(rest)))
+                .round()
+                .astype(int)
+            )
             frames += list(rest[some])
         return sorted(map(int, frames))
 
@@ -265,17 +273,17 @@ class WholeTrack:
             steps = self._axes(pose)
             for step in steps:
                 along = step[:3] @ covariance[t][:3, :3] @ step[:3]
-                covariance[t] += np.outer(step, step) * max(UNKNOWN[0] ** 2 - along, 0)
+                covariance[t] += np.outer(step, step) * max(UNKNOWN_SIGMA[0] ** 2 - along, 0)
             if len(steps):
                 axes[t] = steps[0, :3]
                 continue
             variance, vectors = np.linalg.eigh(covariance[t][:3, :3])
-            if variance[-1] > FREE_RAD**2:
+            if variance[-1] > FREE_AXIS_SIGMA_RAD**2:
                 axes[t] = vectors[:, -1]
         return axes
 
 
-def _noise(found: list[Evidence]) -> float:
+def _noise(found: list[PoseEvidence]) -> float:
     """Variance of the evidence over what it states, from how far the views' pulls disagree.
 
     At the minimum each view v of a frame still pulls by g_v; if it errs independently with s^2
@@ -284,15 +292,17 @@ def _noise(found: list[Evidence]) -> float:
     """
     squares = freedom = 0.0
     for evidence in found:
-        total = evidence.information.sum(0) + np.diag(UNKNOWN**-2)
+        total = evidence.information.sum(0) + np.diag(UNKNOWN_SIGMA**-2)
         inverse = np.linalg.inv(total)
         share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
         pull = evidence.gradient
         squares += float(np.einsum("vi,ij,vj->", pull, inverse, pull))
         freedom += float((6 * share * (1 - share)).sum())
     apart = squares / freedom if freedom > 1 else 1.0
-    return SAME_ERRORS * float(np.clip(apart, LEAST_NOISE / SAME_ERRORS, 1.0))
+    return COMMON_ERROR_VARIANCE * float(
+        np.clip(apart, MIN_NOISE_VARIANCE / COMMON_ERROR_VARIANCE, 1.0)
+    )
 
 
-def _score(evidence: Evidence) -> float:
+def _score(evidence: PoseEvidence) -> float:
     return Fit(np.eye(4), np.eye(6), evidence.reports).score

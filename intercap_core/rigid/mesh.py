@@ -15,18 +15,20 @@ import trimesh
 from intercap_core import safe_pickle
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.rigid.constants import (
+    HANDLED_MAX_M,
+    HANDLED_MIN_M,
+    MAX_EXTENT_M,
+    MAX_OPEN_EDGES,
+    MIN_EXTENT_M,
+    MIN_FILLED,
+    SIMPLIFIED_TOLERANCE_M,
+)
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
 
-# Lengths of what people handle; beyond the second pair the file is in another unit.
-LONG_M, SHORT_M = 3.0, 0.02
-MAX_EXTENT_M, MIN_EXTENT_M = 5.0, 0.01
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
-MIN_FILLED = 1e-8  # share of its bounding cube that a body fills; less is a flat sheet
-# Share of edges that do not join two faces: a quarter of a lidless box's of few faces; above the
-# limit the faces are loose, and inside and outside mean nothing.
-MAX_OPEN_EDGES = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +101,7 @@ class ObjectMesh:
         volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
         return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
 
-    def simplified(self, max_faces: int, tolerance_m: float = 0.0005) -> ObjectMesh:
+    def simplified(self, max_faces: int, tolerance_m: float = SIMPLIFIED_TOLERANCE_M) -> ObjectMesh:
         """The same object with about ``max_faces`` faces, for rendering and searching.
 
         Contact vertices are left out (the vertices are others). Returns the mesh itself where it
@@ -193,21 +195,21 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     if extent > MAX_EXTENT_M:
         fitting = [f"{unit} ({scale:g})" for unit, scale in UNITS.items()
-                   if SHORT_M <= extent * scale <= LONG_M]  # fmt: skip
+                   if HANDLED_MIN_M <= extent * scale <= HANDLED_MAX_M]  # fmt: skip
         unit = f"; it looks like {' or '.join(fitting)}" if fitting else ""
         raise UserError(
-            f"{path}: is {extent:.4g} m long, expected {SHORT_M} to {LONG_M:g} m{unit}: scale it "
-            "so that its unit is the metre"
+            f"{path}: is {extent:.4g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
+            f"{unit}: scale it so that its unit is the metre"
         )
     if extent < MIN_EXTENT_M:
         raise UserError(
-            f"{path}: is only {extent:.3g} m long, expected {SHORT_M} to {LONG_M:g} m; scale it so "
-            "that its unit is the metre"
+            f"{path}: is only {extent:.3g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
+            "; scale it so that its unit is the metre"
         )
-    if not SHORT_M <= extent <= LONG_M:
+    if not HANDLED_MIN_M <= extent <= HANDLED_MAX_M:
         log.warning(
             "%s: is %.3g m long; hardly anybody handles what is not %g to %g m, so check its unit",
-            path, extent, SHORT_M, LONG_M,
+            path, extent, HANDLED_MIN_M, HANDLED_MAX_M,
         )  # fmt: skip
 
 

@@ -11,15 +11,9 @@ import numba
 import numpy as np
 
 from intercap_core.camera.projection_kernels import project_point
+from intercap_core.rigid.constants import BEND, BOX_MARGIN_PX, LARGE_PX, NEAR_M, SLACK_PX
 
-NEAR_M = 0.05  # triangles that reach nearer than this are left out: no Kinect images them
 NO_FACE = -1
-BOX_MARGIN_PX = 2  # straight edges between projected corners bend by less in any known lens
-# How far a triangle's edge of L px may bend: L^2 times this over the focal length. Chords between
-# any two pixels of Azure Kinects' colour and depth images need at most 0.135.
-BEND = 0.15
-LARGE_PX = 6.0  # of a triangle from which its edges bound each row
-SLACK_PX = 0.1  # rounding of the ray table and of small windows
 
 
 @numba.njit(cache=True, nogil=True)

@@ -17,12 +17,10 @@ import warp as wp
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.rigid import raster
 from intercap_core.rigid import warp_kernels as kernels
+from intercap_core.rigid.constants import KEPT_ON_DEVICE, VISIBLE_OFFSET_M
 from intercap_core.rigid.normals import vertex_normals
 from intercap_core.rigid.shots import Rendering, Shot, Surface
 from intercap_core.solve.crew import Crew
-
-VISIBLE_OFFSET_M = 0.001  # a vertex is lifted off its own surface before the ray is cast
-_KEPT = 4  # sets of lenses, and meshes, that stay on the device
 
 
 def has_cuda() -> bool:
@@ -129,7 +127,7 @@ class WarpRenderer:
         for known, mesh in self._meshes:
             if known.vertices is surface.vertices and known.faces is surface.faces:
                 return mesh
-        self._meshes = [(surface, _Mesh(surface, self.device)), *self._meshes][:_KEPT]
+        self._meshes = [(surface, _Mesh(surface, self.device)), *self._meshes][:KEPT_ON_DEVICE]
         return self._meshes[0][1]
 
     def _lenses_of(self, shots: Sequence[Shot]) -> tuple[_Lenses, np.ndarray]:
@@ -145,7 +143,7 @@ class WarpRenderer:
             if len(known) == len(wanted) and all(map(lambda a, b: a is b, known, wanted)):
                 return lenses, lens_of
         made = (tuple(wanted), _Lenses(wanted, self.device))
-        self._lenses = [made, *self._lenses][:_KEPT]
+        self._lenses = [made, *self._lenses][:KEPT_ON_DEVICE]
         return made[1], lens_of
 
 

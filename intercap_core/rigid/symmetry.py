@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import Symmetry
-
-MAX_DISCRETE = 128  # elements of the closure; the icosahedron's rotation group has 60
-_SAME = 1e-3  # two transforms nearer than this (per entry) are one: tables carry 4 digits
+from intercap_core.rigid.constants import MAX_DISCRETE, SAME_TRANSFORM
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,7 @@ def _closure(generators: np.ndarray) -> np.ndarray:
     queue = list(generators)
     while queue:
         candidate = queue.pop(0)
-        if any(np.abs(candidate - known).max() < _SAME for known in elements):
+        if any(np.abs(candidate - known).max() < SAME_TRANSFORM for known in elements):
             continue
         elements.append(candidate)
         if len(elements) > MAX_DISCRETE:

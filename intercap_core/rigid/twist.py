@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from intercap_core.rigid.constants import MAX_SPEED_M_S, MAX_TURN_RAD_S
+from intercap_core.rigid.pose import Pose, rotation_log
 from intercap_core.solve.velocity import limited_rate
-
-# A thrown or kicked object; what is faster is a track that jumps.
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
 
 
 def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -19,8 +17,8 @@ def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarra
     """
     if len(poses) < 2:
         return np.zeros((len(poses), 6))
-    turns = Rotation.from_matrix(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1))
-    turn = limited_rate(turns.as_rotvec(), times, max_speed=MAX_TURN_RAD_S, known=known)
+    turns = rotation_log(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1))
+    turn = limited_rate(turns, times, max_speed=MAX_TURN_RAD_S, known=known)
     shifts = np.diff(poses[:, :3, 3], axis=0)
     shift = limited_rate(shifts, times, max_speed=MAX_SPEED_M_S, known=known)
     return np.concatenate([turn, shift], axis=1)
@@ -29,8 +27,9 @@ def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarra
 def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Poses (..., 4, 4) after ``step`` (..., 6): a turn about the origin, from the left, and a
     shift, radians and metres."""
-    result = pose.copy()
-    turn = Rotation.from_rotvec(step[..., :3]).as_matrix()
-    result[..., :3, :3] = turn @ pose[..., :3, :3]
-    result[..., :3, 3] += step[..., 3:]
-    return result
+    return Pose.of(pose).moved(step).matrix
+
+
+def step_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Steps (..., 6) that take poses ``start`` to ``end`` (..., 4, 4): :func:`moved` undone."""
+    return Pose.of(end).step_from(Pose.of(start))

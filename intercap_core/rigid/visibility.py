@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.rigid.constants import VISIBLE_OFFSET_M
 from intercap_core.rigid.normals import vertex_normals
 from intercap_core.rigid.open3d_core import o3d
 
@@ -24,7 +25,7 @@ class OcclusionScene:
         faces: np.ndarray,
         occluders: Sequence[tuple[np.ndarray, np.ndarray]] = (),
         *,
-        offset_m: float = 0.001,
+        offset_m: float = VISIBLE_OFFSET_M,
         threads: int = 0,
     ) -> None:
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)

@@ -5,15 +5,15 @@
 import warp as wp
 
 from intercap_core.camera.projection import MIN_DEPTH_M
-from intercap_core.rigid import raster
+from intercap_core.rigid import constants
 
 wp.config.log_level = wp.LOG_WARNING  # no banner in a job's output
 wp.set_module_options({"enable_backward": False})  # compiles in a third of the time
 
-_NEAR = wp.constant(wp.float64(raster.NEAR_M))
+_NEAR = wp.constant(wp.float64(constants.NEAR_M))
 _MIN_DEPTH = wp.constant(wp.float64(MIN_DEPTH_M))
-_BEND = wp.constant(wp.float64(raster.BEND))
-_SLACK = wp.constant(wp.float64(raster.SLACK_PX))
+_BEND = wp.constant(wp.float64(constants.BEND))
+_SLACK = wp.constant(wp.float64(constants.SLACK_PX))
 EMPTY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 
 

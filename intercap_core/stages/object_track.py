@@ -15,20 +15,21 @@ from intercap_core.capture.frames import Frames
 from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings, digest
 from intercap_core.detections.read import Candidate, Detections
 from intercap_core.errors import UserError
-from intercap_core.object_track.evidence import View, ViewGeometry, distances
+from intercap_core.object_track.constants import (
+    CANDIDATE_MAX_EXTENT,
+    CANDIDATE_MIN_EXTENT,
+    CANDIDATE_SLACK_M,
+    TOLD_SHARE,
+    TRACKING_FACES,
+)
 from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.object_track.passes import Track, Tracker
 from intercap_core.object_track.seed import NotFound
+from intercap_core.object_track.view import View, ViewGeometry, distances
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
 
 log = logging.getLogger(__name__)
-
-MOSTLY = 0.5  # share of the frames from which a track's faults are told
-TRACKING_FACES = 600  # of the mesh that is rendered; kept within 0.5 mm of the full one
-# Extents, of the object's diameter, of a component of the images that may be it: partly hidden, or
-# with something that it touches.
-SMALLEST_EXTENT, LARGEST_EXTENT, SLACK_M = 0.25, 1.4, 0.05
 
 
 class ObjectRecording:
@@ -80,7 +81,10 @@ class ObjectRecording:
 
     def _candidates(self, t: int, c: int) -> list[Candidate]:
         """What may be the object by its size, where that is known."""
-        low, high = SMALLEST_EXTENT * self._diameter_m, LARGEST_EXTENT * self._diameter_m + SLACK_M
+        low, high = (
+            CANDIDATE_MIN_EXTENT * self._diameter_m,
+            CANDIDATE_MAX_EXTENT * self._diameter_m + CANDIDATE_SLACK_M,
+        )
         found = self._detections.candidates(t, c)
         return [one for one in found if not (one.extent_m < low or one.extent_m > high)]
 
@@ -192,7 +196,7 @@ def _tell(track: Track, sequence: str) -> None:
             sequence,
             track.seed_frame,
         )
-    if lost > MOSTLY * count:
+    if lost > TOLD_SHARE * count:
         log.warning(
             "sequence %s: the object is lost in %d of %d frames; check the candidates, or "
             "annotate 'object_pose'",
@@ -200,7 +204,7 @@ def _tell(track: Track, sequence: str) -> None:
             lost,
             count,
         )
-    elif lost + doubtful > MOSTLY * count:
+    elif lost + doubtful > TOLD_SHARE * count:
         log.warning(
             "sequence %s: of %d frames the object is lost in %d, and quite different poses explain "
             "%d alike; annotate 'object_pose' to decide",

@@ -16,7 +16,7 @@ from bench.object_baseline import (
     fit_by_adam,
     rotation_matrix,
 )
-from intercap_core.object_track.evidence import View, ViewGeometry
+from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.rigid.twist import moved

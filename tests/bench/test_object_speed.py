@@ -9,7 +9,7 @@ from bench.object_baseline import Recipe
 from bench.object_clip import ObjectClip
 from bench.object_speed import Run, one_pass, paper, until, whole_track
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.object_track.evidence import View, ViewGeometry
+from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.helpers.object_capture import ObjectCapture
 from tests.rigid.conftest import catalogue

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.camera.masks import encode
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import invert, rigid
-from intercap_core.object_track.evidence import View, ViewGeometry
+from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import render_scene
 from intercap_core.rigid.shots import Drawable, Rendering

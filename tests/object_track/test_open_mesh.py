@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 
 from intercap_core.config import ObjectEntry
-from intercap_core.object_track.evidence import View, ViewGeometry
 from intercap_core.object_track.fit import fit_pose
+from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.helpers.object_capture import ObjectCapture
 from tests.rigid.conftest import catalogue

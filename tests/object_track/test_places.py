@@ -28,32 +28,32 @@ def _joints(place: np.ndarray, count: int) -> np.ndarray:
 def test_what_the_person_is_at_or_what_left_is_the_object(bottle):
     standing = [Standing(HANDLED, 1.0), Standing(APART, 1.0)]
     places = Places(bottle, standing, _joints(HANDLED, 20))
-    assert places.worth(3, HANDLED) == 1.0 and places.worth(3, APART) == 0.1
+    assert places.prior(3, HANDLED) == 1.0 and places.prior(3, APART) == 0.1
     elsewhere = np.array([-1.0, 0.0, 3.0])
-    assert 0.1 < places.worth(3, elsewhere) < 1.0  # something new there moves
+    assert 0.1 < places.prior(3, elsewhere) < 1.0  # something new there moves
     left = Places(bottle, [Standing(HANDLED, 1.0), Standing(APART, 0.4)], None)
-    assert left.worth(3, APART) > left.worth(3, HANDLED)
+    assert left.prior(3, APART) > left.prior(3, HANDLED)
     places.claim(APART)
-    assert places.worth(3, APART) > 0.5
+    assert places.prior(3, APART) > 0.5
 
 
 def test_a_brief_visit_is_not_being_handled(bottle):
     joints = _joints(HANDLED, 40)
     joints[:2, :25] = APART
     places = Places(bottle, [Standing(APART, 1.0)], joints)
-    assert places.worth(3, APART) == 0.1
+    assert places.prior(3, APART) == 0.1
 
 
 def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
     twin = Standing(APART, 0.8, frozenset({8, 12, 16}))
     places = Places(bottle, [twin], _joints(APART, 20))  # the person walks past it
-    assert places.worth(3, APART) == 1.0
+    assert places.prior(3, APART) == 1.0
     places.tracked(8, HANDLED)
     places.tracked(9, HANDLED)  # nobody looked at what stands where in this frame
     places.tracked(12, APART + 0.01)  # the object itself
-    assert places.worth(3, APART) == 1.0
+    assert places.prior(3, APART) == 1.0
     places.tracked(16, HANDLED)
-    assert places.worth(3, APART) == 0.1
+    assert places.prior(3, APART) == 0.1
 
 
 @pytest.mark.parametrize("name", ["tennis_racquet"])
@@ -85,5 +85,5 @@ def test_frames_with_something_that_moves_are_searched_first(bottle):
         joints=capture.joints,
     )  # fmt: skip
     assert sorted(observer.frames_to_search()) == [0, 1, 2]
-    worth = [worth for _, worth in observer.places._standing]
-    assert worth and max(worth) < 0.5, "only the twin is seen, and nobody is there"
+    place_prior = [place_prior for _, place_prior in observer.places._standing]
+    assert place_prior and max(place_prior) < 0.5, "only the twin is seen, and nobody is there"

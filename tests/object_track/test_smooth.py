@@ -187,6 +187,6 @@ def test_a_wrong_frame_does_not_end_a_rest(width: int) -> None:
 
 
 def test_a_long_rest_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("intercap_core.object_track.rest.MAX_REST", 20)
+    monkeypatch.setattr("intercap_core.object_track.rest.MAX_REST_FRAMES", 20)
     true = lifted(60, 58, 59)[:55]
     assert (resting(looks_at(true), np.arange(55) / FPS, CENTRE) == 0).all()

@@ -9,8 +9,8 @@ from intercap_core.camera.masks import encode
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import rigid
 from intercap_core.energy import object_depth, object_silhouette
-from intercap_core.object_track.evidence import ViewGeometry, distances
 from intercap_core.object_track.reduced_mask import decode, reduced_lens
+from intercap_core.object_track.view import ViewGeometry, distances
 from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH
 
 RNG = np.random.default_rng(0)

@@ -7,11 +7,11 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.config import InitialObjectPose, ObjectTrackSettings
 from intercap_core.errors import UserError
-from intercap_core.object_track.evidence import View, ViewGeometry
 from intercap_core.object_track.fit import MotionPrior, assess, assess_all, fit_pose
 from intercap_core.object_track.passes import Tracker
 from intercap_core.object_track.search import rank_frames, rotation_grid, search
 from intercap_core.object_track.seed import NotFound
+from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import CpuRenderer
 from intercap_core.rigid.symmetry import SymmetryGroup

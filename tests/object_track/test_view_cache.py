@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from intercap_core.object_track.evidence import View
 from intercap_core.object_track.reduced_mask import EMPTY
+from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
 
 

@@ -8,9 +8,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings, Symmetry
-from intercap_core.object_track.evidence import View, ViewGeometry
 from intercap_core.object_track.passes import Tracker
 from intercap_core.object_track.turns import near_turns
+from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.symmetry import SymmetryGroup
 from tests.helpers.object_capture import ObjectCapture
