@@ -13,11 +13,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
+from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.constants import (
+    CLOUD_HUBER_M,
+    CONFIDENCE_BINS,
+    FEWEST_IN_BIN,
+    FRAMES_KEPT,
+    FRAMES_POSED,
+    FREE_SPACE_TRUST,
+    HALF_WEIGHT_POINTS,
+    KEYPOINT_SIGMA_M,
+    LARGEST_CONFIDENCE_EXPONENT,
+    LEAST_CONFIDENCE,
+    MAX_SPEED,
+    NOISE_RANGE,
+    PERSISTENCE,
+    SAMPLE_SHARE,
+    SIGMA_RANGE,
+    SMALLEST_SIGMA_PX,
+)
 from intercap_core.body_fit.free_space import seen_through
 from intercap_core.body_fit.observations import Observations, PersonCloud
-from intercap_core.body_fit.problem import BodyProblem, Views
+from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.body_fit.terms import Views
 from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
 from intercap_core.energy.body_cloud import CloudRows, Matches
 from intercap_core.energy.body_keypoints import KeypointSet
@@ -27,43 +46,17 @@ from intercap_core.energy.body_surface import Surface
 from intercap_core.solve.crew import Crew
 from intercap_core.solve.velocity import limited_velocity
 
-# What is left of a keypoint's error in metres once its fixed part is taken out: the start, refined
-# from the residuals themselves.
-_KEYPOINT_SIGMA = (
-    (BODY, 0.02),
-    (LEFT_HAND, 0.01),
-    (RIGHT_HAND, 0.01),
-    (slice(FACE.start, CONTOUR.stop), 0.008),
-)
-_SMALLEST_SIGMA_PX = 1.0
-_PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit do not show
-# Detectors' errors grow as a power of falling confidence, which residuals measure.
-_CONFIDENCE_BINS, _FEWEST_IN_BIN = 6, 30
-_LARGEST_DOUBT = 2.0
-_LEAST_CONFIDENCE = 0.1
-_SIGMA_RANGE = (0.1, 4.0)  # how far the refined sigma may go from the start
-_NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
-# Neighbouring samples stand on the same fold: about four of them make one measurement.
-_SAMPLE_SHARE = 0.25
-_FULL_SAMPLE = 2.0  # points with which a sample counts half
-_HUBER_M = 0.012
-_SEEN_THROUGH_TRUST = 1.0  # of a sample that sticks out of the person, beside a point's
-_VERTEX_CHUNK = 16
-_MOST_KEPT = 256  # frames whose bodies are kept, a quarter of a megabyte each
-# Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
-_MAX_SPEED = 6.0
-
 
 def measured_doubt(confidence: Tensor, error: Tensor) -> float:
     """The power a >= 0 with which errors (M,) grow as confidence (M,) falls: confidence^-a."""
-    bins = torch.tensor_split(confidence.argsort(), _CONFIDENCE_BINS)
-    if len(bins[0]) < _FEWEST_IN_BIN:
+    bins = torch.tensor_split(confidence.argsort(), CONFIDENCE_BINS)
+    if len(bins[0]) < FEWEST_IN_BIN:
         return 0.0
-    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(_LEAST_CONFIDENCE).log()
+    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(LEAST_CONFIDENCE).log()
     y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
     x, y = x - x.mean(), y - y.mean()
     slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
-    return min(max(slope, 0.0), _LARGEST_DOUBT)
+    return min(max(slope, 0.0), LARGEST_CONFIDENCE_EXPONENT)
 
 
 class ViewDistances(NamedTuple):
@@ -116,7 +109,7 @@ class Evidence:
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
         self.usual_confidence = torch.ones_like(self.keypoint_sigma)
-        for part, value in _KEYPOINT_SIGMA:
+        for part, value in KEYPOINT_SIGMA_M:
             self.keypoint_sigma[part] = value
             seen_at = seen.confidence[self.frames, :, part]
             usual = np.median(seen_at[seen_at > 0]) if (seen_at > 0).any() else 1.0
@@ -152,7 +145,7 @@ class Evidence:
         problem.views = Views(
             self._tensor(seen.keypoints[at]),
             confidence,
-            sigma.clamp_min(_SMALLEST_SIGMA_PX),
+            sigma.clamp_min(SMALLEST_SIGMA_PX),
             lenses,
             pose,
             self._shift(points),
@@ -205,13 +198,13 @@ class Evidence:
     def velocity(self, points: Tensor) -> Tensor:
         """(N,...,3) m/s of the usable frames' points (N,...,3)."""
         found = limited_velocity(
-            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=_MAX_SPEED
+            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=MAX_SPEED
         )
         return self._tensor(found)
 
     def _doubted(self, confidence: Tensor, index: Tensor) -> Tensor:
         """Factor (N,C,K) of the sigma of keypoints ``index`` (K,) by their confidence (N,C,K)."""
-        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.usual_confidence[index]
+        share = confidence.clamp_min(LEAST_CONFIDENCE) / self.usual_confidence[index]
         return share ** -self.keypoint_doubt[index]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
@@ -222,15 +215,15 @@ class Evidence:
         scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
         scaled = scaled * self.keypoint_sigma[index, None]
         scaled = scaled * self._doubted(views.confidence, index)[..., None]
-        for part, start in _KEYPOINT_SIGMA:
+        for part, start in KEYPOINT_SIGMA_M:
             here = (index >= part.start) & (index < part.stop)
             known = views.confidence[:, :, here] > 0
             if bool(known.any()):
                 sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
                 self.keypoint_doubt[part] = measured_doubt(sure, off.mean(1))
                 usual = off / self._doubted(views.confidence, index)[:, :, here][known][:, None]
-                found = 1.4826 * _PERSISTENCE * float(usual.median())
-                low, high = (start * factor for factor in _SIGMA_RANGE)
+                found = 1.4826 * PERSISTENCE * float(usual.median())
+                low, high = (start * factor for factor in SIGMA_RANGE)
                 self.keypoint_sigma[part] = min(max(found, low), high)
 
     def refine_cloud_noise(self, problem: BodyProblem) -> None:
@@ -246,7 +239,7 @@ class Evidence:
             known = rows.weight[:, part] > 0
             if bool(known.any()):
                 found = 1.4826 * float(away[:, part][known].median())
-                low, high = (covering.noise * factor for factor in _NOISE_RANGE)
+                low, high = (covering.noise * factor for factor in NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
     def _matched(
@@ -285,7 +278,7 @@ class Evidence:
         # gathered by camera and sample: those that several cameras see tell their offsets
         found = found._replace(sample=cloud.view * size + found.sample)
         found, trust = self._with_seen_through(found, cloud, where, normal, shift)
-        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=_HUBER_M)
+        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=CLOUD_HUBER_M)
         return apart.reshape(views, -1), number.reshape(views, -1), residual
 
     def _with_seen_through(
@@ -312,7 +305,7 @@ class Evidence:
             sample.append(torch.as_tensor(view * size + out, device=where.device))
             distance.append(-self._tensor(away))
         extra = sum(len(part) for part in sample[1:])
-        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), _SEEN_THROUGH_TRUST)])
+        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), FREE_SPACE_TRUST)])
         valid = torch.cat([found.valid, found.valid.new_ones(extra)])
         return Matches(torch.cat(sample), torch.cat(distance), valid), trust
 
@@ -324,9 +317,9 @@ class Evidence:
             return
         self._posed, parts = None, []
         params = self.model.parameters(base)
-        for start in range(0, len(base), _VERTEX_CHUNK):
-            part = (start, *self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK))))
-            if len(base) <= _MOST_KEPT:
+        for start in range(0, len(base), FRAMES_POSED):
+            part = (start, *self.surface.posed(params.frames(slice(start, start + FRAMES_POSED))))
+            if len(base) <= FRAMES_KEPT:
                 parts.append(part)
             yield part
         if parts:
@@ -376,7 +369,7 @@ class Evidence:
         total = points.sum(1)
         mean = (of_views * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
-        share = self.cloud_weight * _SAMPLE_SHARE
-        weight = share * total / (total + _FULL_SAMPLE) / noise**2
+        share = self.cloud_weight * SAMPLE_SHARE
+        weight = share * total / (total + HALF_WEIGHT_POINTS) / noise**2
         target = mean + (normal * where).sum(2)
         return CloudRows(target, normal, weight, mean)

@@ -13,17 +13,17 @@ import torch
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body_fit.bridge import bridge
+from intercap_core.body_fit.constants import (
+    JUMP_M,
+    JUMP_WINDOW_S,
+    RECOVER_TRIALS,
+    RECOVERED_COST_FACTOR,
+    RECOVERED_COST_SLACK,
+)
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.solve.levenberg_marquardt import minimise
 
-# Around a moment hands swing off the straight by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m; fits
-# scatter by less than a tenth of a metre.
-_AROUND_S = 0.21
-JUMP_M = 0.25
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
-_TRIALS = 10
-# What seems to be seen is no worse explained from between the neighbours: then that is the motion.
-_AS_GOOD, _SLACK = 1.2, 5.0
 
 
 def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M) -> np.ndarray:
@@ -34,7 +34,7 @@ def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUM
     """
     result = np.zeros(joints.shape[:2])
     for t, time in enumerate(times):
-        near = np.abs(times - time) <= _AROUND_S
+        near = np.abs(times - time) <= JUMP_WINDOW_S
         half = min(near[:t].sum(), near[t + 1 :].sum())
         if half:
             window = joints[t - half : t + half + 1]
@@ -62,8 +62,8 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     everyone = torch.arange(len(at), device=base.device)
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
-    found = minimise(again, again.own_start(), max_trials=_TRIALS, cost_tolerance=1e-3)
-    kept = found.cost <= _AS_GOOD * before + _SLACK
+    found = minimise(again, again.own_start(), max_trials=RECOVER_TRIALS, cost_tolerance=1e-3)
+    kept = found.cost <= RECOVERED_COST_FACTOR * before + RECOVERED_COST_SLACK
     rows = problem.base[at].clone()
     again.accept(found.own, nothing)
     rows[kept] = again.base[kept]

@@ -150,25 +150,31 @@ def cost(points: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor) -> T
 
 
 def assemble(
-    points: Tensor, by: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor
+    points: Tensor,
+    by: Tensor,
+    by_of_own_limb: Tensor,
+    rows: CloudRows,
+    thickness: Tensor,
+    group: Tensor,
 ) -> CloudTerm:
     """Normal equations of the term.
 
-    points (B,N,3); ``by`` (B,N,n): n . d v / d parameters; thickness (G,) = c0 exp(u), whose
-    derivative by u is itself.
+    points (B,N,3); ``by`` (B,N,n): n . d v / d parameters, for the gradient, and the same with pose
+    blend shapes by the joints of a point's own limb alone, for the Gauss-Newton matrix; thickness
+    (G,) = c0 exp(u), whose derivative by u is itself.
     """
     e = residuals(points, rows, thickness, group)
     weight = rows.weight
-    weighted = by * weight[..., None]
+    weighted = by_of_own_limb * weight[..., None]
     pick = torch.zeros(len(group), len(thickness), dtype=by.dtype, device=by.device)
     pick[torch.arange(len(group)), group] = thickness[group]
     # de/d theta = -by, de/du = -pick
-    gradient = -(weighted * e[..., None]).sum(1)
+    gradient = -(by * (weight * e)[..., None]).sum(1)
     hessian_u = torch.einsum("bn,ng,nh->bgh", weight, pick, pick)
     return CloudTerm(
         0.5 * (weight * e * e).sum(1),
         gradient,
-        weighted.transpose(1, 2) @ by,
+        weighted.transpose(1, 2) @ by_of_own_limb,
         -(weight * e) @ pick,
         weighted.transpose(1, 2) @ pick,
         hessian_u,

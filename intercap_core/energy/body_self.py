@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
@@ -281,7 +282,9 @@ class SelfTerm(NamedTuple):
 def assemble(
     model: BodyModel, params: BodyParameters, pairs: Pairs, index: Tensor, columns: Tensor
 ) -> SelfTerm | None:
-    """Normal equations by the parameters ``columns`` (n,) of the frames ``index`` (b,)."""
+    """Normal equations by the parameters ``columns`` (n,) of the frames ``index`` (b,).
+
+    The gradient knows pose blend shapes, the Gauss-Newton matrix does not."""
     here = pairs.of_frames(index)
     if here is None:
         return None
@@ -293,19 +296,23 @@ def assemble(
         return None
     frame, residual = chosen.frame[active], residual[active]
     # d residual / d parameters = -n . (dp - dq)
-    by_point = linear.full()[..., columns]
-    apart = by_point[frame, chosen.inner[active]] - by_point[frame, chosen.outer[active]]
-    rows = -(chosen.normal[active][:, None] @ apart)[:, 0]
+    inner, outer, normal = chosen.inner[active], chosen.outer[active], chosen.normal[active]
+
+    def rows_of(linear: Linearisation) -> Tensor:
+        by_point = linear.full()[..., columns]
+        return -(normal[:, None] @ (by_point[frame, inner] - by_point[frame, outer]))[:, 0]
+
+    rows, rigid_rows = rows_of(linear), rows_of(linear.with_correctives_of(None))
     robust = geman_mcclure(residual**2, REACH)
     weight = WEIGHT * robust.weight
     count, size = len(present), len(columns)
     total = rows.new_zeros(count).index_add(0, frame, 0.5 * WEIGHT * robust.rho)
-    pull = (weight * residual)[:, None] * rows
-    gradient = rows.new_zeros(count, size).index_add(0, frame, pull)
+    gradients = (weight * residual)[:, None] * rows
+    gradient = rows.new_zeros(count, size).index_add(0, frame, gradients)
     hessian = rows.new_zeros(count, size, size)
     for f in frame.unique().tolist():
         own = frame == f
-        hessian[f] = rows[own].T @ (weight[own, None] * rows[own])
+        hessian[f] = rigid_rows[own].T @ (weight[own, None] * rigid_rows[own])
     return SelfTerm(present, total, gradient, hessian)
 
 

@@ -11,8 +11,9 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body_fit.problem import BodyProblem, Targets
+from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import columns_of
+from intercap_core.body_fit.terms import Targets
 from intercap_core.energy import body_self as term
 from intercap_core.energy.body_keypoints import keypoint_set
 from intercap_core.energy.body_samples import choose_samples
