@@ -33,6 +33,11 @@ from intercap_core.body.skeleton_kernel import RestJoints, pose, rest_points
 from intercap_core.body_fit.constants import KEYPOINT_SCALE
 from intercap_core.body_fit.terms import Bodies, Columns, Observations, Targets, Views
 from intercap_core.energy import body_cloud_kernel, body_keypoints_kernel, body_self
+from intercap_core.energy.body_constants import (
+    SELF_REACH_M,
+    SELF_TOLERANCE_M,
+    SELF_WEIGHT,
+)
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.body_keypoints_kernel import Pieces
 from intercap_core.energy.body_priors_kernel import Priors, add_priors
@@ -332,9 +337,9 @@ class CompiledTerms:
             inner=_array(pairs.inner),
             outer=_array(pairs.outer),
             normal=_array(pairs.normal),
-            tolerance=body_self.TOLERANCE,
-            reach=body_self.REACH,
-            weight=float(observed.self_weight * body_self.WEIGHT),
+            tolerance=SELF_TOLERANCE_M,
+            reach=SELF_REACH_M,
+            weight=float(observed.self_weight * SELF_WEIGHT),
         )
         points = _RestPoints.of(_at_rest(selection, shape), correctives, derivatives)
         return _SelfInputs(compiled, selection, points)

@@ -44,6 +44,7 @@ from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.energy.body_self import SelfContact
 from intercap_core.energy.body_surface import Surface
 from intercap_core.solve.crew import Crew
+from intercap_core.solve.robust import SIGMA_PER_MAD
 from intercap_core.solve.velocity import limited_velocity
 
 
@@ -222,7 +223,7 @@ class Evidence:
                 sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
                 self.keypoint_doubt[part] = measured_doubt(sure, off.mean(1))
                 usual = off / self._doubted(views.confidence, index)[:, :, here][known][:, None]
-                found = 1.4826 * PERSISTENCE * float(usual.median())
+                found = SIGMA_PER_MAD * PERSISTENCE * float(usual.median())
                 low, high = (start * factor for factor in SIGMA_RANGE)
                 self.keypoint_sigma[part] = min(max(found, low), high)
 
@@ -238,7 +239,7 @@ class Evidence:
             part = self.group == g
             known = rows.weight[:, part] > 0
             if bool(known.any()):
-                found = 1.4826 * float(away[:, part][known].median())
+                found = SIGMA_PER_MAD * float(away[:, part][known].median())
                 low, high = (covering.noise * factor for factor in NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 

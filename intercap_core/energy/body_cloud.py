@@ -26,11 +26,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from intercap_core.energy.body_samples import NORMAL_LENGTH
+from intercap_core.energy.body_constants import (
+    MATCH_COSINE,
+    MATCH_SIDEWAYS_M,
+    NORMAL_LENGTH_M,
+)
 from intercap_core.energy.body_surface import Surface
-
-_ASIDE = 0.03  # metres beside the normal's line beyond which a point meets nothing
-_TURNED_AWAY = 0.3  # cosine between the normals of point and vertex below which they do not match
 
 
 class CloudRows(NamedTuple):
@@ -68,8 +69,8 @@ def match(
     """
     v, n = vertices[samples], vertex_normals[samples]
     centre = v.mean(0)
-    ours = torch.cat([v - centre, NORMAL_LENGTH * n], 1)
-    theirs = torch.cat([points - centre, NORMAL_LENGTH * normals], 1)
+    ours = torch.cat([v - centre, NORMAL_LENGTH_M * n], 1)
+    theirs = torch.cat([points - centre, NORMAL_LENGTH_M * normals], 1)
     sample = torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2).argmin(1)
     near = patch[sample]
     gap = points[:, None] - vertices[near]
@@ -79,8 +80,8 @@ def match(
     normal = vertex_normals[at]
     distance = (normal * gap).sum(1)
     sideways = (gap - distance[:, None] * normal).norm(dim=1)
-    valid = ((normal * normals).sum(1) > _TURNED_AWAY) & (distance.abs() < reach)
-    return Matches(sample, distance, valid & (sideways < _ASIDE))
+    valid = ((normal * normals).sum(1) > MATCH_COSINE) & (distance.abs() < reach)
+    return Matches(sample, distance, valid & (sideways < MATCH_SIDEWAYS_M))
 
 
 def match_compiled(
@@ -98,7 +99,7 @@ def match_compiled(
     found = body_match_kernel.match(
         points.to(kind).numpy(), normals.to(kind).numpy(), vertices.numpy(),
         vertex_normals.numpy(), surface.sample, surface.patch, surface.order, surface.groups,
-        vertices.numpy().dtype.type(NORMAL_LENGTH), reach, _ASIDE, _TURNED_AWAY,
+        vertices.numpy().dtype.type(NORMAL_LENGTH_M), reach, MATCH_SIDEWAYS_M, MATCH_COSINE,
     )  # fmt: skip
     return Matches(*map(torch.from_numpy, found))
 
