@@ -65,9 +65,9 @@ def _beyond(start: int, end: int, known: np.ndarray, times: np.ndarray) -> tuple
     at = np.flatnonzero(known)
     earlier, later = times[start] - times[at], times[at] - times[end]
     found = []
-    for frame, away in ((start, earlier), (end, later)):
-        near = (away >= VELOCITY_WINDOW_S[0]) & (away <= VELOCITY_WINDOW_S[1])
-        found.append(int(at[near][away[near].argmin()]) if near.any() else frame)
+    for frame, seconds in ((start, earlier), (end, later)):
+        near = (seconds >= VELOCITY_WINDOW_S[0]) & (seconds <= VELOCITY_WINDOW_S[1])
+        found.append(int(at[near][seconds[near].argmin()]) if near.any() else frame)
     return found[0], found[1]
 
 
@@ -119,7 +119,7 @@ def bridged_sigma(
     """
     result = sigma.copy()
     at = np.flatnonzero(known)
-    away = np.abs(times[:, None] - times[at][None]).min(1)
+    seconds = np.abs(times[:, None] - times[at][None]).min(1)
     speed = _speed(joints, known, times)
     for t in np.flatnonzero(~known):
         ends = np.concatenate([at[at < t][-1:], at[at > t][:1]])
@@ -133,7 +133,7 @@ def bridged_sigma(
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
         if len(tried) < FEWEST_BRIDGES:
-            off = np.minimum(speed * away[t], LARGEST_BRIDGED_SIGMA_M)
+            off = np.minimum(speed * seconds[t], LARGEST_BRIDGED_SIGMA_M)
         else:
             built = np.tensordot(weights[0], [joints[tried + step] for step in steps], 1)
             off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))

@@ -1,4 +1,4 @@
-"""What the observations ask of bodies as they stand: E_J's pixels and E_D's correspondences.
+"""Observations for bodies at their current pose: E_J's pixels and E_D's correspondences.
 
 Set up anew between rounds of the solver, together with how far each kind of observation is trusted.
 """
@@ -61,7 +61,7 @@ def measured_doubt(confidence: Tensor, error: Tensor) -> float:
 
 
 class ViewDistances(NamedTuple):
-    """What the points of each camera say of the samples: their mean distance (N,C,S), metres, and
+    """Each camera's points by sample of the skin: their mean distance (N,C,S), metres, and
     effective number (N,C,S), 0 = none; the samples' normals (N,S,3)."""
 
     distance: Tensor
@@ -119,7 +119,7 @@ class Evidence:
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
 
-    def look(
+    def observe_keypoints(
         self,
         problem: BodyProblem,
         *,
@@ -153,7 +153,7 @@ class Evidence:
         )
 
     def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
-        """Those of the body, and of hands and face where asked for.
+        """Those of the body, and of hands and face where requested.
 
         The jaw line is left out: its landmarks slide over the cheek with the view.
         """
@@ -234,12 +234,14 @@ class Evidence:
         points = self.model.forward(
             self.model.parameters(problem.base), vertex_ids=self.sample_ids
         ).vertices
-        away = body_cloud.residuals(points, rows, problem.thickness_of_group(), self.group).abs()
+        residual = body_cloud.residuals(
+            points, rows, problem.thickness_of_group(), self.group
+        ).abs()
         for g, covering in enumerate(COVERINGS):
             part = self.group == g
             known = rows.weight[:, part] > 0
             if bool(known.any()):
-                found = SIGMA_PER_MAD * float(away[:, part][known].median())
+                found = SIGMA_PER_MAD * float(residual[:, part][known].median())
                 low, high = (covering.noise * factor for factor in NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
@@ -253,7 +255,7 @@ class Evidence:
         expected: Tensor,
         reach: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What the cloud of the t-th frame says of its samples: their mean distance and effective
+        """Matches of the t-th frame's cloud by sample of the skin: mean distance and effective
         number of points by camera (C,S), and the median distance, metres.
 
         vertices and normals (R,3) of the surface; ``where`` (S,3) its samples are, and how far they
@@ -299,12 +301,12 @@ class Evidence:
         for window in cloud.windows:
             view = window.view
             late = where if shift is None else where + shift[view]
-            out, away = seen_through(
+            out, inside = seen_through(
                 window, self.seen.rig[view], float(self.seen.depth_bias[view]),
                 late.cpu().numpy(), outward,
             )  # fmt: skip
             sample.append(torch.as_tensor(view * size + out, device=where.device))
-            distance.append(-self._tensor(away))
+            distance.append(-self._tensor(inside))
         extra = sum(len(part) for part in sample[1:])
         trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), FREE_SPACE_TRUST)])
         valid = torch.cat([found.valid, found.valid.new_ones(extra)])
@@ -312,7 +314,7 @@ class Evidence:
 
     def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Some frames of the bodies ``base`` (N,P) at a time: the first one's place, vertices and
-        normals (b,R,3) of the surface. Those of short sequences are kept for the next look."""
+        normals (b,R,3) of the surface. Those of short sequences are kept for the next call."""
         if self._posed is not None and torch.equal(self._posed[0], base):
             yield from self._posed[1]
             return
@@ -328,7 +330,7 @@ class Evidence:
 
     def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
         """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
-        not asked for."""
+        switched off."""
         if not problem.self_weight:
             return None
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)

@@ -77,8 +77,7 @@ class Layout:
         return torch.cat(parts) if parts else base.new_zeros(0)
 
     def split(self, shared: Tensor, offsets: Tensor, u: Tensor) -> Shared:
-        """What shared parameters (m,) say, and the given offsets (25,3) and u (G,) where they are
-        fixed."""
+        """Shared parameters (m,) by kind, the given offsets (25,3) and u (G,) where fixed."""
         betas = None
         if self.one_shape:
             betas, shared = shared[: self.num_betas], shared[self.num_betas :]

@@ -1,4 +1,4 @@
-"""What the cameras say about the person: keypoints of all frames, and each frame's fused cloud."""
+"""Observations of the person: keypoints of all frames, and each frame's fused cloud."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ class Observations:
         placed = self.placed
         if not placed.any():
             return placed
-        away = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
+        gap = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
-        return placed | ((away <= NEAR_START_S) & (known >= ENOUGH_KEYPOINTS))
+        return placed | ((gap <= NEAR_START_S) & (known >= ENOUGH_KEYPOINTS))
 
 
 # neck, shoulders, mid hip, hips, knees: keypoints that a pose can be started from

@@ -38,7 +38,7 @@ class BodyProblem:
     fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they
     belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
     where ``fit_shared`` says so, else fixed. touching: the body's parts that are inside each other,
-    and the weight of that. pose: what a learned prior says of each frame's pose. terms: by default
+    and the weight of that. pose: a learned prior of each frame's pose. terms: by default
     the quickest form on the device of ``base``.
     """
 

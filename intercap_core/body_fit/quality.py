@@ -1,4 +1,4 @@
-"""Which parts of a fitted body can be believed: determined by what was seen, and not against it."""
+"""Which parts of a fitted body are reliable: determined by observations and in line with them."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def compare(
         weight, good = confidence[:, :, at], whitened[:, :, at] <= scale
         over = (1,) if part.endswith(_JOINTED) else (1, 2)
         share = 1 - (weight * good).sum(over) / weight.sum(over)
-        # an elbow that is right says nothing of a wrist
+        # a correct elbow does not imply a correct wrist
         result.against[:, column] = share if share.ndim == 1 else _worst(share)
         result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
         borne_out = ((weight > 0) & good).sum(1)

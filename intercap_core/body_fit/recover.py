@@ -1,4 +1,5 @@
-"""Frames whose body left the motion of its neighbours: found, and fitted again from between them.
+"""Outliers in time: frames whose body departs from its neighbours' motion are found and refitted,
+starting from an interpolation of the neighbours.
 
 A fit that starts from a wrong triangulation, or an arm that one view cannot place in depth, ends in
 another minimum of the energy, alone among frames that agree.
@@ -52,12 +53,12 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     changed = np.zeros(len(times), bool)
     params = model.parameters(problem.base)
     joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
-    odd = np.asarray((jumps(joints.double().cpu().numpy(), times) > 0).any(1))
-    if not odd.any() or odd.all():
+    jumped = np.asarray((jumps(joints.double().cpu().numpy(), times) > 0).any(1))
+    if not jumped.any() or jumped.all():
         return changed
-    between = bridge(problem.base.double().cpu().numpy(), ~odd, times)
-    at = torch.as_tensor(np.flatnonzero(odd), device=problem.base.device)
-    base = torch.as_tensor(between[odd]).to(problem.base)
+    between = bridge(problem.base.double().cpu().numpy(), ~jumped, times)
+    at = torch.as_tensor(np.flatnonzero(jumped), device=problem.base.device)
+    base = torch.as_tensor(between[jumped]).to(problem.base)
     again = _of_frames(problem, at, base)
     everyone = torch.arange(len(at), device=base.device)
     nothing = base.new_zeros(0)
@@ -69,7 +70,7 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     rows[kept] = again.base[kept]
     problem.base = problem.base.clone()
     problem.base[at] = rows
-    changed[np.flatnonzero(odd)[kept.cpu().numpy()]] = True
+    changed[np.flatnonzero(jumped)[kept.cpu().numpy()]] = True
     return changed
 
 

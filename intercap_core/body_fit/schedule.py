@@ -76,7 +76,7 @@ class Fit:
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
-    """Own parameter columns: trunk and limbs, then hands, jaw and expression where asked for."""
+    """Own parameter columns: trunk and limbs, then hands, jaw and expression where requested."""
     pose = list(range(0, 66))
     if face:
         jaw = 3 * JOINT_INDEX["jaw"]
@@ -128,13 +128,13 @@ class Fitter:
         )  # fmt: skip
         problem.targets = self._lifted()
         for widened in WIDENED if problem.targets else (1.0, 1.0):
-            evidence.look(problem, widened=widened)
+            evidence.observe_keypoints(problem, widened=widened)
             self._minimise(problem, 6)
             evidence.refine_sigma(problem)
         problem.fit_shared = True
         for reach in CLOUD_REACH_M[:2] if evidence.has_cloud else ():
             problem.rows = evidence.match(problem, reach)
-            evidence.look(problem)
+            evidence.observe_keypoints(problem)
             self._minimise(problem, 3)
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
@@ -151,7 +151,7 @@ class Fitter:
                 problem.rows = evidence.match(problem, CLOUD_REACH_M[-1])
             problem.touching = evidence.touch(problem)
             evidence.refine_sigma(problem)
-            evidence.look(problem, hands=hands, face=face)
+            evidence.observe_keypoints(problem, hands=hands, face=face)
             solution = self._minimise(problem, 4, keep_normal=last)
         assert solution.normal is not None
         return self._report(problem, solution.normal.hessian)
@@ -178,7 +178,7 @@ class Fitter:
             problem.rows = self.evidence.match(problem, CLOUD_REACH_M[-1])
         problem.touching = self.evidence.touch(problem)
         self._expect_pose(problem)
-        self.evidence.look(problem, hands=self.settings.hands, face=self.settings.face)
+        self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
         """Median pixel error (N,C) and cloud distance (N,), metres; NaN = nothing seen."""
@@ -243,7 +243,7 @@ class Fitter:
         return solution
 
     def _expect_pose(self, problem: BodyProblem) -> None:
-        """Take what the learned prior, where there is one, says around the problem's poses."""
+        """Linearise the learned pose prior, where there is one, about the problem's poses."""
         if self.pose_prior is not None:
             problem.pose = self.pose_prior.around(problem.base[:, 3:66])
 
@@ -321,7 +321,7 @@ class Fitter:
         problem.columns = columns[~torch.isin(columns, fixed)]
         problem.rows, problem.one_shape, problem.fit_shared = None, False, False
         for widened in WIDENED:
-            self.evidence.look(problem, hands=hands, face=face, widened=widened)
+            self.evidence.observe_keypoints(problem, hands=hands, face=face, widened=widened)
             self._minimise(problem, 6)
-        self.evidence.look(problem, hands=hands, face=face)
+        self.evidence.observe_keypoints(problem, hands=hands, face=face)
         problem.columns, problem.rows, problem.one_shape, problem.fit_shared = kept

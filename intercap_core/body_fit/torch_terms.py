@@ -99,7 +99,7 @@ class KeypointTerm:
         )
 
     def _of_points(self, observed: Observations, keypoints: Keypoints, index: Tensor) -> PointTerm:
-        """What views and targets say about the points, together."""
+        """Cost, gradient and matrix of views and targets by the points, summed."""
         views, targets, terms = observed.views, observed.targets, []
         if views is not None:
             terms.append(

@@ -3,7 +3,7 @@
     E_D = sum over views v, points p of the person's cloud in v of min over visible vertices |v - p|
 
 Here the distance is taken along the surface's normal, to the vertex that is nearest in position and
-in orientation; a vertex can only be met by points whose surface looks the same way, which leaves
+in orientation; a vertex can only be met by points whose surface faces the same way, which leaves
 the vertices that the point's camera sees. The measured surface is clothing and hair, not skin:
 
     e = n . (p - v) - c_g,      c_g = c0_g exp(u_g),   u_g ~ N(0, spread^2)
@@ -35,9 +35,9 @@ from intercap_core.energy.body_surface import Surface
 
 
 class CloudRows(NamedTuple):
-    """What the points say, by sample (B,N): the solver's rows until the next matching.
+    """The points by sample (B,N): the solver's rows until the next matching.
 
-    target (B,N): n . v that the mean of the points asks for, metres; normal (B,N,3); weight (B,N)
+    target (B,N): n . v of the mean of the matched points, metres; normal (B,N,3); weight (B,N)
     1/m^2, 0 = no point; distance (B,N): mean signed distance of the points now, outside positive.
     """
 
@@ -114,11 +114,11 @@ def gather(
 ) -> tuple[Tensor, Tensor]:
     """Mean distance (N,) and number of effective points (N,) of each sample, in one frame.
 
-    trust (M,) of each point; ``expected`` (N,) the covering's thickness at each sample: points away
-    from it by more than ``huber`` metres pull less (iterated once, by Huber's weight).
+    trust (M,) of each point; ``expected`` (N,) the covering's thickness at each sample: points that
+    differ from it by more than ``huber`` metres count less (one iteration of Huber's weight).
     """
-    away = (found.distance - expected[found.sample]).abs()
-    weight = trust * found.valid * (huber / away.clamp_min(huber))
+    excess = (found.distance - expected[found.sample]).abs()
+    weight = trust * found.valid * (huber / excess.clamp_min(huber))
     total = torch.zeros(num_samples, dtype=trust.dtype, device=trust.device)
     total = total.index_add(0, found.sample, weight)
     summed = torch.zeros_like(total).index_add(0, found.sample, weight * found.distance)

@@ -1,7 +1,7 @@
 """The normal equations of :mod:`.body_cloud`, compiled: a limb's samples touch few columns.
 
-Equal to :func:`.body_cloud.assemble` to rounding, but for what :mod:`.correctives_kernel` says
-about pose blend shapes.
+Equal to :func:`.body_cloud.assemble` to rounding, pose blend shapes included: see
+:mod:`.correctives_kernel`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _find_columns(moved_by, place, group, place_u, local, local_u, to):
 def _fill_row(row, local, shape, c, b, i, n, arms, by_shape):
     """Write n . d point i / d parameters of body b by the columns ``local`` (P,); n . point.
 
-    ``shape``: the shape's columns that are asked for, from 0; arms (L,3), by_shape (S,) scratch.
+    ``shape``: the shape's fitted columns, from 0; arms (L,3), by_shape (S,) scratch.
     """
     x0, x1, x2, along = c.rest[b, i, 0], c.rest[b, i, 1], c.rest[b, i, 2], 0.0
     n0, n1, n2 = n

@@ -2,13 +2,13 @@
 
     E_J = sum over views v, keypoints i of k_i w_i^v rho_J( Pi^v(X_i(theta, beta, gamma)) - J_i^v )
 
-with Geman and McClure's rho_J, the detector's confidence w and a fixed trust k = 1 / sigma^2 by
+with Geman and McClure's rho_J, the detector's confidence w and a fixed precision k = 1 / sigma^2 by
 keypoint. X_i is the model's keypoint plus an offset o_i that is fixed in the frame of the bone that
 carries it: detectors and body models mean different points by the same name ("hip"), and that
 difference is the same in every frame. o_i is estimated with a Gaussian prior, see
 :mod:`.body_priors`.
 
-Everything a view says about a keypoint acts through the 3D point, so the views are summed into one
+A view's residuals depend on the body through the 3D point alone, so the views are summed into one
 3 x 3 matrix and one 3-vector for each keypoint before the body's derivatives come in.
 """
 
@@ -135,7 +135,7 @@ def evaluate(
 ) -> Keypoints:
     """Keypoints (B,K,3) of B bodies; offsets (K,3), metres, in the frames of their bones.
 
-    Derivatives, if asked for, are by the chosen ``columns`` (n,) of the parameters, or by all.
+    Derivatives, if requested, are by the chosen ``columns`` (n,) of the parameters, or by all.
     """
     local = rotation_from_axis_angle(params.full_pose())
     still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
@@ -181,16 +181,16 @@ def reprojection(
     scale: float,
     shift: Tensor | None = None,
 ) -> PointTerm:
-    """E_J of points (B,K,3), master frame, seen in C views.
+    """E_J of points (B,K,3), master frame, in C views.
 
-    observed (B,C,K,2) px; confidence (B,C,K), 0 = not seen; sigma (B,C,K) px, the trust; lenses
+    observed (B,C,K,2) px; confidence (B,C,K), 0 = not detected; sigma (B,C,K) px; lenses
     (C,13) as :mod:`projection` takes them; colour_from_master (C,4,4). ``scale``: residuals beyond
     so many sigma stop counting. shift (B,C,K,3), metres: how much farther each point has moved when
     that camera exposes. cost = sum w rho(|r / sigma|^2) / 2.
     """
     rotation, translation = colour_from_master[:, :3, :3], colour_from_master[:, :3, 3]
-    seen = points[:, None] if shift is None else points[:, None] + shift
-    in_camera = seen @ rotation.transpose(1, 2) + translation[:, None]
+    moved = points[:, None] if shift is None else points[:, None] + shift
+    in_camera = moved @ rotation.transpose(1, 2) + translation[:, None]
     pixels, by_point = projection.project_with_jacobian(in_camera, lenses[:, None])
     known = confidence > 0
     residual = torch.where(known[..., None], (pixels - observed) / sigma[..., None], 0)
@@ -213,8 +213,8 @@ def pixel_residuals(
 ) -> Tensor:
     """Projection minus observation (B,C,K,2), px."""
     rotation, translation = colour_from_master[:, :3, :3], colour_from_master[:, :3, 3]
-    seen = points[:, None] if shift is None else points[:, None] + shift
-    in_camera = seen @ rotation.transpose(1, 2) + translation[:, None]
+    moved = points[:, None] if shift is None else points[:, None] + shift
+    in_camera = moved @ rotation.transpose(1, 2) + translation[:, None]
     return projection.project(in_camera, lenses[:, None]) - observed
 
 

@@ -2,8 +2,7 @@
 
 A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
 the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.
-Equal to the plain term to rounding, but for what :mod:`.correctives_kernel` says about pose blend
-shapes.
+Equal to the torch term to rounding, pose blend shapes included: see :mod:`.correctives_kernel`.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ def assemble(
     batch, size = vector.shape
     gradient, hessian = torch.zeros_like(vector), vector.new_zeros(batch, size, size)
     if pose is not None:
-        away = vector[:, _BODY_POSE] - pose.mean
-        gradient[:, _BODY_POSE] += (pose.precision @ away[..., None])[..., 0]
+        difference = vector[:, _BODY_POSE] - pose.mean
+        gradient[:, _BODY_POSE] += (pose.precision @ difference[..., None])[..., 0]
         hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
     for rows, weight in terms(model, vector, body_pose=pose is None):
         rows.add_to(hessian, gradient, weight)

@@ -115,7 +115,7 @@ class SelfContact:
         own = part[samples.vertex]
         factor = np.where(_HINGED[own[:, None], own], JOINED_HINGE_THICKNESSES, JOINED_THICKNESSES)
         joined = factor * (thickness[:, None] + thickness) / 2
-        joined[own[:, None] == own] = 0  # never asked
+        joined[own[:, None] == own] = 0  # parts do not collide with themselves
         apart = _over_the_surface(template, faces, part, samples.vertex, joined) > joined
         apart &= own[:, None] != own
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
@@ -137,7 +137,7 @@ class SelfContact:
 
 
 class Pairs(NamedTuple):
-    """M samples that are inside another part, or nearly, until the next look.
+    """M samples that are inside another part, or nearly, until pairs are found anew.
 
     frame (M,); inner, outer (M,): places in ``vertices`` (U,) of the sample and of the vertex whose
     surface it is behind; normal (M,3) of that surface, outward, master frame.
@@ -215,7 +215,7 @@ def find_plain(
         nearest_distance, nearest = torch.where(looked_at, distance, _FAR).min(1)
         some = nearest_distance < _FAR
         found.append(_behind(contact, near[some], nearest[some], vertices, normals))
-    # what touches in the web between two fingers looks the same way
+    # normals agree where two fingers join: no collision
     facing = (normals[found[1][0]] * normals[found[1][1]]).sum(1) < 0
     found[1] = (found[1][0][facing], found[1][1][facing])
     inner, outer = (torch.cat(part) for part in zip(*found, strict=True))
@@ -349,7 +349,7 @@ def _over_the_surface(
     length = np.linalg.norm(points[vertex[edges[:, 0]]] - points[vertex[edges[:, 1]]], axis=1)
     count = len(vertex)
     graph = scipy.sparse.csr_matrix((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    # who is farther straight on than asked is farther over the surface too
+    # the geodesic distance is no shorter than the Euclidean one
     straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
     farthest = np.where(straight <= limit, limit, 0).max(1)
     found = np.full((count, count), np.inf)

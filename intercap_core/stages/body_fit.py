@@ -69,9 +69,9 @@ def run(
     fit = Fitter(model, seen, clouds, settings, pose_prior).run()
 
     fitted = np.zeros(seen.num_frames, bool)
-    # limbs may be guessed at behind a table: it is the trunk that says whose body this is
+    # limbs may be occluded: only the trunk decides whether this is the subject's body
     believed = quality.trunk_distance(fit.parts) < WRONG_TRUNK_M
-    # one view's keypoints do not say how far away the body is, its points do
+    # one view's keypoints leave the body's depth free, its depth points fix it
     placed = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
     fitted[fit.frames[believed & placed.cpu().numpy()]] = True
     if not fitted.any():
@@ -90,8 +90,8 @@ def run(
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
     sigma = np.zeros((seen.num_frames, 55))
     stated = joint_covariance(model, fit).cpu().numpy()
-    # what has left the motion of its neighbours may well belong among them; where nothing but one
-    # view's pixels holds a limb, any step does
+    # an outlier in time may be a wrong minimum: its sigma is widened; a limb that only one view's
+    # pixels constrain is widened by any departure from the median
     least = np.full_like(sigma, JUMP_M)
     least[fit.frames] *= ~quality.unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)
