@@ -1,12 +1,14 @@
 """Pose blend shapes of chosen points, compiled: the points at rest, and the exact gradient.
 
 A point at rest moves by P vec(R - I), R the 54 local rotations below the root. Terms take the moved
-points, and leave the pull p = dE / dx on each point at rest; then dE/dR = P^T p, and the gradient
-by the parameters follows with dR / d theta_c = skew(J_l e_c) R, J_l the left Jacobian.
+points and write their gradient p = dE / dx by each point at rest; then dE/dR = P^T p, and the
+gradient by the parameters follows with dR / d theta_c = skew(J_l e_c) R, J_l the left Jacobian.
 
-Gauss-Newton's matrices of keypoints and cloud know these derivatives by the joints of a point's own
-limb. Others are left out: they would tie every point to every joint, for the sake of millimetres a
-radian. A minimum is where the gradient is zero, so it stays where it is.
+The Gauss-Newton matrices of keypoints and cloud have these derivatives by the joints of a point's
+own limb (:class:`.selection.Limbs`), that of self-penetration none; the torch terms leave out the
+same. In full they would tie every point to every joint, for millimetres a radian, and assembling
+the normal equations would take 2 times as long for the body alone, 3.5 times with hands and face.
+Minima stay where they are, since the gradient is exact.
 """
 
 from __future__ import annotations
@@ -54,8 +56,8 @@ def features(vectors):
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
-def move(correctives, feature, asked, rest):
-    """Move the points at rest (B,N,3), those that are ``asked`` (B,N) for, by feature (B,486).
+def move(correctives, feature, used, rest):
+    """Move the points at rest (B,N,3), those that are ``used`` (B,N), by feature (B,486).
 
     By hand, as :func:`.skeleton_kernel.rest_points`.
     """
@@ -64,7 +66,7 @@ def move(correctives, feature, asked, rest):
         for b in range(len(rest)):
             by = feature[b]
             for i in range(first, min(first + _TOGETHER, len(ids))):
-                if not asked[b, ids[i]]:
+                if not used[b, ids[i]]:
                     continue
                 t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
                 x = y = z = by[0] * np.float32(0)  # of the same type
@@ -78,14 +80,18 @@ def move(correctives, feature, asked, rest):
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def gather(correctives, pull, by_feature):
-    """Add to by_feature (B,486) what the pull (B,N,3) on points at rest is by the features."""
+def gather(correctives, rest_gradient, by_feature):
+    """Add to by_feature (B,486) the gradient by the features, from rest_gradient (B,N,3)."""
     ids, tables = correctives
     for first in range(0, len(ids), _TOGETHER):
-        for b in range(len(pull)):
+        for b in range(len(rest_gradient)):
             by = by_feature[b]
             for i in range(first, min(first + _TOGETHER, len(ids))):
-                x, y, z = pull[b, ids[i], 0], pull[b, ids[i], 1], pull[b, ids[i], 2]
+                x, y, z = (
+                    rest_gradient[b, ids[i], 0],
+                    rest_gradient[b, ids[i], 1],
+                    rest_gradient[b, ids[i], 2],
+                )
                 if x == 0 and y == 0 and z == 0:
                     continue
                 t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
@@ -94,7 +100,7 @@ def gather(correctives, pull, by_feature):
 
 
 @numba.njit(cache=True, nogil=True)
-def changes(vectors):
+def rotation_derivatives(vectors):
     """d R / d axis-angle, (B,54,3,9) by axis and number of the rotation, at (B,P) parameters."""
     out = np.empty((len(vectors), NUM_FEATURES // 9, 3, 9), vectors.dtype)
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
@@ -115,29 +121,30 @@ def changes(vectors):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_gradient(change, by_feature, place, gradient):
+def add_gradient(by_pose, by_feature, place, gradient):
     """Add a gradient by the features (B,486) to that by the parameters (B,n).
 
-    change (B,54,3,9) of :func:`changes`; ``place`` (P,): each parameter's column, -1 = fixed.
+    by_pose (B,54,3,9) of :func:`rotation_derivatives`; ``place`` (P,): each parameter's column,
+    -1 = fixed.
     """
-    for b in range(len(change)):
-        for joint in range(change.shape[1]):
+    for b in range(len(by_pose)):
+        for joint in range(by_pose.shape[1]):
             for d in range(3):
                 q = place[_FIRST + 3 * joint + d]
                 if q >= 0:
                     for k in range(9):
-                        gradient[b, q] += change[b, joint, d, k] * by_feature[b, 9 * joint + k]
+                        gradient[b, q] += by_pose[b, joint, d, k] * by_feature[b, 9 * joint + k]
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def add_to_row(row, local, joints, t, table, change):
-    """Add what the correctives of one point change by ``joints`` to its row of derivatives.
+def add_to_row(row, local, joints, t, table, by_pose):
+    """Add to a point's row of derivatives what its correctives change by ``joints``.
 
-    t (3,): the row's direction turned back to the point at rest; table (3,486); change (54,3,9);
+    t (3,): the row's direction turned back to the point at rest; table (3,486); by_pose (54,3,9);
     ``local`` (P,): each parameter's place in the row, -1 = not there.
     """
     for joint in joints:
-        first, by = 9 * (joint - 1), change[joint - 1]
+        first, by = 9 * (joint - 1), by_pose[joint - 1]
         s0 = s1 = s2 = t[0] * np.float32(0)  # of the same type
         for k in range(9):
             along = (

@@ -9,8 +9,9 @@ blended rotation; pose blend shapes add T P d R_k / d theta_k.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,6 +82,14 @@ class Linearisation:
     def joints(self) -> Tensor:
         """(B,55,3); empty if the joints were not asked for."""
         return self.points[:, self.selection.num_vertices :]
+
+    def with_correctives_of(self, joints: np.ndarray | None) -> Linearisation:
+        """The same, with pose blend shapes by the flagged ``joints`` (N,55) of each point alone;
+        None: by no joint."""
+        if self.correctives is None or joints is None:
+            return replace(self, correctives=None)
+        flags = torch.as_tensor(joints[:, 1:], device=self.points.device)
+        return replace(self, correctives=self.correctives * flags[:, None, :, None])
 
     def full(self) -> Tensor:
         """(B,N,3,P): every derivative, mostly zeros; for few points."""

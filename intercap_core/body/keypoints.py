@@ -1,7 +1,7 @@
 """The 135 keypoints that detectors give, as fixed linear combinations of vertices and joints.
 
 Order: OpenPose body 25, left hand 21, right hand 21, face 51 (dlib 17 to 67), jaw line 17 (dlib 0
-to 16, taken for a head seen from the front; as a camera sees it: `contour`).
+to 16, of a head seen from the front).
 """
 
 from __future__ import annotations

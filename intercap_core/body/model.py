@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.contour import FaceContour, contour_rows
 from intercap_core.body.jacobian import Linearisation, linearise, shaped_points
-from intercap_core.body.joints import JOINT_INDEX, PARENTS
-from intercap_core.body.keypoints import CONTOUR, KeypointMap, keypoint_map
+from intercap_core.body.joints import PARENTS
+from intercap_core.body.keypoints import KeypointMap, keypoint_map
 from intercap_core.body.kinematics import (
     PosedJoints,
     pose_joints,
@@ -62,9 +61,8 @@ class BodyModel:
 
     faces (F,3) int64. parents: of each joint, -1 for the pelvis. hand_mean (2,45) and
     hand_components (2,H,45), left then right: axis-angle = mean + coefficients @ components;
-    hand_deviation (2,H): usual size of each coefficient. keypoint_map, contour (the jaw line from
-    every side), regions (name to vertex ids), markers (81,) LEMO's marker vertices by
-    `marker_names`.
+    hand_deviation (2,H): usual size of each coefficient. keypoint_map, regions (name to vertex
+    ids), markers (81,) LEMO's marker vertices by `marker_names`.
     """
 
     marker_names = MARKER_NAMES
@@ -106,9 +104,6 @@ class BodyModel:
             file.contour_barycentric[0],
         )
         self._keypoint_matrix = tensor(self.keypoint_map.matrix)
-        self.contour = FaceContour.build(
-            file.faces, file.contour_faces, file.contour_barycentric, device, dtype
-        )
         self.markers = maps.markers
         self.regions = maps.regions or _regions(file, rest_joints)
         self._selections: OrderedDict[bytes, Selection] = OrderedDict()
@@ -239,47 +234,6 @@ class BodyModel:
     def keypoints_of(self, params: BodyParameters) -> Tensor:
         """(B,135,3), evaluating only the vertices that keypoints use."""
         return self.keypoints(self.forward(params, vertex_ids=self.keypoint_map.vertex_ids))
-
-    def keypoint_jacobian(self, params: BodyParameters) -> tuple[Tensor, Tensor]:
-        """Keypoints (B,135,3) and their derivatives (B,135,3,P)."""
-        lin = self.linearise(params, vertex_ids=self.keypoint_map.vertex_ids, joints=True)
-        full = lin.full()
-        batch = full.shape[0]
-        mixed = self._keypoint_matrix @ full.reshape(batch, full.shape[1], -1)
-        return self._keypoint_matrix @ lin.points, mixed.reshape(batch, -1, *full.shape[2:])
-
-    def keypoints_by_view(self, params: BodyParameters, camera_from_master: Tensor) -> Tensor:
-        """(B,C,135,3), master frame: keypoints as cameras (C,3,3) or (C,4,4) see them.
-
-        They differ in the jaw line alone, which follows the head's yaw in each view. Bodies are in
-        the master frame.
-        """
-        views = len(camera_from_master)
-        points = self.keypoints_of(params)[:, None].repeat(1, views, 1, 1)
-        vertices = self.forward(params, vertex_ids=self.contour.vertex_ids).vertices
-        rows = self.contour_rows(params, camera_from_master)
-        points[:, :, CONTOUR] = self.contour.mix(vertices, rows)
-        return points
-
-    def contour_jacobian(
-        self, params: BodyParameters, camera_from_master: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Jaw lines (B,C,17,3) in those cameras and their derivatives (B,C,17,3,P), rows held."""
-        rows = self.contour_rows(params, camera_from_master)
-        lin = self.linearise(params, vertex_ids=self.contour.vertex_ids)
-        return self.contour.mix(lin.points, rows), self.contour.mix(lin.full(), rows)
-
-    def contour_rows(self, params: BodyParameters, camera_from_master: Tensor) -> Tensor:
-        """(B,C) rows of `contour` for cameras (C,3,3) or (C,4,4); see there.
-
-        The head's own turn counts with the neck's: the face hangs on the head (smplx stops at the
-        neck, which on FLAME carries the face).
-        """
-        with torch.no_grad():
-            local = rotation_from_axis_angle(params.full_pose())
-            still = local.new_zeros(local.shape[0], len(PARENTS), 3)
-            head = pose_joints(still, local, still[:, 0]).rotations[:, JOINT_INDEX["head"]]
-            return contour_rows(head, camera_from_master[:, :3, :3].to(head))
 
     def _select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool) -> Selection:
         """The selection for these vertices; the last few are kept."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,6 +30,24 @@ class Block:
 
     rows: Tensor
     joints: Tensor
+
+
+class Limbs(NamedTuple):
+    """N points by limb: those that hang on nearly the same joints.
+
+    order (N,): points, limb by limb; starts (L+1,): where each limb starts in it, and the end;
+    moved_by (L,55) bool: the joints that move any point of a limb.
+    """
+
+    order: np.ndarray
+    starts: np.ndarray
+    moved_by: np.ndarray
+
+    def moved_by_point(self) -> np.ndarray:
+        """(N,55) bool: the joints of each point's own limb."""
+        flags = np.zeros((len(self.order), NUM_JOINTS), bool)
+        flags[self.order] = self.moved_by.repeat(np.diff(self.starts), 0)
+        return flags
 
 
 @dataclass(frozen=True)
@@ -54,14 +73,13 @@ class Selection:
     num_vertices: int
 
     @cached_property
-    def limbs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The blocks as arrays: points (N,) block by block, where each starts and the last ends,
-        and which of the 55 joints move each, bool."""
+    def limbs(self) -> Limbs:
+        """The blocks as arrays."""
         rows = [block.rows.cpu().numpy() for block in self.blocks]
         moved_by = np.zeros((len(rows), NUM_JOINTS), bool)
         for block, flags in zip(self.blocks, moved_by, strict=True):
             flags[block.joints.cpu().numpy()] = True
-        return np.concatenate(rows), np.cumsum([0, *map(len, rows)]), moved_by
+        return Limbs(np.concatenate(rows), np.cumsum([0, *map(len, rows)]), moved_by)
 
 
 _IS_ANCESTOR = np.zeros((NUM_JOINTS, NUM_JOINTS), bool)  # [joint, ancestor or itself]

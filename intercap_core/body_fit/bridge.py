@@ -8,17 +8,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.parameters import NUM_POSE
-
-_FEWEST_BRIDGES = 5  # built where the truth is known, to tell how far off one is
-_WALKING, _STANDING = 1.0, 0.1  # m/s: where nothing is known of the speed; people sway
-_LARGEST_SIGMA = 0.5  # m, an arm's length
-# A velocity is that to the nearest known frame between these, seconds: nearer ones show the fit's
-# noise, farther ones another motion.
-_VELOCITY_S = (0.045, 0.15)
-# How much of it is believed over the mean velocity of the bridge, which noise does not disturb. On
-# hidden stretches of 1 to 15 frames at 15 a second anything from 0.7 to 1 is best.
-_BELIEVED = 0.85
-_BELIEVED_FOR_S = 1.0  # over longer bridges, of which this is not known, it fades
+from intercap_core.body_fit.constants import (
+    FEWEST_BRIDGES,
+    LARGEST_BRIDGED_SIGMA_M,
+    STANDING_SPEED,
+    VELOCITY_WEIGHT,
+    VELOCITY_WEIGHT_UNTIL_S,
+    VELOCITY_WINDOW_S,
+    WALKING_SPEED,
+)
 
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -67,9 +65,9 @@ def _beyond(start: int, end: int, known: np.ndarray, times: np.ndarray) -> tuple
     at = np.flatnonzero(known)
     earlier, later = times[start] - times[at], times[at] - times[end]
     found = []
-    for frame, away in ((start, earlier), (end, later)):
-        near = (away >= _VELOCITY_S[0]) & (away <= _VELOCITY_S[1])
-        found.append(int(at[near][away[near].argmin()]) if near.any() else frame)
+    for frame, seconds in ((start, earlier), (end, later)):
+        near = (seconds >= VELOCITY_WINDOW_S[0]) & (seconds <= VELOCITY_WINDOW_S[1])
+        found.append(int(at[near][seconds[near].argmin()]) if near.any() else frame)
     return found[0], found[1]
 
 
@@ -84,7 +82,7 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
         slopes[0] = np.array([1.0, 0.0, -1.0, 0.0]) / (knots[0] - knots[2])
     if knots[3] > knots[1]:
         slopes[1] = np.array([0.0, -1.0, 0.0, 1.0]) / (knots[3] - knots[1])
-    believed = _BELIEVED * min(1.0, _BELIEVED_FOR_S / length)
+    believed = VELOCITY_WEIGHT * min(1.0, VELOCITY_WEIGHT_UNTIL_S / length)
     first, last = (mean + believed * (slope - mean) for slope in slopes)
     rise = s**2 * (3 - 2 * s)
     ends = np.concatenate([1 - rise, rise, np.zeros_like(s), np.zeros_like(s)], 1)
@@ -121,7 +119,7 @@ def bridged_sigma(
     """
     result = sigma.copy()
     at = np.flatnonzero(known)
-    away = np.abs(times[:, None] - times[at][None]).min(1)
+    seconds = np.abs(times[:, None] - times[at][None]).min(1)
     speed = _speed(joints, known, times)
     for t in np.flatnonzero(~known):
         ends = np.concatenate([at[at < t][-1:], at[at > t][:1]])
@@ -134,8 +132,8 @@ def bridged_sigma(
         steps = knots - t
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
-        if len(tried) < _FEWEST_BRIDGES:
-            off = np.minimum(speed * away[t], _LARGEST_SIGMA)
+        if len(tried) < FEWEST_BRIDGES:
+            off = np.minimum(speed * seconds[t], LARGEST_BRIDGED_SIGMA_M)
         else:
             built = np.tensordot(weights[0], [joints[tried + step] for step in steps], 1)
             off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))
@@ -146,7 +144,7 @@ def bridged_sigma(
 def _speed(joints: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Usual speed (J,) along one coordinate, m/s, between neighbouring known frames."""
     pairs = np.flatnonzero(known[1:] & known[:-1])
-    if len(pairs) < _FEWEST_BRIDGES:
-        return np.full(joints.shape[1], _WALKING)
+    if len(pairs) < FEWEST_BRIDGES:
+        return np.full(joints.shape[1], WALKING_SPEED)
     moved = (joints[pairs + 1] - joints[pairs]) / np.diff(times)[pairs, None, None]
-    return np.maximum(np.sqrt((moved**2).mean((0, 2))), _STANDING)
+    return np.maximum(np.sqrt((moved**2).mean((0, 2))), STANDING_SPEED)

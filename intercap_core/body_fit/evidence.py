@@ -1,4 +1,4 @@
-"""What the observations ask of bodies as they stand: E_J's pixels and E_D's correspondences.
+"""Observations for bodies at their current pose: E_J's pixels and E_D's correspondences.
 
 Set up anew between rounds of the solver, together with how far each kind of observation is trusted.
 """
@@ -13,11 +13,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
+from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.constants import (
+    CLOUD_HUBER_M,
+    CONFIDENCE_BINS,
+    FEWEST_IN_BIN,
+    FRAMES_KEPT,
+    FRAMES_POSED,
+    FREE_SPACE_TRUST,
+    HALF_WEIGHT_POINTS,
+    KEYPOINT_SIGMA_M,
+    LARGEST_CONFIDENCE_EXPONENT,
+    LEAST_CONFIDENCE,
+    MAX_SPEED,
+    NOISE_RANGE,
+    PERSISTENCE,
+    SAMPLE_SHARE,
+    SIGMA_RANGE,
+    SMALLEST_SIGMA_PX,
+)
 from intercap_core.body_fit.free_space import seen_through
 from intercap_core.body_fit.observations import Observations, PersonCloud
-from intercap_core.body_fit.problem import BodyProblem, Views
+from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.body_fit.terms import Views
 from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
 from intercap_core.energy.body_cloud import CloudRows, Matches
 from intercap_core.energy.body_keypoints import KeypointSet
@@ -25,49 +44,24 @@ from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.energy.body_self import SelfContact
 from intercap_core.energy.body_surface import Surface
 from intercap_core.solve.crew import Crew
+from intercap_core.solve.robust import SIGMA_PER_MAD
 from intercap_core.solve.velocity import limited_velocity
-
-# What is left of a keypoint's error in metres once its fixed part is taken out: the start, refined
-# from the residuals themselves.
-_KEYPOINT_SIGMA = (
-    (BODY, 0.02),
-    (LEFT_HAND, 0.01),
-    (RIGHT_HAND, 0.01),
-    (slice(FACE.start, CONTOUR.stop), 0.008),
-)
-_SMALLEST_SIGMA_PX = 1.0
-_PERSISTENCE = 1.5  # errors that last over frames, which the residuals of a fit do not show
-# Detectors' errors grow as a power of falling confidence, which residuals measure.
-_CONFIDENCE_BINS, _FEWEST_IN_BIN = 6, 30
-_LARGEST_DOUBT = 2.0
-_LEAST_CONFIDENCE = 0.1
-_SIGMA_RANGE = (0.1, 4.0)  # how far the refined sigma may go from the start
-_NOISE_RANGE = (0.1, 1.5)  # the same of the cloud's noise
-# Neighbouring samples stand on the same fold: about four of them make one measurement.
-_SAMPLE_SHARE = 0.25
-_FULL_SAMPLE = 2.0  # points with which a sample counts half
-_HUBER_M = 0.012
-_SEEN_THROUGH_TRUST = 1.0  # of a sample that sticks out of the person, beside a point's
-_VERTEX_CHUNK = 16
-_MOST_KEPT = 256  # frames whose bodies are kept, a quarter of a megabyte each
-# Hands and feet reach some 5 m/s in everyday tasks; fits that are not settled yet jump farther.
-_MAX_SPEED = 6.0
 
 
 def measured_doubt(confidence: Tensor, error: Tensor) -> float:
     """The power a >= 0 with which errors (M,) grow as confidence (M,) falls: confidence^-a."""
-    bins = torch.tensor_split(confidence.argsort(), _CONFIDENCE_BINS)
-    if len(bins[0]) < _FEWEST_IN_BIN:
+    bins = torch.tensor_split(confidence.argsort(), CONFIDENCE_BINS)
+    if len(bins[0]) < FEWEST_IN_BIN:
         return 0.0
-    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(_LEAST_CONFIDENCE).log()
+    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(LEAST_CONFIDENCE).log()
     y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
     x, y = x - x.mean(), y - y.mean()
     slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
-    return min(max(slope, 0.0), _LARGEST_DOUBT)
+    return min(max(slope, 0.0), LARGEST_CONFIDENCE_EXPONENT)
 
 
 class ViewDistances(NamedTuple):
-    """What the points of each camera say of the samples: their mean distance (N,C,S), metres, and
+    """Each camera's points by sample of the skin: their mean distance (N,C,S), metres, and
     effective number (N,C,S), 0 = none; the samples' normals (N,S,3)."""
 
     distance: Tensor
@@ -116,7 +110,7 @@ class Evidence:
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
         self.usual_confidence = torch.ones_like(self.keypoint_sigma)
-        for part, value in _KEYPOINT_SIGMA:
+        for part, value in KEYPOINT_SIGMA_M:
             self.keypoint_sigma[part] = value
             seen_at = seen.confidence[self.frames, :, part]
             usual = np.median(seen_at[seen_at > 0]) if (seen_at > 0).any() else 1.0
@@ -125,7 +119,7 @@ class Evidence:
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
 
-    def look(
+    def observe_keypoints(
         self,
         problem: BodyProblem,
         *,
@@ -152,14 +146,14 @@ class Evidence:
         problem.views = Views(
             self._tensor(seen.keypoints[at]),
             confidence,
-            sigma.clamp_min(_SMALLEST_SIGMA_PX),
+            sigma.clamp_min(SMALLEST_SIGMA_PX),
             lenses,
             pose,
             self._shift(points),
         )
 
     def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
-        """Those of the body, and of hands and face where asked for.
+        """Those of the body, and of hands and face where requested.
 
         The jaw line is left out: its landmarks slide over the cheek with the view.
         """
@@ -205,13 +199,13 @@ class Evidence:
     def velocity(self, points: Tensor) -> Tensor:
         """(N,...,3) m/s of the usable frames' points (N,...,3)."""
         found = limited_velocity(
-            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=_MAX_SPEED
+            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=MAX_SPEED
         )
         return self._tensor(found)
 
     def _doubted(self, confidence: Tensor, index: Tensor) -> Tensor:
         """Factor (N,C,K) of the sigma of keypoints ``index`` (K,) by their confidence (N,C,K)."""
-        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.usual_confidence[index]
+        share = confidence.clamp_min(LEAST_CONFIDENCE) / self.usual_confidence[index]
         return share ** -self.keypoint_doubt[index]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
@@ -222,15 +216,15 @@ class Evidence:
         scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
         scaled = scaled * self.keypoint_sigma[index, None]
         scaled = scaled * self._doubted(views.confidence, index)[..., None]
-        for part, start in _KEYPOINT_SIGMA:
+        for part, start in KEYPOINT_SIGMA_M:
             here = (index >= part.start) & (index < part.stop)
             known = views.confidence[:, :, here] > 0
             if bool(known.any()):
                 sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
                 self.keypoint_doubt[part] = measured_doubt(sure, off.mean(1))
                 usual = off / self._doubted(views.confidence, index)[:, :, here][known][:, None]
-                found = 1.4826 * _PERSISTENCE * float(usual.median())
-                low, high = (start * factor for factor in _SIGMA_RANGE)
+                found = SIGMA_PER_MAD * PERSISTENCE * float(usual.median())
+                low, high = (start * factor for factor in SIGMA_RANGE)
                 self.keypoint_sigma[part] = min(max(found, low), high)
 
     def refine_cloud_noise(self, problem: BodyProblem) -> None:
@@ -240,13 +234,15 @@ class Evidence:
         points = self.model.forward(
             self.model.parameters(problem.base), vertex_ids=self.sample_ids
         ).vertices
-        away = body_cloud.residuals(points, rows, problem.thickness_of_group(), self.group).abs()
+        residual = body_cloud.residuals(
+            points, rows, problem.thickness_of_group(), self.group
+        ).abs()
         for g, covering in enumerate(COVERINGS):
             part = self.group == g
             known = rows.weight[:, part] > 0
             if bool(known.any()):
-                found = 1.4826 * float(away[:, part][known].median())
-                low, high = (covering.noise * factor for factor in _NOISE_RANGE)
+                found = SIGMA_PER_MAD * float(residual[:, part][known].median())
+                low, high = (covering.noise * factor for factor in NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
     def _matched(
@@ -259,7 +255,7 @@ class Evidence:
         expected: Tensor,
         reach: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What the cloud of the t-th frame says of its samples: their mean distance and effective
+        """Matches of the t-th frame's cloud by sample of the skin: mean distance and effective
         number of points by camera (C,S), and the median distance, metres.
 
         vertices and normals (R,3) of the surface; ``where`` (S,3) its samples are, and how far they
@@ -285,7 +281,7 @@ class Evidence:
         # gathered by camera and sample: those that several cameras see tell their offsets
         found = found._replace(sample=cloud.view * size + found.sample)
         found, trust = self._with_seen_through(found, cloud, where, normal, shift)
-        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=_HUBER_M)
+        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=CLOUD_HUBER_M)
         return apart.reshape(views, -1), number.reshape(views, -1), residual
 
     def _with_seen_through(
@@ -305,28 +301,28 @@ class Evidence:
         for window in cloud.windows:
             view = window.view
             late = where if shift is None else where + shift[view]
-            out, away = seen_through(
+            out, inside = seen_through(
                 window, self.seen.rig[view], float(self.seen.depth_bias[view]),
                 late.cpu().numpy(), outward,
             )  # fmt: skip
             sample.append(torch.as_tensor(view * size + out, device=where.device))
-            distance.append(-self._tensor(away))
+            distance.append(-self._tensor(inside))
         extra = sum(len(part) for part in sample[1:])
-        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), _SEEN_THROUGH_TRUST)])
+        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), FREE_SPACE_TRUST)])
         valid = torch.cat([found.valid, found.valid.new_ones(extra)])
         return Matches(torch.cat(sample), torch.cat(distance), valid), trust
 
     def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Some frames of the bodies ``base`` (N,P) at a time: the first one's place, vertices and
-        normals (b,R,3) of the surface. Those of short sequences are kept for the next look."""
+        normals (b,R,3) of the surface. Those of short sequences are kept for the next call."""
         if self._posed is not None and torch.equal(self._posed[0], base):
             yield from self._posed[1]
             return
         self._posed, parts = None, []
         params = self.model.parameters(base)
-        for start in range(0, len(base), _VERTEX_CHUNK):
-            part = (start, *self.surface.posed(params.frames(slice(start, start + _VERTEX_CHUNK))))
-            if len(base) <= _MOST_KEPT:
+        for start in range(0, len(base), FRAMES_POSED):
+            part = (start, *self.surface.posed(params.frames(slice(start, start + FRAMES_POSED))))
+            if len(base) <= FRAMES_KEPT:
                 parts.append(part)
             yield part
         if parts:
@@ -334,7 +330,7 @@ class Evidence:
 
     def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
         """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
-        not asked for."""
+        switched off."""
         if not problem.self_weight:
             return None
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)
@@ -376,7 +372,7 @@ class Evidence:
         total = points.sum(1)
         mean = (of_views * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
-        share = self.cloud_weight * _SAMPLE_SHARE
-        weight = share * total / (total + _FULL_SAMPLE) / noise**2
+        share = self.cloud_weight * SAMPLE_SHARE
+        weight = share * total / (total + HALF_WEIGHT_POINTS) / noise**2
         target = mean + (normal * where).sum(2)
         return CloudRows(target, normal, weight, mean)

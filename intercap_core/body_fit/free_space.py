@@ -7,7 +7,7 @@ sticks out of the person. It has to go in along its normal until the measured pe
 
 c the covering's thickness as in :mod:`intercap_core.energy.body_cloud`. The person's mask has no
 say, so one that is too small, or lacks a hand, draws nothing to it; what hides the vertex is nearer
-than it, and pixels without depth are unknown: neither pulls.
+than it, and pixels without depth are unknown: neither has a residual.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body_fit import free_space_kernel
+from intercap_core.body_fit.constants import (
+    FREE_SPACE_BEHIND_M,
+    FREE_SPACE_FACING,
+    FREE_SPACE_NEAREST_M,
+    FREE_SPACE_REACH_M,
+    FREE_SPACE_STEP_M,
+)
 from intercap_core.camera.rig import Camera
-
-_BEHIND_M = 0.06  # farther behind the vertex is not the person's surface there
-_FACING = 0.1  # cosine between normal and line of sight; larger ones look away
-_NEAREST_M = 0.3  # points nearer to the camera are not looked at
-_REACH_M = 0.05
-_WAY_M = 0.01  # steps along the way in
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,5 +52,6 @@ def seen_through(
     return free_space_kernel.seen_through(
         window.depth, *window.first, tuple(camera.depth.parameters.tolist()),
         camera.depth_from_master, depth_bias, points, normals,
-        _BEHIND_M, _FACING, _NEAREST_M, _REACH_M, _WAY_M,
+        FREE_SPACE_BEHIND_M, FREE_SPACE_FACING, FREE_SPACE_NEAREST_M, FREE_SPACE_REACH_M,
+        FREE_SPACE_STEP_M,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the cameras say about the person: keypoints of all frames, and each frame's fused cloud."""
+"""Observations of the person: keypoints of all frames, and each frame's fused cloud."""
 
 from __future__ import annotations
 
@@ -14,6 +14,15 @@ from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
 from intercap_core.body.keypoints import BODY
 from intercap_core.body_fit import person_pixels_kernel
+from intercap_core.body_fit.constants import (
+    BEFORE_BACKGROUND_M,
+    DEPTH_EDGE_M,
+    EDGE_TRUST,
+    ENOUGH_KEYPOINTS,
+    NEAR_START_S,
+    NORMAL_BASE_PX,
+    OUTLIER_VIEW_TRUST,
+)
 from intercap_core.body_fit.free_space import DepthWindow
 from intercap_core.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
 from intercap_core.camera.masks import Runs
@@ -22,16 +31,6 @@ from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.errors import UserError
 from intercap_core.schemas import PERSON, SCENE
-
-_OUTLIER_TRUST = 0.2  # of a view that disagrees with the triangulated point
-_BEFORE_BACKGROUND_M = 0.04  # nearer than the background by less is background
-_NORMAL_BASE_PX = 3  # half the base over which a normal is measured
-_EDGE_M = 0.04  # a larger step between those pixels is an edge of the person
-# A body without a trunk's three points starts where those of frames so near put it, when so many of
-# the 25 body keypoints pull it to where it has gone.
-_NEAR_S = 1.0
-_ENOUGH_JOINTS = 6
-_EDGE_TRUST = 0.3  # such points may float between the person and what is behind
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +73,9 @@ class Observations:
         placed = self.placed
         if not placed.any():
             return placed
-        away = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
+        gap = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
-        return placed | ((away <= _NEAR_S) & (known >= _ENOUGH_JOINTS))
+        return placed | ((gap <= NEAR_START_S) & (known >= ENOUGH_KEYPOINTS))
 
 
 # neck, shoulders, mid hip, hips, knees: keypoints that a pose can be started from
@@ -110,7 +109,7 @@ def read_observations(scene: Path, person: Path) -> Observations:
         masks = unpack_ragged(read["mask_offsets"], read["mask_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
     disputed = (views >= 2)[:, None] & ~inlier
-    confidence = np.where(disputed, _OUTLIER_TRUST * confidence, confidence)
+    confidence = np.where(disputed, OUTLIER_VIEW_TRUST * confidence, confidence)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
         sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks,
@@ -205,7 +204,7 @@ def person_pixels(
     return person_pixels_kernel.person_pixels(
         depth,
         np.zeros((0, 0), np.uint16) if background is None else background,
-        int(1000 * _BEFORE_BACKGROUND_M),
+        int(1000 * BEFORE_BACKGROUND_M),
         (rows.start, rows.stop),
         (columns.start, columns.stop),
         camera.depth.rays,
@@ -229,7 +228,7 @@ def _placed(
         points = points - depth_bias * points / points[:, 2:]
     master = camera.master_from_depth
     rotation = master[:3, :3].astype(np.float32)
-    return apply(master, points), normals @ rotation.T, np.where(edge, _EDGE_TRUST, 1.0)
+    return apply(master, points), normals @ rotation.T, np.where(edge, EDGE_TRUST, 1.0)
 
 
 def _window(camera: Camera, mask: Runs, depth: np.ndarray) -> tuple[slice, slice] | None:
@@ -266,14 +265,14 @@ def _points_and_normals(
         r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
         there = depth[r, c].astype(np.float32) * np.float32(1e-3)
         ray = rays[r, c]
-        good = (there > 0) & (np.abs(there - z) < _EDGE_M) & np.isfinite(ray[:, 0])
+        good = (there > 0) & (np.abs(there - z) < DEPTH_EDGE_M) & np.isfinite(ray[:, 0])
         ray = np.where(good[:, None], ray, 0)
         return np.concatenate([ray * there[:, None], there[:, None]], 1), good
 
     ray = np.nan_to_num(rays[row, column])
     here = np.concatenate([ray * z[:, None], z[:, None]], 1)
     spans, smooth = [], np.ones(len(index), bool)
-    for dr, dc in ((0, _NORMAL_BASE_PX), (_NORMAL_BASE_PX, 0)):
+    for dr, dc in ((0, NORMAL_BASE_PX), (NORMAL_BASE_PX, 0)):
         ahead, a = at(row + dr, column + dc)
         back, b = at(row - dr, column - dc)
         # one-sided where the other side is another surface

@@ -1,4 +1,4 @@
-"""Which parts of a fitted body can be believed: determined by what was seen, and not against it."""
+"""Which parts of a fitted body are reliable: determined by observations and in line with them."""
 
 from __future__ import annotations
 
@@ -16,25 +16,17 @@ from intercap_core.body.keypoints import (
     LEFT_HAND,
     RIGHT_HAND,
 )
+from intercap_core.body_fit.constants import (
+    DISAGREEING_SHARE,
+    FACE_VISIBLE_SHARE,
+    LARGEST_HAND_SIGMA_M,
+    LARGEST_SIGMA_M,
+    MEASURED_SHARE,
+    MIRRORED_SIGMA_M,
+    UNSEEN_SIGMA_M,
+)
 from intercap_core.schemas import BODY_PARTS
 
-# A coordinate's deviation of 26 mm puts half of such joints more than 40 mm off (the median of a
-# chi variable with three degrees of freedom is 1.538): what counts as a bad body. Fingers lie
-# 20 mm apart; half of a hand's joints farther off than that are taken for a neighbour's.
-_LARGEST_SIGMA_M = 0.026
-_LARGEST_HAND_SIGMA_M = 0.013
-# Keypoints beyond the robust term's scale no longer pull: more than half of a part's against it.
-_DISAGREE = 0.5
-_FACE_SEEN = 0.5  # of the face's landmarks, by some view
-_MEASURED = 0.15  # of a part's samples: half of what a view sees of a limb, which is a third
-# A forearm seen by one view leans towards it or away, the ends up to twice its length (0.25 m)
-# apart, a leg's two segments (0.4 m each) farther, of a finger (0.08 m) less: by this in the mean
-# square, along one coordinate, where no point says which; the nearer to ``_MEASURED``, the less.
-_MIRRORED_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
-# A limb that no view bears out may be anywhere in its reach, a wrist 0.55 m from the shoulder, an
-# ankle 0.85 m from the hip; points then may as well be those of another limb. Prior and fit, which
-# are linear about one pose, would state less.
-_UNSEEN_M = {"arm": 0.20, "leg": 0.25}
 MEDIAN_CHI_3 = 1.5382  # median length of a three-dimensional normal error, in deviations
 _MEDIAN_CHI_2 = 1.1774  # median length of a two-dimensional normal error, in deviations
 _MEAN_CHI_3 = 1.5958  # mean length of a three-dimensional normal error, in deviations
@@ -125,7 +117,7 @@ def compare(
         weight, good = confidence[:, :, at], whitened[:, :, at] <= scale
         over = (1,) if part.endswith(_JOINTED) else (1, 2)
         share = 1 - (weight * good).sum(over) / weight.sum(over)
-        # an elbow that is right says nothing of a wrist
+        # a correct elbow does not imply a correct wrist
         result.against[:, column] = share if share.ndim == 1 else _worst(share)
         result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
         borne_out = ((weight > 0) & good).sum(1)
@@ -150,7 +142,7 @@ def trunk_distance(evidence: PartEvidence) -> np.ndarray:
 
 def unmeasured(evidence: PartEvidence) -> np.ndarray:
     """Limbs and hands (N,8) bool that one view alone bears out, without points of theirs."""
-    found = (evidence.views < 2) & (evidence.measured < _MEASURED) & (evidence.seen > 0)
+    found = (evidence.views < 2) & (evidence.measured < MEASURED_SHARE) & (evidence.seen > 0)
     result = np.asarray(found.cpu().numpy())
     result[:, [BODY_PARTS.index(part) for part in ("trunk", "face")]] = False
     return result
@@ -167,10 +159,10 @@ def unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
 
 def _leaning(evidence: PartEvidence) -> np.ndarray:
     """How far (N,8), metres, parts may lean the wrong way that one view bears out, or none."""
-    known = np.clip(evidence.measured.cpu().numpy() / _MEASURED, 0, 1)
+    known = np.clip(evidence.measured.cpu().numpy() / MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
-    mirrored = np.array([_MIRRORED_M.get(limb, 0.0) for limb in limbs])
-    unseen = np.array([_UNSEEN_M.get(limb, 0.0) for limb in limbs])
+    mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
+    unseen = np.array([UNSEEN_SIGMA_M.get(limb, 0.0) for limb in limbs])
     leaning = np.where(unmeasured(evidence), mirrored * (1 - known) ** 2, 0.0)
     return np.where(evidence.seen.cpu().numpy() == 0, unseen, leaning)
 
@@ -183,7 +175,7 @@ def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     alone sees may lean towards it or away, the more the fewer points it has. What is wrong of an
     arm is wrong of its hand.
     """
-    disputed = evidence.against.cpu().numpy() > _DISAGREE
+    disputed = evidence.against.cpu().numpy() > DISAGREEING_SHARE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
     distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
@@ -201,15 +193,15 @@ def undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
 
     sigma (N,55): stated deviation of the joints, metres.
     """
-    found = evidence.against.cpu().numpy() > _DISAGREE
+    found = evidence.against.cpu().numpy() > DISAGREEING_SHARE
     for column, part in enumerate(BODY_PARTS):
-        limit = _LARGEST_SIGMA_M
+        limit = LARGEST_SIGMA_M
         if part.endswith("hand"):
-            limit = _LARGEST_HAND_SIGMA_M
+            limit = LARGEST_HAND_SIGMA_M
             found[:, column] |= evidence.seen[:, column].cpu().numpy() == 0
         found[:, column] |= _rms(sigma[:, _joints_of(part)]) > limit
     face = BODY_PARTS.index("face")
-    found[:, face] |= evidence.seen[:, face].cpu().numpy() < _FACE_SEEN
+    found[:, face] |= evidence.seen[:, face].cpu().numpy() < FACE_VISIBLE_SHARE
     return found
 
 

@@ -1,4 +1,5 @@
-"""Frames whose body left the motion of its neighbours: found, and fitted again from between them.
+"""Outliers in time: frames whose body departs from its neighbours' motion are found and refitted,
+starting from an interpolation of the neighbours.
 
 A fit that starts from a wrong triangulation, or an arm that one view cannot place in depth, ends in
 another minimum of the energy, alone among frames that agree.
@@ -13,17 +14,17 @@ import torch
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body_fit.bridge import bridge
+from intercap_core.body_fit.constants import (
+    JUMP_M,
+    JUMP_WINDOW_S,
+    RECOVER_TRIALS,
+    RECOVERED_COST_FACTOR,
+    RECOVERED_COST_SLACK,
+)
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.solve.levenberg_marquardt import minimise
 
-# Around a moment hands swing off the straight by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m; fits
-# scatter by less than a tenth of a metre.
-_AROUND_S = 0.21
-JUMP_M = 0.25
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
-_TRIALS = 10
-# What seems to be seen is no worse explained from between the neighbours: then that is the motion.
-_AS_GOOD, _SLACK = 1.2, 5.0
 
 
 def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M) -> np.ndarray:
@@ -34,7 +35,7 @@ def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUM
     """
     result = np.zeros(joints.shape[:2])
     for t, time in enumerate(times):
-        near = np.abs(times - time) <= _AROUND_S
+        near = np.abs(times - time) <= JUMP_WINDOW_S
         half = min(near[:t].sum(), near[t + 1 :].sum())
         if half:
             window = joints[t - half : t + half + 1]
@@ -52,24 +53,24 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     changed = np.zeros(len(times), bool)
     params = model.parameters(problem.base)
     joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
-    odd = np.asarray((jumps(joints.double().cpu().numpy(), times) > 0).any(1))
-    if not odd.any() or odd.all():
+    jumped = np.asarray((jumps(joints.double().cpu().numpy(), times) > 0).any(1))
+    if not jumped.any() or jumped.all():
         return changed
-    between = bridge(problem.base.double().cpu().numpy(), ~odd, times)
-    at = torch.as_tensor(np.flatnonzero(odd), device=problem.base.device)
-    base = torch.as_tensor(between[odd]).to(problem.base)
+    between = bridge(problem.base.double().cpu().numpy(), ~jumped, times)
+    at = torch.as_tensor(np.flatnonzero(jumped), device=problem.base.device)
+    base = torch.as_tensor(between[jumped]).to(problem.base)
     again = _of_frames(problem, at, base)
     everyone = torch.arange(len(at), device=base.device)
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
-    found = minimise(again, again.own_start(), max_trials=_TRIALS, cost_tolerance=1e-3)
-    kept = found.cost <= _AS_GOOD * before + _SLACK
+    found = minimise(again, again.own_start(), max_trials=RECOVER_TRIALS, cost_tolerance=1e-3)
+    kept = found.cost <= RECOVERED_COST_FACTOR * before + RECOVERED_COST_SLACK
     rows = problem.base[at].clone()
     again.accept(found.own, nothing)
     rows[kept] = again.base[kept]
     problem.base = problem.base.clone()
     problem.base[at] = rows
-    changed[np.flatnonzero(odd)[kept.cpu().numpy()]] = True
+    changed[np.flatnonzero(jumped)[kept.cpu().numpy()]] = True
     return changed
 
 

@@ -13,21 +13,25 @@ from intercap_core.body.keypoints import BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import VPoser
+from intercap_core.body_fit.constants import (
+    CLOUD_REACH_M,
+    KEYPOINT_SCALE,
+    START_SIGMA_M,
+    TURN_WORSE,
+    WIDENED,
+)
 from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.observations import Observations, PersonCloud
-from intercap_core.body_fit.problem import KEYPOINT_SCALE, BodyProblem, Targets
+from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.quality import PartEvidence, compare
 from intercap_core.body_fit.recover import recover
 from intercap_core.body_fit.start import between, place_trunk, turned_around
+from intercap_core.body_fit.terms import Targets, Terms
 from intercap_core.config import BodyFitSettings
 from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.solve.levenberg_marquardt import Solution, minimise
 
-_START_SIGMA = 0.04
-_REACH_M = (0.10, 0.06, 0.05)
 _WRISTS = ("left_wrist", "right_wrist")
-_WIDENED = (5.0, 2.0)  # how much the keypoints' sigma is widened while the hands find their place
-_TURN_WORSE = 1.5  # frames whose cost exceeds the median by this are tried facing the other way
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class Fit:
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
-    """Own parameter columns: trunk and limbs, then hands, jaw and expression where asked for."""
+    """Own parameter columns: trunk and limbs, then hands, jaw and expression where requested."""
     pose = list(range(0, 66))
     if face:
         jaw = 3 * JOINT_INDEX["jaw"]
@@ -88,7 +92,10 @@ def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Ten
 
 
 class Fitter:
-    """Fits all usable frames of one sequence; create, then :meth:`run`."""
+    """Fits all usable frames of one sequence; create, then :meth:`run`.
+
+    ``terms``: of the body's energy, by default the quickest form on the model's device.
+    """
 
     def __init__(
         self,
@@ -97,8 +104,10 @@ class Fitter:
         clouds: list[PersonCloud | None],
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
+        terms: Terms | None = None,
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
+        self._terms = terms
         self.evidence = Evidence(model, seen, clouds, settings.cloud_weight)
         self.frames = self.evidence.frames
         self.one_shape = settings.shape == "shared"
@@ -115,16 +124,17 @@ class Fitter:
             self.one_shape,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
             self_weight=self.settings.self_penetration_weight,
+            terms=self._terms,
         )  # fmt: skip
         problem.targets = self._lifted()
-        for widened in _WIDENED if problem.targets else (1.0, 1.0):
-            evidence.look(problem, widened=widened)
+        for widened in WIDENED if problem.targets else (1.0, 1.0):
+            evidence.observe_keypoints(problem, widened=widened)
             self._minimise(problem, 6)
             evidence.refine_sigma(problem)
         problem.fit_shared = True
-        for reach in _REACH_M[:2] if evidence.has_cloud else ():
+        for reach in CLOUD_REACH_M[:2] if evidence.has_cloud else ():
             problem.rows = evidence.match(problem, reach)
-            evidence.look(problem)
+            evidence.observe_keypoints(problem)
             self._minimise(problem, 3)
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
@@ -138,10 +148,10 @@ class Fitter:
         problem.columns = columns_of(self.model, hands=hands, face=face, betas=not self.one_shape)
         for last in (False, True):
             if evidence.has_cloud:
-                problem.rows = evidence.match(problem, _REACH_M[-1])
+                problem.rows = evidence.match(problem, CLOUD_REACH_M[-1])
             problem.touching = evidence.touch(problem)
             evidence.refine_sigma(problem)
-            evidence.look(problem, hands=hands, face=face)
+            evidence.observe_keypoints(problem, hands=hands, face=face)
             solution = self._minimise(problem, 4, keep_normal=last)
         assert solution.normal is not None
         return self._report(problem, solution.normal.hessian)
@@ -159,15 +169,16 @@ class Fitter:
             False,
             offsets=settled.offsets.to(base), u=settled.covering.to(base),
             self_weight=self.settings.self_penetration_weight,
+            terms=self._terms,
         )  # fmt: skip
 
     def observe(self, problem: BodyProblem) -> None:
         """Take correspondences, visibility and pixel sigmas anew at the problem's bodies."""
         if self.evidence.has_cloud:
-            problem.rows = self.evidence.match(problem, _REACH_M[-1])
+            problem.rows = self.evidence.match(problem, CLOUD_REACH_M[-1])
         problem.touching = self.evidence.touch(problem)
         self._expect_pose(problem)
-        self.evidence.look(problem, hands=self.settings.hands, face=self.settings.face)
+        self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
         """Median pixel error (N,C) and cloud distance (N,), metres; NaN = nothing seen."""
@@ -232,7 +243,7 @@ class Fitter:
         return solution
 
     def _expect_pose(self, problem: BodyProblem) -> None:
-        """Take what the learned prior, where there is one, says around the problem's poses."""
+        """Linearise the learned pose prior, where there is one, about the problem's poses."""
         if self.pose_prior is not None:
             problem.pose = self.pose_prior.around(problem.base[:, 3:66])
 
@@ -250,7 +261,7 @@ class Fitter:
             place_trunk(keypoints, joints, pelvis), self.evidence.seen.times[self.frames]
         )
         straight = self._fit_triangulated(placed, joints)
-        poor = np.flatnonzero((straight.cost > _TURN_WORSE * straight.cost.median()).cpu().numpy())
+        poor = np.flatnonzero((straight.cost > TURN_WORSE * straight.cost.median()).cpu().numpy())
         if len(poor):
             turned = self._fit_triangulated(turned_around(placed[poor]), joints[poor])
             better = turned.cost < straight.cost[poor]
@@ -272,7 +283,7 @@ class Fitter:
         lifted = (seen.joint_views[self.frames][:, BODY] == 1) & np.isfinite(joints).all(2)
         if not lifted.any():
             return None
-        return Targets(self._tensor(np.nan_to_num(joints)), self._tensor(lifted), _START_SIGMA)
+        return Targets(self._tensor(np.nan_to_num(joints)), self._tensor(lifted), START_SIGMA_M)
 
     def _fit_triangulated(self, placed: np.ndarray, joints: np.ndarray) -> Solution:
         base = self.model.zeros(len(placed)).vector().clone()
@@ -287,8 +298,9 @@ class Fitter:
             columns_of(self.model, hands=False, face=False, betas=True), False,
             offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
             targets=Targets(
-                self._tensor(np.nan_to_num(joints)), self._tensor(known), _START_SIGMA
+                self._tensor(np.nan_to_num(joints)), self._tensor(known), START_SIGMA_M
             ),
+            terms=self._terms,
         )  # fmt: skip
         solution = minimise(problem, problem.own_start(), max_trials=15, cost_tolerance=1e-2)
         problem.accept(solution.own, solution.shared)
@@ -308,8 +320,8 @@ class Fitter:
         kept = (problem.columns, problem.rows, problem.one_shape, problem.fit_shared)
         problem.columns = columns[~torch.isin(columns, fixed)]
         problem.rows, problem.one_shape, problem.fit_shared = None, False, False
-        for widened in _WIDENED:
-            self.evidence.look(problem, hands=hands, face=face, widened=widened)
+        for widened in WIDENED:
+            self.evidence.observe_keypoints(problem, hands=hands, face=face, widened=widened)
             self._minimise(problem, 6)
-        self.evidence.look(problem, hands=hands, face=face)
+        self.evidence.observe_keypoints(problem, hands=hands, face=face)
         problem.columns, problem.rows, problem.one_shape, problem.fit_shared = kept

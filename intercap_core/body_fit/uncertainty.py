@@ -8,11 +8,11 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body_fit.constants import (
+    MODEL_SIGMA_M,
+)
 from intercap_core.body_fit.schedule import Fit
 
-# What ten shape components cannot say about a person's joints: 1.3 mm off in the mean over adults
-# that the open body was not made from (docs/body.md), along one coordinate.
-_MODEL_M = 0.001
 _CHUNK = 16
 _NUM_JOINTS = 55
 
@@ -37,7 +37,7 @@ def joint_covariance(model: BodyModel, fit: Fit) -> Tensor:
     counts = fit.shared_counts.double()
     information = information / (counts[:, None] * counts[None]).sqrt()
     shared_factor = torch.linalg.cholesky(information)
-    model_error = _MODEL_M**2 * torch.eye(3).to(information)
+    model_error = MODEL_SIGMA_M**2 * torch.eye(3).to(information)
     result = information.new_zeros(len(fit.vectors), _NUM_JOINTS, 3, 3)
     for at, (factor, answer, _) in zip(_chunks(len(fit.vectors)), at_rest, strict=True):
         lin = model.linearise(

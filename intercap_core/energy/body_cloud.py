@@ -3,7 +3,7 @@
     E_D = sum over views v, points p of the person's cloud in v of min over visible vertices |v - p|
 
 Here the distance is taken along the surface's normal, to the vertex that is nearest in position and
-in orientation; a vertex can only be met by points whose surface looks the same way, which leaves
+in orientation; a vertex can only be met by points whose surface faces the same way, which leaves
 the vertices that the point's camera sees. The measured surface is clothing and hair, not skin:
 
     e = n . (p - v) - c_g,      c_g = c0_g exp(u_g),   u_g ~ N(0, spread^2)
@@ -26,17 +26,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from intercap_core.energy.body_samples import NORMAL_LENGTH
+from intercap_core.energy.body_constants import (
+    MATCH_COSINE,
+    MATCH_SIDEWAYS_M,
+    NORMAL_LENGTH_M,
+)
 from intercap_core.energy.body_surface import Surface
-
-_ASIDE = 0.03  # metres beside the normal's line beyond which a point meets nothing
-_TURNED_AWAY = 0.3  # cosine between the normals of point and vertex below which they do not match
 
 
 class CloudRows(NamedTuple):
-    """What the points say, by sample (B,N): the solver's rows until the next matching.
+    """The points by sample (B,N): the solver's rows until the next matching.
 
-    target (B,N): n . v that the mean of the points asks for, metres; normal (B,N,3); weight (B,N)
+    target (B,N): n . v of the mean of the matched points, metres; normal (B,N,3); weight (B,N)
     1/m^2, 0 = no point; distance (B,N): mean signed distance of the points now, outside positive.
     """
 
@@ -68,8 +69,8 @@ def match(
     """
     v, n = vertices[samples], vertex_normals[samples]
     centre = v.mean(0)
-    ours = torch.cat([v - centre, NORMAL_LENGTH * n], 1)
-    theirs = torch.cat([points - centre, NORMAL_LENGTH * normals], 1)
+    ours = torch.cat([v - centre, NORMAL_LENGTH_M * n], 1)
+    theirs = torch.cat([points - centre, NORMAL_LENGTH_M * normals], 1)
     sample = torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2).argmin(1)
     near = patch[sample]
     gap = points[:, None] - vertices[near]
@@ -79,8 +80,8 @@ def match(
     normal = vertex_normals[at]
     distance = (normal * gap).sum(1)
     sideways = (gap - distance[:, None] * normal).norm(dim=1)
-    valid = ((normal * normals).sum(1) > _TURNED_AWAY) & (distance.abs() < reach)
-    return Matches(sample, distance, valid & (sideways < _ASIDE))
+    valid = ((normal * normals).sum(1) > MATCH_COSINE) & (distance.abs() < reach)
+    return Matches(sample, distance, valid & (sideways < MATCH_SIDEWAYS_M))
 
 
 def match_compiled(
@@ -98,7 +99,7 @@ def match_compiled(
     found = body_match_kernel.match(
         points.to(kind).numpy(), normals.to(kind).numpy(), vertices.numpy(),
         vertex_normals.numpy(), surface.sample, surface.patch, surface.order, surface.groups,
-        vertices.numpy().dtype.type(NORMAL_LENGTH), reach, _ASIDE, _TURNED_AWAY,
+        vertices.numpy().dtype.type(NORMAL_LENGTH_M), reach, MATCH_SIDEWAYS_M, MATCH_COSINE,
     )  # fmt: skip
     return Matches(*map(torch.from_numpy, found))
 
@@ -113,11 +114,11 @@ def gather(
 ) -> tuple[Tensor, Tensor]:
     """Mean distance (N,) and number of effective points (N,) of each sample, in one frame.
 
-    trust (M,) of each point; ``expected`` (N,) the covering's thickness at each sample: points away
-    from it by more than ``huber`` metres pull less (iterated once, by Huber's weight).
+    trust (M,) of each point; ``expected`` (N,) the covering's thickness at each sample: points that
+    differ from it by more than ``huber`` metres count less (one iteration of Huber's weight).
     """
-    away = (found.distance - expected[found.sample]).abs()
-    weight = trust * found.valid * (huber / away.clamp_min(huber))
+    excess = (found.distance - expected[found.sample]).abs()
+    weight = trust * found.valid * (huber / excess.clamp_min(huber))
     total = torch.zeros(num_samples, dtype=trust.dtype, device=trust.device)
     total = total.index_add(0, found.sample, weight)
     summed = torch.zeros_like(total).index_add(0, found.sample, weight * found.distance)
@@ -150,25 +151,31 @@ def cost(points: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor) -> T
 
 
 def assemble(
-    points: Tensor, by: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor
+    points: Tensor,
+    by: Tensor,
+    by_of_own_limb: Tensor,
+    rows: CloudRows,
+    thickness: Tensor,
+    group: Tensor,
 ) -> CloudTerm:
     """Normal equations of the term.
 
-    points (B,N,3); ``by`` (B,N,n): n . d v / d parameters; thickness (G,) = c0 exp(u), whose
-    derivative by u is itself.
+    points (B,N,3); ``by`` (B,N,n): n . d v / d parameters, for the gradient, and the same with pose
+    blend shapes by the joints of a point's own limb alone, for the Gauss-Newton matrix; thickness
+    (G,) = c0 exp(u), whose derivative by u is itself.
     """
     e = residuals(points, rows, thickness, group)
     weight = rows.weight
-    weighted = by * weight[..., None]
+    weighted = by_of_own_limb * weight[..., None]
     pick = torch.zeros(len(group), len(thickness), dtype=by.dtype, device=by.device)
     pick[torch.arange(len(group)), group] = thickness[group]
     # de/d theta = -by, de/du = -pick
-    gradient = -(weighted * e[..., None]).sum(1)
+    gradient = -(by * (weight * e)[..., None]).sum(1)
     hessian_u = torch.einsum("bn,ng,nh->bgh", weight, pick, pick)
     return CloudTerm(
         0.5 * (weight * e * e).sum(1),
         gradient,
-        weighted.transpose(1, 2) @ by,
+        weighted.transpose(1, 2) @ by_of_own_limb,
         -(weight * e) @ pick,
         weighted.transpose(1, 2) @ pick,
         hessian_u,

@@ -1,7 +1,7 @@
 """The normal equations of :mod:`.body_cloud`, compiled: a limb's samples touch few columns.
 
-Equal to :func:`.body_cloud.assemble` to rounding, but for what :mod:`.correctives_kernel` says
-about pose blend shapes.
+Equal to :func:`.body_cloud.assemble` to rounding, pose blend shapes included: see
+:mod:`.correctives_kernel`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _find_columns(moved_by, place, group, place_u, local, local_u, to):
 def _fill_row(row, local, shape, c, b, i, n, arms, by_shape):
     """Write n . d point i / d parameters of body b by the columns ``local`` (P,); n . point.
 
-    ``shape``: the shape's columns that are asked for, from 0; arms (L,3), by_shape (S,) scratch.
+    ``shape``: the shape's fitted columns, from 0; arms (L,3), by_shape (S,) scratch.
     """
     x0, x1, x2, along = c.rest[b, i, 0], c.rest[b, i, 1], c.rest[b, i, 2], 0.0
     n0, n1, n2 = n
@@ -110,22 +110,22 @@ def _add_squares(rows, weights, block):
 @numba.njit(cache=True, nogil=True)
 def add_equations(
     chain, limbs, normal, weight, target, thickness, group, frames, place, place_u,
-    cost, gradient, hessian, pull, tables, change,
+    cost, gradient, hessian, rest_gradient, tables, by_pose,
 ):  # fmt: skip
     """Add the normal equations of E_D to those of the frames (B,).
 
     ``limbs``: as :attr:`.Selection.limbs`; normal (T,N,3), weight (T,N), 0 = no row, target (T,N);
     thickness (G,) of each group's points, (N,), whose derivative by its column in ``place_u`` (G,)
     is itself; ``place`` (P,): the parameters' columns; -1 = fixed. cost (B,), gradient (B,n),
-    hessian (B,n,n). pull (B,N,3): the gradient by the points at rest, tables (N,3,486) and change
-    (B,54,3,9): see :mod:`.correctives_kernel`; of no body without pose blend shapes.
+    hessian (B,n,n). rest_gradient (B,N,3): that of the points at rest, filled in, tables (N,3,486)
+    and by_pose (B,54,3,9): see :mod:`.correctives_kernel`; of no body without pose blend shapes.
     """
     order, starts, moved_by = limbs
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     arms = np.empty((chain.chain.shape[1], 3), dtype)
     by_shape = np.empty(len(place) - _SHAPE, dtype)
-    weights, pulls = np.empty(_TOGETHER, dtype), np.empty(1, dtype)
+    weights, weighted = np.empty(_TOGETHER, dtype), np.empty(1, dtype)
     limbs_count, size = len(starts) - 1, len(place) + len(place_u)
     all_local = np.empty((limbs_count, len(place)), np.int64)
     all_local_u = np.empty((limbs_count, len(place_u)), np.int64)
@@ -142,7 +142,7 @@ def add_equations(
             local, local_u, to = all_local[limb], all_local_u[limb], all_to[limb]
             rows, block = np.empty((_TOGETHER, m), dtype), np.zeros((m, m), dtype)
             slope = np.zeros(m, dtype)
-            bent_by = np.flatnonzero(moved_by[limb, 1:]) + 1
+            of_limb = np.flatnonzero(moved_by[limb, 1:]) + 1
             for at in range(starts[limb], starts[limb + 1]):
                 i = order[at]
                 w, g = weight[t, i], group[i]
@@ -155,14 +155,14 @@ def add_equations(
                     row[local_u[g]] = thickness[g]
                 e = target[t, i] - along - thickness[g]
                 total += w * e * e / 2
-                pulls[0] = w * e
+                weighted[0] = w * e
                 for q in range(m):
-                    slope[q] -= pulls[0] * row[q]
-                if len(pull):
+                    slope[q] -= weighted[0] * row[q]
+                if len(rest_gradient):
                     back = turned_back(chain, b, i, n)
                     for d in range(3):
-                        pull[b, i, d] -= pulls[0] * back[d]
-                    add_to_row(row, local, bent_by, back, tables[i], change[b])
+                        rest_gradient[b, i, d] -= weighted[0] * back[d]
+                    add_to_row(row, local, of_limb, back, tables[i], by_pose[b])
                 weights[filled] = w
                 filled += 1
                 if filled == _TOGETHER:

@@ -2,13 +2,13 @@
 
     E_J = sum over views v, keypoints i of k_i w_i^v rho_J( Pi^v(X_i(theta, beta, gamma)) - J_i^v )
 
-with Geman and McClure's rho_J, the detector's confidence w and a fixed trust k = 1 / sigma^2 by
+with Geman and McClure's rho_J, the detector's confidence w and a fixed precision k = 1 / sigma^2 by
 keypoint. X_i is the model's keypoint plus an offset o_i that is fixed in the frame of the bone that
 carries it: detectors and body models mean different points by the same name ("hip"), and that
 difference is the same in every frame. o_i is estimated with a Gaussian prior, see
 :mod:`.body_priors`.
 
-Everything a view says about a keypoint acts through the 3D point, so the views are summed into one
+A view's residuals depend on the body through the 3D point alone, so the views are summed into one
 3 x 3 matrix and one 3-vector for each keypoint before the body's derivatives come in.
 """
 
@@ -25,17 +25,23 @@ from torch import Tensor
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 from intercap_core.body.kinematics import pose_joints, rotation_from_axis_angle, skew
 from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import BodyParameters
+from intercap_core.body.parameters import NUM_POSE, BodyParameters
+from intercap_core.body.selection import Limbs
 from intercap_core.camera import projection
 from intercap_core.solve.robust import geman_mcclure
 
 
 class Keypoints(NamedTuple):
-    """points (B,K,3) with offsets applied, derivatives (B,K,3,n), bone rotations (B,K,3,3)."""
+    """points (B,K,3) with offsets applied, derivatives (B,K,3,n), bone rotations (B,K,3,3).
+
+    of_own_limb (B,K,3,n): derivatives with pose blend shapes by the joints of each keypoint's own
+    limb alone, as Gauss-Newton matrices have them.
+    """
 
     points: Tensor
     derivatives: Tensor | None
     rotations: Tensor
+    of_own_limb: Tensor | None = None
 
 
 class PointTerm(NamedTuple):
@@ -55,6 +61,7 @@ class KeypointSet:
 
     vertices (N,) ids; matrix (K,N+55) over those vertices and the joints; carrier (K,): joint whose
     bone carries the keypoint's offset, and turned_by (K,55): 1 for the joints that turn that bone.
+    limbs: keypoints on the same chain of joints.
     """
 
     index: Tensor
@@ -62,6 +69,7 @@ class KeypointSet:
     matrix: Tensor
     carrier: Tensor
     turned_by: Tensor
+    limbs: Limbs
 
 
 def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
@@ -82,13 +90,38 @@ def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
     used = np.flatnonzero(matrix[:, :count].any(0))
     matrix = np.concatenate([matrix[:, used], matrix[:, count:]], 1)
     device = model.device
+    vertices = keypoints.vertex_ids[used]
+    follows = np.zeros((len(vertices) + NUM_JOINTS, NUM_JOINTS), bool)  # a joint its parent alone
+    follows[: len(vertices)] = model.skinning_weights[torch.as_tensor(vertices)].cpu().numpy() != 0
+    follows[len(vertices) + np.arange(NUM_JOINTS), [max(parent, 0) for parent in PARENTS]] = True
     return KeypointSet(
         torch.as_tensor(rows, device=device),
-        torch.as_tensor(keypoints.vertex_ids[used], device=device),
+        torch.as_tensor(vertices, device=device),
         torch.as_tensor(matrix, dtype=model.dtype, device=device),
         torch.as_tensor(carrier, device=device),
         torch.as_tensor(turned, dtype=model.dtype, device=device),
+        _limbs([_chain(np.flatnonzero(bones)) for bones in (matrix != 0) @ follows]),
     )
+
+
+def _chain(bones: np.ndarray) -> frozenset[int]:
+    """All joints that move any of the bones."""
+    return frozenset().union(*(ancestors(bone) for bone in bones.tolist()))
+
+
+def _limbs(chains: list[frozenset[int]]) -> Limbs:
+    """Keypoints by limb: each goes with the first of those of longest chain that holds its own."""
+    limbs: list[list[int]] = []
+    for k in sorted(range(len(chains)), key=lambda k: (-len(chains[k]), k)):
+        home = next((limb for limb in limbs if chains[k] <= chains[limb[0]]), None)
+        if home is None:
+            limbs.append([k])
+        else:
+            home.append(k)
+    moved_by = np.zeros((len(limbs), NUM_JOINTS), bool)
+    for flags, limb in zip(moved_by, limbs, strict=True):
+        flags[sorted(chains[limb[0]])] = True
+    return Limbs(np.concatenate(limbs), np.cumsum([0, *map(len, limbs)]), moved_by)
 
 
 def evaluate(
@@ -102,7 +135,7 @@ def evaluate(
 ) -> Keypoints:
     """Keypoints (B,K,3) of B bodies; offsets (K,3), metres, in the frames of their bones.
 
-    Derivatives, if asked for, are by the chosen ``columns`` (n,) of the parameters, or by all.
+    Derivatives, if requested, are by the chosen ``columns`` (n,) of the parameters, or by all.
     """
     local = rotation_from_axis_angle(params.full_pose())
     still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
@@ -116,7 +149,7 @@ def evaluate(
     if columns is None:
         columns = torch.arange(model.num_parameters, device=model.device)
     linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
-    full = linear.full()
+    full = linear.with_correctives_of(None).full()
     batch, _, _, size = full.shape
     by = (chosen.matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
     # a turn w of joint l moves the arm R o by w x R o, for every l the carrier hangs on
@@ -126,7 +159,15 @@ def evaluate(
     by[:, moved, :, : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(
         batch, len(moved), 3, 3 * NUM_JOINTS
     )
-    return Keypoints(chosen.matrix @ linear.points + arms, by[..., columns], rotations)
+    of_own_limb = by
+    if linear.correctives is not None:
+        extra = torch.einsum("kn,bnijd->bkijd", chosen.matrix, linear.correctives)
+        flags = torch.as_tensor(chosen.limbs.moved_by_point()[:, 1:], device=model.device)
+        of_own_limb = by.clone()
+        of_own_limb[..., 3:NUM_POSE] += (extra * flags[:, None, :, None]).flatten(3)
+        by[..., 3:NUM_POSE] += extra.flatten(3)
+    points = chosen.matrix @ linear.points + arms
+    return Keypoints(points, by[..., columns], rotations, of_own_limb[..., columns])
 
 
 def reprojection(
@@ -140,16 +181,16 @@ def reprojection(
     scale: float,
     shift: Tensor | None = None,
 ) -> PointTerm:
-    """E_J of points (B,K,3), master frame, seen in C views.
+    """E_J of points (B,K,3), master frame, in C views.
 
-    observed (B,C,K,2) px; confidence (B,C,K), 0 = not seen; sigma (B,C,K) px, the trust; lenses
+    observed (B,C,K,2) px; confidence (B,C,K), 0 = not detected; sigma (B,C,K) px; lenses
     (C,13) as :mod:`projection` takes them; colour_from_master (C,4,4). ``scale``: residuals beyond
     so many sigma stop counting. shift (B,C,K,3), metres: how much farther each point has moved when
     that camera exposes. cost = sum w rho(|r / sigma|^2) / 2.
     """
     rotation, translation = colour_from_master[:, :3, :3], colour_from_master[:, :3, 3]
-    seen = points[:, None] if shift is None else points[:, None] + shift
-    in_camera = seen @ rotation.transpose(1, 2) + translation[:, None]
+    moved = points[:, None] if shift is None else points[:, None] + shift
+    in_camera = moved @ rotation.transpose(1, 2) + translation[:, None]
     pixels, by_point = projection.project_with_jacobian(in_camera, lenses[:, None])
     known = confidence > 0
     residual = torch.where(known[..., None], (pixels - observed) / sigma[..., None], 0)
@@ -172,8 +213,8 @@ def pixel_residuals(
 ) -> Tensor:
     """Projection minus observation (B,C,K,2), px."""
     rotation, translation = colour_from_master[:, :3, :3], colour_from_master[:, :3, 3]
-    seen = points[:, None] if shift is None else points[:, None] + shift
-    in_camera = seen @ rotation.transpose(1, 2) + translation[:, None]
+    moved = points[:, None] if shift is None else points[:, None] + shift
+    in_camera = moved @ rotation.transpose(1, 2) + translation[:, None]
     return projection.project(in_camera, lenses[:, None]) - observed
 
 
@@ -199,14 +240,14 @@ def triangulated(
 
 def assemble(term: PointTerm, keypoints: Keypoints) -> tuple[Tensor, Tensor]:
     """Gradient (B,n) and Hessian (B,n,n) by the parameters that the derivatives are by."""
-    if keypoints.derivatives is None:
+    if keypoints.derivatives is None or keypoints.of_own_limb is None:
         raise ValueError("keypoints were evaluated without derivatives")
-    by = keypoints.derivatives
-    batch, _, _, size = by.shape
-    pulled = (term.matrix @ by).reshape(batch, -1, size)
-    flat = by.reshape(batch, -1, size)
-    gradient = (flat.transpose(1, 2) @ term.gradient.reshape(batch, -1, 1))[..., 0]
-    return gradient, flat.transpose(1, 2) @ pulled
+    batch, _, _, size = keypoints.derivatives.shape
+    by = keypoints.derivatives.reshape(batch, -1, size)
+    gradient = (by.transpose(1, 2) @ term.gradient.reshape(batch, -1, 1))[..., 0]
+    weighted = (term.matrix @ keypoints.of_own_limb).reshape(batch, -1, size)
+    rows = keypoints.of_own_limb.reshape(batch, -1, size)
+    return gradient, rows.transpose(1, 2) @ weighted
 
 
 def assemble_offsets(
@@ -217,13 +258,13 @@ def assemble_offsets(
     Returns gradient (B,3 count), cross block (B,n,3 count) with the body's parameters, and the
     offsets' own block (B,3 count,3 count), block diagonal.
     """
-    if keypoints.derivatives is None:
+    if keypoints.of_own_limb is None:
         raise ValueError("keypoints were evaluated without derivatives")
     rotation = keypoints.rotations[:, :count]
     batch = rotation.shape[0]
     gradient = (rotation.transpose(2, 3) @ term.gradient[:, :count, :, None])[..., 0]
     turned = term.matrix[:, :count] @ rotation
-    by = keypoints.derivatives[:, :count]
+    by = keypoints.of_own_limb[:, :count]
     cross = (by.transpose(2, 3) @ turned).permute(0, 2, 1, 3).flatten(2)
     own = rotation.new_zeros(batch, count, 3, count, 3)
     each = torch.arange(count, device=rotation.device)

@@ -2,13 +2,11 @@
 
 A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
 the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.
-Equal to the plain term to rounding, but for what :mod:`.correctives_kernel` says about pose blend
-shapes.
+Equal to the torch term to rounding, pose blend shapes included: see :mod:`.correctives_kernel`.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numba
@@ -16,12 +14,12 @@ import numpy as np
 from torch import Tensor
 
 from intercap_core.body.correctives_kernel import add_to_row
-from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
+from intercap_core.body.joints import PARENTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.skeleton_kernel import columns_of_limb, rest_points
 from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.sightings_kernel import ask
+from intercap_core.energy.sightings_kernel import evaluate_keypoint
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _PARENTS = np.array(PARENTS)
@@ -58,24 +56,16 @@ class Pieces(NamedTuple):
         made_of, bone = np.nonzero((matrix != 0) @ (weights != 0))
         share = matrix[made_of] * weights[:, bone].T  # (E,N), of each point in each piece
         carrier = np.flatnonzero(bone == chosen.carrier.numpy()[made_of])
-        bones, starts = bone.tolist(), np.searchsorted(made_of, np.arange(len(matrix) + 1))
+        starts = np.searchsorted(made_of, np.arange(len(matrix) + 1))
 
         def mixed(values: Tensor) -> np.ndarray:
             return np.tensordot(share, values.double().numpy(), 1).astype(dtype)
 
-        chains = [
-            frozenset().union(*(ancestors(bone) for bone in bones[first:end]))
-            for first, end in pairwise(starts)
-        ]
-        limbs = _limbs(chains)
-        moved_by = np.zeros((len(limbs), NUM_JOINTS), bool)
-        for flags, limb in zip(moved_by, limbs, strict=True):
-            flags[sorted(chains[limb[0]])] = True
         posedirs = points.directions[..., :0] if points.posedirs is None else points.posedirs
         return cls(
             starts, bone, share.sum(1).astype(dtype), mixed(points.template),
-            mixed(points.directions), carrier, np.cumsum([0, *map(len, limbs)]),
-            np.concatenate(limbs), moved_by, mixed(posedirs),
+            mixed(points.directions), carrier, chosen.limbs.starts, chosen.limbs.order,
+            chosen.limbs.moved_by, mixed(posedirs),
         )  # fmt: skip
 
     def at_rest(self, shape: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -83,18 +73,6 @@ class Pieces(NamedTuple):
         rest = rest_points(self.template, self.directions, shape)
         rest[:, self.carrier] += offsets
         return rest
-
-
-def _limbs(chains: list[frozenset[int]]) -> list[list[int]]:
-    """Keypoints by limb: each goes with the first of those of longest chain that holds its own."""
-    limbs: list[list[int]] = []
-    for k in sorted(range(len(chains)), key=lambda k: (-len(chains[k]), k)):
-        home = next((limb for limb in limbs if chains[k] <= chains[limb[0]]), None)
-        if home is None:
-            limbs.append([k])
-        else:
-            home.append(k)
-    return limbs
 
 
 @numba.njit(cache=True, nogil=True)
@@ -120,14 +98,14 @@ def _point(skeleton, pieces, rest, b, k):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_cost(skeleton, pieces, rest, seen, frames, cost):
+def add_cost(skeleton, pieces, rest, observed, frames, cost):
     """Add E_J to cost (B,) of the frames (B,), whose pieces at rest are (B,E,3)."""
     gradient, matrix = np.empty(3), np.empty((3, 3))
     for b in range(len(frames)):
         total = 0.0
         for k in range(len(pieces.carrier)):
             p = _point(skeleton, pieces, rest, b, k)
-            total += ask(seen, frames[b], k, p, False, gradient, matrix)
+            total += evaluate_keypoint(observed, frames[b], k, p, False, gradient, matrix)
         cost[b] += total
 
 
@@ -176,37 +154,37 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
 
 
 @numba.njit(cache=True, nogil=True)
-def _bend(skeleton, pieces, b, k, slope, pull, rows, local, joints, change):
-    """Write the pull on the pieces of keypoint k, and add to its rows (3,m) what ``joints`` change
-    by pose blend shapes; slope (3,) of the cost by the keypoint."""
+def _add_correctives(skeleton, pieces, b, k, slope, rest_gradient, rows, local, joints, by_pose):
+    """Add the gradient by the pieces of keypoint k at rest, and to its rows (3,m) what ``joints``
+    change by pose blend shapes; slope (3,): gradient of the cost by the keypoint."""
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
         turn = skeleton.rotations[b, pieces.bone[e]]
         for i in range(3):
             for d in range(3):
-                pull[b, e, d] += turn[i, d] * slope[i]
-            add_to_row(rows[i], local, joints, turn[i], pieces.posedirs[e], change)
+                rest_gradient[b, e, d] += turn[i, d] * slope[i]
+            add_to_row(rows[i], local, joints, turn[i], pieces.posedirs[e], by_pose)
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _pull(matrix, rows, pulled):
-    """pulled = matrix rows, (3,m)."""
+def _weigh(matrix, rows, weighted):
+    """weighted = matrix rows, (3,m)."""
     for i in range(3):
         m0, m1, m2 = matrix[i, 0], matrix[i, 1], matrix[i, 2]
         for q in range(rows.shape[1]):
-            pulled[i, q] = m0 * rows[0, q] + m1 * rows[1, q] + m2 * rows[2, q]
+            weighted[i, q] = m0 * rows[0, q] + m1 * rows[1, q] + m2 * rows[2, q]
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_product(rows, pulled, block):
-    """Add the lower triangle of rows^T pulled, (m,m), to block; rows and pulled (3,m)."""
+def _add_product(rows, weighted, block):
+    """Add the lower triangle of rows^T weighted, (m,m), to block; rows and weighted (3,m)."""
     for p in range(block.shape[0]):
         a0, a1, a2 = rows[0, p], rows[1, p], rows[2, p]
         for q in range(p + 1):
-            block[p, q] += a0 * pulled[0, q] + a1 * pulled[1, q] + a2 * pulled[2, q]
+            block[p, q] += a0 * weighted[0, q] + a1 * weighted[1, q] + a2 * weighted[2, q]
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_offset(turn, slope, matrix, pulled, to, first, gradient, hessian):
+def _add_offset(turn, slope, matrix, weighted, to, first, gradient, hessian):
     """Add the part of a keypoint's offset, whose three columns start at ``first``; turn (3,3) of
     the bone that carries it."""
     for d in range(3):
@@ -217,24 +195,24 @@ def _add_offset(turn, slope, matrix, pulled, to, first, gradient, hessian):
                 hessian[first + d, first + e] += turn[i, e] * (
                     r0 * matrix[0, i] + r1 * matrix[1, i] + r2 * matrix[2, i]
                 )
-        for q in range(pulled.shape[1]):
-            part = r0 * pulled[0, q] + r1 * pulled[1, q] + r2 * pulled[2, q]
+        for q in range(weighted.shape[1]):
+            part = r0 * weighted[0, q] + r1 * weighted[1, q] + r2 * weighted[2, q]
             hessian[to[q], first + d] += part
             hessian[first + d, to[q]] += part
 
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    skeleton, pieces, rest, seen, frames, place, first_offset, offsets,
-    cost, gradient, hessian, pull, change,
+    skeleton, pieces, rest, observed, frames, place, first_offset, offsets,
+    cost, gradient, hessian, rest_gradient, by_pose,
 ):  # fmt: skip
     """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
     (B,E,3).
 
     ``place`` (P,) says where a parameter's column is, -1 = fixed; the offsets of the first
     ``offsets`` keypoints, three columns each, start at ``first_offset``. cost (B,), gradient (B,n),
-    hessian (B,n,n). pull (B,E,3): the gradient by the pieces at rest, change (B,54,3,9): see
-    :mod:`.correctives_kernel`; of no body without pose blend shapes.
+    hessian (B,n,n). rest_gradient (B,E,3): that of the pieces at rest, filled in, and by_pose
+    (B,54,3,9): see :mod:`.correctives_kernel`; of no body without pose blend shapes.
     """
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
@@ -250,13 +228,13 @@ def add_equations(
     for b in range(len(frames)):
         for limb in range(limbs):
             m, local, to = width[limb], all_local[limb], all_to[limb]
-            rows, pulled = np.empty((3, m), dtype), np.empty((3, m), dtype)
+            rows, weighted = np.empty((3, m), dtype), np.empty((3, m), dtype)
             block = np.zeros((m, m), dtype)
-            bent_by = np.flatnonzero(pieces.moved_by[limb, 1:]) + 1
+            of_limb = np.flatnonzero(pieces.moved_by[limb, 1:]) + 1
             for at in range(pieces.limb_starts[limb], pieces.limb_starts[limb + 1]):
                 k = pieces.order[at]
                 p = _point(skeleton, pieces, rest, b, k)
-                cost[b] += ask(seen, frames[b], k, p, True, slope, matrix)
+                cost[b] += evaluate_keypoint(observed, frames[b], k, p, True, slope, matrix)
                 if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
                     continue
                 _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)
@@ -264,17 +242,28 @@ def add_equations(
                     gradient[b, to[q]] += (
                         rows[0, q] * slope[0] + rows[1, q] * slope[1] + rows[2, q] * slope[2]
                     )
-                if len(pull):
-                    _bend(skeleton, pieces, b, k, slope, pull, rows, local, bent_by, change[b])
+                if len(rest_gradient):
+                    _add_correctives(
+                        skeleton,
+                        pieces,
+                        b,
+                        k,
+                        slope,
+                        rest_gradient,
+                        rows,
+                        local,
+                        of_limb,
+                        by_pose[b],
+                    )  # fmt: skip
                 for i in range(3):
                     for o in range(3):
                         narrow[i, o] = matrix[i, o]
-                _pull(narrow, rows, pulled)
-                _add_product(rows, pulled, block)
+                _weigh(narrow, rows, weighted)
+                _add_product(rows, weighted, block)
                 if k < offsets:
                     turn = skeleton.rotations[b, pieces.bone[pieces.carrier[k]]]
                     first = first_offset + 3 * k
-                    _add_offset(turn, slope, matrix, pulled, to, first, gradient[b], hessian[b])
+                    _add_offset(turn, slope, matrix, weighted, to, first, gradient[b], hessian[b])
             for p in range(m):
                 for q in range(p):
                     block[q, p] = block[p, q]

@@ -44,11 +44,12 @@ def vertex_normals(vertices, faces, starts, around, out):
 
 @numba.njit(cache=True, nogil=True)
 def match(
-    points, looks, vertices, normals, samples, patch, order, starts, length, reach, aside, turned
+    points, point_normals, vertices, normals, samples, patch, order, starts, length, reach, aside,
+    turned,
 ):  # fmt: skip
     """Sample (M,), signed distance (M,) and whether it counts (M,), as :func:`.body_cloud.match`.
 
-    points and their normals ``looks`` (M,3); ``order`` (S,) lists the samples group by group, from
+    points and point_normals (M,3); ``order`` (S,) lists the samples group by group, from
     ``starts[g]`` to ``starts[g + 1]``. ``length`` metres a radian between normals; a match counts
     within ``reach`` metres along the normal, ``aside`` metres beside it, and where the cosine
     between the normals is over ``turned``.
@@ -78,7 +79,7 @@ def match(
     for m in range(len(points)):
         for d in range(3):
             here[d] = points[m, d]
-            here[3 + d] = length * looks[m, d]
+            here[3 + d] = length * point_normals[m, d]
         least = _square(own, best, here)
         bound = np.sqrt(least)
         _squares(centre, 0, groups, here, to_group)
@@ -100,7 +101,7 @@ def match(
         distance[m] = height
         sx, sy, sz = gx - height * nx, gy - height * ny, gz - height * nz
         valid[m] = (
-            nx * looks[m, 0] + ny * looks[m, 1] + nz * looks[m, 2] > turned
+            nx * point_normals[m, 0] + ny * point_normals[m, 1] + nz * point_normals[m, 2] > turned
             and abs(height) < reach
             and np.sqrt(sx * sx + sy * sy + sz * sz) < aside
         )
@@ -213,7 +214,7 @@ def find(
                 continue
             if not np.sqrt(sx * sx + sy * sy + sz * sz) < sideways[j]:
                 continue
-            # what touches in the web between two fingers looks the same way
+            # normals agree where two fingers join: no collision
             if same_hand and (normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz >= 0):
                 continue
             inner[found], outer[found] = v, at

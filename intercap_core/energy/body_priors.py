@@ -8,8 +8,6 @@ standing at ease. Anatomical limits hold with either.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -18,11 +16,13 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import PoseGaussian
+from intercap_core.energy.body_constants import (
+    BENDING_WEIGHT,
+    LIMIT_WEIGHT,
+    SMALLEST_HAND_DEVIATION,
+)
 
-_LIMIT_WEIGHT = 1 / math.radians(4)  # ranges are means plus two deviations: a soft edge
-_BENDING_WEIGHT = 1 / 6  # exp(sign theta) = 1 at the straight limb, where it should cost little
 _BODY_POSE = slice(3, 66)
-_SMALLEST_HAND_DEVIATION = 0.03  # components that hardly vary among grasps still give a little
 
 
 def terms(
@@ -32,13 +32,13 @@ def terms(
 
     ``body_pose``: with the open default's Gaussian of the 21 body joints.
     """
-    deviation = model.hand_deviation.clamp_min(_SMALLEST_HAND_DEVIATION)
+    deviation = model.hand_deviation.clamp_min(SMALLEST_HAND_DEVIATION)
     own = (model.hand_mean, model.hand_components, deviation)
     hands = [(priors.hand_pose(vector, *own, side=side), 1.0) for side in (0, 1)]
     return [
         (priors.rest_pose(vector, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
-        (priors.joint_limits(vector), _LIMIT_WEIGHT),
-        (priors.bending(vector), _BENDING_WEIGHT),
+        (priors.joint_limits(vector), LIMIT_WEIGHT),
+        (priors.bending(vector), BENDING_WEIGHT),
         *hands,
     ]
 
@@ -63,8 +63,8 @@ def assemble(
     batch, size = vector.shape
     gradient, hessian = torch.zeros_like(vector), vector.new_zeros(batch, size, size)
     if pose is not None:
-        away = vector[:, _BODY_POSE] - pose.mean
-        gradient[:, _BODY_POSE] += (pose.precision @ away[..., None])[..., 0]
+        difference = vector[:, _BODY_POSE] - pose.mean
+        gradient[:, _BODY_POSE] += (pose.precision @ difference[..., None])[..., 0]
         hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
     for rows, weight in terms(model, vector, body_pose=pose is None):
         rows.add_to(hessian, gradient, weight)

@@ -66,57 +66,57 @@ class Priors(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_block(away, precision, first, place, gradient, hessian, slopes):
-    """Add a Gaussian's part of neighbouring parameters, ``away`` (m,) from its mean; its cost."""
+def _add_block(deviation, precision, first, place, gradient, hessian, derivatives):
+    """Add the Gaussian of neighbouring parameters, ``deviation`` (m,) from its mean; its cost."""
     total = 0.0
-    for i in range(len(away)):
-        pull = np.float64(0)
-        for j in range(len(away)):
-            pull += precision[i, j] * away[j]
-        total += 0.5 * pull * away[i]
+    for i in range(len(deviation)):
+        slope = np.float64(0)
+        for j in range(len(deviation)):
+            slope += precision[i, j] * deviation[j]
+        total += 0.5 * slope * deviation[i]
         p = place[first + i]
-        if slopes and p >= 0:
-            gradient[p] += pull
-            for j in range(len(away)):
+        if derivatives and p >= 0:
+            gradient[p] += slope
+            for j in range(len(deviation)):
                 if place[first + j] >= 0:
                     hessian[p, place[first + j]] += precision[i, j]
     return total
 
 
 @numba.njit(cache=True, nogil=True)
-def add_priors(prior, vectors, frames, place, slopes, cost, gradient, hessian):
-    """Add the priors at vectors (B,P) to the cost (B,) and, if ``slopes``, to gradient (B,n) and
-    hessian (B,n,n), by ``place`` (P,), each parameter's column, -1 = fixed. frames (B,): ids."""
+def add_priors(prior, vectors, frames, place, derivatives, cost, gradient, hessian):
+    """Add the priors at vectors (B,P) to the cost (B,) and, if ``derivatives``, to gradient (B,n)
+    and hessian (B,n,n), by ``place`` (P,), each parameter's column, -1 = fixed. frames (B,)."""
     for b in range(len(vectors)):
         x = vectors[b]
-        g, h = gradient[b if slopes else 0], hessian[b if slopes else 0]
+        g, h = gradient[b if derivatives else 0], hessian[b if derivatives else 0]
         total = 0.0
         for p in range(len(place)):
-            away = x[p] - prior.mean[p]
-            pull, curve = prior.own[p] * away, prior.own[p]
-            total += 0.5 * pull * away
+            deviation = x[p] - prior.mean[p]
+            slope, curve = prior.own[p] * deviation, prior.own[p]
+            total += 0.5 * slope * deviation
             if p < len(prior.ranges):
                 beyond = max(x[p] - prior.ranges[p, 1], 0) + min(x[p] - prior.ranges[p, 0], 0)
                 if beyond != 0:
                     total += 0.5 * prior.outside * beyond * beyond
-                    pull += prior.outside * beyond
+                    slope += prior.outside * beyond
                     curve += prior.outside
-            if slopes and place[p] >= 0:
-                g[place[p]] += pull
+            if derivatives and place[p] >= 0:
+                g[place[p]] += slope
                 h[place[p], place[p]] += curve
         for r in range(len(prior.bends)):
             p = place[prior.bends[r]]
             squared = prior.bending * np.exp(2 * prior.sign[r] * x[prior.bends[r]])
             total += 0.5 * squared
-            if slopes and p >= 0:
+            if derivatives and p >= 0:
                 g[p] += prior.sign[r] * squared
                 h[p, p] += squared
         for side in range(2):
             first = _HANDS[side]
-            away = x[first : first + 45] - prior.mean[first : first + 45]
-            total += _add_block(away, prior.hands[side], first, place, g, h, slopes)
+            deviation = x[first : first + 45] - prior.mean[first : first + 45]
+            total += _add_block(deviation, prior.hands[side], first, place, g, h, derivatives)
         if len(prior.pose):
             t = frames[b]
-            away = x[_BODY : _BODY + 63] - prior.pose[t]
-            total += _add_block(away, prior.pose_precision[t], _BODY, place, g, h, slopes)
+            deviation = x[_BODY : _BODY + 63] - prior.pose[t]
+            total += _add_block(deviation, prior.pose_precision[t], _BODY, place, g, h, derivatives)
         cost[b] += total

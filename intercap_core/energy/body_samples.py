@@ -11,11 +11,11 @@ import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
 from intercap_core.body.model import BodyModel
-
-_BODY_SPACING = 0.045
-_HAND_SPACING = 0.015
-_PATCH = 20  # vertices around a sample among which a point looks for its nearest
-NORMAL_LENGTH = 0.06  # metres that a turn of one radian between normals counts as
+from intercap_core.energy.body_constants import (
+    BODY_SPACING_M,
+    HAND_SPACING_M,
+    PATCH_VERTICES,
+)
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,11 @@ def choose_samples(model: BodyModel) -> Samples:
     outer = _outer(template, faces, joint)
     chosen = [
         _grid(template, np.flatnonzero(outer & part), spacing)
-        for part, spacing in ((~hand, _BODY_SPACING), (hand, _HAND_SPACING))
+        for part, spacing in ((~hand, BODY_SPACING_M), (hand, HAND_SPACING_M))
     ]
     vertex = np.concatenate(chosen)
     outside = np.flatnonzero(outer)
-    _, near = scipy.spatial.cKDTree(template[outside]).query(template[vertex], _PATCH)
+    _, near = scipy.spatial.cKDTree(template[outside]).query(template[vertex], PATCH_VERTICES)
     names = [c.name for c in COVERINGS]
     group = np.array([_covering(joint[v], names) for v in vertex])
     face = _is_face(template, joint, model)[vertex]

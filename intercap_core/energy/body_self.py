@@ -25,29 +25,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.energy.body_constants import (
+    DEEPEST_M,
+    DEEPEST_THICKNESSES,
+    GEODESIC_ROUNDS,
+    JOINED_HINGE_THICKNESSES,
+    JOINED_THICKNESSES,
+    SELF_REACH_M,
+    SELF_TOLERANCE_M,
+    SELF_WEIGHT,
+    SPACING_RANK,
+    WATCHED_M,
+)
 from intercap_core.energy.body_samples import Samples
 from intercap_core.solve.robust import geman_mcclure
 
-# Skin yields by some millimetres where parts press on each other.
-TOLERANCE = 0.003
-# The fitted skin is off by about this much, on either side.
-SIGMA = 0.008
-REACH = 0.015  # depth beyond which the push fades
-# Neighbouring samples are inside together: about four of them make one measurement.
-WEIGHT = 0.25 / SIGMA**2
-# Samples nearer over the surface than this times the mean thickness of what they lie on are joined;
-# flesh meets flesh where a joint closes, so parts on both sides of one are joined farther.
-_JOINED = 1.6
-_JOINED_AT_JOINT = 3.2
-_DEEPEST = 0.5  # of the thickness: deeper is the far side of the same part
-_DEEPEST_M = 0.06
-_MARGIN = 0.004  # metres outside at which a sample is watched: it may go in before the next look
-_SPACING_RANK = 6  # the so many nearest vertices surround a vertex
 _FAR = 1e6
-_ROUNDS = 12  # in which ways over the surface are looked for, each as far as its vertices need
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 _HAND_PARTS = ("wrist", "thumb", "index", "middle", "ring", "pinky")
@@ -116,13 +113,13 @@ class SelfContact:
         part = _PART_OF_JOINT[model.skinning_weights.argmax(1).cpu().numpy()]
         thickness = _thickness(template, faces, samples.vertex)
         own = part[samples.vertex]
-        factor = np.where(_HINGED[own[:, None], own], _JOINED_AT_JOINT, _JOINED)
+        factor = np.where(_HINGED[own[:, None], own], JOINED_HINGE_THICKNESSES, JOINED_THICKNESSES)
         joined = factor * (thickness[:, None] + thickness) / 2
-        joined[own[:, None] == own] = 0  # never asked
+        joined[own[:, None] == own] = 0  # parts do not collide with themselves
         apart = _over_the_surface(template, faces, part, samples.vertex, joined) > joined
         apart &= own[:, None] != own
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
-        spacing = np.sort(around, 1)[:, _SPACING_RANK]
+        spacing = np.sort(around, 1)[:, SPACING_RANK]
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=model.device)
@@ -134,13 +131,13 @@ class SelfContact:
             tensor(part[samples.patch]),
             tensor(_HAND_OF_PART[own]),
             tensor(apart),
-            tensor(np.minimum(_DEEPEST * thickness, _DEEPEST_M)).to(model.dtype),
+            tensor(np.minimum(DEEPEST_THICKNESSES * thickness, DEEPEST_M)).to(model.dtype),
             tensor(spacing).to(model.dtype),
         )
 
 
 class Pairs(NamedTuple):
-    """M samples that are inside another part, or nearly, until the next look.
+    """M samples that are inside another part, or nearly, until pairs are found anew.
 
     frame (M,); inner, outer (M,): places in ``vertices`` (U,) of the sample and of the vertex whose
     surface it is behind; normal (M,3) of that surface, outward, master frame.
@@ -181,8 +178,9 @@ def find(contact: SelfContact, vertices: Tensor, normals: Tensor) -> tuple[Tenso
     """Samples of one body that are inside another part: vertex ids (M,) of sample and surface, and
     the surface's normal (M,3).
 
-    vertices (V,3) metres, unit normals (V,3). Samples up to ``_MARGIN`` outside are found too. The
-    fingers of a hand are looked at apart: the next finger is nearer than what a hand is inside of.
+    vertices (V,3) metres, unit normals (V,3). Samples up to ``WATCHED_M`` outside are found too.
+    Fingers of one hand are searched separately: the next finger is nearer than what a hand
+    penetrates.
     """
     if vertices.device.type == "cpu":
         return find_compiled(contact, vertices, normals)
@@ -197,7 +195,7 @@ def find_compiled(
 
     given = (getattr(contact, field.name).numpy() for field in fields(contact))
     found = body_match_kernel.find(
-        len(_PART_NAMES), _MARGIN, vertices.numpy(), normals.numpy(), *given
+        len(_PART_NAMES), WATCHED_M, vertices.numpy(), normals.numpy(), *given
     )
     inner, outer = map(torch.from_numpy, found)
     return inner, outer, normals[outer]
@@ -217,7 +215,7 @@ def find_plain(
         nearest_distance, nearest = torch.where(looked_at, distance, _FAR).min(1)
         some = nearest_distance < _FAR
         found.append(_behind(contact, near[some], nearest[some], vertices, normals))
-    # what touches in the web between two fingers looks the same way
+    # normals agree where two fingers join: no collision
     facing = (normals[found[1][0]] * normals[found[1][1]]).sum(1) < 0
     found[1] = (found[1][0][facing], found[1][1][facing])
     inner, outer = (torch.cat(part) for part in zip(*found, strict=True))
@@ -239,7 +237,7 @@ def _behind(
     normal = normals[outer]
     height = (gap * normal).sum(1)
     beside = (gap - height[:, None] * normal).norm(dim=1)
-    inside = (height < _MARGIN) & (height > -contact.deepest[nearest])
+    inside = (height < WATCHED_M) & (height > -contact.deepest[nearest])
     inside &= beside < contact.sideways[nearest]
     return contact.vertex[sample[inside]], outer[inside]
 
@@ -250,7 +248,7 @@ def _near_other_parts(contact: SelfContact, where: Tensor) -> Tensor:
     index = contact.part[:, None].expand(-1, 3)
     low = where.new_full((count, 3), _FAR).scatter_reduce(0, index, where, "amin")
     high = where.new_full((count, 3), -_FAR).scatter_reduce(0, index, where, "amax")
-    inside = (where[:, None] > low - _MARGIN) & (where[:, None] < high + _MARGIN)
+    inside = (where[:, None] > low - WATCHED_M) & (where[:, None] < high + WATCHED_M)
     inside = inside.all(2)
     inside[torch.arange(len(where)), contact.part] = False
     return inside.any(1).nonzero()[:, 0]
@@ -264,8 +262,8 @@ def cost(model: BodyModel, params: BodyParameters, pairs: Pairs, index: Tensor) 
         return total
     chosen, present = here
     points = model.forward(params.frames(present), vertex_ids=pairs.vertices).vertices
-    robust = geman_mcclure(_residuals(points, chosen) ** 2, REACH)
-    return total.index_add(0, present[chosen.frame], 0.5 * WEIGHT * robust.rho)
+    robust = geman_mcclure(_residuals(points, chosen) ** 2, SELF_REACH_M)
+    return total.index_add(0, present[chosen.frame], 0.5 * SELF_WEIGHT * robust.rho)
 
 
 class SelfTerm(NamedTuple):
@@ -281,7 +279,9 @@ class SelfTerm(NamedTuple):
 def assemble(
     model: BodyModel, params: BodyParameters, pairs: Pairs, index: Tensor, columns: Tensor
 ) -> SelfTerm | None:
-    """Normal equations by the parameters ``columns`` (n,) of the frames ``index`` (b,)."""
+    """Normal equations by the parameters ``columns`` (n,) of the frames ``index`` (b,).
+
+    The gradient knows pose blend shapes, the Gauss-Newton matrix does not."""
     here = pairs.of_frames(index)
     if here is None:
         return None
@@ -293,26 +293,30 @@ def assemble(
         return None
     frame, residual = chosen.frame[active], residual[active]
     # d residual / d parameters = -n . (dp - dq)
-    by_point = linear.full()[..., columns]
-    apart = by_point[frame, chosen.inner[active]] - by_point[frame, chosen.outer[active]]
-    rows = -(chosen.normal[active][:, None] @ apart)[:, 0]
-    robust = geman_mcclure(residual**2, REACH)
-    weight = WEIGHT * robust.weight
+    inner, outer, normal = chosen.inner[active], chosen.outer[active], chosen.normal[active]
+
+    def rows_of(linear: Linearisation) -> Tensor:
+        by_point = linear.full()[..., columns]
+        return -(normal[:, None] @ (by_point[frame, inner] - by_point[frame, outer]))[:, 0]
+
+    rows, rigid_rows = rows_of(linear), rows_of(linear.with_correctives_of(None))
+    robust = geman_mcclure(residual**2, SELF_REACH_M)
+    weight = SELF_WEIGHT * robust.weight
     count, size = len(present), len(columns)
-    total = rows.new_zeros(count).index_add(0, frame, 0.5 * WEIGHT * robust.rho)
-    pull = (weight * residual)[:, None] * rows
-    gradient = rows.new_zeros(count, size).index_add(0, frame, pull)
+    total = rows.new_zeros(count).index_add(0, frame, 0.5 * SELF_WEIGHT * robust.rho)
+    gradients = (weight * residual)[:, None] * rows
+    gradient = rows.new_zeros(count, size).index_add(0, frame, gradients)
     hessian = rows.new_zeros(count, size, size)
     for f in frame.unique().tolist():
         own = frame == f
-        hessian[f] = rows[own].T @ (weight[own, None] * rows[own])
+        hessian[f] = rigid_rows[own].T @ (weight[own, None] * rigid_rows[own])
     return SelfTerm(present, total, gradient, hessian)
 
 
 def _residuals(points: Tensor, pairs: Pairs) -> Tensor:
     """How much deeper than the tolerance (M,), metres, of points (F,U,3); 0 = outside."""
     gap = points[pairs.frame, pairs.inner] - points[pairs.frame, pairs.outer]
-    return (-(pairs.normal * gap).sum(1) - TOLERANCE).clamp_min(0)
+    return (-(pairs.normal * gap).sum(1) - SELF_TOLERANCE_M).clamp_min(0)
 
 
 def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
@@ -345,11 +349,11 @@ def _over_the_surface(
     length = np.linalg.norm(points[vertex[edges[:, 0]]] - points[vertex[edges[:, 1]]], axis=1)
     count = len(vertex)
     graph = scipy.sparse.csr_matrix((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    # who is farther straight on than asked is farther over the surface too
+    # the geodesic distance is no shorter than the Euclidean one
     straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
     farthest = np.where(straight <= limit, limit, 0).max(1)
     found = np.full((count, count), np.inf)
-    for some in np.array_split(np.argsort(farthest, kind="stable"), _ROUNDS):
+    for some in np.array_split(np.argsort(farthest, kind="stable"), GEODESIC_ROUNDS):
         found[some] = scipy.sparse.csgraph.dijkstra(
             graph, directed=False, indices=some, limit=farthest[some].max()
         )

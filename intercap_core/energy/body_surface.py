@@ -11,9 +11,11 @@ from torch import Tensor
 from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.energy.body_samples import NORMAL_LENGTH, Samples
-
-_GROUP = 24  # samples that are looked at together
+from intercap_core.energy.body_constants import (
+    NORMAL_LENGTH_M,
+    SAMPLES_TOGETHER,
+)
+from intercap_core.energy.body_samples import Samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +80,12 @@ def _grouped(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray
     """The samples halved by place and orientation, at rest, until few are left: their order (N,)
     and where each group starts, and the last ends."""
     template = model.template[None]
-    rest = torch.cat([template, NORMAL_LENGTH * vertex_normals(template, model.faces)], 2)[0]
+    rest = torch.cat([template, NORMAL_LENGTH_M * vertex_normals(template, model.faces)], 2)[0]
     at = rest.double().cpu().numpy()[samples.vertex]
     whole, parts = [np.arange(len(at))], []
     while whole:
         part = whole.pop()
-        if len(part) <= _GROUP:
+        if len(part) <= SAMPLES_TOGETHER:
             parts.append(part)
             continue
         axis = int(np.ptp(at[part], axis=0).argmax())

@@ -18,7 +18,7 @@ from intercap_core.body.skeleton_kernel import turned_back
 _SHAPE = TRANSL.stop
 
 
-class Touching(NamedTuple):
+class SelfPairs(NamedTuple):
     """Pairs of :class:`.body_self.Pairs` by frame: those of frame t from starts[t] to starts[t+1].
 
     inner, outer (M,) points of a chain, normal (M,3). tolerance, reach (m) and weight (1/m^2) as
@@ -33,14 +33,12 @@ class Touching(NamedTuple):
     reach: float
     weight: float
 
-    def asked(self, frames: np.ndarray, count: int) -> np.ndarray:
-        """Which of so many points pairs of the frames (B,) ask for, (B,N) bool."""
-        asked = np.zeros((len(frames), count), bool)
-        for row, first, end in zip(
-            asked, self.starts[frames], self.starts[frames + 1], strict=True
-        ):
+    def used_points(self, frames: np.ndarray, count: int) -> np.ndarray:
+        """Which of so many points the pairs of the frames (B,) are made of, (B,N) bool."""
+        used = np.zeros((len(frames), count), bool)
+        for row, first, end in zip(used, self.starts[frames], self.starts[frames + 1], strict=True):
             row[self.inner[first:end]] = row[self.outer[first:end]] = True
-        return asked
+        return used
 
 
 @numba.njit(cache=True, nogil=True)
@@ -75,62 +73,63 @@ def add_plane_cost(chain, normal, weight, target, thickness, group, frames, cost
 
 
 @numba.njit(cache=True, nogil=True)
-def _depth(chain, touching, b, at):
-    """How much deeper than the tolerance pair ``at`` is, metres; not above zero = apart."""
-    n = touching.normal[at]
-    outer = _along(chain, b, touching.outer[at], n)
-    return outer - _along(chain, b, touching.inner[at], n) - touching.tolerance
+def _depth(chain, pairs, b, at):
+    """How much deeper than the tolerance pair ``at`` is, metres; not positive = apart."""
+    n = pairs.normal[at]
+    outer = _along(chain, b, pairs.outer[at], n)
+    return outer - _along(chain, b, pairs.inner[at], n) - pairs.tolerance
 
 
 @numba.njit(cache=True, nogil=True)
-def add_self_cost(chain, touching, frames, cost):
+def add_self_cost(chain, pairs, frames, cost):
     """Add E_P_self to cost (B,) of the frames (B,)."""
-    square = touching.reach * touching.reach
+    square = pairs.reach * pairs.reach
     for b in range(len(frames)):
         total = 0.0
-        for at in range(touching.starts[frames[b]], touching.starts[frames[b] + 1]):
-            depth = _depth(chain, touching, b, at)
+        for at in range(pairs.starts[frames[b]], pairs.starts[frames[b] + 1]):
+            depth = _depth(chain, pairs, b, at)
             if depth > 0:
                 total += depth * depth * square / (depth * depth + square)
-        cost[b] += 0.5 * touching.weight * total
+        cost[b] += 0.5 * pairs.weight * total
 
 
 @numba.njit(cache=True, nogil=True)
-def add_self_equations(chain, touching, frames, place, cost, gradient, hessian, pull):
+def add_self_equations(chain, pairs, frames, place, cost, gradient, hessian, rest_gradient):
     """Add the normal equations of E_P_self to those of the frames (B,).
 
     ``place`` (P,): each parameter's column, -1 = fixed. cost (B,), gradient (B,n), hessian (B,n,n).
-    pull (B,N,3): the gradient by the points at rest; of no body if not wanted.
+    rest_gradient (B,N,3): that of the points at rest, filled in; of no body without pose blend
+    shapes.
     """
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     columns = place[place >= 0]
     scratch = np.empty((chain.chain.shape[1], 3), hessian.dtype)
     one = np.ones(1, hessian.dtype)[0]
-    square = touching.reach * touching.reach
+    square = pairs.reach * pairs.reach
     for b in range(len(frames)):
-        first, end = touching.starts[frames[b]], touching.starts[frames[b] + 1]
+        first, end = pairs.starts[frames[b]], pairs.starts[frames[b] + 1]
         rows = np.zeros((end - first, gradient.shape[1]), hessian.dtype)
         root = np.zeros(end - first, hessian.dtype)
         count = 0
         for at in range(first, end):
-            depth = _depth(chain, touching, b, at)
+            depth = _depth(chain, pairs, b, at)
             if depth <= 0:
                 continue
-            row, n = rows[count], touching.normal[at]
+            row, n = rows[count], pairs.normal[at]
             # d depth / d parameters = -n . (dp - dq)
-            _add_point(row, place, shape, chain, b, touching.outer[at], one, n, scratch)
-            _add_point(row, place, shape, chain, b, touching.inner[at], -one, n, scratch)
+            _add_point(row, place, shape, chain, b, pairs.outer[at], one, n, scratch)
+            _add_point(row, place, shape, chain, b, pairs.inner[at], -one, n, scratch)
             share = square / (depth * depth + square)
-            cost[b] += 0.5 * touching.weight * share * depth * depth
-            weight = touching.weight * share * share
+            cost[b] += 0.5 * pairs.weight * share * depth * depth
+            weight = pairs.weight * share * share
             for q in columns:
                 gradient[b, q] += weight * depth * row[q]
-            if len(pull):
-                outer, inner = touching.outer[at], touching.inner[at]
+            if len(rest_gradient):
+                outer, inner = pairs.outer[at], pairs.inner[at]
                 o, p = turned_back(chain, b, outer, n), turned_back(chain, b, inner, n)
                 for d in range(3):
-                    pull[b, outer, d] += weight * depth * o[d]
-                    pull[b, inner, d] -= weight * depth * p[d]
+                    rest_gradient[b, outer, d] += weight * depth * o[d]
+                    rest_gradient[b, inner, d] -= weight * depth * p[d]
             root[count] = np.sqrt(weight)
             count += 1
         if count == 0:

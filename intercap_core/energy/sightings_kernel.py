@@ -1,4 +1,4 @@
-"""What views and triangulated points say of a keypoint, compiled: :mod:`.body_keypoints`."""
+"""E_J of one keypoint, summed over views and its target, compiled: :mod:`.body_keypoints`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from intercap_core.camera.projection import MIN_DEPTH_M
 
 
-class Seen(NamedTuple):
+class KeypointObservations(NamedTuple):
     """What T frames' keypoints are compared with, in the model's floating type.
 
     observed (T,C,K,2), confidence, sigma (T,C,K), lenses (C,13), colour_from_master (C,4,4), shift
-    (T,C,K,3): see :func:`.body_keypoints.reprojection`; targets (T,K,3), trust (T,K): see
-    :func:`.body_keypoints.triangulated`. What there is none of is of no frame.
+    (T,C,K,3): see :func:`.body_keypoints.reprojection`; targets (T,K,3), targets_confidence (T,K):
+    see :func:`.body_keypoints.triangulated`. Arrays of what is absent have no frame.
     """
 
     observed: np.ndarray
@@ -25,7 +25,7 @@ class Seen(NamedTuple):
     colour_from_master: np.ndarray
     shift: np.ndarray
     targets: np.ndarray
-    trust: np.ndarray
+    targets_confidence: np.ndarray
     targets_sigma: float
     scale: float
 
@@ -67,40 +67,40 @@ def _project(px, py, pz, q):
 
 
 @numba.njit(cache=True, nogil=True)
-def ask(seen, t, k, p, slopes, gradient, matrix):
-    """What frame t says of keypoint k at p: returns its cost and, if ``slopes`` are wanted, writes
-    gradient (3,) and matrix (3,3) by the point."""
+def evaluate_keypoint(given, t, k, p, derivatives, gradient, matrix):
+    """E_J of keypoint k of frame t at point p (3,), metres, master frame: returns its cost and,
+    with ``derivatives``, writes gradient (3,) and Gauss-Newton matrix (3,3) by the point."""
     cost = 0.0
     gradient[:] = 0
     matrix[:] = 0
-    square = seen.scale * seen.scale
+    square = given.scale * given.scale
     j = np.empty((2, 3))
-    views = seen.confidence.shape[1] if len(seen.confidence) else 0
+    views = given.confidence.shape[1] if len(given.confidence) else 0
     for c in range(views):
-        trust = seen.confidence[t, c, k]
-        if not trust > 0:
+        confidence = given.confidence[t, c, k]
+        if not confidence > 0:
             continue
         x, y, z = p
-        if len(seen.shift):
-            x += seen.shift[t, c, k, 0]
-            y += seen.shift[t, c, k, 1]
-            z += seen.shift[t, c, k, 2]
-        m = seen.colour_from_master[c]
+        if len(given.shift):
+            x += given.shift[t, c, k, 0]
+            y += given.shift[t, c, k, 1]
+            z += given.shift[t, c, k, 2]
+        m = given.colour_from_master[c]
         u, v, ux, uy, uz, vx, vy, vz = _project(
             m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
             m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
             m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
-            seen.lenses[c],
+            given.lenses[c],
         )
-        sharp = 1.0 / seen.sigma[t, c, k]
-        ru = (u - seen.observed[t, c, k, 0]) * sharp
-        rv = (v - seen.observed[t, c, k, 1]) * sharp
+        sharp = 1.0 / given.sigma[t, c, k]
+        ru = (u - given.observed[t, c, k, 0]) * sharp
+        rv = (v - given.observed[t, c, k, 1]) * sharp
         squared = ru * ru + rv * rv
         share = square / (squared + square)
-        cost += 0.5 * trust * share * squared
-        if not slopes:
+        cost += 0.5 * confidence * share * squared
+        if not derivatives:
             continue
-        weight = trust * share * share
+        weight = confidence * share * share
         for i in range(3):
             j[0, i] = (ux * m[0, i] + uy * m[1, i] + uz * m[2, i]) * sharp
             j[1, i] = (vx * m[0, i] + vy * m[1, i] + vz * m[2, i]) * sharp
@@ -108,15 +108,15 @@ def ask(seen, t, k, p, slopes, gradient, matrix):
             gradient[i] += weight * (j[0, i] * ru + j[1, i] * rv)
             for o in range(3):
                 matrix[i, o] += weight * (j[0, i] * j[0, o] + j[1, i] * j[1, o])
-    if len(seen.targets) and seen.trust[t, k] > 0:
-        sharp = 1.0 / seen.targets_sigma
-        r0 = (p[0] - seen.targets[t, k, 0]) * sharp
-        r1 = (p[1] - seen.targets[t, k, 1]) * sharp
-        r2 = (p[2] - seen.targets[t, k, 2]) * sharp
+    if len(given.targets) and given.targets_confidence[t, k] > 0:
+        sharp = 1.0 / given.targets_sigma
+        r0 = (p[0] - given.targets[t, k, 0]) * sharp
+        r1 = (p[1] - given.targets[t, k, 1]) * sharp
+        r2 = (p[2] - given.targets[t, k, 2]) * sharp
         squared = r0 * r0 + r1 * r1 + r2 * r2
         share = square / (squared + square)
-        cost += 0.5 * seen.trust[t, k] * share * squared
-        weight = seen.trust[t, k] * share * share * sharp
+        cost += 0.5 * given.targets_confidence[t, k] * share * squared
+        weight = given.targets_confidence[t, k] * share * share * sharp
         gradient[0] += weight * r0
         gradient[1] += weight * r1
         gradient[2] += weight * r2

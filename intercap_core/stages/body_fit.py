@@ -20,8 +20,13 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.plausible import check_body
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
+from intercap_core.body_fit.constants import (
+    BAD_BODY_M,
+    JUMP_M,
+    WRONG_TRUNK_M,
+)
 from intercap_core.body_fit.observations import person_clouds, read_observations
-from intercap_core.body_fit.recover import JUMP_M, jumps
+from intercap_core.body_fit.recover import jumps
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widened
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, digest
@@ -29,10 +34,6 @@ from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
 NUM_BETAS, NUM_EXPRESSION = 10, 10
-# A body whose trunk's keypoints are this far off, in the median, is not the person's.
-_BAD_RESIDUAL_M = 0.06
-# What the metrics call a bad body, by the mean error of its surface.
-_BAD_BODY_M = 0.040
 
 
 def run(
@@ -68,15 +69,15 @@ def run(
     fit = Fitter(model, seen, clouds, settings, pose_prior).run()
 
     fitted = np.zeros(seen.num_frames, bool)
-    # limbs may be guessed at behind a table: it is the trunk that says whose body this is
-    believed = quality.trunk_distance(fit.parts) < _BAD_RESIDUAL_M
-    # one view's keypoints do not say how far away the body is, its points do
+    # limbs may be occluded: only the trunk decides whether this is the subject's body
+    believed = quality.trunk_distance(fit.parts) < WRONG_TRUNK_M
+    # one view's keypoints leave the body's depth free, its depth points fix it
     placed = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
     fitted[fit.frames[believed & placed.cpu().numpy()]] = True
     if not fitted.any():
         raise UserError(
             f"{person}: sequence {seen.sequence}: in every frame the fitted trunk is more than "
-            f"{1000 * _BAD_RESIDUAL_M:.0f} mm from its keypoints, or rests on one view without "
+            f"{1000 * WRONG_TRUNK_M:.0f} mm from its keypoints, or rests on one view without "
             "points of the person; check the camera poses, and that keypoints and masks belong to "
             "this recording"
         )
@@ -89,8 +90,8 @@ def run(
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
     sigma = np.zeros((seen.num_frames, 55))
     stated = joint_covariance(model, fit).cpu().numpy()
-    # what has left the motion of its neighbours may well belong among them; where nothing but one
-    # view's pixels holds a limb, any step does
+    # an outlier in time may be a wrong minimum: its sigma is widened; a limb that only one view's
+    # pixels constrain is widened by any departure from the median
     least = np.full_like(sigma, JUMP_M)
     least[fit.frames] *= ~quality.unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)
@@ -107,7 +108,7 @@ def run(
     covariance[fit.frames] = stated
     covariance[~fitted] = 0
     share = model.skinning_weights.double().mean(0).cpu().numpy()
-    uncertain = fitted & (quality.expected_error(sigma, share) > _BAD_BODY_M)
+    uncertain = fitted & (quality.expected_error(sigma, share) > BAD_BODY_M)
 
     keypoint_residual = np.full((seen.num_frames, len(seen.rig)), np.nan)
     keypoint_residual[fit.frames] = fit.pixel_residual.cpu().numpy()

@@ -12,7 +12,7 @@ from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES, maps_path, smplx_
 from intercap_core.body.model import BodyModel
 from intercap_core.body.regions import REGION_NAMES
 
-from .conftest import open_arrays, random_vector
+from .conftest import open_arrays
 
 
 def _mirror(name: str) -> str:
@@ -69,17 +69,6 @@ def test_points_are_where_their_names_say(body64: BodyModel) -> None:
     assert at["face_36"][0] < at["face_39"][0] < at["face_42"][0] < at["face_45"][0]
     assert at["face_48"][0] < at["face_51"][0] < at["face_54"][0]
     assert at["face_30"][2] > at["face_27"][2]
-
-
-def test_keypoint_jacobian_equals_autograd(body64: BodyModel) -> None:
-    vector = random_vector(1, body64.num_parameters, 10, torch.float64)[0]
-    points, jacobian = body64.keypoint_jacobian(body64.parameters(vector[None]))
-    expected = torch.autograd.functional.jacobian(
-        lambda v: body64.keypoints_of(body64.parameters(v[None]))[0], vector
-    )
-    assert (jacobian[0] - expected).abs().max() < 1e-10
-    full = body64.keypoints(body64.forward(body64.parameters(vector[None])))
-    assert torch.allclose(points, full, atol=1e-12)
 
 
 def test_regions_are_disjoint_and_on_the_right_part(body64: BodyModel) -> None:

@@ -42,7 +42,7 @@ def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: Samples)
     )
     linear = model.linearise(model.parameters(x), vertex_ids=ids)
     by = linear.along(rows.normal[:, :, None])[:, :, 0]
-    found = term.assemble(linear.vertices, by, rows, rest * u.exp(), group)
+    found = term.assemble(linear.vertices, by, by, rows, rest * u.exp(), group)
 
     def cost(x: Tensor, u: Tensor) -> Tensor:
         points = model.forward(model.parameters(x), vertex_ids=ids).vertices
@@ -65,7 +65,7 @@ def test_cross_block_is_the_gauss_newton_product(model: BodyModel, samples: Samp
         _random(1, count, seed=2), _random(1, count, 3, seed=3),
         _random(1, count, seed=4).abs(), torch.zeros(1, count).double(),
     )  # fmt: skip
-    found = term.assemble(points, by, rows, thickness, group)
+    found = term.assemble(points, by, by, rows, thickness, group)
     pick = torch.zeros(count, len(thickness), dtype=torch.float64)
     pick[torch.arange(count), group] = thickness[group]
     j = torch.cat([-by[0], -pick], 1)

@@ -11,9 +11,11 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body_fit.problem import BodyProblem, Targets
+from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import columns_of
+from intercap_core.body_fit.terms import Targets
 from intercap_core.energy import body_self as term
+from intercap_core.energy.body_constants import SELF_TOLERANCE_M
 from intercap_core.energy.body_keypoints import keypoint_set
 from intercap_core.energy.body_samples import choose_samples
 from intercap_core.solve.levenberg_marquardt import minimise
@@ -80,7 +82,7 @@ def test_nothing_touches_at_rest_or_with_hanging_arms(
 ) -> None:
     for params in (model.zeros(), _pose(model), _pose(model, left_elbow=(0, -90, 0))):
         pairs = _find(model, contact, params)
-        assert _depth(model, params, pairs) < term.TOLERANCE
+        assert _depth(model, params, pairs) < SELF_TOLERANCE_M
         if pairs is not None:
             assert float(term.cost(model, params, pairs, torch.tensor([0]))) == 0.0
             columns = torch.arange(165)
@@ -96,7 +98,7 @@ def test_samples_that_are_found_are_inside_by_winding_number(
     normals = vertex_normals(vertices, model.faces)
     inner, outer, normal = term.find(contact, vertices[0], normals[0])
     depth = -((vertices[0, inner] - vertices[0, outer]) * normal).sum(1)
-    deep = inner[depth > term.TOLERANCE]
+    deep = inner[depth > SELF_TOLERANCE_M]
     assert len(deep) >= 3
     # just outside one's own skin, the mesh is wound around only what is inside another part
     just_outside = vertices[0, deep] + 1e-3 * normals[0, deep]
@@ -176,6 +178,6 @@ def test_a_fit_to_keypoints_of_penetrating_limbs_comes_apart(
     here = model.parameters(problem.base)
     after = _depth(model, here, _find(model, contact, here))
     assert before > 0.008
-    assert after - term.TOLERANCE < 0.5 * (before - term.TOLERANCE)
+    assert after - SELF_TOLERANCE_M < 0.5 * (before - SELF_TOLERANCE_M)
     moved = (model.keypoints_of(here)[:, :67] - truth).norm(dim=2)
     assert float(moved.median()) < 0.03

@@ -17,9 +17,12 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.compiled_terms import CompiledTerms
 from intercap_core.body_fit.observations import person_clouds, read_observations
-from intercap_core.body_fit.problem import BodyProblem, Views
+from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, columns_of
+from intercap_core.body_fit.terms import Views
+from intercap_core.body_fit.torch_terms import TorchTerms
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
 from intercap_core.energy import body_cloud, body_keypoints, body_samples
@@ -390,7 +393,7 @@ def test_artefacts_of_another_recording_are_refused(model, clothed, tmp_path: Pa
         )  # fmt: skip
 
 
-def test_blend_shapes_compiled_or_plain_end_in_the_same_bodies(tmp_path, monkeypatch):
+def test_blend_shapes_compiled_or_plain_end_in_the_same_bodies(tmp_path):
     """A bend moves the skin around its joint by a centimetre and more."""
     file = load_body_file(None, 10, 10)
     joints = (file.joint_regressor @ file.template)[1:]
@@ -404,10 +407,10 @@ def test_blend_shapes_compiled_or_plain_end_in_the_same_bodies(tmp_path, monkeyp
     capture = Capture(model, tmp_path, 3, cameras=4, pixel_noise=1.0, depth_noise_mm=3.0)
     seen = read_observations(capture.inputs.scene, capture.inputs.person)
     found = []
-    for compiled in (True, False):
-        monkeypatch.setattr(BodyProblem, "is_compiled", compiled)
+    samples = body_samples.choose_samples(model)
+    for terms in (CompiledTerms(model, samples), TorchTerms(model, samples)):
         clouds = list(person_clouds(capture.inputs.frames, seen, 800, model.device))
-        vectors = Fitter(model, seen, clouds, SETTINGS).run().vectors
+        vectors = Fitter(model, seen, clouds, SETTINGS, terms=terms).run().vectors
         found.append(model.forward(model.parameters(vectors)).joints.numpy())
     assert 1000 * np.linalg.norm(found[0] - found[1], axis=2).max() < 0.3
     assert 1000 * np.linalg.norm(found[0] - capture.joints, axis=2)[:, :22].mean() < 6

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from intercap_core.body.jacobian import Linearisation, linearise
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
-from intercap_core.body.selection import Selection
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit.problem import BodyProblem, Targets, Views
+from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import columns_of
+from intercap_core.body_fit.terms import Targets, Views
+from intercap_core.body_fit.torch_terms import TorchTerms
 from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
-from intercap_core.energy.body_keypoints_kernel import Pieces
 
 FRAMES, CAMERAS, KEYPOINTS = 5, 3, 118
 ROUNDING = 5e-6  # float32; depths of millimetres are differences of positions metres away
@@ -94,10 +91,6 @@ def _problem(model: BodyModel) -> BodyProblem:
     )  # fmt: skip
 
 
-def _is_blended(model: BodyModel) -> bool:
-    return model.linearise(model.zeros(), vertex_ids=np.array([0])).correctives is not None
-
-
 def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
     model = problem.model
     spread = 0.3 * _random(FRAMES, 63, 63, seed=11)
@@ -118,45 +111,24 @@ def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
     }  # fmt: skip
 
 
-def _of_own_limb(problem: BodyProblem) -> Callable[..., Linearisation]:
-    """`linearise`, but of blend shapes only what compiled matrices know: what the joints of a
-    point's own limb change, and nothing for parts that touch."""
-    pieces = Pieces.of(problem.model, problem.keypoints)
-
-    def found(selection: Selection, *given: Any) -> Linearisation:
-        full = linearise(selection, *given)
-        known = np.zeros((len(selection.template), 55), np.float32)
-        if selection.num_vertices < len(known):
-            ends = pairwise(pieces.limb_starts)
-            for (first, end), moved_by in zip(ends, pieces.moved_by, strict=True):
-                made_of = problem.keypoints.matrix[pieces.order[first:end]].any(0)
-                known[made_of.numpy()] += moved_by
-        elif len(known) == len(problem.samples.vertex):
-            order, starts, moved_by = selection.limbs
-            known[order] = moved_by.repeat(np.diff(starts), 0)
-        assert full.correctives is not None
-        return replace(full, correctives=full.correctives * known[:, None, 1:, None])
-
-    return found
+def _difference(one: Tensor, other: Tensor) -> float:
+    """Largest difference relative to the largest entry."""
+    return float((one - other).abs().max() / other.abs().max())
 
 
 @pytest.mark.parametrize("name", ["all", "own shape, learned pose", "targets alone",
                                   "fingers of a standing body"])  # fmt: skip
 @pytest.mark.parametrize("index", [[0, 1, 2, 3, 4], [3, 1]], ids=["every frame", "some"])
-def test_equal_to_the_plain_terms(
-    name: str, index: list[int], problem: BodyProblem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen, at = _variants(problem)[name], torch.tensor(index)
-    own, shared = chosen.own_start()[at], chosen.shared_start()
-    found, cost = chosen.linearise(own, shared, at), chosen.cost(own, shared, at)
-    monkeypatch.setattr(BodyProblem, "is_compiled", False)
-    plain = chosen.linearise(own, shared, at)
-    if _is_blended(chosen.model):
-        monkeypatch.setattr("intercap_core.body.model.linearise", _of_own_limb(chosen))
-        plain = plain._replace(hessian=chosen.linearise(own, shared, at).hessian)
-    for ours, theirs in zip(found, plain, strict=True):
-        assert float((ours - theirs).abs().max() / theirs.abs().max()) < ROUNDING
-    torch.testing.assert_close(cost, plain.cost, rtol=ROUNDING, atol=0)
+def test_equal_to_the_torch_terms(name: str, index: list[int], problem: BodyProblem) -> None:
+    compiled, at = _variants(problem)[name], torch.tensor(index)
+    in_torch = replace(compiled, terms=TorchTerms(problem.model, problem.samples))
+    own, shared = compiled.own_start()[at], compiled.shared_start()
+    found, expected = (each.linearise(own, shared, at) for each in (compiled, in_torch))
+    for ours, theirs in zip(found, expected, strict=True):
+        assert _difference(ours, theirs) < ROUNDING
+    for each in (compiled, in_torch):
+        cost = each.cost(own, shared, at)
+        torch.testing.assert_close(cost, expected.cost, rtol=ROUNDING, atol=0)
 
 
 def test_threads_change_nothing(problem: BodyProblem) -> None:
@@ -179,6 +151,21 @@ def in_double() -> Iterator[None]:
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.usefixtures("in_double")
+@pytest.mark.parametrize("blend_shapes", [False, True], ids=["open", "blend shapes"])
+def test_the_same_normal_equations_in_double(blend_shapes: bool) -> None:
+    """Compiled and torch terms agree far beyond what float32 could tell: they take the same
+    steps."""
+    model = _body(blend_shapes=blend_shapes)
+    compiled = _problem(model)
+    in_torch = replace(compiled, terms=TorchTerms(model, compiled.samples))
+    own, shared, index = compiled.own_start(), compiled.shared_start(), torch.arange(FRAMES)
+    found, expected = (each.linearise(own, shared, index) for each in (compiled, in_torch))
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.dtype == torch.float64
+        assert _difference(ours, theirs) < 1e-12
 
 
 @pytest.mark.usefixtures("in_double")
