@@ -8,6 +8,7 @@ makes waits for that one.
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import re
 import signal
@@ -203,7 +204,7 @@ def progress(orders: Sequence[Order], beside: int, elapsed: float) -> str:
     ended = sum(order.status is not None for order in orders)
     return (
         f"{ended} of {len(orders)} projects done after {elapsed / 60:.0f} minutes, at most "
-        f"{left * pace / beside / 60:.0f} left"
+        f"{math.ceil(left * pace / beside / 60)} left"
     )
 
 
