@@ -27,7 +27,8 @@ Figures = dict[str, float]
 Columns = Mapping[str, tuple[str, int]]  # of a table: heading to a figure's key and its digits
 
 SPREAD = "_spread"
-_NO_SPREAD = ("worst", "slips_", "frames", "captures")  # extremes and counts
+COUNTS = ("frames", "captures", "slips_true", "slips_missed", "slips_false")
+EXTREME = "worst"
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +174,7 @@ def spread(
     found: Figures = {}
     for key in dict.fromkeys(key for one in alone for key in one):
         values = np.array([one[key] for one in alone if math.isfinite(one.get(key, math.nan))])
-        if len(values) > 1 and not any(word in key for word in _NO_SPREAD):
+        if len(values) > 1 and key not in COUNTS and EXTREME not in key:
             found[f"{key}{SPREAD}"] = float(values.std(ddof=1) / np.sqrt(len(values)))
     return found
 
