@@ -3,7 +3,9 @@
 # make lint      ruff, import-linter, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track and the body's fit, those of config/body to
-#                the latter), tables and results/evaluation.json
+#                the latter), tables and results/evaluation.json; about an hour on two cores, goes
+#                on where it was ended
+# make evaluate-quick  five recordings to the end within ten minutes, beside the recorded figures
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker
 #                and the body's fit beside the paper's recipe, results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
@@ -15,7 +17,7 @@ STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
-.PHONY: demo test lint ruff-check ruff-format imports snakefmt mypy snakemake-lint evaluate bench docs \
+.PHONY: demo test lint ruff-check ruff-format imports snakefmt mypy snakemake-lint evaluate evaluate-quick bench docs \
     environment clean
 
 demo: $(STAMP)
@@ -46,6 +48,9 @@ snakemake-lint: $(STAMP)
 
 evaluate: $(STAMP)
 	$(BIN)/intercap evaluate --cores $(CORES)
+
+evaluate-quick: $(STAMP)
+	$(BIN)/intercap evaluate --quick --output results/evaluation-quick.json --cores $(CORES)
 
 bench: $(STAMP)
 	$(BIN)/intercap bench --cores $(CORES)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from intercap_core.commands import bench as commands
 from intercap_core.errors import UserError
 
 
 def add_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
     """Put ``<area>.<measure>`` into the JSON that is there, in place of the area's older ones."""
-    known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
-    kept = {key: value for key, value in known.items() if not key.startswith(f"{area}.")}
     new = {f"{area}.{key}": round(float(value), 4) for key, value in figures.items()}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps({**kept, **new}, indent=1) + "\n", encoding="utf-8")
+    commands.add_figures(output, new)
 
 
 def from_command_line(

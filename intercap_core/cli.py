@@ -209,6 +209,13 @@ def evaluate(
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
         "results/evaluation.json"
     ),
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="A fixed small set to the end in ten minutes, beside its recorded figures.",
+        ),
+    ] = False,
     cores: Cores = 0,
 ) -> None:
     """Run the evaluation captures and print the tables against truth.
@@ -216,13 +223,19 @@ def evaluate(
     Examples: intercap evaluate; intercap evaluate --only bodies --output body.json
     """
     from intercap_core.evaluation.evaluate import evaluate as run_evaluation
+    from intercap_core.evaluation.evaluate import evaluate_quick
 
     _check_output(output, replace_any=True)
-    whole = settings if only in (None, Part.sequences) else None
-    scenes = captures if only in (None, Part.captures) else []
-    tracks = objects if only in (None, Part.objects) else []
-    fits = bodies if only in (None, Part.bodies) else []
-    raise typer.Exit(run_evaluation(whole, scenes, tracks, fits, output, cores=cores))
+    if quick:
+        raise typer.Exit(evaluate_quick(output, cores=cores))
+    parts = {
+        Part.sequences: [settings],
+        Part.captures: captures,
+        Part.objects: objects,
+        Part.bodies: bodies,
+    }
+    chosen = {part.value: some for part, some in parts.items() if only in (None, part)}
+    raise typer.Exit(run_evaluation(chosen, output, cores=cores))
 
 
 @app.command(rich_help_panel=WHOLE)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -30,6 +31,8 @@ MEGABYTE = 1 << 20
 
 def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     """Measure the project's first sequence and write flat JSON, keys ``area.measure``.
+
+    Figures of other commands that are in the file stay.
 
     The recording is made before, if it is a virtual one. Then every stage from the recordings to
     the metrics is computed anew through the workflow: process starts count, the studio does not.
@@ -52,10 +55,27 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
         **_stages(project, sequence, frames),
         **extraction(project, sequence, frames),
     }
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    add_figures(output, figures)
     _print(figures, f"{sequence}: {frames} frame sets of {cameras} cameras")
     print(output)
+
+
+def add_figures(output: Path, figures: Mapping[str, float]) -> None:
+    """Put figures ``area.measure`` into the JSON that is there, for their areas' older ones.
+
+    What is there of other areas stays: several commands write into one file. Raises UserError where
+    the file is no JSON object.
+    """
+    known = {}
+    if output.exists():
+        try:
+            known = dict(json.loads(output.read_text(encoding="utf-8")))
+        except (ValueError, TypeError):
+            raise UserError(f"{output} holds no figures; remove it or name another file") from None
+    areas = {key.partition(".")[0] for key in figures}
+    kept = {key: value for key, value in known.items() if key.partition(".")[0] not in areas}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 
 
 def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from rich.console import Console
 from rich.table import Table
 
 from intercap_core.config import Config
-from intercap_core.evaluation.recordings import console_of, number, take_to, variant
+from intercap_core.evaluation.part import (
+    Measured,
+    Part,
+    add_rows,
+    console_of,
+    keyed,
+    number,
+    spread,
+    variant,
+)
 from intercap_core.metrics import body_errors
 from intercap_core.metrics.body_errors import BodyErrors
 from intercap_core.metrics.figures import Figures
 from intercap_core.project import Project
 
+Bodies = Measured[BodyErrors]
 AREA = "body"
 OTHER_AREAS = ("object",)  # whose recordings are measured here too
 _WIDTH = 190
@@ -30,45 +39,24 @@ _COLUMNS = {
 _FLAGS = ("bad_frames_share", "bad_frames_recall", "bad_frames_precision")
 
 
-@dataclass(frozen=True)
-class BodyEvaluation:
-    """Errors of every recording of one project, what failed, and the workflow's exit status.
-
-    ``rig`` says in words what was given.
-    """
-
-    dataset: str
-    rig: str
-    errors: Sequence[BodyErrors]
-    missing: Sequence[str]
-    status: int
-
-    @property
-    def start(self) -> str:
-        """What stands before the keys of this project's figures."""
-        return variant(self.dataset, AREA, *OTHER_AREAS)
+def measure(project: Project, sequence: str) -> BodyErrors:
+    """Errors of one recording's body after ``body_fit``."""
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    return body_errors.measure(
+        project.artefact(sequence, "frames"),
+        project.artefact(sequence, "scene"),
+        project.artefact(sequence, "person"),
+        project.artefact(sequence, "body_fit"),
+        truth,
+        project.config.body_models,
+        project.subjects[project.sequences[sequence].subject].gender,
+    )
 
 
-def evaluate_bodies(project: Project, *, cores: int = 0) -> BodyEvaluation:
-    """Bring the body fits of all sequences up to date and measure them.
-
-    Raises UserError where a sequence has no truth to be held to, or none has a fit.
-    """
-    taken = take_to(project, "body_fit", cores=cores)
-    errors = [
-        body_errors.measure(
-            project.artefact(name, "frames"),
-            project.artefact(name, "scene"),
-            project.artefact(name, "person"),
-            path,
-            taken.truths[name],
-            project.config.body_models,
-            project.subjects[project.sequences[name].subject].gender,
-        )
-        for name, path in taken.artefacts.items()
-    ]
-    config = project.config
-    return BodyEvaluation(config.dataset, rig_of(config), errors, taken.missing, taken.status)
+def _start(evaluation: Bodies) -> str:
+    """What stands before the keys of a project's figures."""
+    return variant(evaluation.dataset, AREA, *OTHER_AREAS)
 
 
 def rig_of(config: Config) -> str:
@@ -82,7 +70,7 @@ def rig_of(config: Config) -> str:
     return ", ".join(words)
 
 
-def flat(evaluations: Sequence[BodyEvaluation]) -> dict[str, float]:
+def flat(evaluations: Sequence[Bodies]) -> dict[str, float]:
     """Keys ``body.pve_mm``, ``body.cup_drink.pve_mm``, ``body.noise2_pve_mm``.
 
     The quality of the flags without a variant's name is over all projects together: a project
@@ -91,9 +79,9 @@ def flat(evaluations: Sequence[BodyEvaluation]) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for evaluation in evaluations:
-        start = evaluation.start
+        start = _start(evaluation)
         found[f"{AREA}.{start}recordings"] = float(len(evaluation.errors))
-        found |= _keys("", start, body_errors.figures(evaluation.errors))
+        found |= _keys("", start, _with_spread(evaluation.errors))
         if evaluation is _reference(evaluations):
             for name, (mean, _, _) in body_errors.by_joint(evaluation.errors).items():
                 found[f"{AREA}.joint_{name}_mm"] = mean
@@ -102,7 +90,7 @@ def flat(evaluations: Sequence[BodyEvaluation]) -> dict[str, float]:
                 found |= _keys(f"{name}.", start, body_errors.figures(recordings))
     compared = _compared(evaluations)
     if compared:
-        found |= _keys("", "compared_", body_errors.figures(compared))
+        found |= _keys("", "compared_", _with_spread(compared))
     if _reference(evaluations) is not None:
         every = body_errors.flag_figures([e for found_ in evaluations for e in found_.errors])
         for key in _FLAGS:
@@ -111,23 +99,27 @@ def flat(evaluations: Sequence[BodyEvaluation]) -> dict[str, float]:
     return found
 
 
+def _with_spread(errors: Sequence[BodyErrors]) -> Figures:
+    return body_errors.figures(errors) | spread(body_errors.figures, errors)
+
+
 def _keys(group: str, start: str, figures: Mapping[str, float]) -> dict[str, float]:
-    return {f"{AREA}.{group}{start}{key}": value for key, value in figures.items()}
+    return keyed(f"{AREA}.{group}{start}", figures)
 
 
-def _reference(evaluations: Sequence[BodyEvaluation]) -> BodyEvaluation | None:
+def _reference(evaluations: Sequence[Bodies]) -> Bodies | None:
     """The project that is no variant."""
-    return next((e for e in evaluations if not e.start), None)
+    return next((e for e in evaluations if not _start(e)), None)
 
 
-def _apart(evaluations: Sequence[BodyEvaluation]) -> list[BodyEvaluation]:
+def _apart(evaluations: Sequence[Bodies]) -> list[Bodies]:
     """Projects with recordings of their own, rather than those of another one taken otherwise."""
     reference = _reference(evaluations)
     known = {e.truth for e in reference.errors} if reference else set()
     return [e for e in evaluations if e is reference or not {x.truth for x in e.errors} <= known]
 
 
-def _compared(evaluations: Sequence[BodyEvaluation]) -> list[BodyErrors]:
+def _compared(evaluations: Sequence[Bodies]) -> list[BodyErrors]:
     """The reference's errors in the recordings that variants took anew."""
     reference = _reference(evaluations)
     others = [e for e in evaluations if e not in _apart(evaluations)]
@@ -137,7 +129,7 @@ def _compared(evaluations: Sequence[BodyEvaluation]) -> list[BodyErrors]:
     return [x for x in reference.errors if x.truth in shared]
 
 
-def print_bodies(evaluations: Sequence[BodyEvaluation]) -> None:
+def print_bodies(evaluations: Sequence[Bodies]) -> None:
     """By interaction for each project of its own recordings, by rig for those taken otherwise, by
     joint, and each recording's worst frame."""
     console = console_of(_WIDTH)
@@ -158,18 +150,18 @@ def print_bodies(evaluations: Sequence[BodyEvaluation]) -> None:
     )
 
 
-def _print_interactions(console: Console, found: BodyEvaluation) -> None:
+def _print_interactions(console: Console, found: Bodies) -> None:
     table = Table("interaction", "frames", *_COLUMNS, box=None)
     table.title = f"{found.dataset}: bodies against truth, mm, after body_fit"
     groups = body_errors.by_interaction(found.errors)
     for name, errors in {**groups, "all": list(found.errors)}.items():
-        _add_row(table, name, body_errors.figures(errors))
+        _add_row(table, name, errors, with_spread=name == "all")
     for name in found.missing:
         table.add_row(f"{name}: no fit")
     console.print(table)
 
 
-def _print_rigs(console: Console, evaluations: Sequence[BodyEvaluation]) -> None:
+def _print_rigs(console: Console, evaluations: Sequence[Bodies]) -> None:
     compared = _compared(evaluations)
     if not compared:
         return
@@ -177,22 +169,25 @@ def _print_rigs(console: Console, evaluations: Sequence[BodyEvaluation]) -> None
     table.title = f"the same {len(compared)} recordings with less"
     reference, apart = _reference(evaluations), _apart(evaluations)
     assert reference is not None
-    _add_row(table, reference.rig, body_errors.figures(compared))
+    _add_row(table, reference.rig, compared)
     for found in evaluations:
         if found in apart:
             continue
-        _add_row(table, found.rig, body_errors.figures(found.errors))
+        _add_row(table, found.rig, found.errors)
         for name in found.missing:
             table.add_row(f"{found.rig}: {name}: no fit")
     console.print(table)
 
 
-def _add_row(table: Table, name: str, figures: Figures) -> None:
-    cells = (number(figures.get(key), digits) for key, digits in _COLUMNS.values())
-    table.add_row(name, number(figures.get("frames"), 0), *cells)
+def _add_row(
+    table: Table, name: str, errors: Sequence[BodyErrors], *, with_spread: bool = True
+) -> None:
+    figures = body_errors.figures(errors)
+    spreads = spread(body_errors.figures, errors) if with_spread else None
+    add_rows(table, name, figures, _COLUMNS, spreads, [number(figures.get("frames"), 0)])
 
 
-def _print_joints(console: Console, evaluations: Sequence[BodyEvaluation]) -> None:
+def _print_joints(console: Console, evaluations: Sequence[Bodies]) -> None:
     """Mean, 95th percentile and honesty of each joint; a group of columns for each project."""
     table = Table("joint", box=None, title="body joints: mean and p95, mm; median normalised error")
     columns = [body_errors.by_joint(found.errors) for found in evaluations]
@@ -209,7 +204,7 @@ def _print_joints(console: Console, evaluations: Sequence[BodyEvaluation]) -> No
     console.print(table)
 
 
-def _print_worst(console: Console, evaluations: Sequence[BodyEvaluation]) -> None:
+def _print_worst(console: Console, evaluations: Sequence[Bodies]) -> None:
     table = Table(
         "recording", "rig", "frame", "PVE", "MPJPE", "worst joint", "mm", "hands", "flagged",
         box=None, title="each recording's worst frame",
@@ -230,3 +225,15 @@ def _print_worst(console: Console, evaluations: Sequence[BodyEvaluation]) -> Non
                 "yes" if e.flagged[t] else "",
             )
     console.print(table)
+
+
+PART = Part(
+    "bodies",
+    "body_fit",
+    ("frames", "scene", "person"),
+    "metrics.body_errors",
+    measure,
+    flat,
+    print_bodies,
+    lambda project: rig_of(project.config),
+)

@@ -4,45 +4,46 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from rich.table import Table
 
-from intercap_core.evaluation.recordings import console_of, number, take_to
+from intercap_core.evaluation.part import (
+    SPREAD,
+    Figures,
+    Measured,
+    Part,
+    console_of,
+    keyed,
+    number,
+    spread,
+)
 from intercap_core.metrics import capture
 from intercap_core.metrics.capture import CaptureErrors
 from intercap_core.project import Project
 
+Captures = Measured[CaptureErrors]
 _WIDTH = 112
 
 
-@dataclass(frozen=True)
-class CaptureEvaluation:
-    """Errors of every capture of one project, their figures, and the workflow's exit status."""
-
-    area: str
-    errors: Sequence[CaptureErrors]
-    figures: dict[str, float]
-    missing: Sequence[str]
-    status: int
+def measure(project: Project, sequence: str) -> CaptureErrors:
+    """Errors of one capture after ``scene``."""
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
+    return capture.measure(frames, scene, truth)
 
 
-def evaluate_captures(project: Project, *, cores: int = 0) -> CaptureEvaluation:
-    """Bring the scenes of all sequences up to date and measure them; no later stage is run.
-
-    Raises UserError where a sequence has no truth to hold it to, or none has a scene.
-    """
-    taken = take_to(project, "scene", cores=cores)
-    errors = [
-        capture.measure(project.artefact(name, "frames"), scene, taken.truths[name])
-        for name, scene in taken.artefacts.items()
-    ]
-    area = project.config.dataset
-    return CaptureEvaluation(area, errors, capture.figures(errors), taken.missing, taken.status)
+def flat(evaluations: Sequence[Captures]) -> Figures:
+    """Keys ``<dataset>.<measure>``."""
+    found: Figures = {}
+    for captured in evaluations:
+        figures = capture.figures(captured.errors) | spread(capture.figures, captured.errors)
+        found |= keyed(f"{captured.dataset}.", figures)
+    return found
 
 
-def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:
+def print_captures(evaluations: Sequence[Captures]) -> None:
     """One table with a row for each capture, one of the figures with a column for each project."""
     console = console_of(_WIDTH)
     heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
@@ -65,14 +66,27 @@ def print_captures(evaluations: Sequence[CaptureEvaluation]) -> None:
         for name in found.missing:
             table.add_row(name, "no scene")
     console.print(table)
-    names = list(dict.fromkeys(name for found in evaluations for name in found.figures))
-    table = Table("measure", *(found.area for found in evaluations), box=None)
-    table.title = "all captures, after scene"
-    for name in names:
-        values = (found.figures.get(name, math.nan) for found in evaluations)
-        table.add_row(name, *(number(value, 3) for value in values))
+    columns = [
+        capture.figures(found.errors) | spread(capture.figures, found.errors)
+        for found in evaluations
+    ]
+    names = [name for column in columns for name in column if not name.endswith(SPREAD)]
+    table = Table("measure", *(found.dataset for found in evaluations), box=None)
+    table.title = "all captures, after scene (+- standard error over captures)"
+    for name in dict.fromkeys(names):
+        table.add_row(name, *(_with_spread(column, name) for column in columns))
     console.print(table)
+
+
+def _with_spread(figures: Figures, name: str) -> str:
+    value, error = (figures.get(key, math.nan) for key in (name, f"{name}{SPREAD}"))
+    return number(value, 3) + (f" +- {error:.3f}" if math.isfinite(error) else "")
 
 
 def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
     return number(1e3 * float(values.mean()), digits) if len(values) else ""
+
+
+PART = Part(
+    "captures", "scene", ("frames",), "metrics.capture", measure, flat, print_captures
+)  # fmt: skip

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from rich.table import Table
 
-from intercap_core.evaluation.recordings import console_of, number, take_to, variant
+from intercap_core.evaluation.part import (
+    Figures,
+    Measured,
+    Part,
+    add_rows,
+    console_of,
+    keyed,
+    number,
+    spread,
+    variant,
+)
 from intercap_core.metrics import object_errors
 from intercap_core.metrics.object_errors import ObjectErrors
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
 
+Objects = Measured[ObjectErrors]
 AREA = "object"
 _WIDTH = 120
 _COLUMNS = {
@@ -25,67 +35,48 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ObjectEvaluation:
-    """Errors of every recording of one project, what failed, and the workflow's exit status."""
-
-    dataset: str
-    errors: Sequence[ObjectErrors]
-    missing: Sequence[str]
-    status: int
-
-    @property
-    def objects(self) -> dict[str, list[ObjectErrors]]:
-        """The recordings of each object, by name."""
-        names = sorted({e.object_ for e in self.errors})
-        return {name: [e for e in self.errors if e.object_ == name] for name in names}
-
-    def flat(self) -> dict[str, float]:
-        """Keys ``object.lost_share``, ``object.cup.lost_share``, ``object.views_2.lost_share``.
-
-        Those of a dataset called object_<variant> are ``object.<variant>_lost_share`` and so on.
-        """
-        start = variant(self.dataset, AREA)
-        found = {f"{AREA}.{start}recordings": float(len(self.errors))}
-        groups = {"": object_errors.figures(self.errors)}
-        groups |= {f"{name}.": object_errors.figures(e) for name, e in self.objects.items()}
-        for group, figures in groups.items():
-            found |= {f"{AREA}.{group}{start}{key}": value for key, value in figures.items()}
-        for views, figures in object_errors.by_views(self.errors).items():
-            group = f"{start}views_{views.replace('-', '_to_')}"
-            found |= {f"{AREA}.{group}.{key}": value for key, value in figures.items()}
-        return found
+def measure(project: Project, sequence: str) -> ObjectErrors:
+    """Errors of one recording's object after ``object_track``."""
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    mesh = ObjectMesh.load(project.objects[project.sequences[sequence].object])
+    scene, track = (project.artefact(sequence, stage) for stage in ("scene", "object_track"))
+    return object_errors.measure(scene, track, truth, mesh)
 
 
-def evaluate_objects(project: Project, *, cores: int = 0) -> ObjectEvaluation:
-    """Bring the object tracks of all sequences up to date and measure them.
+def by_object(errors: Sequence[ObjectErrors]) -> dict[str, list[ObjectErrors]]:
+    """The recordings of each object, by name."""
+    names = sorted({e.object_ for e in errors})
+    return {name: [e for e in errors if e.object_ == name] for name in names}
 
-    Raises UserError where a sequence has no truth to be held to, or none has a track.
+
+def flat(evaluations: Sequence[Objects]) -> Figures:
+    """Keys ``object.lost_share``, ``object.cup.lost_share``, ``object.views_2.lost_share``.
+
+    Those of a dataset called object_<variant> are ``object.<variant>_lost_share`` and so on.
     """
-    taken = take_to(project, "object_track", cores=cores)
-    meshes = {name: ObjectMesh.load(entry) for name, entry in project.objects.items()}
-    errors = [
-        object_errors.measure(
-            project.artefact(name, "scene"),
-            path,
-            taken.truths[name],
-            meshes[project.sequences[name].object],
-        )
-        for name, path in taken.artefacts.items()
-    ]
-    return ObjectEvaluation(project.config.dataset, errors, taken.missing, taken.status)
+    found: Figures = {}
+    for tracked in evaluations:
+        start = variant(tracked.dataset, AREA)
+        found[f"{AREA}.{start}recordings"] = float(len(tracked.errors))
+        for group, errors in {"": tracked.errors, **by_object(tracked.errors)}.items():
+            figures = object_errors.figures(errors) | spread(object_errors.figures, errors)
+            found |= keyed(f"{AREA}.{group}{'.' if group else ''}{start}", figures)
+        for views, figures in object_errors.by_views(tracked.errors).items():
+            found |= keyed(f"{AREA}.{start}views_{views.replace('-', '_to_')}.", figures)
+    return found
 
 
-def print_objects(evaluations: Sequence[ObjectEvaluation]) -> None:
+def print_objects(evaluations: Sequence[Objects]) -> None:
     """For each project a row an object and one for all, then a row for each number of views."""
     console = console_of(_WIDTH)
     for found in evaluations:
         table = Table("object", *_COLUMNS, box=None)
         table.title = f"{found.dataset}: objects against truth, after object_track"
-        for name, errors in {**found.objects, "all": list(found.errors)}.items():
-            figures = object_errors.figures(errors)
-            cells = (number(figures.get(key), digits) for key, digits in _COLUMNS.values())
-            table.add_row(name, *cells)
+        for name, errors in by_object(found.errors).items():
+            add_rows(table, name, object_errors.figures(errors), _COLUMNS)
+        spreads = spread(object_errors.figures, found.errors)
+        add_rows(table, "all", object_errors.figures(found.errors), _COLUMNS, spreads)
         for name in found.missing:
             table.add_row(f"{name}: no track")
         console.print(table)
@@ -96,3 +87,8 @@ def print_objects(evaluations: Sequence[ObjectEvaluation]) -> None:
                 name, *(number(v, d) for v, d in zip(figures.values(), digits, strict=True))
             )
         console.print(table)
+
+
+PART = Part(
+    "objects", "object_track", ("scene",), "metrics.object_errors", measure, flat, print_objects
+)  # fmt: skip

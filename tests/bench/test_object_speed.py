@@ -7,7 +7,15 @@ import pytest
 
 from bench.object_baseline import Recipe
 from bench.object_clip import ObjectClip
-from bench.object_speed import Run, one_pass, paper, until, whole_track
+from bench.object_speed import (
+    Run,
+    compared_figures,
+    one_pass,
+    paper,
+    print_compared,
+    until,
+    whole_track,
+)
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
@@ -80,3 +88,17 @@ def test_the_shortest_schedule_that_reaches_our_accuracy() -> None:
 def test_the_shortest_schedule_near_its_best_where_none_reaches_ours() -> None:
     found = [(5, _run(9.0)), (40, _run(3.1)), (75, _run(2.9, lost=0.2)), (150, _run(3.0))]
     assert until(_run(1.0), found) == (40, found[1][1], False)
+
+
+def test_objects_count_by_their_frames(capsys: pytest.CaptureFixture[str]) -> None:
+    def run(millimetres: float, frames: int, seconds: float) -> Run:
+        return Run.of_errors(np.full((2, frames), millimetres), frames, seconds)
+
+    found = {"cup": (run(2, 3, 0.3), run(60, 3, 6)), "stool": (run(3, 1, 0.1), run(1, 1, 2))}
+    figures = compared_figures(found)
+    assert figures["all_translation_median_mm"] == 2 and figures["cup.baseline_lost_share"] == 1
+    assert figures["all_baseline_lost_share"] == 0.75 and figures["all_nearer_count"] == 1
+    assert figures["all_ms_per_frame"] == pytest.approx(100)
+    assert figures["all_speedup_recipe"] == pytest.approx(20)
+    print_compared(found)
+    assert "stool" in capsys.readouterr().out

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.bench import extraction
+from intercap_core.commands.bench import add_figures, extraction
 from intercap_core.config import Config, ObjectEntry, SubjectEntry
+from intercap_core.errors import UserError
 from intercap_core.project import Project
 from tests.helpers.kinect_files import entry_of, record
 
@@ -31,3 +33,14 @@ def test_extraction_counts_sets_and_whole_files(tmp_path: Path) -> None:
     assert found["frames.bytes_ratio"] == pytest.approx(ratio, abs=1e-3)
     assert found["frames.fps"] > 0
     assert not list(project.results.iterdir())  # nothing is left
+
+
+def test_figures_of_other_commands_stay(tmp_path: Path) -> None:
+    output = tmp_path / "bench.json"
+    output.write_text('{"object.speedup": 5, "frames.old": 1, "frames.fps": 2}')
+    add_figures(output, {"frames.fps": 3.0, "end_to_end.seconds_per_frame": 1.5})
+    expected = {"object.speedup": 5, "frames.fps": 3.0, "end_to_end.seconds_per_frame": 1.5}
+    assert json.loads(output.read_text()) == expected
+    output.write_text("[1")
+    with pytest.raises(UserError, match="holds no figures"):
+        add_figures(output, {"frames.fps": 3.0})

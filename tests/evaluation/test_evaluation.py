@@ -11,10 +11,12 @@ import pytest
 from intercap_core.cli import BODY_SETTINGS, OBJECT_SETTINGS
 from intercap_core.errors import UserError
 from intercap_core.evaluation import bodies as body_evaluation
-from intercap_core.evaluation.bodies import BodyEvaluation
-from intercap_core.evaluation.captures import CaptureEvaluation, evaluate_captures, print_captures
-from intercap_core.evaluation.objects import ObjectEvaluation, print_objects
-from intercap_core.metrics import capture
+from intercap_core.evaluation import objects as object_evaluation
+from intercap_core.evaluation.captures import flat as capture_figures
+from intercap_core.evaluation.captures import print_captures
+from intercap_core.evaluation.evaluate import QUICK_SETTINGS
+from intercap_core.evaluation.objects import print_objects
+from intercap_core.evaluation.part import Measured, require_truth
 from intercap_core.metrics.body_clouds import CLOUD_KEYS
 from intercap_core.metrics.body_errors import BodyErrors
 from intercap_core.metrics.capture import CaptureErrors, SlipCounts
@@ -36,6 +38,7 @@ def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
     others = [
         Path(f"config/{other}/config.yaml") for other in ("demo", "test", "bench", "evaluation")
     ]
+    others.append(QUICK_SETTINGS)
     for path in [*others, *objects]:
         studio = load_project(path).config.studio
         assert studio is not None
@@ -56,7 +59,7 @@ def test_all_objects_are_evaluated_with_and_without_a_detector() -> None:
 
 def test_captures_without_truth_cannot_be_evaluated() -> None:
     with pytest.raises(UserError, match="has no truth to be evaluated against"):
-        evaluate_captures(load_project(Path("config/config.yaml")))
+        require_truth(load_project(Path("config/config.yaml")))
 
 
 def test_every_capture_and_figure_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,9 +70,10 @@ def test_every_capture_and_figure_is_printed(capsys: pytest.CaptureFixture[str])
         slips, 0.0015, 0.05, none,
     )  # fmt: skip
     alone = CaptureErrors("alone", "", none, none, none, none, slips, np.nan, np.nan, none)
-    errors = [many, alone]
-    found = CaptureEvaluation("capture", errors, capture.figures(errors), ["broken"], 1)
+    found = Measured("capture", [many, alone], ["broken"])
     print_captures([found])
+    flat = capture_figures([found])
+    assert flat["capture.captures"] == 2 and "capture.captures_spread" not in flat
     printed = capsys.readouterr().out
     for words in ("many", "alone", "broken", "1 of 2", "1.50", "extrinsics_floor_only_mm"):
         assert words in printed
@@ -83,10 +87,10 @@ def test_keys_of_a_variant_come_after_the_area_and_the_object() -> None:
         np.zeros((count, 3)), np.zeros((count, 3)), np.array([6, 2, 1]), np.ones(count, bool),
         np.zeros(count, bool),
     )  # fmt: skip
-    flat = ObjectEvaluation("object", [cup], [], 0).flat()
+    flat = object_evaluation.flat([Measured("object", [cup])])
     assert flat["object.translation_median_mm"] == pytest.approx(2.5)
     assert flat["object.cup.lost_share"] == flat["object.views_0_to_1.lost_share"] / 3
-    flat = ObjectEvaluation("object_noise2", [cup], [], 0).flat()
+    flat = object_evaluation.flat([Measured("object_noise2", [cup])])
     assert flat["object.noise2_translation_median_mm"] == pytest.approx(2.5)
     assert flat["object.cup.noise2_lost_share"] == pytest.approx(1 / 3)
     assert flat["object.noise2_views_2.frames"] == 1
@@ -97,7 +101,7 @@ def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixtu
         "a", "cup", 15.0, np.array([0.0021]), np.array([0.5]), np.full(1, np.nan),
         np.zeros((1, 3)), np.zeros((1, 3)), np.array([4]), np.zeros(1, bool), np.zeros(1, bool),
     )  # fmt: skip
-    print_objects([ObjectEvaluation("object", [cup], ["kick_s09"], 1)])
+    print_objects([Measured("object", [cup], ["kick_s09"])])
     printed = capsys.readouterr().out
     for words in ("cup", "all", "kick_s09: no track", "2.1", "0.50"):
         assert words in printed
@@ -136,12 +140,12 @@ def _body(name: str, pve_mm: float, *, interaction: str = "drink", flagged: bool
     )  # fmt: skip
 
 
-def _bodies() -> list[BodyEvaluation]:
+def _bodies() -> list[Measured[BodyErrors]]:
     main = [_body("a", 5), _body("b", 7, interaction="sit")]
     return [
-        BodyEvaluation("object", "all views", main, [], 0),
-        BodyEvaluation("object_noise2", "all views", [_body("c", 50, flagged=True)], [], 0),
-        BodyEvaluation("body_two_view", "2 views", [_body("b", 90)], ["a"], 1),
+        Measured("object", main, rig="all views"),
+        Measured("object_noise2", [_body("c", 50, flagged=True)], rig="all views"),
+        Measured("body_two_view", [_body("b", 90)], ["a"], "2 views"),
     ]
 
 
@@ -149,7 +153,7 @@ def test_figures_that_versions_are_compared_by_keep_their_names() -> None:
     clouds = {key: np.ones(1) for key in CLOUD_KEYS}
     error = replace(_body("a", 50, flagged=True), clouds=clouds)
     kinds = ("object", "object_noise2", "body_per_frame_shape", "body_rgb_only", "body_two_view")
-    flat = body_evaluation.flat([BodyEvaluation(kind, "", [error], [], 0) for kind in kinds])
+    flat = body_evaluation.flat([Measured(kind, [error]) for kind in kinds])
     names = (
         "pve_mm", "mpjpe_mm", "hand_mpjpe_mm", "hand_grasp_mpjpe_mm", "face_mm", "noise2_pve_mm",
         "per_frame_shape_pve_mm", "cloud_to_mesh_mm", "mesh_to_cloud_visible_mm",
@@ -161,6 +165,7 @@ def test_figures_that_versions_are_compared_by_keep_their_names() -> None:
 def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
     flat = body_evaluation.flat(_bodies())
     assert flat["body.pve_mm"] == pytest.approx(6)
+    assert flat["body.pve_mm_spread"] == pytest.approx(1)  # of 5 and 7 mm
     assert flat["body.sit.mpjpe_mm"] == pytest.approx(7)
     assert flat["body.noise2_pve_mm"] == flat["body.drink.noise2_pve_mm"] == pytest.approx(50)
     assert flat["body.two_view_mpjpe_mm"] == pytest.approx(90)

@@ -1,0 +1,207 @@
+"""What the parts of an evaluation have in common: recordings taken to a stage and measured."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from importlib import import_module
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core.errors import UserError
+from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.project import Project, load_project
+
+Errors = TypeVar("Errors")
+Figures = dict[str, float]
+Columns = Mapping[str, tuple[str, int]]  # of a table: heading to a figure's key and its digits
+
+SPREAD = "_spread"
+COUNTS = ("frames", "captures", "slips_true", "slips_missed", "slips_false")
+EXTREME = "worst"
+
+
+@dataclass(frozen=True, eq=False)
+class Measured(Generic[Errors]):
+    """The errors of every recording of one project, and the recordings that did not get there.
+
+    ``rig`` says in words what the settings leave of the recordings, where that matters.
+    """
+
+    dataset: str
+    errors: Sequence[Errors]
+    missing: Sequence[str] = ()
+    rig: str = ""
+
+
+@dataclass(frozen=True)
+class Part(Generic[Errors]):
+    """One part of the evaluation.
+
+    ``measure`` (project, sequence) compares the artefact of ``stage`` with the truth; it reads the
+    artefacts ``reads`` beside it, and ``code`` is the module (below ``intercap_core``) whose digest
+    stands for what it computes. ``flat`` gives the keys ``area.measure`` of all projects,
+    ``print_tables`` prints them, ``rig`` describes a project's settings.
+    """
+
+    name: str
+    stage: str
+    reads: tuple[str, ...]
+    code: str
+    measure: Callable[[Project, str], Errors]
+    flat: Callable[[Sequence[Measured[Errors]]], Figures]
+    print_tables: Callable[[Sequence[Measured[Errors]]], None]
+    rig: Callable[[Project], str] = lambda _: ""
+
+    def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
+        """Measure every recording whose artefact is there, several at a time.
+
+        Raises UserError where no sequence of a project has come to the stage.
+        """
+        there = [
+            [name for name in project.sequences if project.artefact(name, self.stage).is_file()]
+            for project in projects
+        ]
+        for project, names in zip(projects, there, strict=True):
+            if not names:
+                raise UserError(
+                    f"{project.path}: no sequence has a {self.stage}; look into {project.logs}"
+                )
+        module = import_module(f"intercap_core.evaluation.{self.name}")
+        jobs = [
+            (module.__name__, project.path, name)
+            for project, names in zip(projects, there, strict=True)
+            for name in names
+        ]
+        context = get_context("spawn")  # numerical libraries keep threads that a fork would lose
+        with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
+            errors: Iterator[Any] = iter(list(pool.map(_measure_one, *zip(*jobs, strict=True))))
+        return [
+            Measured(
+                project.config.dataset,
+                [next(errors) for _ in names],
+                [name for name in project.sequences if name not in names],
+                self.rig(project),
+            )
+            for project, names in zip(projects, there, strict=True)
+        ]
+
+
+def _measure_one(module: str, settings: Path, sequence: str) -> object:
+    part: Part[object] = import_module(module).PART
+    return measured_once(part, load_project(settings), sequence)
+
+
+def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors:
+    """Measure one recording, or take its errors from the last time that all inputs were the same.
+
+    The errors lie beside the artefacts, named by the digest of what they were computed from: the
+    files, the project's tables and settings, and the code.
+    """
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    state = hashlib.sha256(code_digest(part.code).encode())
+    state.update(code_digest(f"evaluation.{part.name}").encode())
+    row = project.sequences[sequence]
+    entry, subject = project.objects[row.object], project.subjects[row.subject]
+    for told in (entry, subject, project.config.body_models):
+        state.update(told.model_dump_json().encode())
+    files = [project.artefact(sequence, stage) for stage in (*part.reads, part.stage)]
+    for path in (*files, truth, entry.mesh):
+        with open(path, "rb") as file:
+            state.update(hashlib.file_digest(file, "sha256").digest())
+    kept = project.results / sequence / "evaluation"
+    path = kept / f"{part.name}-{state.hexdigest()[:24]}.pickle"
+    if path.is_file():
+        with open(path, "rb") as file:
+            found: Errors = pickle.load(file)  # written below, in the project's own results
+        return found
+    errors = part.measure(project, sequence)
+    kept.mkdir(parents=True, exist_ok=True)
+    for old in kept.glob(f"{part.name}-*.pickle"):
+        old.unlink()
+    partial = path.with_suffix(f".{os.getpid()}")
+    partial.write_bytes(pickle.dumps(errors))
+    partial.replace(path)  # a killed run leaves no half-written file under the final name
+    return errors
+
+
+def require_truth(project: Project) -> None:
+    """Raises UserError where a sequence has no truth to be held to."""
+    for name, row in project.sequences.items():
+        if row.truth is None:
+            raise UserError(
+                f"{project.path}: sequence {name!r} has no truth to be evaluated against; leave "
+                "it out, or name its truth in the table"
+            )
+
+
+def variant(dataset: str, *areas: str) -> str:
+    """What stands before a measure's name: "noise2_" of object_noise2 in the area object."""
+    for area in areas:
+        if dataset == area or dataset.startswith(f"{area}_"):
+            dataset = dataset.removeprefix(area)
+            break
+    name = dataset.strip("_")
+    return f"{name}_" if name else ""
+
+
+def keyed(prefix: str, figures: Mapping[str, float]) -> Figures:
+    """The figures with this before each key."""
+    return {f"{prefix}{key}": value for key, value in figures.items()}
+
+
+def spread(
+    figures: Callable[[Sequence[Errors]], Mapping[str, float]], recordings: Sequence[Errors]
+) -> Figures:
+    """Standard error of each figure over the recordings, keys ``<figure>_spread``.
+
+    Every recording's figure is taken on its own; their sample deviation over the square root of
+    their number. Counts and extremes have none, nor has a figure that fewer than two recordings
+    have.
+    """
+    alone = [figures([recording]) for recording in recordings]
+    found: Figures = {}
+    for key in dict.fromkeys(key for one in alone for key in one):
+        values = np.array([one[key] for one in alone if math.isfinite(one.get(key, math.nan))])
+        if len(values) > 1 and key not in COUNTS and EXTREME not in key:
+            found[f"{key}{SPREAD}"] = float(values.std(ddof=1) / np.sqrt(len(values)))
+    return found
+
+
+def add_rows(
+    table: Table,
+    name: str,
+    figures: Mapping[str, float],
+    columns: Columns,
+    spreads: Mapping[str, float] | None = None,
+    cells: Sequence[str] = (),
+) -> None:
+    """A row of ``figures``, after ``cells``; below it their spreads where any are given."""
+    row = (number(figures.get(key), digits) for key, digits in columns.values())
+    table.add_row(name, *cells, *row)
+    if spreads:
+        row = (number(spreads.get(key + SPREAD), digits) for key, digits in columns.values())
+        table.add_row("  +-", *("" for _ in cells), *row)
+
+
+def console_of(width: int) -> Console:
+    """A console for tables of this width: one that is cut when piped is of no use."""
+    console = Console()
+    console.width = max(console.width, width)
+    return console
+
+
+def number(value: float | None, digits: int) -> str:
+    """A cell of a table; empty where the figure is not known."""
+    return "" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -1,0 +1,114 @@
+"""The part of `intercap evaluate` that is taken to the end: every stage held to truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core.evaluation.part import SPREAD, Figures, Measured, Part, keyed, number, spread
+from intercap_core.metrics import figures
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.project import Project
+from intercap_core.stage_list import ESTIMATES
+
+PLAIN, ANNOTATED = "no annotations", "annotated"
+Areas = dict[str, Figures]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSequence:
+    """The metrics of one sequence, and whether it is annotated."""
+
+    metrics: SequenceMetrics
+    annotated: bool
+
+
+Sequences = Measured[MeasuredSequence]
+
+
+def measure(project: Project, sequence: str) -> MeasuredSequence:
+    """What stage ``metrics`` has measured."""
+    made = project.annotation_made(sequence) or project.annotation_path(sequence).exists()
+    return MeasuredSequence(SequenceMetrics.read(project.artefact(sequence, "metrics")), made)
+
+
+def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]:
+    """The sequences apart by whether they are annotated; empty groups are left out."""
+    every = [e for found in evaluations for e in found.errors]
+    apart = {
+        name: [e.metrics for e in every if e.annotated == annotated]
+        for name, annotated in ((PLAIN, False), (ANNOTATED, True))
+    }
+    return {name: sequences for name, sequences in apart.items() if sequences}
+
+
+def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
+    """Every figure of a group of sequences by area: the stages, and what is not one stage's."""
+    found = {stage: figures.truth_figures(sequences, stage) for stage in ESTIMATES}
+    for stage in ESTIMATES:
+        sweep = figures.contact_sweep(sequences, stage)
+        found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
+    return {
+        **found,
+        "penetration": figures.penetration_figures(sequences),
+        "vertex_to_cloud": figures.cloud_figures(sequences),
+        "vertex_to_cloud_floor": figures.floor_figures(sequences),
+        "extrinsics": figures.extrinsics_figures(sequences),
+        "flags": figures.flag_figures(sequences),
+    }
+
+
+def with_spread(sequences: Sequence[SequenceMetrics]) -> Areas:
+    """The same, and to each figure its standard error over the sequences."""
+    return {
+        area: found | spread(lambda some, area=area: areas(some)[area], sequences)  # type: ignore[misc]
+        for area, found in areas(sequences).items()
+    }
+
+
+def flat(evaluations: Sequence[Sequences]) -> Figures:
+    """Keys ``joint.body_pve_mm``; areas of annotated sequences end in ``_annotated``."""
+    found: Figures = {}
+    for group, sequences in groups(evaluations).items():
+        for area, measures in with_spread(sequences).items():
+            found |= keyed(f"{area}{'' if group == PLAIN else '_annotated'}.", measures)
+    return found
+
+
+def print_sequences(evaluations: Sequence[Sequences]) -> None:
+    """One table for the three stages side by side, one for the rest; a column for each group."""
+    console = Console()
+    found = {name: with_spread(some) for name, some in groups(evaluations).items()}
+    counts = {name: len(some) for name, some in groups(evaluations).items()}
+    for group, tables in found.items():
+        table = Table("measure", *ESTIMATES, box=None)
+        table.title = f"against truth, {group} ({counts[group]} sequences, +- standard error)"
+        for measure in _names([tables[stage] for stage in ESTIMATES]):
+            table.add_row(measure, *(_cell(tables[stage], measure) for stage in ESTIMATES))
+        console.print(table)
+    table = Table("after joint", *found, box=None, title="all frames (+- standard error)")
+    for area in next(iter(found.values()), {}):
+        if area in ESTIMATES:
+            continue
+        columns = [tables[area] for tables in found.values()]
+        for name in _names(columns):
+            table.add_row(f"{area}.{name}", *(_cell(column, name) for column in columns))
+    console.print(table)
+    for name in (name for measured in evaluations for name in measured.missing):
+        console.print(f"{name}: no metrics", highlight=False, markup=False)
+
+
+def _names(columns: Sequence[Figures]) -> list[str]:
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [name for name in names if not name.endswith(SPREAD)]
+
+
+def _cell(column: Figures, name: str) -> str:
+    error = number(column.get(name + SPREAD), 3)
+    return number(column.get(name), 3) + (f" +- {error}" if error else "")
+
+
+PART = Part("sequences", "metrics", (), "metrics.figures", measure, flat, print_sequences)

@@ -1,0 +1,48 @@
+"""Errors of a recording are measured again only where what they come from has changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from intercap_core.config import Config, ObjectEntry, SubjectEntry
+from intercap_core.evaluation.captures import PART
+from intercap_core.evaluation.part import measured_once, spread
+from intercap_core.project import Project
+from tests.helpers.kinect_files import entry_of
+
+
+def test_errors_are_kept_by_content(tmp_path: Path) -> None:
+    entry = entry_of(tmp_path, cameras=2).model_copy(update={"truth": tmp_path / "truth.h5"})
+    config = Config(dataset="trial", results=tmp_path)
+    subjects = {entry.subject: SubjectEntry(subject=entry.subject, gender="neutral")}
+    objects = {entry.object: ObjectEntry(name=entry.object, mesh=tmp_path / "mesh.ply")}
+    project = Project(config, tmp_path / "config.yaml", {"one": entry}, subjects, objects)
+    files = [project.artefact("one", stage) for stage in ("frames", "scene")]
+    for path in (*files, tmp_path / "truth.h5", tmp_path / "mesh.ply"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(path.name)
+    calls: list[str] = []
+
+    def measure(_: Project, sequence: str) -> str:
+        calls.append(sequence)
+        return "errors"
+
+    part = replace(PART, measure=measure)
+    for _ in range(2):
+        assert measured_once(part, project, "one") == "errors"
+    assert calls == ["one"]
+    files[1].write_text("another scene")
+    measured_once(part, project, "one")
+    assert calls == ["one", "one"]
+    assert len(list((files[1].parent / "evaluation").iterdir())) == 1  # the older errors are gone
+
+
+def test_the_spread_is_the_standard_error_over_recordings() -> None:
+    def figures(values: list[float]) -> dict[str, float]:
+        return {"mm": sum(values) / len(values), "worst_mm": max(values)}
+
+    assert spread(figures, [1.0, 3.0]) == {"mm_spread": pytest.approx(1.0)}
+    assert spread(figures, [1.0]) == {}

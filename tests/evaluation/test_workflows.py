@@ -1,0 +1,86 @@
+"""Which projects wait for which, what a run is expected to take, and what was done before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from intercap_core.cli import BODY_SETTINGS, CAPTURE_SETTINGS, OBJECT_SETTINGS
+from intercap_core.evaluation import bodies, budget, objects
+from intercap_core.evaluation.evaluate import PARTS
+from intercap_core.evaluation.reference import worse
+from intercap_core.evaluation.workflows import Order, orders_of, progress
+from intercap_core.project import Project, load_project
+
+SETTINGS = {
+    "sequences": [Path("config/evaluation/config.yaml")],
+    "captures": CAPTURE_SETTINGS,
+    "objects": OBJECT_SETTINGS,
+    "bodies": BODY_SETTINGS,
+}
+
+
+@pytest.fixture(scope="module")
+def wanted() -> dict[str, tuple[str, list[Project]]]:
+    return {
+        name: (PARTS[name].stage, [load_project(path) for path in paths])
+        for name, paths in SETTINGS.items()
+    }
+
+
+def _frames(wanted: dict[str, tuple[str, list[Project]]]) -> dict[Path, int]:
+    return budget.frames_of([project for _, some in wanted.values() for project in some])
+
+
+def test_projects_wait_for_those_that_make_their_recordings(
+    wanted: dict[str, tuple[str, list[Project]]],
+) -> None:
+    orders = orders_of(wanted, _frames(wanted))
+    by_name = {order.project.config.dataset: order for order in orders}
+    assert len(orders) == len(by_name) == 1 + 3 + 5 + 7
+    assert orders[0] is by_name["object"]  # what most wait for comes first
+    assert by_name["object"].stages == [objects.PART.stage, bodies.PART.stage]
+    for name in ("object_no_detector", "body_two_view"):
+        assert by_name[name].after == [by_name["object"]]
+    assert by_name["object_noise2"].after == []
+
+
+def test_each_part_is_expected_to_keep_to_its_budget(
+    wanted: dict[str, tuple[str, list[Project]]],
+) -> None:
+    frames = _frames(wanted)
+    minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
+    for part in PARTS:
+        assert minutes[f"{part}_minutes_expected"] <= minutes[f"{part}_minutes_budget"]
+    assert sum(budget.BUDGET_MINUTES[part] for part in PARTS) <= 75
+
+
+def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
+    project = load_project(Path("config/test/config.yaml"))
+    order = Order(project, ["scene"], {"frames": [10.0, 30.0], "scene": [60.0, 60.0]})
+    assert order.left() == (160.0, 0.0)
+
+    class Watcher:
+        transcript = tmp_path / "snakemake.log"
+
+        def jobs(self) -> dict[str, object]:
+            return {"a: frames": type("State", (), {"state": "finished"})}
+
+    order.watcher = Watcher()  # type: ignore[assignment]
+    order.watcher.transcript.write_text(
+        "Job stats:\njob  count\n---\nframes  1\nscene  2\ntotal  3\n"
+    )
+    assert order.left() == (120.0, 20.0)
+    assert progress([order], 2, 0.0) == "0 of 1 projects done after 0 minutes, at most 1 left"
+    order.status = 0
+    assert order.left() == (0.0, 140.0)
+
+
+def test_worse_goes_beyond_the_spread_in_the_bad_direction() -> None:
+    assert worse("joint.body_pve_mm", 8.0, 7.0, 0.3)
+    assert not worse("joint.body_pve_mm", 8.0, 7.0, 0.6)
+    assert not worse("joint.body_pve_mm", 6.0, 7.0, 0.1)
+    assert worse("joint.contact_region_f1", 0.8, 0.95, 0.02)
+    assert worse("object.cup.lost_share", 0.3, 0.0, 0.0)
+    assert not worse("object.recordings", 3, 5, 0.0)
