@@ -21,7 +21,9 @@ def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:
 
 
 def visible_vertex_error(
-    vertices: np.ndarray, true_vertices: np.ndarray, visible: np.ndarray
+    vertices: np.ndarray,
+    true_vertices: np.ndarray,
+    visible: np.ndarray,
 ) -> np.ndarray:
     """The same (...) over the vertices that cameras truly see (..., V) bool; NaN where none is."""
     error = np.linalg.norm(vertices - true_vertices, axis=-1)
@@ -90,7 +92,10 @@ def hand_error(
 
 
 def corresponding_vertices(
-    true_vertices: np.ndarray, true_faces: np.ndarray, face: np.ndarray, weights: np.ndarray
+    true_vertices: np.ndarray,
+    true_faces: np.ndarray,
+    face: np.ndarray,
+    weights: np.ndarray,
 ) -> np.ndarray:
     """The true surface's points (..., V, 3) that correspond to a fitted mesh's vertices.
 

@@ -21,7 +21,9 @@ def vertex_contact(signed_distance: np.ndarray, threshold_m: float = CONTACT_M) 
 
 
 def region_contact(
-    vertex: np.ndarray, regions: Mapping[str, np.ndarray], names: Sequence[str]
+    vertex: np.ndarray,
+    regions: Mapping[str, np.ndarray],
+    names: Sequence[str],
 ) -> np.ndarray:
     """Whether some vertex of each region touches: (..., V) bool to (..., R) in ``names``' order."""
     return np.stack([vertex[..., regions[name]].any(-1) for name in names], -1)

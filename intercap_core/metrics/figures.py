@@ -181,7 +181,9 @@ def contact_sweep(sequences: Sequence[SequenceMetrics], stage: str) -> dict[floa
 
 
 def _over(
-    sequences: Sequence[SequenceMetrics], key: str, how: Callable[[np.ndarray], Any]
+    sequences: Sequence[SequenceMetrics],
+    key: str,
+    how: Callable[[np.ndarray], Any],
 ) -> float:
     values = pooled(sequences, key)
     if values is None or not np.isfinite(values).any():
