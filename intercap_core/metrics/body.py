@@ -115,7 +115,7 @@ def normalised_joint_error(
     sigma: np.ndarray,
     which: slice = BODY_JOINTS,
 ) -> np.ndarray:
-    """Distance of some joints (..., 22) over the stated deviation: median 1 if honest.
+    """Distance of some joints (..., 22) over the stated deviation: median 1 if calibrated.
 
     ``sigma`` (..., 55) is the standard deviation of each coordinate, metres. ``which`` of the 55
     joints; the body's where nothing is said.

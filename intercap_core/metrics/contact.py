@@ -1,7 +1,7 @@
 """Contact by distance, and how well it agrees with the true contact.
 
 A vertex is in contact when its signed distance to the other surface is at most the threshold: one
-that has sunk in touches too. The paper thresholds the unsigned distance at 4.5 mm; the two differ
+that penetrates is in contact too. The paper thresholds the unsigned distance at 4.5 mm; the two differ
 by vertices that are deeper than that.
 """
 

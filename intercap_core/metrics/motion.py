@@ -1,4 +1,4 @@
-"""Smoothness and promptness of a track over time."""
+"""Smoothness and lag of a track over time."""
 
 from __future__ import annotations
 

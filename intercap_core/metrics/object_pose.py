@@ -67,7 +67,7 @@ def normalised_translation_error(
     true_translation: np.ndarray,
     covariance: np.ndarray,
 ) -> np.ndarray:
-    """Mahalanobis length (T,) of the translation's error over its median: median 1 if honest.
+    """Mahalanobis length (T,) of the translation's error over its median: 1 if calibrated.
 
     ``covariance`` (T, 6, 6) of (rotation vector, translation); NaN where it says nothing.
     """

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 FAMILY_B_SLOWER = 1.7  # correlation times of family "b" against those of family "a"
-OVERSAMPLING = 4
 _QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
 
 
