@@ -1,8 +1,8 @@
 """Contact by distance, and how well it agrees with the true contact.
 
-A vertex is in contact when its signed distance to the other surface is at most the threshold: one
-that penetrates is in contact too. The paper thresholds the unsigned distance at 4.5 mm; the two differ
-by vertices that are deeper than that.
+A vertex is in contact when its signed distance to the other surface is at most the threshold, so
+a penetrating vertex is too. The paper thresholds the unsigned distance at 4.5 mm; the two differ
+by the vertices that lie deeper than that.
 """
 
 from __future__ import annotations
