@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bench.object_baseline import Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
 from intercap_core.camera.transforms import rigid
+from intercap_core.errors import UserError
 from intercap_core.object_track.fit import fit_pose
 from intercap_core.rigid.twist import moved
 
@@ -24,9 +26,10 @@ def draw_convergence(clip: ObjectClip, output: Path) -> None:
     """Fit ``FRAMES`` frames from 3 cm and 10 degrees off the truth, in seeded directions.
 
     Medians over the frames against the median time from the fit's begin, everything included that
-    is done for one frame. Ours are fits that were stopped after as many steps.
+    is done for one frame. Ours are fits that were stopped after as many steps. Raises UserError
+    where matplotlib is not installed.
     """
-    from matplotlib.figure import Figure
+    figure_of = _figure()
 
     frames = np.flatnonzero(clip.seen)
     frames = frames[np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().astype(int)]
@@ -37,7 +40,7 @@ def draw_convergence(clip: ObjectClip, output: Path) -> None:
         (f"Adam, learning rate {FASTER.learning_rate_m:g}", FASTER),
     ):
         lines[name] = _baseline(clip, frames, starts, recipe)
-    figure = Figure(figsize=(7.5, 3.2), layout="constrained")
+    figure = figure_of(figsize=(7.5, 3.2), layout="constrained")
     for axes, column, label in zip(figure.subplots(1, 2), (1, 2), ("mm", "degrees"), strict=True):
         for name, points in lines.items():
             axes.plot(points[:, 0], points[:, column], label=name, marker=".", markersize=3)
@@ -46,6 +49,18 @@ def draw_convergence(clip: ObjectClip, output: Path) -> None:
     figure.axes[0].legend(fontsize="small")
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=150, metadata={"Software": None})
+
+
+def _figure() -> Any:
+    """matplotlib's class of figures."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError(
+            "the picture of convergence is drawn by matplotlib, which is not installed; install "
+            "it with pip install 'intercap-core[bench]'"
+        ) from error
+    return Figure
 
 
 def _start(clip: ObjectClip, t: int) -> np.ndarray:

@@ -90,7 +90,7 @@ def faults_of_sequences(project: Project) -> list[Fault]:
         name: _fault_of_mesh(project, name)
         for name in {row.object for row in project.sequences.values()}
     }
-    faults = _annotations_of_nobody(project)
+    faults = _annotations_without_sequence(project)
     for name, row in project.sequences.items():
         try:
             project.annotation(name)
@@ -170,7 +170,10 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
 
 
 def _notes_of_keypoints(
-    settings: DetectionsSettings, folder: Path, layout: Layout, cameras: list[str]
+    settings: DetectionsSettings,
+    folder: Path,
+    layout: Layout,
+    cameras: list[str],
 ) -> list[str]:
     """What a look at the first people of each camera shows: their form, place and confidence."""
     from intercap_core.detections.keypoint_check import look_at_keypoints
@@ -194,7 +197,10 @@ def _colour_size(layout: Layout, camera: str) -> tuple[int, int] | None:
 
 
 def _notes_of_candidates(
-    project: Project, row: SequenceEntry, layout: Layout, cameras: list[str]
+    project: Project,
+    row: SequenceEntry,
+    layout: Layout,
+    cameras: list[str],
 ) -> list[str]:
     """What a look at the first results of each camera shows: their form, size and labels."""
     from intercap_core.detections.candidate_check import look_at_candidates
@@ -224,7 +230,7 @@ def _notes_of_candidates(
     return notes
 
 
-def _annotations_of_nobody(project: Project) -> list[Fault]:
+def _annotations_without_sequence(project: Project) -> list[Fault]:
     folder = tidy(project.path.parent / project.config.annotations)
     known = {folder / f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
     known |= {project.annotation_path(name) for name in project.sequences}

@@ -1,7 +1,7 @@
 """Files that are generated from the code, so that they cannot disagree with it.
 
 The settings with their defaults, the explanation of every setting and column, JSON schemas for
-editors, and the contents of every artefact.
+editors, the contents of every artefact, and how rooms and stages hang together.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pydantic import BaseModel
 
 from intercap_core import schemas
 from intercap_core.artefacts import Schema
+from intercap_core.commands import architecture
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
 
 ENTRIES: dict[str, tuple[type[BaseModel], str, str]] = {
@@ -48,6 +49,7 @@ def contents() -> dict[str, str]:
         "config/config.yaml": default_settings(),
         "config/README.md": settings_page(),
         "docs/artefacts.md": artefacts_page(),
+        "docs/architecture.md": architecture.page(),
     }
     for name, (model, _, _) in ENTRIES.items():
         text = json.dumps(model.model_json_schema(), indent=2) + "\n"
@@ -68,7 +70,11 @@ def default_settings() -> str:
 
 
 def _settings(
-    top: dict[str, Any], schema: dict[str, Any], values: dict[str, Any], pad: str, lines: list[str]
+    top: dict[str, Any],
+    schema: dict[str, Any],
+    values: dict[str, Any],
+    pad: str,
+    lines: list[str],
 ) -> None:
     for name, entry in schema["properties"].items():
         if name in LEFT_OUT_OF_DEFAULTS and not pad:

@@ -76,7 +76,10 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
 
 
 def snakemake_command(
-    settings: Path, *, cores: int = 0, arguments: Sequence[str] = ()
+    settings: Path,
+    *,
+    cores: int = 0,
+    arguments: Sequence[str] = (),
 ) -> list[str]:
     """The command line that runs a project's workflow; ``cores`` 0 = all."""
     return [

@@ -37,7 +37,12 @@ class Exposures:
 
 
 def write(
-    folder: Path, motion: Motion, rig: Rig, mesh: ObjectMesh, obj_id: int, exposures: Exposures
+    folder: Path,
+    motion: Motion,
+    rig: Rig,
+    mesh: ObjectMesh,
+    obj_id: int,
+    exposures: Exposures,
 ) -> None:
     """Write ``models/`` and one scene folder a camera, numbered in the rig's order.
 

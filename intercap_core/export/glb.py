@@ -51,7 +51,11 @@ class _Document:
         self._length = 0
 
     def accessor(
-        self, values: np.ndarray, *, target: int | None = None, bounds: bool = False
+        self,
+        values: np.ndarray,
+        *,
+        target: int | None = None,
+        bounds: bool = False,
     ) -> int:
         """Append an array (N,) or (N, k) and return its accessor; ``bounds`` adds min and max."""
         values = np.ascontiguousarray(values)
@@ -129,7 +133,10 @@ def rest_pose(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _body(
-    document: _Document, motion: Motion, animation: dict[str, Any], times: int
+    document: _Document,
+    motion: Motion,
+    animation: dict[str, Any],
+    times: int,
 ) -> tuple[int, int]:
     """Add the skinned mesh and its skeleton; returns the pelvis' node and the mesh's."""
     vertices, joints = rest_pose(motion)
@@ -176,7 +183,11 @@ def _body(
 
 
 def _object(
-    document: _Document, motion: Motion, mesh: ObjectMesh, animation: dict[str, Any], times: int
+    document: _Document,
+    motion: Motion,
+    mesh: ObjectMesh,
+    animation: dict[str, Any],
+    times: int,
 ) -> int:
     geometry = _geometry(document, mesh.vertices, mesh.faces)
     colours = np.column_stack([mesh.colours, np.full(len(mesh.colours), 255, np.uint8)])

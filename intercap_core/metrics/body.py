@@ -21,7 +21,9 @@ def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:
 
 
 def visible_vertex_error(
-    vertices: np.ndarray, true_vertices: np.ndarray, visible: np.ndarray
+    vertices: np.ndarray,
+    true_vertices: np.ndarray,
+    visible: np.ndarray,
 ) -> np.ndarray:
     """The same (...) over the vertices that cameras truly see (..., V) bool; NaN where none is."""
     error = np.linalg.norm(vertices - true_vertices, axis=-1)
@@ -90,7 +92,10 @@ def hand_error(
 
 
 def corresponding_vertices(
-    true_vertices: np.ndarray, true_faces: np.ndarray, face: np.ndarray, weights: np.ndarray
+    true_vertices: np.ndarray,
+    true_faces: np.ndarray,
+    face: np.ndarray,
+    weights: np.ndarray,
 ) -> np.ndarray:
     """The true surface's points (..., V, 3) that correspond to a fitted mesh's vertices.
 
@@ -110,7 +115,7 @@ def normalised_joint_error(
     sigma: np.ndarray,
     which: slice = BODY_JOINTS,
 ) -> np.ndarray:
-    """Distance of some joints (..., 22) over the stated deviation: median 1 if honest.
+    """Distance of some joints (..., 22) over the stated deviation: median 1 if calibrated.
 
     ``sigma`` (..., 55) is the standard deviation of each coordinate, metres. ``which`` of the 55
     joints; the body's where nothing is said.

@@ -47,7 +47,11 @@ class BodyClouds:
     @classmethod
     @contextlib.contextmanager
     def open(
-        cls, frames: Path, scene: Path, person: Path, model: BodyModel
+        cls,
+        frames: Path,
+        scene: Path,
+        person: Path,
+        model: BodyModel,
     ) -> Iterator[BodyClouds]:
         """Open for a ``with`` block; raises UserError as reading artefacts does."""
         with Frames.open(frames) as images, artefacts.read(scene, SCENE) as found:

@@ -109,7 +109,9 @@ def measure(
 
 
 def _surface(
-    track: BodyTrack, truth: Truth, clouds: BodyClouds
+    track: BodyTrack,
+    truth: Truth,
+    clouds: BodyClouds,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Errors of skin and face (T,), and distances to the measured points of every few frames."""
     total = len(track.joints)

@@ -32,8 +32,10 @@ class Slip:
 
 @dataclass(frozen=True)
 class SlipCounts:
-    """True slips that were found or missed, and found ones that are none of these; images whose
-    slip is wrong, of all ``images``."""
+    """True slips that were detected or missed, and false detections, by event.
+
+    ``images_wrong`` of all ``images`` are given a slip that is not the true one.
+    """
 
     found: int
     missed: int
@@ -91,7 +93,7 @@ def compare_slips(slip: np.ndarray, true_slip: np.ndarray, available: np.ndarray
     """Compare slips (T, C) by event, on the sets in which the camera has an image (T, C).
 
     A true event is found where a detected one of the same camera and the same number of frames
-    overlaps it; a detected one that no true event answers to in this way is false.
+    overlaps it; a detected event that overlaps no such true one is a false detection.
     """
     true, found = slip_events(true_slip, available), slip_events(slip, available)
     answered = sum(any(_meet(t, f) for f in found) for t in true)
@@ -218,8 +220,8 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
         found["offset_error_worst_ms"] = 1e3 * float(np.abs(offset).max())
     normalised = _joined([c.offset_normalised for c in captures])
     if np.isfinite(normalised).any():
-        honest = float(np.nanmedian(np.abs(normalised))) / MEDIAN_CHI_1
-        found["offset_normalised_median"] = honest
+        ratio = float(np.nanmedian(np.abs(normalised))) / MEDIAN_CHI_1
+        found["offset_normalised_median"] = ratio
     if len(offset):
         found["offset_estimated_share"] = float(np.isfinite(normalised).mean())
     found["slips_true"] = float(sum(c.slips.found + c.slips.missed for c in captures))
@@ -241,7 +243,7 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
 
 
 def _true_bias(truth: artefacts.Artefact) -> np.ndarray:
-    """(C,), NaN for a truth that does not tell."""
+    """(C,), NaN where the truth does not state it."""
     if "depth_bias" in truth:
         return truth["depth_bias"]
     return np.full(len(truth["time_offset"]), np.nan)

@@ -1,8 +1,8 @@
 """Contact by distance, and how well it agrees with the true contact.
 
-A vertex is in contact when its signed distance to the other surface is at most the threshold: one
-that has sunk in touches too. The paper thresholds the unsigned distance at 4.5 mm; the two differ
-by vertices that are deeper than that.
+A vertex is in contact when its signed distance to the other surface is at most the threshold, so
+a penetrating vertex is too. The paper thresholds the unsigned distance at 4.5 mm; the two differ
+by the vertices that lie deeper than that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ def vertex_contact(signed_distance: np.ndarray, threshold_m: float = CONTACT_M) 
 
 
 def region_contact(
-    vertex: np.ndarray, regions: Mapping[str, np.ndarray], names: Sequence[str]
+    vertex: np.ndarray,
+    regions: Mapping[str, np.ndarray],
+    names: Sequence[str],
 ) -> np.ndarray:
     """Whether some vertex of each region touches: (..., V) bool to (..., R) in ``names``' order."""
     return np.stack([vertex[..., regions[name]].any(-1) for name in names], -1)

@@ -23,7 +23,9 @@ def rig_centre(master_from_camera: np.ndarray) -> np.ndarray:
 
 
 def displacement(
-    master_from_camera: np.ndarray, true_master_from_camera: np.ndarray, master: int
+    master_from_camera: np.ndarray,
+    true_master_from_camera: np.ndarray,
+    master: int,
 ) -> np.ndarray:
     """RMS displacement (C,) of the points of a 2 m cube at the rig's true centre, metres.
 

@@ -181,7 +181,9 @@ def contact_sweep(sequences: Sequence[SequenceMetrics], stage: str) -> dict[floa
 
 
 def _over(
-    sequences: Sequence[SequenceMetrics], key: str, how: Callable[[np.ndarray], Any]
+    sequences: Sequence[SequenceMetrics],
+    key: str,
+    how: Callable[[np.ndarray], Any],
 ) -> float:
     values = pooled(sequences, key)
     if values is None or not np.isfinite(values).any():
@@ -271,7 +273,7 @@ def summary(dataset: str, sequences: Sequence[SequenceMetrics]) -> dict[str, Any
 
 
 def _rounded(value: Any) -> Any:
-    """Six digits are more than any figure here is good for; NaN is null in JSON."""
+    """Six significant digits; NaN is null in JSON."""
     if isinstance(value, dict):
         return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""Smoothness and promptness of a track over time."""
+"""Smoothness and lag of a track over time."""
 
 from __future__ import annotations
 
@@ -73,7 +73,10 @@ def turns(rotation: np.ndarray, true_rotation: np.ndarray, symmetry: SymmetryGro
 
 
 def motion_onset_lags(
-    centre: np.ndarray, true_centre: np.ndarray, is_moving: np.ndarray, fps: float
+    centre: np.ndarray,
+    true_centre: np.ndarray,
+    is_moving: np.ndarray,
+    fps: float,
 ) -> list[float]:
     """Frames by which the track is late each time the object starts to move (negative: early).
 

@@ -187,7 +187,7 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
     ended = [end for r in recordings for end in _lost_runs_end(r.lost)]
     if ended:
         found["recovered_share"] = float(np.mean(ended))
-    return found | _promptness(recordings)
+    return found | _jitter_and_lag(recordings)
 
 
 def by_views(recordings: Sequence[ObjectErrors]) -> dict[str, Figures]:
@@ -221,7 +221,7 @@ def _lost_runs_end(lost: np.ndarray) -> list[bool]:
     return [bool(end < len(lost)) for end in ends]
 
 
-def _promptness(recordings: Sequence[ObjectErrors]) -> Figures:
+def _jitter_and_lag(recordings: Sequence[ObjectErrors]) -> Figures:
     """Jitter over all frames of rest, and by how much the track errs at the start of motion."""
     found: Figures = {}
     steps, turns, lags = [np.zeros(0)], [np.zeros(0)], []

@@ -30,7 +30,9 @@ def centre_error(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
 
 
 def rotation_error_deg(
-    rotation: np.ndarray, true_rotation: np.ndarray, symmetry: SymmetryGroup
+    rotation: np.ndarray,
+    true_rotation: np.ndarray,
+    symmetry: SymmetryGroup,
 ) -> np.ndarray:
     """Geodesic angle (...), the smallest over the symmetry group, degrees."""
     return symmetry.rotation_error_deg(rotation, true_rotation)
@@ -42,7 +44,9 @@ def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) ->
 
 
 def first_seen_found(
-    translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray, views: np.ndarray
+    translation_error_m: np.ndarray,
+    rotation_error_degrees: np.ndarray,
+    views: np.ndarray,
 ) -> bool | None:
     """Whether the first frame that truly has a view is within 20 mm and 10 degrees.
 
@@ -59,9 +63,11 @@ def first_seen_found(
 
 
 def normalised_translation_error(
-    translation: np.ndarray, true_translation: np.ndarray, covariance: np.ndarray
+    translation: np.ndarray,
+    true_translation: np.ndarray,
+    covariance: np.ndarray,
 ) -> np.ndarray:
-    """Mahalanobis length (T,) of the translation's error over its median: median 1 if honest.
+    """Mahalanobis length (T,) of the translation's error over its median: 1 if calibrated.
 
     ``covariance`` (T, 6, 6) of (rotation vector, translation); NaN where it says nothing.
     """

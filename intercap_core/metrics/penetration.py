@@ -1,4 +1,4 @@
-"""How deep body and object are in each other."""
+"""Penetration depths between body and object."""
 
 from __future__ import annotations
 

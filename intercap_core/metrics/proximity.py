@@ -23,7 +23,10 @@ class PosedObject:
         self._low, self._high = vertices.min(0) - REACH_M, vertices.max(0) + REACH_M
 
     def signed_distance(
-        self, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+        self,
+        points: np.ndarray,
+        rotation: np.ndarray,
+        translation: np.ndarray,
     ) -> np.ndarray:
         """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
 
@@ -42,7 +45,10 @@ def distance_to_body(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 
 
 def _within_reach(
-    field: DistanceField, points: np.ndarray, low: np.ndarray, high: np.ndarray
+    field: DistanceField,
+    points: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
 ) -> np.ndarray:
     result = np.full(len(points), REACH_M)
     near = np.flatnonzero(((points > low) & (points < high)).all(1))
@@ -63,7 +69,10 @@ class Sight:
             )
 
     def seen(
-        self, points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camera]
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        cameras: Sequence[Camera],
     ) -> np.ndarray:
         """Whether some depth camera (colour where it has none) sees each surface point (N,).
 

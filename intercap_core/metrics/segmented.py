@@ -30,7 +30,11 @@ class ViewMasks:
 
 
 def segmented_points(
-    depth: np.ndarray, camera: Camera, masks: ViewMasks, near: np.ndarray, bias_m: float
+    depth: np.ndarray,
+    camera: Camera,
+    masks: ViewMasks,
+    near: np.ndarray,
+    bias_m: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points of the person and of the object (N, 3) float32, master frame, metres.
 

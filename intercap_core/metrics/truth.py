@@ -79,7 +79,9 @@ class Truth:
             )
 
     def object_samples_visible(
-        self, samples: SurfaceSamples, mesh: ObjectMesh
+        self,
+        samples: SurfaceSamples,
+        mesh: ObjectMesh,
     ) -> tuple[np.ndarray, np.ndarray]:
         """True object points nearest to the tracked mesh's samples, and which cameras truly see.
 
@@ -110,7 +112,10 @@ def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndar
 
 
 def object_errors(
-    truth: Truth, track: ObjectTrack, mesh: ObjectMesh, fps: float
+    truth: Truth,
+    track: ObjectTrack,
+    mesh: ObjectMesh,
+    fps: float,
 ) -> dict[str, np.ndarray]:
     """Errors of T object poses by key of the metrics artefact."""
     centre = mesh.centre_of_mass

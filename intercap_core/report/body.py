@@ -65,7 +65,12 @@ class BodyFacts:
 
 
 def read_fit(
-    frames: Path, scene: Path, person: Path, body_fit: Path, body_models: BodyModels, gender: str
+    frames: Path,
+    scene: Path,
+    person: Path,
+    body_fit: Path,
+    body_models: BodyModels,
+    gender: str,
 ) -> BodyFacts:
     """Read and draw one fit. What cannot be drawn is left out, with its reason in ``note``.
 

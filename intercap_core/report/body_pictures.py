@@ -50,7 +50,11 @@ def body_sheet(
 
 
 def _cell(
-    camera: Camera, rgb: np.ndarray, body: PosedBody, faces: np.ndarray, detected: np.ndarray
+    camera: Camera,
+    rgb: np.ndarray,
+    body: PosedBody,
+    faces: np.ndarray,
+    detected: np.ndarray,
 ) -> np.ndarray | None:
     lens = camera.colour
     local = apply(camera.colour_from_master, body.vertices)

@@ -123,7 +123,10 @@ def read_capture(frames: Path, scene: Path) -> CaptureFacts:
 
 
 def camera_states(
-    colour: np.ndarray, depth: np.ndarray, slip: np.ndarray, dropped: np.ndarray
+    colour: np.ndarray,
+    depth: np.ndarray,
+    slip: np.ndarray,
+    dropped: np.ndarray,
 ) -> list[str]:
     """What each set holds of one camera, one of STATES, from what is there; all (T,)."""
     state = np.full(len(colour), "missing", object)
@@ -324,7 +327,9 @@ def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
 
 
 def _profile_chart(
-    profiles: Sequence[FloorProfile], x_range: tuple[float, float], top: float
+    profiles: Sequence[FloorProfile],
+    x_range: tuple[float, float],
+    top: float,
 ) -> str:
     series = [charts.Series("", _colour(p.c), p.along, 1e3 * p.height) for p in profiles]
     return charts.line_chart(

@@ -194,9 +194,13 @@ class _Stage:
         return (near < self.radius) & (points[:, 2] > _FLOOR_M) & (points[:, 2] < _TOP_M)
 
     def picture(
-        self, side: tuple[str, float, float], cloud: FusedCloud, rig: Rig, world: np.ndarray,
+        self,
+        side: tuple[str, float, float],
+        cloud: FusedCloud,
+        rig: Rig,
+        world: np.ndarray,
         when: str,
-    ) -> CapturePicture:  # fmt: skip
+    ) -> CapturePicture:
         """The coloured cloud with the floor's grid and the cameras."""
         name, azimuth, elevation = side
         target = np.append(self.centre, _AIM_M)
@@ -267,9 +271,12 @@ def _draw_frustum(picture: np.ndarray, view: View, corners: np.ndarray, c: int, 
 
 
 def _draw_lines(
-    picture: np.ndarray, view: View, ends: np.ndarray, colour: int | tuple[int, ...],
+    picture: np.ndarray,
+    view: View,
+    ends: np.ndarray,
+    colour: int | tuple[int, ...],
     thick: int = 1,
-) -> None:  # fmt: skip
+) -> None:
     """Lines (N, 2, 3), smooth at the edges; those that reach behind the viewer are left out."""
     at, z = view.project(ends.reshape(-1, 3))
     kept = (z > _NEAR_M).reshape(-1, 2).all(1) & (np.abs(at.reshape(-1, 4)).max(1) < 1e4)

@@ -124,7 +124,9 @@ class StateRow:
 
 
 def state_timeline(
-    rows: Sequence[StateRow], total: int, marks: Sequence[tuple[int, str]] = ()
+    rows: Sequence[StateRow],
+    total: int,
+    marks: Sequence[tuple[int, str]] = (),
 ) -> str:
     """Rows of ``total`` frames in the page's colours of states (CSS classes).
 

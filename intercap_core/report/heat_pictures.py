@@ -73,7 +73,10 @@ def body_pictures(model: BodyModel, likelihood: np.ndarray, top: float) -> list[
 
 
 def object_pictures(
-    vertices: np.ndarray, faces: np.ndarray, heat: SurfaceHeat, top: float
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    heat: SurfaceHeat,
+    top: float,
 ) -> list[HeatPicture]:
     """Two opposite views of an object (V, 3), (F, 3), from above (its frame is z up)."""
     fine, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, _MAX_EDGE_M, max_iter=12)

@@ -123,7 +123,11 @@ def choose_cameras(fit: Fit, rig: Rig, frames: Sequence[int], count: int) -> lis
 
 
 def overlays(
-    images: Frames, rig: Rig, fit: Fit, cameras: Sequence[int], frames: Sequence[int]
+    images: Frames,
+    rig: Rig,
+    fit: Fit,
+    cameras: Sequence[int],
+    frames: Sequence[int],
 ) -> list[Overlay]:
     """Pictures in the order of cameras, then frames; an image that is missing is left out.
 
@@ -170,14 +174,19 @@ def encode_jpeg(rgb: np.ndarray) -> bytes:
 
 
 def _painted(
-    vertices: np.ndarray, faces: np.ndarray, colour: tuple[float, ...], pose: np.ndarray
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colour: tuple[float, ...],
+    pose: np.ndarray,
 ) -> Painted:
     colours = np.broadcast_to(np.array(colour), (len(vertices), 3))
     return Painted(vertices, faces, colours, pose)
 
 
 def _window(
-    camera: Camera, bodies: Sequence[np.ndarray], objects: Sequence[np.ndarray]
+    camera: Camera,
+    bodies: Sequence[np.ndarray],
+    objects: Sequence[np.ndarray],
 ) -> tuple[int, int, int, int] | None:
     """x, y, width, height of the image part that holds body and object in all frames."""
     lens, pose = camera.colour, camera.colour_from_master

@@ -63,9 +63,14 @@ class View:
 
     @classmethod
     def towards(
-        cls, target: np.ndarray, azimuth: float, elevation: float, distance: float, focal: float,
+        cls,
+        target: np.ndarray,
+        azimuth: float,
+        elevation: float,
+        distance: float,
+        focal: float,
         size: tuple[int, int],
-    ) -> View:  # fmt: skip
+    ) -> View:
         """Look at ``target`` (3,), z up, from ``distance`` metres; angles in radians."""
         away = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
@@ -114,7 +119,10 @@ def measured_points(images: Frames, rig: Rig, t: int) -> list[CameraPoints]:
 
 
 def fuse(
-    measured: Sequence[CameraPoints], rig: Rig, world_from_master: np.ndarray, bias: np.ndarray
+    measured: Sequence[CameraPoints],
+    rig: Rig,
+    world_from_master: np.ndarray,
+    bias: np.ndarray,
 ) -> FusedCloud:
     """Bring all cameras' points into one frame by the poses of ``rig``.
 
@@ -169,7 +177,9 @@ def _spread(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cover(
-    source: np.ndarray, depth: np.ndarray, coverable: np.ndarray
+    source: np.ndarray,
+    depth: np.ndarray,
+    coverable: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Put the nearest of its eight neighbours where it is in front of ``coverable`` (H, W)."""
     height, width = depth.shape
@@ -185,7 +195,11 @@ def _cover(
 
 
 def _of_camera(
-    c: int, camera: Camera, depth: np.ndarray, image: np.ndarray | None, most: int
+    c: int,
+    camera: Camera,
+    depth: np.ndarray,
+    image: np.ndarray | None,
+    most: int,
 ) -> CameraPoints:
     step = max(1, int(np.ceil(np.sqrt(depth.size / most))))
     thin = _thinned(camera, depth[::step, ::step].shape, step)

@@ -44,7 +44,12 @@ class Crop:
         return cv2.resize(window, (self.cell, self.cell), interpolation=cv2.INTER_AREA)
 
     def outline(
-        self, cell: np.ndarray, mask: np.ndarray, x: int, y: int, colour: tuple[int, int, int]
+        self,
+        cell: np.ndarray,
+        mask: np.ndarray,
+        x: int,
+        y: int,
+        colour: tuple[int, int, int],
     ) -> None:
         """Draw the rim of a mask (h, w) whose corner is at image pixel (x, y)."""
         square = np.zeros((self.size, self.size), np.uint8)

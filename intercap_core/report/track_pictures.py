@@ -39,7 +39,11 @@ def track_sheet(
 
 
 def _cell(
-    camera: Camera, rgb: np.ndarray, mesh: ObjectMesh, pose: np.ndarray, rle: bytes
+    camera: Camera,
+    rgb: np.ndarray,
+    mesh: ObjectMesh,
+    pose: np.ndarray,
+    rle: bytes,
 ) -> np.ndarray | None:
     """The image around the object, enlarged to a cell, with both outlines; None: not in view."""
     lens = camera.colour

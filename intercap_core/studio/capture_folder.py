@@ -96,7 +96,12 @@ class CaptureFolder(ABC):
         """Lay a file of keypoints beside the images, where the layout has them there."""
 
     def add_masks(  # noqa: B027
-        self, camera: str, t: int, fps: int, candidates: list[dict[str, Any]], label: str
+        self,
+        camera: str,
+        t: int,
+        fps: int,
+        candidates: list[dict[str, Any]],
+        label: str,
     ) -> None:
         """The same for masks of the person and of the object, COCO label ``label``."""
 

@@ -46,7 +46,7 @@ class HandShape:
 
 
 def shape(fingers: tuple[float, float, float], thumb: tuple[float, float, float],
-          opposition: float, spread: float = 3.0) -> HandShape:  # fmt: skip
+          opposition: float, spread: float = 3.0,) -> HandShape:  # fmt: skip
     """A shape with the same flexion in all four fingers."""
     flexion = np.array([fingers] * 4 + [thumb], float)
     flexion[1:4] += np.array([[2.0, 2, 1], [6, 4, 2], [4, 3, 2]])  # towards the little finger
@@ -125,10 +125,15 @@ class Hand:
         posed = self._part.skin(local, np.zeros((len(vectors), 3)))
         return posed.vertices - self.rest.rest[self.wrist]
 
-    def close(self, start: HandShape, limits: dict[str, tuple[float, float, float]],
-              surface: DistanceField, object_from_wrist: np.ndarray,
-              tissue: float = TISSUE_M, fingers: tuple[int, ...] = (1, 3, 0, 2, THUMB)
-              ) -> tuple[HandShape, np.ndarray]:  # fmt: skip
+    def close(
+        self,
+        start: HandShape,
+        limits: dict[str, tuple[float, float, float]],
+        surface: DistanceField,
+        object_from_wrist: np.ndarray,
+        tissue: float = TISSUE_M,
+        fingers: tuple[int, ...] = (1, 3, 0, 2, THUMB),
+    ) -> tuple[HandShape, np.ndarray]:
         """Flex joint after joint until the skin meets the object or the limit is reached.
 
         ``object_from_wrist`` (4, 4) takes the hand's rest frame at the wrist to the object's;
@@ -142,7 +147,7 @@ class Hand:
                 moved = self.moved[f][j]
 
                 def least(angles: np.ndarray, f: int = f, j: int = j,
-                          moved: np.ndarray = moved) -> np.ndarray:  # fmt: skip
+                          moved: np.ndarray = moved,) -> np.ndarray:  # fmt: skip
                     trial = np.tile(flexion[f], (len(angles), 1))
                     trial[:, j] = angles
                     poses = np.tile(self.local(replace(start, flexion=flexion)),
@@ -176,7 +181,7 @@ class Hand:
         return closed, np.array(gaps)
 
     def gap(self, hand: HandShape, surface: DistanceField, object_from_wrist: np.ndarray,
-            ids: np.ndarray | slice = slice(None)) -> float:  # fmt: skip
+            ids: np.ndarray | slice = slice(None),) -> float:  # fmt: skip
         """Least signed distance of the hand, or of its vertices ``ids``, to the object, metres."""
         skin = self.skin(self.local(hand)[None])[:, ids]
         return float(self._distance(skin, surface, object_from_wrist)[0])

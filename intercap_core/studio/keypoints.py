@@ -62,7 +62,7 @@ class Detector:
         return cls(noise, frames, direction * size[:, None] * noise.scale)
 
     def detect(self, camera: Camera, points: np.ndarray, axes: np.ndarray,
-               hidden: np.ndarray) -> np.ndarray:  # fmt: skip
+               hidden: np.ndarray,) -> np.ndarray:  # fmt: skip
         """Keypoints (T, 135, 3) x, y, confidence of the subject in one camera.
 
         ``points`` (T, 135, 3) true points and ``axes`` (T, 3, 3) the pelvis's rotation, both in
@@ -112,7 +112,7 @@ class Detector:
         return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
 
     def _confidence(self, rng: np.random.Generator, error: np.ndarray,
-                    hidden: np.ndarray) -> np.ndarray:  # fmt: skip
+                    hidden: np.ndarray,) -> np.ndarray:  # fmt: skip
         """(T, 135) in [0, 1]: falls with the error, but knows only part of it."""
         size = np.linalg.norm(error, axis=-1)
         chance = self.noise.process(rng, self.frames, 135, 0.3)
@@ -123,7 +123,7 @@ class Detector:
         return np.clip(confidence, 0.02, 0.98)
 
     def _swapped(self, rng: np.random.Generator, pixels: np.ndarray,
-                 confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+                 confidence: np.ndarray,) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Left and right of the whole body or of the legs, exchanged for a short while."""
         chance = np.full((self.frames, 2), SWAP_PROBABILITY)
         shared = self.noise.process(rng, self.frames, 1, SWAP_S)[:, 0]

@@ -169,7 +169,12 @@ class BehaveFolder(CaptureFolder):
         (_behave_frame(self.path, t, fps) / f"{camera}.color.json").write_text(content)
 
     def add_masks(
-        self, camera: str, t: int, fps: int, candidates: list[dict[str, Any]], label: str
+        self,
+        camera: str,
+        t: int,
+        fps: int,
+        candidates: list[dict[str, Any]],
+        label: str,
     ) -> None:
         """``k<n>.person_mask.jpg`` and ``k<n>.obj_rend_mask.jpg``: the first candidate of each."""
         for wanted, kind in (("person", "person_mask"), (label, "obj_rend_mask")):

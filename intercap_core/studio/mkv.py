@@ -137,7 +137,10 @@ class MkvWriter:
         self._write_image("IR", infrared, device_time_us)
 
     def write_imu(
-        self, acceleration: np.ndarray, angular_velocity: np.ndarray, device_time_us: int
+        self,
+        acceleration: np.ndarray,
+        angular_velocity: np.ndarray,
+        device_time_us: int,
     ) -> None:
         """Add one sample: m/s^2 (3,) and rad/s (3,), both in their sensor's axes."""
         time_ns = device_time_us * 1000
@@ -178,7 +181,10 @@ class MkvWriter:
         return int.from_bytes(digest[:7], "big") | 1
 
     def _tags(
-        self, colour_mode: str, depth_mode: str | None, calibrated: bool
+        self,
+        colour_mode: str,
+        depth_mode: str | None,
+        calibrated: bool,
     ) -> dict[str, tuple[str, str]]:
         """Tags of tracks and attachment: name -> (value, what it is about)."""
         tags = {
@@ -199,7 +205,10 @@ class MkvWriter:
         return tags
 
     def _write_head(
-        self, fps: int, calibration: bytes | None, tags: dict[str, tuple[str, str]]
+        self,
+        fps: int,
+        calibration: bytes | None,
+        tags: dict[str, tuple[str, str]],
     ) -> None:
         ebml = (
             _unsigned(0x4286, 1)  # EBMLVersion

@@ -156,7 +156,7 @@ class Puppet:
         return replace(trunk, pelvis=pelvis)
 
     def legs(self, world: np.ndarray, pelvis: np.ndarray, ankle: np.ndarray, heading: np.ndarray,
-             pitch: np.ndarray, splay: float = SPLAY) -> None:  # fmt: skip
+             pitch: np.ndarray, splay: float = SPLAY,) -> None:  # fmt: skip
         """Set the legs for ankles (N, 2, 3), foot headings and pitch (N, 2), in place.
 
         The knees point between the pelvis's and the foot's heading, ``splay`` rad outward.
@@ -192,7 +192,7 @@ class Puppet:
         return at
 
     def idle_wrist(self, world: np.ndarray, pelvis: np.ndarray, side: int,
-                   swing: np.ndarray) -> Pose:  # fmt: skip
+                   swing: np.ndarray,) -> Pose:  # fmt: skip
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
         # where the chest's left is: its front may point down and back in a deep stoop
@@ -237,7 +237,7 @@ class Puppet:
         return Trunk(trunk.pelvis, trunk.heading, bend, trunk.head)
 
     def arm_to(self, world: np.ndarray, pelvis: np.ndarray, side: int, wrist: Pose,
-               raised: np.ndarray | float = 0.0) -> None:  # fmt: skip
+               raised: np.ndarray | float = 0.0,) -> None:  # fmt: skip
         """Set one arm for a wrist pose, in place; ``raised`` (N,) lifts the elbow outward."""
         name, sign = SIDES[side], (1.0, -1.0)[side]
         shoulder = self.arm_root(world, pelvis, side)
@@ -268,7 +268,7 @@ class Puppet:
             world[:, hand.first + joint] = world[:, parent] @ local[:, joint]
 
     def finger_track(self, side: int, start: HandShape,
-                     keys: list[tuple[np.ndarray, HandShape]]) -> np.ndarray:  # fmt: skip
+                     keys: list[tuple[np.ndarray, HandShape]],) -> np.ndarray:  # fmt: skip
         """Rotation vectors (N, 15, 3): from ``start`` to each shape in turn by its share (N,)."""
         hand = self.hands[side]
         vectors = hand.local(start)[None]

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 FAMILY_B_SLOWER = 1.7  # correlation times of family "b" against those of family "a"
-OVERSAMPLING = 4
 _QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
 
 
@@ -37,7 +36,7 @@ class NoiseSource:
         return np.random.default_rng([self.seed, zlib.crc32(repr(name).encode())])
 
     def process(self, rng: np.random.Generator, frames: int, channels: int,
-                correlation_s: float) -> np.ndarray:  # fmt: skip
+                correlation_s: float,) -> np.ndarray:  # fmt: skip
         """(frames, channels): zero mean, unit variance, correlated over ``correlation_s``."""
         if self.family == "b":
             correlation_s *= FAMILY_B_SLOWER
@@ -53,7 +52,7 @@ class NoiseSource:
         ).reshape(frames, channels)
 
     def _first_order(self, rng: np.random.Generator, frames: int, channels: int,
-                     correlation_s: float) -> np.ndarray:  # fmt: skip
+                     correlation_s: float,) -> np.ndarray:  # fmt: skip
         keep = np.exp(-1 / max(correlation_s * self.fps, 1e-3))
         steps = rng.normal(size=(frames, channels))
         path = np.empty_like(steps)

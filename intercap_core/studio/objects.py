@@ -40,7 +40,10 @@ def true_mesh(entry: ObjectEntry, seed: int) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _split_edges(
-    vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray, rng: np.random.Generator
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colours: np.ndarray,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split each edge between 30 and 70 % of its length, each triangle into four."""
     corners = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -58,7 +61,9 @@ def _split_edges(
 
 
 def _smooth_displacement(
-    vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """A random smooth vector field (V, 3) without rigid motion, in metres.
 

@@ -140,7 +140,10 @@ class Kinect:
         return Recorded(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
 
     def _inertial(
-        self, t: int, rng: np.random.Generator, stage_from_depth: np.ndarray
+        self,
+        t: int,
+        rng: np.random.Generator,
+        stage_from_depth: np.ndarray,
     ) -> list[tuple[np.ndarray, np.ndarray, int]]:
         """Acceleration, turning rate and device time over one period of a device that stands
         still: its accelerometer feels the ground push up."""
@@ -161,7 +164,7 @@ class Kinect:
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
 
     def _write_keypoints(self, folder: CaptureFolder, detector: Detector, moment: Moment,
-                         points: np.ndarray, hidden: np.ndarray) -> None:  # fmt: skip
+                         points: np.ndarray, hidden: np.ndarray,) -> None:  # fmt: skip
         master = self.stage.rig.master_from_stage[:3, :3]
         subject = detector.detect(
             self.true, self.stage.to_master(points), master @ moment.pelvis, hidden
@@ -176,7 +179,10 @@ class Kinect:
 
 
 def surfaces_at(
-    stage: Stage, moment: Moment, t: int, colours: np.ndarray
+    stage: Stage,
+    moment: Moment,
+    t: int,
+    colours: np.ndarray,
 ) -> tuple[Surface, Surface]:
     """The clothed body and the object at one moment."""
     clothed, thing, subject = moment.clothed[t], stage.thing, stage.subject

@@ -98,7 +98,7 @@ class View:
     """One lens of one camera: its rays and what it sees of the empty room."""
 
     def __init__(self, lens: Intrinsics, stage_from_camera: np.ndarray, room: Room,
-                 *, coloured: bool) -> None:  # fmt: skip
+                 *, coloured: bool,) -> None:  # fmt: skip
         self.lens = lens
         self.camera_from_stage = np.linalg.inv(stage_from_camera)
         self.rotation = stage_from_camera[:3, :3].astype(np.float32)
@@ -173,7 +173,7 @@ class View:
 
 @numba.njit(cache=True)
 def _interpolate(here, pixels, face, rays, camera_from_mesh, vertices, faces, normals, colours,
-                 stage_from_mesh, normal, colour):  # fmt: skip
+                 stage_from_mesh, normal, colour,):  # fmt: skip
     """Fill rows ``here`` of ``normal`` and ``colour`` (n, 3) from the corners of the triangles hit.
 
     A corner's weight is the volume that the ray spans with the two other corners.
@@ -225,7 +225,10 @@ def _facing(room: Room, eye: np.ndarray) -> np.ndarray:
 
 
 def _room_colours(
-    room: Room, points: np.ndarray, face: np.ndarray, facing: np.ndarray
+    room: Room,
+    points: np.ndarray,
+    face: np.ndarray,
+    facing: np.ndarray,
 ) -> np.ndarray:
     """Colours (N, 3) of points of the empty room on faces (N,), not yet shaded."""
     colours = np.empty((len(points), 3), np.float32)

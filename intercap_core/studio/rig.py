@@ -193,7 +193,11 @@ def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> I
 
 
 def _slips(
-    rng: np.random.Generator, cameras: int, frames: int, kind: str, noise: float
+    rng: np.random.Generator,
+    cameras: int,
+    frames: int,
+    kind: str,
+    noise: float,
 ) -> tuple[tuple[frozenset[int], ...], np.ndarray]:
     """Frames that are missing, or silent slips (T, C), in two subordinate cameras where there are
     two; a camera starts late and one ends early."""

@@ -47,7 +47,11 @@ class DepthSensor:
     """One depth camera looking at the room through ``view``; errors from ``noise``."""
 
     def __init__(
-        self, view: View, noise: NoiseSource, name: str, mode: str = "NFOV_UNBINNED"
+        self,
+        view: View,
+        noise: NoiseSource,
+        name: str,
+        mode: str = "NFOV_UNBINNED",
     ) -> None:
         self.view, self._noise, self._limits = view, noise, LIMITS[mode]
         rng = noise.rng("depth", name)
@@ -123,7 +127,7 @@ class DepthSensor:
 
 
 def _blotches(rng: np.random.Generator, shape: tuple[int, ...], size: float,
-              contrast: float) -> np.ndarray:  # fmt: skip
+              contrast: float,) -> np.ndarray:  # fmt: skip
     """Values in [0, 1] (H, W) that change over ``size`` pixels."""
     smooth = cv2.GaussianBlur(gaussian(rng, shape), (0, 0), size)
     return 0.5 + 0.5 * np.tanh(smooth / contrast / 1.2)

@@ -52,7 +52,10 @@ class Stage:
     """
 
     def __init__(
-        self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry
+        self,
+        capture: StudioCapture,
+        settings: StudioSettings,
+        entry: ObjectEntry,
     ) -> None:
         check_capture(capture, settings, entry.name)
         self.depth_mode, self.has_depth = settings.depth_mode, capture.depth

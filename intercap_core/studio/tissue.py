@@ -11,7 +11,10 @@ NEAR_M = 0.01
 
 
 def press_out(
-    points: np.ndarray, surface: DistanceField, stage_from_object: np.ndarray, bounds: np.ndarray
+    points: np.ndarray,
+    surface: DistanceField,
+    stage_from_object: np.ndarray,
+    bounds: np.ndarray,
 ) -> np.ndarray:
     """Move points (N, 3) of the stage that are inside the object to its surface.
 

@@ -26,7 +26,7 @@ ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 
 
 
 def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture: StudioCapture,
-                recorded: Sequence[Recorded]) -> np.ndarray:  # fmt: skip
+                recorded: Sequence[Recorded],) -> np.ndarray:  # fmt: skip
     """Write the truth artefact of the set times' ``moment``; ``recorded`` by each camera.
 
     Returns the true region contact (T, R).

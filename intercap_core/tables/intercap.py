@@ -198,7 +198,12 @@ def _calibration(key: Key, folder: Path, known: dict[str, Path], row: Row) -> Pa
 
 
 def _annotate(
-    row: Row, folders: list[Path], numbers: np.ndarray, result: Draft, *, with_pose: bool
+    row: Row,
+    folders: list[Path],
+    numbers: np.ndarray,
+    result: Draft,
+    *,
+    with_pose: bool,
 ) -> None:
     """Convert a sequence's annotations; the first is named in the row, others are put aside."""
     name = row.columns["sequence"]
@@ -217,7 +222,10 @@ def _annotate(
 
 
 def _objects(
-    folders: dict[Key, Path], meshes: Path | None, objects: Path, result: Draft
+    folders: dict[Key, Path],
+    meshes: Path | None,
+    objects: Path,
+    result: Draft,
 ) -> Path | dict[str, dict[str, Any]]:
     """Entries for the release's meshes, or the objects.yaml that is there."""
     used = Counter(key[1] for key in folders)

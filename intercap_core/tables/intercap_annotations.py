@@ -76,7 +76,9 @@ def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
 
 
 def _contact(
-    path: Path, numbers: np.ndarray, faults: list[str]
+    path: Path,
+    numbers: np.ndarray,
+    faults: list[str],
 ) -> list[dict[str, str | int]] | None:
     """Intervals of contact: lines alternate between first frame, from 1, and last frame.
 

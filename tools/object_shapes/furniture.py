@@ -18,7 +18,10 @@ def _facing_up(vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _square_rod(
-    start: Sequence[float], end: Sequence[float], size: float, end_size: float
+    start: Sequence[float],
+    end: Sequence[float],
+    size: float,
+    end_size: float,
 ) -> Manifold:
     return tube([start, end], [size / np.sqrt(2), end_size / np.sqrt(2)], 4, side=(1, 0, 0))
 

@@ -39,7 +39,10 @@ def box(size: Sequence[float], centre: Sequence[float]) -> Manifold:
 
 
 def rounded_box(
-    size: Sequence[float], centre: Sequence[float], radius: float, segments: int = 12
+    size: Sequence[float],
+    centre: Sequence[float],
+    radius: float,
+    segments: int = 12,
 ) -> Manifold:
     """A box with all edges rounded by ``radius``: the hull of eight spheres."""
     half = np.asarray(size) / 2 - radius
@@ -65,7 +68,11 @@ def rod(
 
 
 def disc(
-    centre: Sequence[float], axis: int, radius: float, width: float, segments: int = 24
+    centre: Sequence[float],
+    axis: int,
+    radius: float,
+    width: float,
+    segments: int = 24,
 ) -> Manifold:
     """A cylinder of ``width`` along coordinate ``axis`` around ``centre``: a wheel, a button."""
     offset = np.zeros(3)
@@ -230,7 +237,12 @@ def _centroid(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def ring_stack(
-    heights: np.ndarray, radii: np.ndarray, *, lobes: int, depth: float, twist_deg: float
+    heights: np.ndarray,
+    radii: np.ndarray,
+    *,
+    lobes: int,
+    depth: float,
+    twist_deg: float,
 ) -> Manifold:
     """Star-shaped rings of ``lobes`` pleats, turned along z like a furled canopy."""
     segments = 4 * lobes

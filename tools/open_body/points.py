@@ -73,9 +73,12 @@ _RIGHT_ONLY = {
 
 
 def _leave(
-    origin: np.ndarray, direction: np.ndarray, vertices: np.ndarray, scene: object,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    vertices: np.ndarray,
+    scene: object,
     faces: np.ndarray,
-) -> int:  # fmt: skip
+) -> int:
     """The vertex nearest to where the ray first leaves the skin."""
     d = direction / np.linalg.norm(direction)
     ray = np.concatenate([origin, d]).astype(np.float32)[None]
@@ -86,7 +89,7 @@ def _leave(
 
 
 def markers(vertices: np.ndarray, faces: np.ndarray, joints: np.ndarray,
-            weights: np.ndarray) -> dict[str, int]:  # fmt: skip
+            weights: np.ndarray,) -> dict[str, int]:  # fmt: skip
     """Vertex id of each of `MARKER_NAMES`."""
     import open3d as o3d
 
@@ -109,7 +112,10 @@ def markers(vertices: np.ndarray, faces: np.ndarray, joints: np.ndarray,
 
 
 def keypoint_vertices(
-    vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, tips: np.ndarray
+    vertices: np.ndarray,
+    weights: np.ndarray,
+    joints: np.ndarray,
+    tips: np.ndarray,
 ) -> dict[str, int]:
     """Vertex id of each of `POINT_NAMES`; tips (10,3) ends of the finger bones."""
 
@@ -144,9 +150,14 @@ def keypoint_vertices(
 
 
 def write_maps(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray, joints: np.ndarray,
-    tips: np.ndarray, mouth_outline: np.ndarray,
-) -> None:  # fmt: skip
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    weights: np.ndarray,
+    joints: np.ndarray,
+    tips: np.ndarray,
+    mouth_outline: np.ndarray,
+) -> None:
     regions = find_regions(vertices, faces, weights, joints, mouth_outline)
     content = {
         "points": keypoint_vertices(vertices, weights, joints, tips),

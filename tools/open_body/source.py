@@ -55,7 +55,10 @@ class Source:
     faces_uv: np.ndarray
 
     def coefficients(
-        self, phenotypes: dict, local: dict | None = None, actions: dict | None = None
+        self,
+        phenotypes: dict,
+        local: dict | None = None,
+        actions: dict | None = None,
     ) -> np.ndarray:
         """(B,K) blend-shape weights for dictionaries of (B,) values."""
         import torch

@@ -160,7 +160,7 @@ def _bulges(vertices: np.ndarray, joints: np.ndarray, faces: np.ndarray) -> np.n
 
 
 def _clothing(vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, faces: np.ndarray,
-              long_sleeves: bool, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
+              long_sleeves: bool, rng: np.random.Generator,) -> np.ndarray:  # fmt: skip
     """(V,) thickness in metres: 5 to 20 mm with folds; 0 on hands, face and feet."""
     mean = _neighbour_mean(faces, len(vertices))
 

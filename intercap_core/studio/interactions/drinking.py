@@ -132,7 +132,7 @@ class Drinking(Handling):
         return thing.towards(Pose.still(self.put, count), ramp(times, 2.02, RELEASE_S - 0.03), lift)
 
     def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
-              thing: np.ndarray) -> Pose:  # fmt: skip
+              thing: np.ndarray,) -> Pose:  # fmt: skip
         """The right hand handles the vessel; the left only comes near."""
         wrist = super().wrist(side, world, pelvis, times, thing)
         if side == RIGHT:

@@ -80,7 +80,7 @@ class Approach:
     floor: float = -np.inf
 
     def wrist(self, puppet: Puppet, side: int, hand_shape: HandShape, surface: DistanceField,
-              stage_from_object: np.ndarray, *, thumb: bool = False) -> np.ndarray:  # fmt: skip
+              stage_from_object: np.ndarray, *, thumb: bool = False,) -> np.ndarray:  # fmt: skip
         """The wrist (4, 4) of the stage once the palm or a finger (with ``thumb``: or the thumb) is
         pressed against the thing."""
         hand = puppet.hands[side]
@@ -102,7 +102,7 @@ def around_wall(at: np.ndarray, floor: float) -> Iterator[Approach]:
 
 
 def laid_on(puppet: Puppet, side: int, surface: DistanceField, stage_from_object: np.ndarray,
-            approach: Approach) -> Grip:  # fmt: skip
+            approach: Approach,) -> Grip:  # fmt: skip
     """A flat hand laid on the thing, the thumb along it, fingers bent until they meet it."""
     hand = puppet.hands[side]
     wrist = approach.wrist(puppet, side, LAID, surface, stage_from_object, thumb=True)
@@ -112,7 +112,7 @@ def laid_on(puppet: Puppet, side: int, surface: DistanceField, stage_from_object
 
 
 def wrapped(puppet: Puppet, side: int, open_shape: HandShape, surface: DistanceField,
-            stage_from_object: np.ndarray, approaches: Iterable[Approach]) -> Grip:  # fmt: skip
+            stage_from_object: np.ndarray, approaches: Iterable[Approach],) -> Grip:  # fmt: skip
     """Palm against the thing, fingers around it, then the thumb from where it has room.
 
     Of ``approaches`` the first is kept in which all fingers meet the thing or nearly do, else the

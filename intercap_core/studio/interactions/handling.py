@@ -74,7 +74,7 @@ class Handling(Interaction):
         )
 
     def table(self, middle: tuple[float, float], half: tuple[float, float], top: float,
-              heading: float = 0.0) -> None:  # fmt: skip
+              heading: float = 0.0,) -> None:  # fmt: skip
         """Place a block: ``middle`` and ``half`` its sizes on the floor, its ``top``, metres."""
         low = (middle[0] - half[0], middle[1] - half[1], 0.0)
         high = (middle[0] + half[0], middle[1] + half[1], top)
@@ -114,7 +114,7 @@ class Handling(Interaction):
         return Trunk(pelvis, track[:, 3], bend, head)
 
     def before_chest(self, world: np.ndarray, origin: np.ndarray, offset: np.ndarray,
-                     about: np.ndarray) -> Pose:  # fmt: skip
+                     about: np.ndarray,) -> Pose:  # fmt: skip
         """The thing (N) held before the person: ``offset`` (3,) metres to the left, up and ahead
         of ``origin`` (N, 3), turned by ``about`` (N, 3) from how it was taken."""
         person = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
@@ -124,7 +124,7 @@ class Handling(Interaction):
     # --- playing ----------------------------------------------------------------------------
 
     def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
-              thing: np.ndarray) -> Pose:  # fmt: skip
+              thing: np.ndarray,) -> Pose:  # fmt: skip
         """The wrist (N) of a hand: to the ``thing`` (N, 4, 4), with it, away from it."""
         swing = self.arm_swing(times)[:, SIDES.index(side)]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)

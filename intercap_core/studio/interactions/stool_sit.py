@@ -35,7 +35,7 @@ class StoolSit(Sitting):
         return self.approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), hover)
 
     def left_wrist(self, idle: Pose, world: np.ndarray, pelvis: np.ndarray,
-                   times: np.ndarray) -> Pose:  # fmt: skip
+                   times: np.ndarray,) -> Pose:  # fmt: skip
         count = len(times)
         place = self.hover_place
         aside = place.copy()
