@@ -163,3 +163,14 @@ class Rig:
             between = artefact["colour_from_depth"][index] if lenses["depth"] else None
             cameras.append(Camera(name, lenses["colour"], lenses["depth"], between, poses[index]))
         return cls(tuple(cameras))
+
+
+def ring_centre(rig: Rig) -> np.ndarray:
+    """The point (3,) closest to all optical axes; for one camera, or parallel ones, 2 m ahead."""
+    poses = rig.master_from_colour
+    axes, centres = poses[:, :3, 2], poses[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    if np.linalg.eigvalsh(normal)[0] < 0.05 * len(rig):
+        return (centres + 2 * axes).mean(0)
+    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
+from intercap_core.camera.rig import Rig, ring_centre
 from intercap_core.camera.triangulation import midpoints, pixel_scale, reproject, view_pairs
 from intercap_core.detections.read import Detections
 from intercap_core.person.sides import BODY_POINTS, PARTNER
@@ -84,17 +84,6 @@ def find_subject(
         people[t] = group.members
     _add_single_views(people, chosen, detections, rig, times, min_confidence)
     return people
-
-
-def ring_centre(rig: Rig) -> np.ndarray:
-    """The point (3,) closest to all optical axes; for one camera, or parallel ones, 2 m ahead."""
-    poses = rig.master_from_colour
-    axes, centres = poses[:, :3, 2], poses[:, :3, 3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    if np.linalg.eigvalsh(normal)[0] < 0.05 * len(rig):
-        return (centres + 2 * axes).mean(0)
-    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))
 
 
 def _groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[Group]:

@@ -12,8 +12,8 @@ import numpy as np
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.transforms import apply
+from intercap_core.scene.constants import PERSON_MASK_REDUCTION
 
-REDUCTION = 8  # the mask is worked out on every eighth pixel
 # Bones and how far from them skin, clothing and hair reach, metres; hands reach past the wrist.
 BONES = (
     ("neck", "mid_hip", 0.26), ("right_shoulder", "right_hip", 0.20),
@@ -45,7 +45,10 @@ def person_pixels(
     if not known.any():
         return result
     start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
-    small = np.s_[REDUCTION // 2 :: REDUCTION, REDUCTION // 2 :: REDUCTION]
+    small = np.s_[
+        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
+        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
+    ]
     z = depth[small].astype(np.float64) * 1e-3
     points = np.dstack([lens.rays[small] * z[..., None], z])
     low = np.minimum(start, start + along).min(0) - reach.max()
