@@ -1,8 +1,7 @@
 """The lens of :mod:`.projection`, compiled: the one form that every compiled kernel calls.
 
-The same operations in the same order as :func:`.projection.project` and
-:func:`.projection.project_with_jacobian`, one point at a time: equal to rounding everywhere, also
-nearer than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow
+One point at a time; equal to :func:`.projection.project` and
+:func:`.projection.project_with_jacobian` to rounding everywhere, also nearer than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow
 IEEE 754 instead of raising, so that loops around these functions can be vectorised.
 """
 
@@ -30,27 +29,10 @@ def distort(x, y, distortion):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def project_point(px, py, pz, parameters):
-    """Pixel (u, v) of one point, camera frame, metres; ``parameters`` (13,)."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
-    inverse_z = 1 / max(pz, MIN_DEPTH_M)
-    x, y = px * inverse_z, py * inverse_z
-    stretch = max(np.sqrt(x * x + y * y) / limit, 1.0)
-    xd, yd = distort(x / stretch, y / stretch, (k1, k2, p1, p2, k3, k4, k5, k6))
-    return fx * (xd * stretch) + cx, fy * (yd * stretch) + cy
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def project_point_with_jacobian(px, py, pz, parameters):
-    """Pixel (u, v) of one point and du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ, px/m.
-
-    ``px``, ``py``, ``pz`` in the camera's frame, metres; ``parameters`` (13,). Where the depth is
-    raised to ``MIN_DEPTH_M`` the pixel does not depend on Z and those derivatives are zero.
-    """
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
-    free = pz > MIN_DEPTH_M
-    inverse_z = 1 / pz if free else 1 / MIN_DEPTH_M
-    x, y = px * inverse_z, py * inverse_z
+def distort_with_jacobian(x, y, parameters):
+    """Distorted (xd, yd) of a point of the normalised plane, continued beyond the metric radius, and
+    dxd/dx, dxd/dy, dyd/dx, dyd/dy; ``parameters`` (13,)."""
+    _, _, _, _, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
     radius = np.sqrt(x * x + y * y)
     outside = radius > limit
     stretch = radius / limit if outside else 1.0
@@ -62,15 +44,42 @@ def project_point_with_jacobian(px, py, pz, parameters):
     dd = 2 * slope / below
     xd, yd = distort(x, y, (k1, k2, p1, p2, k3, k4, k5, k6))
     xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
-    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y
+    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y  # the model's Jacobian is symmetric
     yx = xy
     yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
     if outside:
         along_x, along_y = (xd - xx * x - xy * y) / s, (yd - xy * x - yy * y) / s
         xx, xy = xx + along_x * x, xy + along_x * y
         yx, yy = yx + along_y * x, yy + along_y * y
-        xd, yd, x, y = xd * stretch, yd * stretch, x * stretch, y * stretch
-    by_z = -inverse_z if free else 0.0
-    ux, uy, uz = fx * xx * inverse_z, fx * xy * inverse_z, fx * (xx * x + xy * y) * by_z
-    vx, vy, vz = fy * yx * inverse_z, fy * yy * inverse_z, fy * (yx * x + yy * y) * by_z
+        xd, yd = xd * stretch, yd * stretch
+    return xd, yd, xx, xy, yx, yy
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def project_point(px, py, pz, parameters):
+    """Pixel (u, v) of one point, camera frame, metres; ``parameters`` (13,)."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
+    z = max(pz, MIN_DEPTH_M)
+    x, y = px / z, py / z
+    stretch = max(np.sqrt(x * x + y * y) / limit, 1.0)
+    xd, yd = distort(x / stretch, y / stretch, (k1, k2, p1, p2, k3, k4, k5, k6))
+    return fx * stretch * xd + cx, fy * stretch * yd + cy
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def project_point_with_jacobian(px, py, pz, parameters):
+    """Pixel (u, v) of one point and du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ, px/m.
+
+    ``px``, ``py``, ``pz`` in the camera's frame, metres; ``parameters`` (13,). Where the depth is
+    raised to ``MIN_DEPTH_M`` the pixel does not depend on Z and those derivatives are zero.
+    """
+    fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
+    z = max(pz, MIN_DEPTH_M)
+    x, y = px / z, py / z
+    xd, yd, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
+    ux, uy = fx * xx / z, fx * (xy / z)
+    vx, vy = fy * (yx / z), fy * yy / z
+    uz, vz = 0.0, 0.0
+    if pz > MIN_DEPTH_M:
+        uz, vz = -(ux * x + uy * y), -(vx * x + vy * y)
     return fx * xd + cx, fy * yd + cy, ux, uy, uz, vx, vy, vz

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from intercap_core.camera.projection_kernels import project_point_with_jacobian
+from intercap_core.camera.projection import MIN_DEPTH_M
+from intercap_core.camera.projection_kernels import distort_with_jacobian
 
 
 class Seen(NamedTuple):
@@ -31,6 +32,20 @@ class Seen(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
+def _project(px, py, pz, lens):
+    """:func:`.projection_kernels.project_point_with_jacobian`, with products of the inverse depth."""
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    free = pz > MIN_DEPTH_M
+    inverse = 1 / pz if free else 1 / MIN_DEPTH_M
+    x, y = px * inverse, py * inverse
+    xd, yd, xx, xy, yx, yy = distort_with_jacobian(x, y, lens)
+    by_z = -inverse if free else 0.0
+    ux, uy, uz = fx * xx * inverse, fx * xy * inverse, fx * (xx * x + xy * y) * by_z
+    vx, vy, vz = fy * yx * inverse, fy * yy * inverse, fy * (yx * x + yy * y) * by_z
+    return fx * xd + cx, fy * yd + cy, ux, uy, uz, vx, vy, vz
+
+
+@numba.njit(cache=True, nogil=True)
 def ask(seen, t, k, p, slopes, gradient, matrix):
     """What frame t says of keypoint k at p: returns its cost and, if ``slopes`` are wanted, writes
     gradient (3,) and matrix (3,3) by the point."""
@@ -50,7 +65,7 @@ def ask(seen, t, k, p, slopes, gradient, matrix):
             y += seen.shift[t, c, k, 1]
             z += seen.shift[t, c, k, 2]
         m = seen.colour_from_master[c]
-        u, v, ux, uy, uz, vx, vy, vz = project_point_with_jacobian(
+        u, v, ux, uy, uz, vx, vy, vz = _project(
             m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
             m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
             m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
