@@ -1,8 +1,9 @@
 """The lens of :mod:`.projection`, compiled: the one form that every compiled kernel calls.
 
 One point at a time; equal to :func:`.projection.project` and
-:func:`.projection.project_with_jacobian` to rounding everywhere, also nearer than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow
-IEEE 754 instead of raising, so that loops around these functions can be vectorised.
+:func:`.projection.project_with_jacobian` to rounding everywhere, also nearer
+than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow IEEE 754
+instead of raising, so that loops around these functions can be vectorised.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ def distort(x, y, distortion):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def distort_with_jacobian(x, y, parameters):
-    """Distorted (xd, yd) of a point of the normalised plane, continued beyond the metric radius, and
-    dxd/dx, dxd/dy, dyd/dx, dyd/dy; ``parameters`` (13,)."""
+    """Distorted (xd, yd) of a point of the normalised plane, continued beyond the metric radius,
+    and dxd/dx, dxd/dy, dyd/dx, dyd/dy; ``parameters`` (13,)."""
     _, _, _, _, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
     radius = np.sqrt(x * x + y * y)
     outside = radius > limit

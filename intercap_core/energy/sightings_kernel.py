@@ -33,7 +33,7 @@ class Seen(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def _project(px, py, pz, lens):
-    """:func:`.projection_kernels.project_point_with_jacobian`, with products of the inverse depth."""
+    """:func:`.projection_kernels.project_point_with_jacobian`, by the inverse depth."""
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     free = pz > MIN_DEPTH_M
     inverse = 1 / pz if free else 1 / MIN_DEPTH_M

@@ -17,6 +17,7 @@ from intercap_core.scene.constants import (
     FAST_SHARES,
     MIN_VALID_SHARE,
 )
+from intercap_core.solve.gaps import filled_linearly
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
     if len(whole) < 10 or len(times) < 8:
         return TimeNoise("rough", 0.5, 0.25, 1.0)
     rows = np.where(valid[whole], series[whole], np.nan)
-    rows = _bridged(rows)
+    steps = np.arange(rows.shape[1])
+    rows = np.stack([filled_linearly(row[:, None], steps, np.isfinite(row))[:, 0] for row in rows])
     best, chosen = -np.inf, TimeNoise("rough", 0.5, 0.25, 1.0)
     for kind, lengths in ERROR_LENGTHS_S.items():
         for length in lengths:
@@ -70,14 +72,3 @@ def _covariance(times: np.ndarray, kind: str, length: float, fast: float) -> np.
     apart = np.abs(times[:, None] - times) / length
     lasting = np.exp(-apart) if kind == "rough" else np.exp(-(apart**2) / 2)
     return (1 - fast) * lasting + fast * np.eye(len(times))
-
-
-def _bridged(rows: np.ndarray) -> np.ndarray:
-    """Rows (N, T) with NaN replaced by straight lines."""
-    result = rows.copy()
-    steps = np.arange(rows.shape[1])
-    for row in result:
-        bad = np.isnan(row)
-        if bad.any():
-            row[bad] = np.interp(steps[bad], steps[~bad], row[~bad])
-    return result
