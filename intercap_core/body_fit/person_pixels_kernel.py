@@ -10,9 +10,10 @@ import numba
 import numpy as np
 
 from intercap_core.camera.projection import MIN_DEPTH_M
+from intercap_core.camera.projection_kernels import distort
 
 _MIN_DEPTH, _MILLIMETRE = np.float32(MIN_DEPTH_M), np.float32(1e-3)
-_ONE, _TWO, _HALF = np.float32(1), np.float32(2), np.float32(0.5)
+_ONE, _HALF = np.float32(1), np.float32(0.5)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -107,6 +108,7 @@ def _project(near, counts, rays, pose, lens, u, v, z):
     """Colour pixels and depth (W,) of a row of depth pixels; depth 0 where the pixel does not count
     or its point is outside the calibration's radius."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = lens
+    distortion = (k1, k2, p1, p2, k3, k4, k5, k6)
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     e, f, g, h = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     i, j, k, m = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
@@ -119,8 +121,6 @@ def _project(near, counts, rays, pose, lens, u, v, z):
         inside = counts[at] & (depth > _MIN_DEPTH) & (x * x + y * y <= reach * reach)
         inverse = _ONE / max(depth, _MIN_DEPTH)
         x, y = x * inverse, y * inverse
-        s = x * x + y * y
-        factor = (_ONE + s * (k1 + s * (k2 + s * k3))) / (_ONE + s * (k4 + s * (k5 + s * k6)))
-        u[at] = fx * (x * factor + _TWO * p1 * x * y + p2 * (s + _TWO * x * x)) + cx
-        v[at] = fy * (y * factor + p1 * (s + _TWO * y * y) + _TWO * p2 * x * y) + cy
+        xd, yd = distort(x, y, distortion)
+        u[at], v[at] = fx * xd + cx, fy * yd + cy
         z[at] = depth if inside else np.float32(0)

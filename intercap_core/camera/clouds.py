@@ -107,16 +107,6 @@ def colour_lookup(
     return ColourLookup(cloud.depth_index, colour_index, hidden)
 
 
-def colour_on_depth(
-    image: np.ndarray, depth: np.ndarray, camera: Camera, outside: float = 0
-) -> np.ndarray:
-    """Warp a colour-sized image or mask (H, W) onto the depth grid, ``outside`` where unseen."""
-    lookup = colour_lookup(depth, camera)
-    result = np.full(depth.shape, outside, image.dtype)
-    result.ravel()[lookup.depth_index] = lookup.sample(image, outside)
-    return result
-
-
 def _to_colour(cloud: Cloud, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return colour pixels (N, 2) and depths in the colour camera (N,), 0 where not covered."""
     assert camera.colour_from_depth is not None

@@ -23,6 +23,7 @@ from intercap_core.camera.extrinsics_files import (
     rotation_matrix,
 )
 from intercap_core.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
+from intercap_core.camera.projection import radial_fraction
 from intercap_core.camera.transforms import invert, is_rigid, rigid
 from intercap_core.errors import UserError
 
@@ -132,12 +133,11 @@ def turning_radius(distortion: np.ndarray) -> float:
     ``distortion`` (8,). The radial part of OpenCV's model, r d(r^2), must grow and stay finite;
     5 where it does so over all of 80 degrees.
     """
-    k1, k2, _, _, k3, k4, k5, k6 = distortion
     radius = np.linspace(0, 5, 50001)
-    s = radius * radius
-    below = 1 + s * (k4 + s * (k5 + s * k6))
+    lens = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
+    above, below = radial_fraction(radius * radius, lens)
     with np.errstate(divide="ignore", invalid="ignore"):
-        image = radius * (1 + s * (k1 + s * (k2 + s * k3))) / below
+        image = radius * above / below
     bad = np.flatnonzero((np.diff(image) <= 0) | (below[1:] <= 0) | ~np.isfinite(image[1:]))
     return float(radius[max(1, bad[0])] if len(bad) else radius[-1])
 

@@ -48,11 +48,17 @@ def _as_parameters(parameters: Any, points: Any, xp: Any) -> Any:
     return xp.as_tensor(parameters, dtype=points.dtype, device=points.device)
 
 
+def radial_fraction(s: Any, q: Any) -> tuple[Any, Any]:
+    """Return numerator and denominator (...) of the radial factor d at s = r^2, of lenses q."""
+    k1, k2, k3, k4, k5, k6 = (q[..., i] for i in (4, 5, 8, 9, 10, 11))
+    return 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
+
+
 def _radial(s: Any, q: Any) -> tuple[Any, Any]:
     """Return the radial factor d (...) at s = r^2 and 2 dd/ds, so that dd/dx = x * (2 dd/ds)."""
     k1, k2, k3, k4, k5, k6 = (q[..., i] for i in (4, 5, 8, 9, 10, 11))
-    denominator = 1 + s * (k4 + s * (k5 + s * k6))
-    d = (1 + s * (k1 + s * (k2 + s * k3))) / denominator
+    numerator, denominator = radial_fraction(s, q)
+    d = numerator / denominator
     slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
     return d, 2 * slope / denominator
 

@@ -14,6 +14,11 @@ from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.transforms import invert
 from intercap_core.schemas import FRAMES, SCENE
 
+# Smallest eigenvalue, a camera, of the normal matrix of the point nearest to all optical axes: with
+# less they are as good as parallel, and the centre is this far ahead, metres. Tuned on the studio.
+MIN_AXES_EIGENVALUE = 0.05
+PARALLEL_AXES_DISTANCE_M = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -163,3 +168,14 @@ class Rig:
             between = artefact["colour_from_depth"][index] if lenses["depth"] else None
             cameras.append(Camera(name, lenses["colour"], lenses["depth"], between, poses[index]))
         return cls(tuple(cameras))
+
+
+def ring_centre(rig: Rig) -> np.ndarray:
+    """The point (3,) closest to all optical axes; for one camera, or parallel ones, 2 m ahead."""
+    poses = rig.master_from_colour
+    axes, centres = poses[:, :3, 2], poses[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    if np.linalg.eigvalsh(normal)[0] < MIN_AXES_EIGENVALUE * len(rig):
+        return (centres + PARALLEL_AXES_DISTANCE_M * axes).mean(0)
+    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from intercap_core.camera.projection import MIN_DEPTH_M
+from intercap_core.camera.projection_kernels import distort_with_jacobian
 
 
 class KeypointObservations(NamedTuple):
@@ -31,39 +32,17 @@ class KeypointObservations(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def _project(px, py, pz, q):
-    """Pixel (u, v) and its derivatives du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ of a point in the
-    camera's frame: :func:`.projection.project_with_jacobian`, beyond the metric radius too."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = q
+def _project(px, py, pz, lens):
+    """:func:`.projection_kernels.project_point_with_jacobian`, by the inverse depth."""
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     free = pz > MIN_DEPTH_M
     inverse = 1 / pz if free else 1 / MIN_DEPTH_M
     x, y = px * inverse, py * inverse
-    radius = np.sqrt(x * x + y * y)
-    outside = radius > limit
-    stretch = radius / limit if outside else 1.0
-    x, y = x / stretch, y / stretch
-    s = x * x + y * y
-    below = 1 + s * (k4 + s * (k5 + s * k6))
-    d = (1 + s * (k1 + s * (k2 + s * k3))) / below
-    slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
-    dd = 2 * slope / below
-    xd = x * d + 2 * p1 * x * y + p2 * (s + 2 * x * x)
-    yd = y * d + p1 * (s + 2 * y * y) + 2 * p2 * x * y
-    xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
-    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y
-    yx = xy
-    yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
-    if outside:
-        along_x, along_y = (xd - xx * x - xy * y) / s, (yd - xy * x - yy * y) / s
-        xx, xy = xx + along_x * x, xy + along_x * y
-        yx, yy = yx + along_y * x, yy + along_y * y
-        xd, yd, x, y = xd * stretch, yd * stretch, x * stretch, y * stretch
+    xd, yd, xx, xy, yx, yy = distort_with_jacobian(x, y, lens)
     by_z = -inverse if free else 0.0
-    return (
-        fx * xd + cx, fy * yd + cy,
-        fx * xx * inverse, fx * xy * inverse, fx * (xx * x + xy * y) * by_z,
-        fy * yx * inverse, fy * yy * inverse, fy * (yx * x + yy * y) * by_z,
-    )  # fmt: skip
+    ux, uy, uz = fx * xx * inverse, fx * xy * inverse, fx * (xx * x + xy * y) * by_z
+    vx, vy, vz = fy * yx * inverse, fy * yy * inverse, fy * (yx * x + yy * y) * by_z
+    return fx * xd + cx, fy * yd + cy, ux, uy, uz, vx, vy, vz
 
 
 @numba.njit(cache=True, nogil=True)

@@ -236,4 +236,5 @@ PART = Part(
     flat,
     print_bodies,
     lambda project: rig_of(project.config),
+    kept=BodyErrors,
 )

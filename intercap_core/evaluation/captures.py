@@ -88,5 +88,12 @@ def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
 
 
 PART = Part(
-    "captures", "scene", ("frames",), "metrics.capture", measure, flat, print_captures
-)  # fmt: skip
+    "captures",
+    "scene",
+    ("frames",),
+    "metrics.capture",
+    measure,
+    flat,
+    print_captures,
+    kept=CaptureErrors,
+)

@@ -90,5 +90,12 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
 
 
 PART = Part(
-    "objects", "object_track", ("scene",), "metrics.object_errors", measure, flat, print_objects
-)  # fmt: skip
+    "objects",
+    "object_track",
+    ("scene",),
+    "metrics.object_errors",
+    measure,
+    flat,
+    print_objects,
+    kept=ObjectErrors,
+)

@@ -8,16 +8,17 @@ import os
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from intercap_core import safe_pickle
 from intercap_core.errors import UserError
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.project import Project, load_project
@@ -50,8 +51,9 @@ class Part(Generic[Errors]):
 
     ``measure`` (project, sequence) compares the artefact of ``stage`` with the truth; it reads the
     artefacts ``reads`` beside it, and ``code`` is the module (below ``intercap_core``) whose digest
-    stands for what it computes. ``flat`` gives the keys ``area.measure`` of all projects,
-    ``print_tables`` prints them, ``rig`` describes a project's settings.
+    stands for what it computes. ``kept`` is the dataclass of errors that are stored because
+    measuring takes long; None where they are read at once. ``flat`` gives the keys ``area.measure``
+    of all projects, ``print_tables`` prints them, ``rig`` describes a project's settings.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Part(Generic[Errors]):
     flat: Callable[[Sequence[Measured[Errors]]], Figures]
     print_tables: Callable[[Sequence[Measured[Errors]]], None]
     rig: Callable[[Project], str] = lambda _: ""
+    kept: type[Errors] | None = None
 
     def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
         """Measure every recording whose artefact is there, several at a time.
@@ -110,6 +113,8 @@ def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors
     """
     truth = project.sequences[sequence].truth
     assert truth is not None
+    if part.kept is None:
+        return part.measure(project, sequence)
     state = hashlib.sha256(code_digest(part.code).encode())
     state.update(code_digest(f"evaluation.{part.name}").encode())
     row = project.sequences[sequence]
@@ -120,20 +125,39 @@ def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors
     for path in (*files, truth, entry.mesh):
         with open(path, "rb") as file:
             state.update(hashlib.file_digest(file, "sha256").digest())
-    kept = project.results / sequence / "evaluation"
-    path = kept / f"{part.name}-{state.hexdigest()[:24]}.pickle"
+    folder = project.results / sequence / "evaluation"
+    path = folder / f"{part.name}-{state.hexdigest()[:24]}.pickle"
     if path.is_file():
-        with open(path, "rb") as file:
-            found: Errors = pickle.load(file)  # written below, in the project's own results
-        return found
+        return _dataclass_of(part.kept, safe_pickle.load(path))
     errors = part.measure(project, sequence)
-    kept.mkdir(parents=True, exist_ok=True)
-    for old in kept.glob(f"{part.name}-*.pickle"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob(f"{part.name}-*.pickle"):
         old.unlink()
     partial = path.with_suffix(f".{os.getpid()}")
-    partial.write_bytes(pickle.dumps(errors))
+    partial.write_bytes(pickle.dumps(_plain(errors)))
     partial.replace(path)  # a killed run leaves no half-written file under the final name
     return errors
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses as dictionaries and paths as text, so that no pickle names a class."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    return str(value) if isinstance(value, Path) else value
+
+
+def _dataclass_of(kind: Any, values: dict[str, Any]) -> Any:
+    """The inverse of :func:`_plain`."""
+    hints = get_type_hints(kind)
+    made = {
+        name: _dataclass_of(hints[name], value)
+        if is_dataclass(hints[name])
+        else Path(value)
+        if hints[name] is Path
+        else value
+        for name, value in values.items()
+    }
+    return kind(**made)
 
 
 def require_truth(project: Project) -> None:

@@ -27,6 +27,7 @@ from intercap_core.object_track.groups import Group, centre_of
 from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.solve.robust import geman_mcclure_weight
 
 
 def align(
@@ -58,7 +59,7 @@ def align(
             costs.append(cost)
         for shape in shapes:
             gap, jacobian = outlines.residuals(shape, hull, rotation, translation)
-            weight = (scale**2 / (scale**2 + gap**2)) ** 2
+            weight = geman_mcclure_weight(gap**2, scale)
             weighted = jacobian * weight[..., None]
             hessian += np.einsum("ndi,ndj->nij", weighted, jacobian)
             gradient -= np.einsum("ndi,nd->ni", weighted, gap)
@@ -113,7 +114,7 @@ def _to_points(
     # a measured point cannot lie on a face that looks away from the camera
     to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
     facing = (to_eye * normals).sum(-1) > 0
-    weight = (scale**2 / (scale**2 + distance**2)) ** 2 * np.where(facing, 1.0, FACING_AWAY_WEIGHT)
+    weight = geman_mcclure_weight(distance**2, scale) * np.where(facing, 1.0, FACING_AWAY_WEIGHT)
     cost = np.minimum(
         np.where(facing, distance, np.maximum(distance, FACING_AWAY_MIN_M)), ICP_MAX_RESIDUAL_M
     )

@@ -29,6 +29,7 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.rigid.pose import rotation_log
 from intercap_core.rigid.twist import moved, step_between
+from intercap_core.solve.robust import geman_mcclure_weight
 
 BAND = 2  # nodes that an acceleration couples to the one before
 
@@ -86,7 +87,7 @@ def smooth(
     for _ in range(SMOOTH_STEPS):
         away = step_between(looks.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", away - own, information, away - own)
-        weight = share / (1 + distance / OUTLIER_SIGMAS**2) ** 2
+        weight = share * geman_mcclure_weight(distance, OUTLIER_SIGMAS)
         bands = np.zeros((BAND + 1, count, 6, 6))
         pull = np.zeros((count, 6))
         np.add.at(bands[0], node, weight[:, None, None] * information)

@@ -34,6 +34,7 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.search import own_axes
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.solve.robust import geman_mcclure_weight
 
 
 def near_turns(mesh: ObjectMesh) -> np.ndarray:
@@ -138,7 +139,7 @@ def _placed(
         at = turned + shift
         closest = field.closest(at)
         gap = closest.points - at
-        weight = 1 / (1 + (gap**2).sum(1) / scale**2) ** 2
+        weight = geman_mcclure_weight((gap**2).sum(1), scale)
         weighted = closest.normals * weight[:, None]
         # point to plane, a little to the point where no plane holds it
         matrix = weighted.T @ closest.normals + NEAR_TURN_POINT_WEIGHT * weight.sum() * np.eye(3)

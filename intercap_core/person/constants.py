@@ -62,9 +62,6 @@ MOVED_PX_FACTOR = 2.0  # that limit is this much wider where the subject has mov
 SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the studio
 LIFTED_SUPPORT = 0.5  # of a point that one view lifts by depth; triangulated, it counts about two
 CENTRE_RANGE_M = 1.5  # support counts half so far from the ring's middle; tuned on the studio
-# Smallest eigenvalue, a camera, of the normal matrix of the optical axes' nearest point: below, the
-# axes are as good as parallel and the middle is this far ahead, metres. Tuned on the studio.
-MIN_AXES_EIGENVALUE, PARALLEL_AXES_DISTANCE_M = 0.05, 2.0
 ENOUGH_TRIANGULATED = 8  # body points; a set with so many needs no lifting; tuned on the studio
 MIN_MOVING_POINTS = (
     6  # points before the background; with fewer, the person is taken for part of it

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
+from intercap_core.camera.rig import Rig, ring_centre
 from intercap_core.camera.triangulation import midpoints, pixel_scale, reproject, view_pairs
 from intercap_core.detections.read import Detections
 from intercap_core.person.constants import (
@@ -22,10 +22,8 @@ from intercap_core.person.constants import (
     LINK_SLACK_M,
     MAX_BODY_SPEED_M_S,
     MAX_LINK_GAP_S,
-    MIN_AXES_EIGENVALUE,
     MIN_COMMON_POINTS,
     MOVED_PX_FACTOR,
-    PARALLEL_AXES_DISTANCE_M,
     SAME_PERSON_GAP_M,
     SAME_PERSON_PX_AT_1080P,
 )
@@ -87,17 +85,6 @@ def find_subject(
         people[t] = group.members
     _add_single_views(people, chosen, detections, rig, times, min_confidence)
     return people
-
-
-def ring_centre(rig: Rig) -> np.ndarray:
-    """The point (3,) closest to all optical axes; for one camera, or parallel ones, 2 m ahead."""
-    poses = rig.master_from_colour
-    axes, centres = poses[:, :3, 2], poses[:, :3, 3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    if np.linalg.eigvalsh(normal)[0] < MIN_AXES_EIGENVALUE * len(rig):
-        return (centres + PARALLEL_AXES_DISTANCE_M * axes).mean(0)
-    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))
 
 
 def _groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[Group]:

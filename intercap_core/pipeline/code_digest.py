@@ -4,7 +4,7 @@ The modules that a stage reaches are found by walking imports transitively, thos
 too. What counts is the syntax tree without docstrings and comments, and the data files that lie
 beside a reached module: rewording a docstring re-runs nothing. The declarations that every stage
 shares (settings, schemas, project) are followed name by name: a new setting of one stage does not
-touch the others. So are the constants of a room, its module ``constants``.
+touch the others. So are the constants of a room, its modules ``constants`` and ``..._constants``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1]
 DECLARATIONS = frozenset({f"{PACKAGE}.{name}" for name in ("config", "schemas", "project")})
-CONSTANTS = "constants"  # module of a room that holds its numbers
+CONSTANTS = (".constants", "_constants")  # ends of modules that hold a room's numbers
 DATA_FOLDERS = ("data", "templates")
 
 WHOLE = "*"  # stands for every name of a module
@@ -64,7 +64,7 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
     waiting = [(name, WHOLE) for name in (start, *_parents(start))]
     while waiting:
         name, used = waiting.pop()
-        if name not in DECLARATIONS and not name.endswith(f".{CONSTANTS}"):
+        if name not in DECLARATIONS and not name.endswith(CONSTANTS):
             used = WHOLE
         known = reached.get(name, frozenset())
         if used in known or WHOLE in known:

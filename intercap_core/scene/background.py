@@ -13,19 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.capture.frames import Frames
+from intercap_core.scene.constants import (
+    BACKGROUND_AGREE_MM,
+    BACKGROUND_AGREE_PER_DEPTH,
+    MAX_SAMPLES,
+    OFTEN_VALID,
+    STATIC_SHARE,
+    STEADY_SHARE,
+    VALID_AGREE,
+)
 from intercap_core.scene.person_space import person_pixels
-
-MAX_SAMPLES = 25  # sets looked at; memory is this many depth images of one camera
-STEADY_SHARE = 0.2  # of a pixel's samples that must agree
-# A pixel that often measures nothing looks past the scene: what it holds now and then, however
-# steadily, may have come by. There nearly all of it must agree.
-OFTEN_VALID = 0.75
-VALID_AGREE = 0.8  # of such a pixel's valid samples
-STATIC_SHARE = 0.5  # above this the pixel shows background most of the time
-# Samples agree within this: three standard deviations of the sensor's random error, about 1 mm +
-# 0.1 % of depth and more at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, figure of NFOV).
-AGREE_MM = 8.0
-AGREE_PER_DEPTH = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +93,7 @@ def _farthest_cluster(ordered: np.ndarray, count: int) -> tuple[np.ndarray, np.n
     for first in range(samples - count, -1, -1):
         low, high = values[open_rows, first], values[open_rows, first + count - 1]
         middle = (low + high) / 2
-        tolerance = AGREE_MM + AGREE_PER_DEPTH * middle
+        tolerance = BACKGROUND_AGREE_MM + BACKGROUND_AGREE_PER_DEPTH * middle
         agree = (low > 0) & (high - low <= tolerance)
         rows = open_rows[agree]
         if len(rows):

@@ -14,14 +14,15 @@ from intercap_core.camera import projection
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert
 from intercap_core.person.sides import BODY_POINTS
+from intercap_core.scene.constants import (
+    KEYPOINT_ERROR_TIME_S,
+    KEYPOINT_SIGMA_FLOOR_PX,
+    MIN_BODY_VIEWS,
+    POINT_STEPS,
+    ROBUST_SIGMA,
+)
 from intercap_core.scene.subject_views import SubjectViews
-
-MIN_BODY_POINTS = 50  # fewer do not constrain a rig
-MIN_VIEWS = 3  # two views say nothing about their own relative pose along most motions
-SIGMA_FLOOR_PX = 3.0
-# A detector's error at one joint lasts about this long; sets closer together count as one.
-ERROR_TIME_S = 0.5
-POINT_STEPS = 2
+from intercap_core.solve.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +42,9 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
     by_point = np.swapaxes(subject.keypoints[:, :, BODY_POINTS], 1, 2).reshape(-1, views, 3)
     inlier = np.swapaxes(subject.inlier[:, :, BODY_POINTS], 1, 2).reshape(-1, views)
     points = subject.joints[:, BODY_POINTS].reshape(-1, 3)
-    good = (subject.views[:, BODY_POINTS].ravel() >= MIN_VIEWS) & np.isfinite(points[:, 0])
-    gap = float(np.median(np.diff(times))) if len(times) > 1 else ERROR_TIME_S
-    weights = by_point[..., 2] * inlier * min(1.0, gap / ERROR_TIME_S)
+    good = (subject.views[:, BODY_POINTS].ravel() >= MIN_BODY_VIEWS) & np.isfinite(points[:, 0])
+    gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
+    weights = by_point[..., 2] * inlier * min(1.0, gap / KEYPOINT_ERROR_TIME_S)
     velocity = np.nan_to_num(velocities(subject.joints[:, BODY_POINTS], times)).reshape(-1, 3)
     return BodyViews(by_point[good, :, :2], weights[good], points[good], velocity[good])
 
@@ -111,8 +112,10 @@ class BodyConstraint:
         residual = pixels - self._views.pixels
         size = np.linalg.norm(residual, axis=-1)
         known = self._views.weights > 0
-        sigma = max(SIGMA_FLOOR_PX, float(np.median(size[known])) / 1.177)  # of a Rayleigh median
-        robust = 1 / (1 + (size / (3 * sigma)) ** 2) ** 2  # Geman-McClure
+        sigma = max(
+            KEYPOINT_SIGMA_FLOOR_PX, float(np.median(size[known])) / 1.177
+        )  # of a Rayleigh median
+        robust = geman_mcclure_weight(size**2, ROBUST_SIGMA * sigma)
         return residual, by_point, self._views.weights * robust / sigma**2, by_pose
 
 

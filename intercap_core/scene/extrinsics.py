@@ -8,7 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.scene.body_constraints import MIN_BODY_POINTS, BodyConstraint, body_views
+from intercap_core.scene.body_constraints import BodyConstraint, body_views
+from intercap_core.scene.constants import (
+    CONVERGED_M,
+    KNOWN_OFFSET_SIGMA_S,
+    MAY_WORSEN,
+    MIN_BODY_POINTS,
+    MUST_IMPROVE,
+    TIMING_INFLATION,
+    WEAK_POINTS,
+    WEAK_RESIDUAL,
+)
 from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.keypoint_timing import Offsets
 from intercap_core.scene.registration import (
@@ -24,15 +34,6 @@ from intercap_core.scene.registration import (
 )
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surface import Surface
-
-MUST_IMPROVE = 0.98  # of the start's held-out cost
-MAY_WORSEN = 1.02
-CONVERGED_M = 0.001
-WEAK_POINTS = 120  # held-out correspondences, background and moving together
-WEAK_RESIDUAL = 2.0  # times the median pair's
-# Keypoints of one person err together more than their own residuals tell.
-TIMING_INFLATION = 2.0
-KNOWN_OFFSET_SIGMA_S = 0.008  # an offset less certain than what devices are off by is not known
 
 
 @dataclass(frozen=True, eq=False)

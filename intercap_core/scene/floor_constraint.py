@@ -10,15 +10,18 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
+from intercap_core.scene.constants import (
+    FLOOR_COSINE,
+    FLOOR_EFFECTIVE_POINTS,
+    FLOOR_SIGMA_M,
+    MAX_FLOOR_POINTS,
+    MIN_FLOOR_POINTS,
+    NEAR_FLOOR_M,
+    ROBUST_SIGMA,
+)
 from intercap_core.scene.ground import Ground
 from intercap_core.scene.surface import Surface
-
-NEAR_M = 0.06  # of the floor at poses that are not yet refined
-MIN_COSINE = 0.94  # of a floor point's normal with the plane's: 20 degrees
-MIN_POINTS = 200  # of a camera's 3 cm cells: a fifth of a square metre
-MAX_POINTS = 1000
-SIGMA_M = 0.005  # floors are not flat, and depth is biased
-EFFECTIVE_POINTS = 10.0  # of one camera: its errors are those of its lens and bias
+from intercap_core.solve.robust import geman_mcclure_weight
 
 
 class FloorConstraint:
@@ -40,9 +43,9 @@ class FloorConstraint:
             pose = rig[c].master_from_depth
             height = (apply(pose, surface.points) - ground.point) @ ground.normal
             facing = surface.normals @ pose[:3, :3].T @ ground.normal
-            rows = np.flatnonzero((np.abs(height) < NEAR_M) & (facing > MIN_COSINE))
-            if len(rows) >= MIN_POINTS:
-                rows = np.random.default_rng(0).permutation(rows)[:MAX_POINTS]
+            rows = np.flatnonzero((np.abs(height) < NEAR_FLOOR_M) & (facing > FLOOR_COSINE))
+            if len(rows) >= MIN_FLOOR_POINTS:
+                rows = np.random.default_rng(0).permutation(rows)[:MAX_FLOOR_POINTS]
                 points[c] = surface.points[rows]
         return cls(rig, points, ground.normal) if len(points) >= 2 else None
 
@@ -66,8 +69,8 @@ class FloorConstraint:
         slope = np.zeros(3)
         for c, points in own.items():
             residual = (points - middle) @ normal
-            robust = 1 / (1 + (residual / (3 * SIGMA_M)) ** 2) ** 2  # Geman-McClure
-            weight = robust * min(1.0, EFFECTIVE_POINTS / len(points)) / SIGMA_M**2
+            robust = geman_mcclure_weight(residual**2, ROBUST_SIGMA * FLOOR_SIGMA_M)
+            weight = robust * min(1.0, FLOOR_EFFECTIVE_POINTS / len(points)) / FLOOR_SIGMA_M**2
             arm = points - poses[c, :3, 3]
             by_pose = np.column_stack(
                 [np.cross(arm, normal), np.broadcast_to(normal, points.shape)]

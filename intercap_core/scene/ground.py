@@ -6,25 +6,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
+from intercap_core.camera.rig import Rig, ring_centre
 from intercap_core.errors import UserError
-from intercap_core.person.subject import ring_centre
-
-GRAVITY_CONE_DEG = 10.0  # an accelerometer and its calibration, on a tripod
-CAMERA_CONE_DEG = 40.0  # the mean of the cameras' own up directions, without an accelerometer
-HYPOTHESES = 400
-HYPOTHESIS_POINTS = 6000
-HYPOTHESIS_TOLERANCE_M = 0.03
-NORMAL_COSINE = 0.94  # of a floor point's normal with the plane's: 20 degrees
-BELOW_M = 0.10  # a point this far under the plane speaks against it
-BELOW_COST = 3.0  # how many inliers such a point outweighs
-MIN_AREA_M2 = 0.5
-REFINE_STEPS = 8
-FOOT_HEIGHT_M = 0.014  # of the lowest of heel and toes over the floor: the open body's, standing
-FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor
-MIN_FOOT_SETS = 5
-MIN_FOOT_SPREAD_M = 0.15  # standard deviation, across: of feet that show a floor's tilt
-SPREAD_MIN_M = 0.02  # annotated points this close to one line give no plane
+from intercap_core.scene.constants import (
+    BELOW_FLOOR_COST,
+    BELOW_FLOOR_M,
+    CAMERA_UP_CONE_DEG,
+    FLOOR_COSINE,
+    FLOOR_FIRST_GATE_M,
+    FLOOR_HYPOTHESES,
+    FLOOR_HYPOTHESIS_POINTS,
+    FLOOR_HYPOTHESIS_TOLERANCE_M,
+    FLOOR_REFINE_STEPS,
+    FOOT_HEIGHT_M,
+    FOOT_TOLERANCE_M,
+    GRAVITY_CONE_DEG,
+    MIN_ANNOTATED_SPREAD_M,
+    MIN_FLOOR_AREA_M2,
+    MIN_FOOT_SETS,
+    MIN_FOOT_SPREAD_M,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ def up_hint(rig: Rig, gravity: np.ndarray) -> tuple[np.ndarray, float]:
         up = -np.median(down, axis=0)
         return up / np.linalg.norm(up), GRAVITY_CONE_DEG
     up = -rotations[:, :, 1].mean(0)
-    return up / np.linalg.norm(up), CAMERA_CONE_DEG
+    return up / np.linalg.norm(up), CAMERA_UP_CONE_DEG
 
 
 def fit_ground(
@@ -80,26 +81,27 @@ def fit_ground(
     by iterated weighted least squares.
     """
     up, cone = up_hint(rig, gravity)
-    facing = normals @ up >= np.cos(np.radians(cone) + np.arccos(NORMAL_COSINE))
+    facing = normals @ up >= np.cos(np.radians(cone) + np.arccos(FLOOR_COSINE))
     highest = np.median(rig.master_from_colour[:, :3, 3] @ up)
     candidates = np.flatnonzero(facing & (points @ up < highest))
     if not len(candidates):
         return NO_GROUND
     rng = np.random.default_rng(0)
-    sample = points[rng.choice(len(points), min(len(points), HYPOTHESIS_POINTS), replace=False)]
-    tried = rng.choice(candidates, min(len(candidates), HYPOTHESES), replace=False)
+    judging = min(len(points), FLOOR_HYPOTHESIS_POINTS)
+    sample = points[rng.choice(len(points), judging, replace=False)]
+    tried = rng.choice(candidates, min(len(candidates), FLOOR_HYPOTHESES), replace=False)
     near_up = normals[tried] @ up >= np.cos(np.radians(cone))
     tried = tried[near_up]
     if not len(tried):
         return NO_GROUND
     height = (sample @ normals[tried].T) - (points[tried] * normals[tried]).sum(1)
-    inside = (np.abs(height) < HYPOTHESIS_TOLERANCE_M).sum(0)
-    below = (height < -BELOW_M).sum(0)
-    best = tried[np.argmax(inside - BELOW_COST * below)]
+    inside = (np.abs(height) < FLOOR_HYPOTHESIS_TOLERANCE_M).sum(0)
+    below = (height < -BELOW_FLOOR_M).sum(0)
+    best = tried[np.argmax(inside - BELOW_FLOOR_COST * below)]
     fitted = _refined(
         points[candidates], normals[candidates], points[best], normals[best], tolerance_m
     )
-    if fitted.inliers * cell_m**2 < MIN_AREA_M2:
+    if fitted.inliers * cell_m**2 < MIN_FLOOR_AREA_M2:
         return NO_GROUND
     return fitted
 
@@ -112,11 +114,11 @@ def _refined(
     tolerance_m: float,
 ) -> Ground:
     """Weighted total least squares, the gate closing from 6 cm to the tolerance."""
-    gates = np.geomspace(max(0.06, tolerance_m), tolerance_m, REFINE_STEPS)
+    gates = np.geomspace(max(FLOOR_FIRST_GATE_M, tolerance_m), tolerance_m, FLOOR_REFINE_STEPS)
     for gate in gates:
         distance = (points - point) @ normal
         weight = np.maximum(0, 1 - (distance / gate) ** 2) ** 2
-        weight *= normals @ normal >= NORMAL_COSINE
+        weight *= normals @ normal >= FLOOR_COSINE
         if (weight > 0).sum() < 10:
             return NO_GROUND
         point = (weight[:, None] * points).sum(0) / weight.sum()
@@ -124,7 +126,7 @@ def _refined(
         _, vectors = np.linalg.eigh((weight[:, None] * centred).T @ centred)
         normal = vectors[:, 0] * np.sign(vectors[:, 0] @ normal)
     distance = (points - point) @ normal
-    inlier = (np.abs(distance) < tolerance_m) & (normals @ normal >= NORMAL_COSINE)
+    inlier = (np.abs(distance) < tolerance_m) & (normals @ normal >= FLOOR_COSINE)
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2))) if inlier.any() else float("nan")
     return Ground(point, normal, rms, int(inlier.sum()), "fitted")
 
@@ -169,10 +171,10 @@ def annotated_ground(
     """
     point = floor.mean(0)
     _, spread, axes = np.linalg.svd(floor - point, full_matrices=False)
-    if spread[1] / np.sqrt(len(floor)) < SPREAD_MIN_M:
+    if spread[1] / np.sqrt(len(floor)) < MIN_ANNOTATED_SPREAD_M:
         raise UserError(
             f"annotation floor: its {len(floor)} points lie on one line within "
-            f"{SPREAD_MIN_M * 1000:.0f} mm; pick points that span the floor"
+            f"{MIN_ANNOTATED_SPREAD_M * 1000:.0f} mm; pick points that span the floor"
         )
     normal = axes[2] * np.sign(axes[2] @ up_hint(rig, gravity)[0])
     distance = (points - point) @ normal

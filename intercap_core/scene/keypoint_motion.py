@@ -16,10 +16,15 @@ from intercap_core.camera import projection
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.camera.triangulation import pixel_scale, triangulate
+from intercap_core.scene.constants import (
+    MIN_CONFIDENCE,
+    MOTION_ROUNDS,
+    MOTION_SIGMA_FLOOR_PX,
+    OUTLIER_SIGMA,
+    SLIPPED_PX_AT_1080P,
+)
 from intercap_core.scene.smooth_paths import Paths, smooth_paths
 
-MIN_CONFIDENCE = 0.3
-LOOSE_PX_AT_1080P = 60.0  # slipped views of moving limbs are to take part
 # Body; of each hand the wrist, knuckles and finger tips; corners of brows, eyes, nose and mouth.
 # Points beyond these move with them and cost as much again.
 _HAND = np.array([0, 4, 5, 8, 9, 13, 17, 20])
@@ -30,9 +35,6 @@ POINTS = np.r_[
     RIGHT_HAND.start + _HAND,
     FACE.start + _FACE,
 ]
-ROUNDS = 3
-SIGMA_FLOOR_PX = 1.0
-OUTLIER_SIGMA = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +121,9 @@ def build_motion(
     if start is None:
         points, valid = _triangulated(pixels, seen, rig)
         sigma = np.broadcast_to(4.0 * scale, seen.shape[1:])
-        rounds = ROUNDS
+        rounds = MOTION_ROUNDS
     else:
-        points, valid, rounds = start, seen, ROUNDS - 1
+        points, valid, rounds = start, seen, MOTION_ROUNDS - 1
     for _ in range(rounds):
         smooth = smooth_paths(times, points).points
         expected, by_point = _project(smooth, rig)
@@ -130,7 +132,7 @@ def build_motion(
         bias = _nanmedian(np.where(valid[..., None], raw, np.nan))
         residual = raw - bias
         size = np.linalg.norm(residual, axis=-1)
-        sigma = np.maximum(_scatter(size, known), SIGMA_FLOOR_PX * scale)
+        sigma = np.maximum(_scatter(size, known), MOTION_SIGMA_FLOOR_PX * scale)
         valid = known & (np.nan_to_num(size, nan=np.inf) < OUTLIER_SIGMA * sigma)
         points = _refitted(smooth, residual, by_point, valid, sigma)
     paths = smooth_paths(times, points)
@@ -171,7 +173,7 @@ def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.nd
         np.swapaxes(pixels, 1, 2).reshape(-1, views, 2),
         np.swapaxes(seen, 1, 2).reshape(-1, views).astype(float),
         rig,
-        max_error_px=LOOSE_PX_AT_1080P,
+        max_error_px=SLIPPED_PX_AT_1080P,
     )
     inlier = np.swapaxes(found.inlier.reshape(sets, count, views), 1, 2)
     return found.points.reshape(sets, count, 3), inlier

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-CONSTANT = 100.0  # variance of a series' constant part, of its own scatter
-MISSING = 1e6  # variance of a sample that is not there
-LENGTHS_S = {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}
-FAST_SHARES = (0.03, 0.1, 0.25, 0.6)
-MIN_SHARE = 0.9  # of a series must be valid for it to help choose
+from intercap_core.scene.constants import (
+    CONSTANT_VARIANCE,
+    ERROR_LENGTHS_S,
+    FAST_SHARES,
+    MIN_VALID_SHARE,
+)
+from intercap_core.solve.gaps import filled_linearly
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class TimeNoise:
     length: float
     fast: float
     scale: float
-    constant: float = CONSTANT
+    constant: float = CONSTANT_VARIANCE
 
     def covariance(self, times: np.ndarray) -> np.ndarray:
         """(T, T), of unit ``scale``, with the constant part."""
@@ -36,7 +38,7 @@ class TimeNoise:
 
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Inverse covariances (N, T, T) of N series, in units of ``scale``; ``variance`` (N, T) is
-        added to each sample: :data:`MISSING` where there is none."""
+        added to each sample: :data:`MISSING_VARIANCE` where there is none."""
         whole = np.broadcast_to(self.covariance(times), (*variance.shape, len(times))).copy()
         rows = np.arange(len(times))
         whole[:, rows, rows] += variance
@@ -45,16 +47,17 @@ class TimeNoise:
 
 def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeNoise:
     """Choose the noise of ``series`` (N, T), unit scatter, from those that are nearly whole."""
-    whole = np.flatnonzero(valid.mean(1) >= MIN_SHARE)
+    whole = np.flatnonzero(valid.mean(1) >= MIN_VALID_SHARE)
     if len(whole) < 10 or len(times) < 8:
         return TimeNoise("rough", 0.5, 0.25, 1.0)
     rows = np.where(valid[whole], series[whole], np.nan)
-    rows = _bridged(rows)
+    steps = np.arange(rows.shape[1])
+    rows = np.stack([filled_linearly(row[:, None], steps, np.isfinite(row))[:, 0] for row in rows])
     best, chosen = -np.inf, TimeNoise("rough", 0.5, 0.25, 1.0)
-    for kind, lengths in LENGTHS_S.items():
+    for kind, lengths in ERROR_LENGTHS_S.items():
         for length in lengths:
             for fast in FAST_SHARES:
-                covariance = _covariance(times, kind, length, fast) + CONSTANT
+                covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
                 low = np.linalg.cholesky(covariance)
                 energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
                 # Median over series: some are of hidden joints, some of a camera out of step.
@@ -69,14 +72,3 @@ def _covariance(times: np.ndarray, kind: str, length: float, fast: float) -> np.
     apart = np.abs(times[:, None] - times) / length
     lasting = np.exp(-apart) if kind == "rough" else np.exp(-(apart**2) / 2)
     return (1 - fast) * lasting + fast * np.eye(len(times))
-
-
-def _bridged(rows: np.ndarray) -> np.ndarray:
-    """Rows (N, T) with NaN replaced by straight lines."""
-    result = rows.copy()
-    steps = np.arange(rows.shape[1])
-    for row in result:
-        bad = np.isnan(row)
-        if bad.any():
-            row[bad] = np.interp(steps[bad], steps[~bad], row[~bad])
-    return result

@@ -15,15 +15,19 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.synchronise import images_of_moments
+from intercap_core.scene.constants import (
+    CONSTANT_VARIANCE,
+    KEYPOINT_OFFSET_KNOWN_S,
+    MIN_TIMING_SETS,
+    MISSING_VARIANCE,
+    OFFSET_SIGMA_S,
+    POSE_SIGMA,
+    SPEED_ERROR,
+    WINDOW_SETS,
+)
 from intercap_core.scene.keypoint_motion import Motion, build_motion
-from intercap_core.scene.keypoint_noise import CONSTANT, MISSING, TimeNoise, fit_noise
+from intercap_core.scene.keypoint_noise import TimeNoise, fit_noise
 
-WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
-POSE_SIGMA = np.r_[np.full(3, np.radians(1.0)), np.full(3, 0.02)]  # of the poses as they are given
-MIN_SETS = 8
-OFFSET_SIGMA_S = 0.05
-KNOWN_SIGMA_S = 0.02  # an offset less certain than this is not known
-SPEED_ERROR = 0.08  # of an offset: paths are smoothed by a little too much or too little
 # Which of POINTS err together: each of the body's on its own, each hand, the face.
 CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
@@ -50,7 +54,7 @@ def keypoint_offsets(
     """
     shown = by_moment(keypoints, slip)
     views = len(rig)
-    if len(times) < MIN_SETS or views < 2:
+    if len(times) < MIN_TIMING_SETS or views < 2:
         unknown = np.where(np.arange(views) == master, 0.0, np.nan)
         return Offsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
     return offsets_of(build_motion(shown, rig, times), master)
@@ -75,7 +79,7 @@ def offsets_of(motion: Motion, master: int) -> Offsets:
     offset[free[own]] = found[free[own]]
     random = inflation * np.diag(covariance)[own]
     sigma[free[own]] = np.sqrt(random + (SPEED_ERROR * offset[free[own]]) ** 2)
-    unknown = sigma > KNOWN_SIGMA_S
+    unknown = sigma > KEYPOINT_OFFSET_KNOWN_S
     offset[unknown], sigma[unknown] = 0.0, np.nan
     return Offsets(
         offset,
@@ -140,14 +144,14 @@ def noise_of(motion: Motion) -> TimeNoise:
 def precisions(motion: Motion, noise: TimeNoise, part: slice) -> np.ndarray:
     """Inverse covariances (K, C, W, W) over time of one window, the same for x and y."""
     valid = np.moveaxis(motion.valid[part], 0, 2)  # (C, K, W)
-    variance = np.where(valid, 0.0, MISSING)
+    variance = np.where(valid, 0.0, MISSING_VARIANCE)
     views, count, size = variance.shape
     found = noise.precision(motion.times[part], variance.reshape(-1, size))
     return np.swapaxes(found.reshape(views, count, size, size), 0, 1)
 
 
 def keypoint_equations(
-    motion: Motion, residual: np.ndarray, columns: np.ndarray, constant: float = CONSTANT
+    motion: Motion, residual: np.ndarray, columns: np.ndarray, constant: float = CONSTANT_VARIANCE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Each keypoint's normal matrix (K, n, n) and vector (K, n).
 
@@ -160,7 +164,7 @@ def keypoint_equations(
     matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
     parts = windows(len(motion.times))
     # A constant that is not free lasts beyond a window: windows do not add up.
-    share = 1.0 if constant >= CONSTANT else 1 / len(parts)
+    share = 1.0 if constant >= CONSTANT_VARIANCE else 1 / len(parts)
     for part in parts:
         precision = precisions(motion, noise, part) * share
         for k in range(count):

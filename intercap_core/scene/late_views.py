@@ -14,9 +14,7 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import pixel_scale, reproject
 from intercap_core.person.sides import BODY_POINTS, swapped
 from intercap_core.person.subject import MIN_COMMON_POINTS, NOBODY
-
-# Of the body's points the median: biases of joints, poses not yet refined, half a frame of motion.
-SAME_PERSON_PX_AT_1080P = 45.0
+from intercap_core.scene.constants import MAX_SLIP, SAME_PERSON_PX_AT_1080P
 
 
 class People(Protocol):
@@ -35,7 +33,7 @@ def with_late_views(
     *,
     fps: float,
     min_confidence: float,
-    max_slip: int = 4,
+    max_slip: int = MAX_SLIP,
 ) -> np.ndarray:
     """Add to the subject's ``index`` (T, C), -1 = not seen, people who are where it was shortly
     before.

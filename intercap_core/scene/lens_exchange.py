@@ -18,18 +18,19 @@ import numpy as np
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.scene.background import Background
-from intercap_core.scene.body_constraints import MIN_BODY_POINTS, BodyConstraint, body_views
+from intercap_core.scene.body_constraints import BodyConstraint, body_views
+from intercap_core.scene.constants import (
+    CALIBRATION_ROTATION_SIGMA,
+    CALIBRATION_TRANSLATION_SIGMA_M,
+    MAX_SUSPECTS,
+    MIN_BODY_POINTS,
+    MUCH_BETTER,
+    SUSPICIOUS,
+)
 from intercap_core.scene.lenses import swapped_lenses
 from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surface import background_surfaces
-
-SUSPICIOUS = 1.3  # a camera's residuals against usual ones: only then is more tried
-MAX_SUSPECTS = 4  # every pair of them is tried
-MUCH_BETTER = 0.8  # of the residuals with the lenses as given
-# How well given poses are known, for cameras that keypoints alone can judge: a rig's own
-# calibration, without what happened to the tripods since.
-ROTATION_SIGMA, TRANSLATION_SIGMA_M = np.radians(0.3), 0.006
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,8 @@ def exchange_lenses(
             subject.keypoints,
             rig,
             times,
-            rotation_sigma=ROTATION_SIGMA,
-            translation_sigma=TRANSLATION_SIGMA_M,
+            rotation_sigma=CALIBRATION_ROTATION_SIGMA,
+            translation_sigma=CALIBRATION_TRANSLATION_SIGMA_M,
         ):
             if pair.first in blind and pair.second in blind:
                 found.append(Exchange(pair.first, pair.second, True, np.nan, np.nan))

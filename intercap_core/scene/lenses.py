@@ -16,17 +16,14 @@ import numpy as np
 from intercap_core.camera import projection
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
-from intercap_core.scene.keypoint_motion import Motion, build_motion
-from intercap_core.scene.keypoint_timing import (
-    CLUSTER,
-    MIN_SETS,
-    keypoint_equations,
-    pose_columns,
+from intercap_core.scene.constants import (
+    LENS_FIT_RANGE,
+    MIN_LENS_GAIN,
+    MIN_TIMING_SETS,
+    VIEW_BIAS_VARIANCE,
 )
-
-VIEW_BIAS = 2.0  # variance of a keypoint's constant error in a view, of its other errors'
-MIN_GAIN = 15.0  # log likelihood; chance brings up to 9
-FIT_RANGE = (0.5, 1.5)  # how much of the pattern must be there
+from intercap_core.scene.keypoint_motion import Motion, build_motion
+from intercap_core.scene.keypoint_timing import CLUSTER, keypoint_equations, pose_columns
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,7 @@ def swapped_lenses(
     chosen: list[LensPair] = []
     for pair in sorted(pairs, key=lambda p: -p.gain):
         used = {c for other in chosen for c in (other.first, other.second)}
-        good = pair.gain >= MIN_GAIN and FIT_RANGE[0] <= pair.share <= FIT_RANGE[1]
+        good = pair.gain >= MIN_LENS_GAIN and LENS_FIT_RANGE[0] <= pair.share <= LENS_FIT_RANGE[1]
         if good and not used & {pair.first, pair.second}:
             chosen.append(pair)
     return chosen
@@ -84,13 +81,13 @@ def lens_gains(
         for b in range(len(rig))
         if a != b and size[a] == size[b] and not np.array_equal(lenses[a], lenses[b])
     ]
-    if not orders or len(times) < MIN_SETS:
+    if not orders or len(times) < MIN_TIMING_SETS:
         return []
     motion = build_motion(keypoints, rig, times)
     whole = np.where(motion.seen[..., None], motion.residual + motion.bias, 0.0)
     patterns = [motion.projected_of(a, _with_lens(motion, a, b)) for a, b in orders]
     columns = np.concatenate([np.stack(patterns), pose_columns(motion)])
-    matrices, vectors = keypoint_equations(motion, whole, columns, constant=VIEW_BIAS)
+    matrices, vectors = keypoint_equations(motion, whole, columns, constant=VIEW_BIAS_VARIANCE)
     number = len(orders)
     prior = np.tile(np.repeat([rotation_sigma**-2.0, translation_sigma**-2.0], 3), len(rig))
     matrix, vector = matrices.sum(0), vectors.sum(0)

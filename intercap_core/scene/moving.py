@@ -17,21 +17,23 @@ from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.scene.background import Background
+from intercap_core.scene.constants import (
+    BEFORE_BACKGROUND_MM,
+    BEFORE_BACKGROUND_SHARE,
+    MOVING_CELL_M,
+    MOVING_MAX_DEPTH_M,
+    MOVING_MOMENTS,
+    MOVING_SEARCH_M,
+    MOVING_SEARCHES,
+    NEIGHBOUR_PIXEL_STEP,
+)
 from intercap_core.scene.surface import Surface, surface_of
-
-MOMENTS = 16  # frame sets looked at, each with the one before and the one after
-CELL_M = 0.02
-MAX_DEPTH_M = 4.0  # beyond, the depth's error is past the body's own motion
-BEFORE_BACKGROUND_MM, BEFORE_BACKGROUND_SHARE = 40.0, 0.012  # nearer by this much is before it
-SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
-SEARCHES = 3
-POINT_STEP = 2  # of the neighbouring sets' pixels, every second in both directions is enough
 
 
 def moving_surfaces(
     frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
 ) -> list[dict[int, Surface]]:
-    """The moving surfaces of up to :data:`MOMENTS` sets, by camera index, depth camera's frame.
+    """The moving surfaces of up to :data:`MOVING_MOMENTS` sets, by camera index, depth frame.
 
     ``rig`` has the lenses; ``image_of`` (T, C): the set whose image of a camera shows each set's
     moment, -1 = none. Surfaces whose speed cannot be told, for want of a set before or after, are
@@ -41,8 +43,8 @@ def moving_surfaces(
     whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after
     whole[1:-1] = (depth_image[:-2] >= 0) & (depth_image[1:-1] >= 0) & (depth_image[2:] >= 0)
     usable = np.flatnonzero(whole.sum(1) >= 2)
-    if len(usable) > MOMENTS:
-        usable = usable[np.linspace(0, len(usable) - 1, MOMENTS).round().astype(int)]
+    if len(usable) > MOVING_MOMENTS:
+        usable = usable[np.linspace(0, len(usable) - 1, MOVING_MOMENTS).round().astype(int)]
     found = []
     for t in usable:
         at_once = {}
@@ -72,7 +74,9 @@ def _moving(
 ) -> Surface:
     """The surface of the middle one of three depth images, ``gaps`` (2,) seconds apart."""
     before, now, after = (_foreground(image, background) for image in images)
-    surface = surface_of(now, lens, window=_box(now), cell_m=CELL_M, max_depth_m=MAX_DEPTH_M)
+    surface = surface_of(
+        now, lens, window=_box(now), cell_m=MOVING_CELL_M, max_depth_m=MOVING_MAX_DEPTH_M
+    )
     if not len(surface):
         return surface
     earlier = _along_normals(surface, _points(before, lens))
@@ -97,9 +101,9 @@ def _box(image: np.ndarray) -> tuple[slice, slice]:
 
 
 def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    thin = np.s_[::POINT_STEP, ::POINT_STEP]
+    thin = np.s_[::NEIGHBOUR_PIXEL_STEP, ::NEIGHBOUR_PIXEL_STEP]
     z = image[thin].astype(np.float64) * 1e-3
-    keep = (z > 0) & (z < MAX_DEPTH_M + 0.3)
+    keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)
     points = np.column_stack([lens.rays[thin][keep] * z[keep, None], z[keep]])
     return points[np.isfinite(points).all(1)]
 
@@ -114,11 +118,11 @@ def _along_normals(surface: Surface, points: np.ndarray) -> np.ndarray:
     if not len(points):
         return np.full(len(surface), np.nan)
     tree = cKDTree(points, balanced_tree=False)
-    for _ in range(SEARCHES):
+    for _ in range(MOVING_SEARCHES):
         sought = surface.points + away[:, None] * surface.normals
-        distance, nearest = tree.query(sought, distance_upper_bound=SEARCH_M)
+        distance, nearest = tree.query(sought, distance_upper_bound=MOVING_SEARCH_M)
         lost |= ~np.isfinite(distance)
         offset = points[np.where(lost, 0, nearest)] - surface.points
         away = np.where(lost, 0.0, (offset * surface.normals).sum(1))
-        lost |= np.abs(away) > SEARCH_M
+        lost |= np.abs(away) > MOVING_SEARCH_M
     return np.where(lost, np.nan, away)

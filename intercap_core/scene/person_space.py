@@ -12,22 +12,8 @@ import numpy as np
 from intercap_core.body.keypoints import LIMB_BONES, keypoint_pairs, of_side
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.transforms import apply
+from intercap_core.scene.constants import LIMB_REACH_M, PERSON_MASK_REDUCTION, TRUNK_REACH_M
 
-REDUCTION = 8  # the mask is worked out on every eighth pixel
-# How far from a bone skin, clothing and hair reach, metres: wider than the body's own radii
-# (`segmentation.constants`), since what is left out of the background only has to hold the person.
-# Of the limbs, in the order of LIMB_BONES; tuned on the studio.
-LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
-# Of trunk and head, which have no bones of their own in the skeleton; hands reach past the wrist.
-TRUNK_REACH_M: dict[tuple[str, str], float] = {
-    ("neck", "mid_hip"): 0.26,
-    ("right_shoulder", "right_hip"): 0.20,
-    ("left_shoulder", "left_hip"): 0.20,
-    ("nose", "neck"): 0.22,
-    ("left_ear", "right_ear"): 0.20,
-    ("right_wrist", "right_wrist"): 0.24,
-    ("left_wrist", "left_wrist"): 0.24,
-}
 _BONES = (*TRUNK_REACH_M, *of_side("right", LIMB_BONES), *of_side("left", LIMB_BONES))
 _FIRST, _SECOND = keypoint_pairs(_BONES).T
 _REACH = np.array([*TRUNK_REACH_M.values(), *LIMB_REACH_M, *LIMB_REACH_M])
@@ -47,7 +33,10 @@ def person_pixels(
     if not known.any():
         return result
     start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
-    small = np.s_[REDUCTION // 2 :: REDUCTION, REDUCTION // 2 :: REDUCTION]
+    small = np.s_[
+        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
+        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
+    ]
     z = depth[small].astype(np.float64) * 1e-3
     points = np.dstack([lens.rays[small] * z[..., None], z])
     low = np.minimum(start, start + along).min(0) - reach.max()

@@ -1,9 +1,10 @@
-"""All cameras of a rig brought together on the surfaces that several of them see.
+"""Registration of all cameras of a rig on the surfaces that several of them see.
 
-Point-to-plane residuals of every overlapping pair and every camera's motion in one robust
-Gauss-Newton problem, with the master fixed, a weak prior on the start, and body keypoints as
-further constraints (:mod:`.body_constraints`): a bare floor alone leaves three motions free.
-Surfaces that move tell the cameras' exposure times as well.
+One robust Gauss-Newton problem (point-to-plane ICP over all pairs at once): residuals of every
+overlapping pair; unknowns are each camera's rotation, translation, depth bias and time offset, with
+the master's pose and time fixed and a weak prior on the start. Further constraints on the poses
+come from body keypoints (:mod:`.body_constraints`) and the floor (:mod:`.floor_constraint`): a bare
+floor alone leaves three motions free. Moving surfaces observe the exposure times as well.
 """
 
 from __future__ import annotations
@@ -18,24 +19,29 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
+from intercap_core.scene.constants import (
+    GATES_M,
+    HELD_GATES_M,
+    HELD_OUT_EVERY,
+    LEVER_M,
+    MIN_NORMALS_COSINE,
+    MIN_PAIR_POINTS,
+    MOMENTS_APART_M,
+    MOVING_EFFECTIVE_POINTS,
+    PAIR_QUERIES,
+    PRIOR_BIAS_M,
+    PRIOR_OFFSET_S,
+    PRIOR_ROTATION_RAD,
+    PRIOR_TRANSLATION_M,
+    STATIC_EFFECTIVE_POINTS,
+    SURFACE_SEARCH_M,
+    SURFACE_SIGMA_FLOOR_M,
+)
 from intercap_core.scene.surface import Surface
+from intercap_core.solve.robust import SIGMA_PER_MAD
 
-MIN_AGREE_COSINE = 0.85  # normals of one surface, seen by two cameras
-MIN_PAIR_POINTS = 60  # fewer correspondences are chance
-HELD_OUT_EVERY = 4  # of each surface's cells
-GATES_M = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)  # distance to the plane, annealed
-HELD_GATES_M = (0.08, 0.04, 0.04)  # where the poses are held
-APART_M = 10.0  # between moments, in the search tree
-SEARCH_M = 0.12  # distance to the nearest cell
-SIGMA_FLOOR_M = 0.003
-# Weak prior on the start: what a careful calibration is wrong by.
-PRIOR_TRANSLATION_M = 0.01
-PRIOR_ROTATION_RAD = np.radians(0.5)
-PRIOR_BIAS_M = 0.003  # the depth's systematic error is up to 11 mm + 0.1 % (device data sheet)
-PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of a period
 ROTATION, TRANSLATION, BIAS, OFFSET = slice(0, 3), slice(3, 6), 6, 7
 FREEDOMS = 8  # of a camera
-LEVER_M = 2.5  # from a camera to what it looks at, in a ring
 
 # Adds a group's normal equations: (poses (C, 4, 4), offset (C,)) -> matrix (C, 6, C, 6), gradient
 # (C, 6) of rotation and translation
@@ -43,12 +49,15 @@ Constraint = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class Kind:
-    """How much surfaces of one kind tell. Neighbouring residuals err together (lens, multipath,
-    bias), so a pair of cameras never counts as more than ``effective_points`` independent
-    measurements each way; ``queries`` points of one camera are sought in another one, over all
-    layers. Of ``rounded`` surfaces two cameras see different flanks, whose points lie inside or
-    outside each other's planes by a constant that is nobody's motion: it is taken off each pair.
+class SurfaceKind:
+    """How surfaces of one kind, background or foreground, enter the registration.
+
+    ``effective_points``: neighbouring residuals are correlated (lens, multipath, bias), so the
+    information of a pair of cameras is limited to that of so many independent measurements each
+    way. ``queries``: how many points of one camera are matched with another's, over all moments.
+    ``rounded``: two cameras see different flanks of such a surface, so the points of one lie off
+    the tangent planes of the other by a constant which is no misalignment: each pair's weighted
+    mean residual is subtracted.
     """
 
     effective_points: float
@@ -56,8 +65,8 @@ class Kind:
     rounded: bool
 
 
-STATIC = Kind(effective_points=10.0, queries=2500, rounded=False)
-MOVING = Kind(effective_points=50.0, queries=2500, rounded=True)
+STATIC = SurfaceKind(STATIC_EFFECTIVE_POINTS, PAIR_QUERIES, rounded=False)
+MOVING = SurfaceKind(MOVING_EFFECTIVE_POINTS, PAIR_QUERIES, rounded=True)
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Layer:
     """What the cameras see at one moment: surfaces by camera index, depth camera's frame."""
 
     surfaces: dict[int, Surface]
-    kind: Kind
+    kind: SurfaceKind
 
 
 @dataclass
@@ -125,7 +134,9 @@ class _Seen:
     @classmethod
     def of(cls, surfaces: Sequence[tuple[int, Surface]], queries: int) -> _Seen:
         surface = Surface.joined([surface for _, surface in surfaces])
-        moment = np.repeat([APART_M * at for at, _ in surfaces], [len(s) for _, s in surfaces])
+        moment = np.repeat(
+            [MOMENTS_APART_M * at for at, _ in surfaces], [len(s) for _, s in surfaces]
+        )
         tree = cKDTree(np.column_stack([surface.points, moment]), balanced_tree=False)
         order = np.random.default_rng(0).permutation(len(surface))
         return cls(
@@ -159,7 +170,7 @@ class Registration:
     def __init__(self, rig: Rig, layers: Sequence[Layer], master: int) -> None:
         self.rig = rig
         self._master = master
-        self._seen: dict[Kind, dict[int, _Seen]] = {}
+        self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
         for kind in dict.fromkeys(layer.kind for layer in layers):
             by_camera: dict[int, list[tuple[int, Surface]]] = {}
             for moment, layer in enumerate(layers):
@@ -210,12 +221,13 @@ class Registration:
             current, covariance.reshape(count, FREEDOMS, count, FREEDOMS), float(moved.max())
         )
 
-    def residuals(self, at: Estimate, kind: Kind) -> PairResiduals:
+    def residuals(self, at: Estimate, kind: SurfaceKind) -> PairResiduals:
         """Median |point to plane| of every pair of cameras over the held-out points."""
         values = {}
         for a, b in combinations(self._seen.get(kind, {}), 2):
             ways = (
-                self._match(kind, *way, at, SEARCH_M, held_out=True) for way in ((a, b), (b, a))
+                self._match(kind, *way, at, SURFACE_SEARCH_M, held_out=True)
+                for way in ((a, b), (b, a))
             )
             distances = np.concatenate([np.abs(match.residual) for match in ways])
             if len(distances) >= MIN_PAIR_POINTS / HELD_OUT_EVERY:
@@ -227,7 +239,14 @@ class Registration:
         )
 
     def _match(
-        self, kind: Kind, a: int, b: int, at: Estimate, gate: float, *, held_out: bool = False
+        self,
+        kind: SurfaceKind,
+        a: int,
+        b: int,
+        at: Estimate,
+        gate: float,
+        *,
+        held_out: bool = False,
     ) -> _Match:
         """Correspondences within reach of camera a's points on camera b's surface."""
         source, target = (at.poses[c] @ self._colour_from_depth(c) for c in (a, b))
@@ -239,14 +258,14 @@ class Registration:
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
         sought = np.column_stack([in_target * (1 + at.bias[b] / depth), own.moment[rows]])
-        distance, nearest = other.tree.query(sought, distance_upper_bound=SEARCH_M)
+        distance, nearest = other.tree.query(sought, distance_upper_bound=SURFACE_SEARCH_M)
         hit = np.flatnonzero(np.isfinite(distance))
         nearest, points = nearest[hit], points[hit]
         normals = surface.normals[nearest] @ target[:3, :3].T
         own_normals = queries.normals[hit] @ source[:3, :3].T
         on_target = apply(target, surface.points[nearest] - at.bias[b] * surface.rays[nearest])
         speed = (queries.speed[hit] + surface.speed[nearest]) / 2
-        good = (normals * own_normals).sum(1) >= MIN_AGREE_COSINE
+        good = (normals * own_normals).sum(1) >= MIN_NORMALS_COSINE
         # The mean normal: two points of one circle are then at distance 0, however far apart
         # (Rusinkiewicz, A symmetric objective function for ICP, 2019).
         normals = normals + own_normals
@@ -289,7 +308,7 @@ class Registration:
                 share = weight / max(weight.sum(), 1e-9)
                 residual = residual - share @ residual
                 rows = rows - np.einsum("n,knf->kf", share, rows)[:, None]
-            sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(residual))))
+            sigma = max(SURFACE_SIGMA_FLOOR_M, SIGMA_PER_MAD * float(np.median(np.abs(residual))))
             weight /= sigma**2 * max(1.0, len(residual) / (2 * kind.effective_points))
             weighted = rows * weight[:, None]
             gradient[[a, b]] += np.einsum("knf,n->kf", weighted, residual)

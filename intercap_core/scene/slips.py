@@ -15,27 +15,22 @@ from itertools import pairwise
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA, Motion, build_motion, seeing
-from intercap_core.scene.keypoint_timing import (
-    MIN_SETS,
-    by_moment,
-    noise_of,
-    offsets_of,
-    precisions,
-    windows,
+from intercap_core.scene.constants import (
+    CLEAR_SLIP_GAIN,
+    MANY_VIEWS,
+    MAX_SLIP,
+    MIN_SLIP_GAIN,
+    MIN_SLIP_GAIN_OF_SET,
+    MIN_TIMING_SETS,
+    OUTLIER_SIGMA,
+    SLIP_GAIN_PER_SET,
+    SLIP_LEFT_OUT,
+    SLIP_ROUNDS,
+    SLIP_WORTH,
+    SLIPS_APART_S,
 )
-
-# In log likelihood, without the keypoints that gain most: limbs that a detector confuses, or
-# places, fit a slip by chance, but never all over the body.
-# Chance finds are short: what is beyond doubt depends on how many sets say it.
-MIN_GAIN, MIN_GAIN_OF_SET = 15.0, 60.0
-LEFT_OUT = 4
-GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
-CLEAR_GAIN = 10.0  # an interval must gain this much over the whole recording's being late
-WORTH = 0.2  # of the best interval's gain makes another worth taking at once
-APART_S = 1.0
-MANY_VIEWS = 4  # suffice for the body's motion without those that slip
-MAX_ROUNDS = 12
+from intercap_core.scene.keypoint_motion import Motion, build_motion, seeing
+from intercap_core.scene.keypoint_timing import by_moment, noise_of, offsets_of, precisions, windows
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,7 @@ class Interval:
     @property
     def beyond_doubt(self) -> bool:
         """Whether it gains more than chance ever would."""
-        return self.sure >= MIN_GAIN + MIN_GAIN_OF_SET / (self.last - self.first + 1)
+        return self.sure >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (self.last - self.first + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +66,7 @@ def find_slips(
     times: np.ndarray,
     fps: float,
     *,
-    max_slip: int = 4,
+    max_slip: int = MAX_SLIP,
     master: int = 0,
 ) -> Slips:
     """Find slips of up to ``max_slip`` frames in any camera, for a while or always.
@@ -80,13 +75,13 @@ def find_slips(
     (T,) s. What all images of a camera are late by is counted from the ``master``'s.
     """
     slip = np.zeros(keypoints.shape[:2], np.int32)
-    if len(times) < MIN_SETS or len(rig) < 2:
+    if len(times) < MIN_TIMING_SETS or len(rig) < 2:
         return Slips(slip, ())
     steps = [s for s in range(-max_slip, max_slip + 1) if s]
     motion = build_motion(keypoints, rig, times)
     offset: np.ndarray | None = None
     always: list[Interval] = []
-    for _ in range(MAX_ROUNDS):
+    for _ in range(SLIP_ROUNDS):
         seen = motion if offset is None else motion.at_offsets(offset)
         evidence = _Evidence(seen, steps, fps)
         best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
@@ -137,8 +132,8 @@ def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
     ordered = sorted(intervals, key=lambda i: -i.gain)
     taken: list[Interval] = []
     for interval in ordered:
-        early, late = times[interval.first] - APART_S, times[interval.last] + APART_S
-        if interval.gain >= WORTH * ordered[0].gain and all(
+        early, late = times[interval.first] - SLIPS_APART_S, times[interval.last] + SLIPS_APART_S
+        if interval.gain >= SLIP_WORTH * ordered[0].gain and all(
             times[other.last] < early or times[other.first] > late for other in taken
         ):
             taken.append(interval)
@@ -185,7 +180,7 @@ def _tolerant(motion: Motion, moved: np.ndarray) -> Motion:
 
 def _sure(gains: np.ndarray) -> float:
     """The sum of the keypoints' gains (K,) without the best few."""
-    return float(np.sort(gains)[:-LEFT_OUT].sum())
+    return float(np.sort(gains)[:-SLIP_LEFT_OUT].sum())
 
 
 class _Evidence:
@@ -228,7 +223,7 @@ class _Evidence:
                 )
         step = max(self._steps, key=lambda s: _sure(always[s]))
         whole = Interval(camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step]))
-        if whole.beyond_doubt and (top is None or whole.gain > top.gain - CLEAR_GAIN):
+        if whole.beyond_doubt and (top is None or whole.gain > top.gain - CLEAR_SLIP_GAIN):
             return whole
         return top
 
@@ -306,7 +301,7 @@ class _Slipped:
     def best(self, step: int) -> Interval:
         """The interval of greatest gain, by place in the window, of camera 0."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
-        gain = interval_gains(self.linear.sum(0) - GAIN_PER_SET, energy)
+        gain = interval_gains(self.linear.sum(0) - SLIP_GAIN_PER_SET, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         gains = self.gains(first, end)
         return Interval(0, first, end - 1, step, float(gains.sum()), _sure(gains))

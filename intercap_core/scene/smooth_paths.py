@@ -13,12 +13,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from intercap_core.scene.constants import MAX_PATH_GAP_S, MIN_PATH_SAMPLES, STIFFER, STIFFNESS
+
 ORDER = 3
-STIFFNESS = 10.0 ** np.arange(-3, 4)  # of third differences between neighbouring sets
-# Likelihood takes errors that last for motion; this much more stiffness is closest to neither bias.
-STIFFER = 4.0
-MIN_SAMPLES = 6
-MAX_GAP_S = 0.35  # paths are carried on over at most this long without sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class Paths:
         from_left += u * (1 - u) ** 2 * length * self.velocity[left]
         from_right = u * u * (3 - 2 * u) * self.points[right]
         from_right -= u * u * (1 - u) * length * self.velocity[right]
-        inside = (u >= -1e-6) & (u <= 1 + 1e-6) & (length <= MAX_GAP_S)
+        inside = (u >= -1e-6) & (u <= 1 + 1e-6) & (length <= MAX_PATH_GAP_S)
         return np.where(inside, from_left + from_right, np.nan)
 
 
@@ -52,9 +49,9 @@ def smooth_paths(times: np.ndarray, points: np.ndarray) -> Paths:
     known = np.isfinite(points[..., 0])
     smooth = np.full(points.shape, np.nan)
     velocity = np.full(points.shape, np.nan)
-    if sets >= MIN_SAMPLES:
+    if sets >= MIN_PATH_SAMPLES:
         penalty = _penalty(times)
-        usable = np.flatnonzero(known.sum(0) >= MIN_SAMPLES)
+        usable = np.flatnonzero(known.sum(0) >= MIN_PATH_SAMPLES)
         for k in usable:
             smooth[:, k] = _smoothed(np.nan_to_num(points[:, k]), known[:, k], penalty)
         velocity[:, usable] = CubicSpline(times, smooth[:, usable])(times, 1)
@@ -110,4 +107,4 @@ def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
     after[known] = np.broadcast_to(times[:, None], known.shape)[known]
     before = np.maximum.accumulate(before, 0)
     after = np.minimum.accumulate(after[::-1], 0)[::-1]
-    return after - before <= MAX_GAP_S
+    return after - before <= MAX_PATH_GAP_S

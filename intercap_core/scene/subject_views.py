@@ -13,10 +13,8 @@ from intercap_core.person.middles import fill_middles
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import NOBODY, find_subject
 from intercap_core.person.swaps import triangulate_people
+from intercap_core.scene.constants import LOOSE_PX_AT_1080P, MIN_CONFIDENCE
 from intercap_core.scene.late_views import with_late_views
-
-MIN_CONFIDENCE = 0.3
-LOOSE_PX_AT_1080P = 40.0  # poses that are a centimetre off are not yet consistent
 
 
 @dataclass(frozen=True, eq=False)

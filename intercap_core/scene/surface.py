@@ -10,12 +10,13 @@ import numpy as np
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Rig
 from intercap_core.scene.background import Background
-
-NORMAL_STEP_RAD = 0.008  # half the base line of a normal: 4 px of the unbinned depth camera
-MAX_KINK_M_PER_M = 0.008  # a pixel this far off its neighbours' middle, per depth, is an edge
-BACKGROUND_CELL_M = 0.03
-MAX_DEPTH_M = 5.0  # beyond, the depth's error is past a centimetre
-MIN_COSINE = 0.26  # surfaces seen at a grazing angle of more than 75 degrees are left out
+from intercap_core.scene.constants import (
+    BACKGROUND_CELL_M,
+    BACKGROUND_MAX_DEPTH_M,
+    MAX_KINK_M_PER_M,
+    MIN_VIEW_COSINE,
+    NORMAL_STEP_RAD,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ def surface_of(
     normals = np.cross(along, across).astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
-    good = np.isfinite(points).all(1) & (facing >= MIN_COSINE)
+    good = np.isfinite(points).all(1) & (facing >= MIN_VIEW_COSINE)
     along_z = np.column_stack([table[row, column], np.ones(len(row))])
     still = np.zeros(np.count_nonzero(good))
     return thinned(Surface(points[good], normals[good], along_z[good], still), cell_m)
@@ -117,6 +118,6 @@ def background_surfaces(rig: Rig, backgrounds: Sequence[Background | None]) -> d
                 lens,
                 keep=background.static,
                 cell_m=BACKGROUND_CELL_M,
-                max_depth_m=MAX_DEPTH_M,
+                max_depth_m=BACKGROUND_MAX_DEPTH_M,
             )
     return surfaces

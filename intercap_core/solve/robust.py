@@ -8,11 +8,12 @@ All rho have rho(0) = 0 and slope 1 at 0, so a scale alone says where a residual
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
 from numba.extending import register_jitable
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class Robust(NamedTuple):
@@ -20,20 +21,6 @@ class Robust(NamedTuple):
 
     rho: Tensor
     weight: Tensor
-
-
-def huber(squared: Tensor, scale: float | Tensor) -> Robust:
-    """Huber 1964: squared residuals (...) count in full up to ``scale``, then linearly.
-
-    ``squared`` and ``scale``^2 are in the same units. rho = s for s <= scale^2, else
-    2 scale sqrt(s) - scale^2.
-    """
-    scale = torch.as_tensor(scale, dtype=squared.dtype, device=squared.device)
-    inside = squared <= scale * scale
-    root = torch.where(inside, scale, squared).sqrt()
-    root = torch.where(inside, scale, root)
-    rho = torch.where(inside, squared, 2 * scale * root - scale * scale)
-    return Robust(rho, scale / root)
 
 
 # Of a Gaussian, sigma over the median of absolute deviations: 1 / Phi^-1(3/4) (Hampel 1974).
@@ -57,6 +44,8 @@ def geman_mcclure(squared: Tensor, scale: float | Tensor) -> Robust:
     rho = scale^2 s / (s + scale^2), which is the field's rho^2 r^2 / (r^2 + rho^2); its slope is
     (scale^2 / (s + scale^2))^2.
     """
+    import torch
+
     c2 = torch.as_tensor(scale, dtype=squared.dtype, device=squared.device) ** 2
     share = c2 / (squared + c2)
     return Robust(share * squared, share * share)

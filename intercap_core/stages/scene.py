@@ -16,6 +16,7 @@ from intercap_core.config import SceneSettings, digest
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.scene.background import Background, background_of
+from intercap_core.scene.constants import BACKGROUND_CELL_M
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import (
@@ -30,7 +31,7 @@ from intercap_core.scene.lens_exchange import Exchange, exchange_lenses
 from intercap_core.scene.moving import moving_surfaces
 from intercap_core.scene.slips import Slips, find_slips
 from intercap_core.scene.subject_views import SubjectViews, subject_views, triangulated
-from intercap_core.scene.surface import BACKGROUND_CELL_M, Surface, background_surfaces
+from intercap_core.scene.surface import Surface, background_surfaces
 from intercap_core.schemas import SCENE
 
 FEET = slice(19, 25)  # toes and heels among the body's keypoints

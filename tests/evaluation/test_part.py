@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from intercap_core.config import Config, ObjectEntry, SubjectEntry
 from intercap_core.evaluation.captures import PART
 from intercap_core.evaluation.part import measured_once, spread
+from intercap_core.metrics.capture import CaptureErrors, SlipCounts
 from intercap_core.project import Project
 from tests.helpers.kinect_files import entry_of
 
@@ -26,13 +28,20 @@ def test_errors_are_kept_by_content(tmp_path: Path) -> None:
         path.write_text(path.name)
     calls: list[str] = []
 
-    def measure(_: Project, sequence: str) -> str:
+    values = np.array([0.1, np.nan])
+    errors = CaptureErrors(
+        "one", "bare", values, values, values, values, SlipCounts(1, 0, 0, 2, 9), 0.1, 0.2, values
+    )
+
+    def measure(_: Project, sequence: str) -> CaptureErrors:
         calls.append(sequence)
-        return "errors"
+        return errors
 
     part = replace(PART, measure=measure)
     for _ in range(2):
-        assert measured_once(part, project, "one") == "errors"
+        found = measured_once(part, project, "one")
+        assert found.sequence == "one" and found.slips == errors.slips
+        np.testing.assert_array_equal(found.after, values)
     assert calls == ["one"]
     files[1].write_text("another scene")
     measured_once(part, project, "one")

@@ -16,8 +16,9 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.person.subject import NOBODY, find_subject
+from intercap_core.scene.constants import MIN_CONFIDENCE
 from intercap_core.scene.late_views import with_late_views
-from intercap_core.scene.subject_views import MIN_CONFIDENCE, triangulated
+from intercap_core.scene.subject_views import triangulated
 from intercap_core.studio.hands import part_of
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.keypoints import Detector

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from intercap_core.camera.rig import ring_centre
 from intercap_core.camera.transforms import apply
 from intercap_core.detections.read import Detections
 from intercap_core.person.sides import swapped
-from intercap_core.person.subject import find_subject, ring_centre
+from intercap_core.person.subject import find_subject
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking, write_detections
 

@@ -7,8 +7,8 @@ import pytest
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
+from intercap_core.scene.constants import FOOT_HEIGHT_M
 from intercap_core.scene.ground import (
-    FOOT_HEIGHT_M,
     NO_GROUND,
     annotated_ground,
     fit_ground,

@@ -9,7 +9,8 @@ import pytest
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.camera.triangulation import reproject
-from intercap_core.scene.keypoint_timing import WINDOW_SETS, keypoint_offsets
+from intercap_core.scene.constants import WINDOW_SETS
+from intercap_core.scene.keypoint_timing import keypoint_offsets
 from intercap_core.scene.slips import find_slips, interval_gains
 from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
 from tests.helpers.synthetic_capture import ring
