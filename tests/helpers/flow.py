@@ -9,9 +9,30 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from numba.core.caching import _CacheLocator
+
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core")
+KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache beside the source
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
+
+
+def share_kernels(package: Path, cache: Path) -> None:
+    """Let a copy of the package at ``package`` keep its kernels in ``cache``, beside the project's.
+
+    Numba tells sources apart by their path. So for each folder of the copy there is a link to
+    where the project's own kernels of that folder lie; an edited copy has a cache of its own.
+    """
+    own = Path(os.environ["NUMBA_CACHE_DIR"])
+    shared = cache / own.name
+    shared.mkdir(parents=True)
+    for module in (ROOT / "intercap_core").rglob("*.py"):
+        copied = package / module.relative_to(ROOT / "intercap_core")
+        link = shared / _CacheLocator.get_suitable_cache_subpath(str(copied))
+        if not link.is_symlink():
+            target = own / _CacheLocator.get_suitable_cache_subpath(str(module))
+            target.mkdir(exist_ok=True)
+            link.symlink_to(target)
 
 
 @dataclass(frozen=True)
@@ -23,14 +44,21 @@ class Flow:
 
     @classmethod
     def copy(cls, folder: Path, settings: str = "config/test/config.yaml") -> Flow:
-        """Copy what a run needs; compiled caches come along."""
+        """Copy what a run needs; compiled kernels are shared with the project."""
         for name in COPIED:
             source = ROOT / name
             if source.is_dir():
-                shutil.copytree(source, folder / name)
+                shutil.copytree(source, folder / name, ignore=KERNELS)
             else:
                 shutil.copy2(source, folder / name)
+        share_kernels(folder / "intercap_core", folder / "kernels")
         return cls(folder, settings)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What the folder's own package is run with."""
+        kernels = str(self.folder / "kernels")
+        return {**os.environ, "PYTHONPATH": str(self.folder), "NUMBA_CACHE_DIR": kernels}
 
     @property
     def results(self) -> Path:
@@ -51,7 +79,7 @@ class Flow:
         return subprocess.run(
             command,
             cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(self.folder)},
+            env=self.environment,
             capture_output=True,
             text=True,
         )
@@ -66,7 +94,7 @@ class Flow:
         return subprocess.run(
             [sys.executable, "-m", "intercap_core.cli", *arguments],
             cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(self.folder), "COLUMNS": "400"},
+            env={**self.environment, "COLUMNS": "400"},
             capture_output=True,
             text=True,
         )
