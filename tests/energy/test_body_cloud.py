@@ -12,11 +12,7 @@ from intercap_core.body.normals import vertex_normals
 from intercap_core.energy import body_cloud as term
 from intercap_core.energy.body_samples import COVERINGS, Samples, choose_samples
 from intercap_core.energy.body_surface import Surface
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
+from tests.helpers.bodies import open_body
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +123,7 @@ def test_samples_cover_the_outer_skin(model: BodyModel, samples: Samples) -> Non
 
 def _posed_bodies() -> tuple[BodyModel, Samples, Tensor]:
     """Four bodies (4,P) in single precision, bent anyhow, two metres before the camera."""
-    model = BodyModel.load()
+    model = open_body()
     x = model.zeros(4).vector().clone()
     x[:, :165] += 0.3 * _random(4, 165).float()
     x[:, 167] = 2.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -10,11 +9,6 @@ from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_keypoints as term
 
 K = 135
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
 
 
 def _random(*shape: int, seed: int = 0) -> Tensor:

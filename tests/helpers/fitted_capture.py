@@ -39,6 +39,7 @@ from intercap_core.schemas import (
     SCENE,
     TRUTH,
 )
+from tests.helpers.bodies import open_body
 
 FPS = 15.0
 BODY_OFFSET_M = 0.010  # the fitted body stands this much beside the true one, down
@@ -118,7 +119,7 @@ def make_capture(
 ) -> Capture:
     """Write all artefacts of a capture of ``total`` frame sets into ``folder``."""
     torch.manual_seed(0)
-    model = BodyModel.load()
+    model = open_body()
     entry = object_entry(object_name)
     mesh = ObjectMesh.load(entry)
     params = _body(model, total)
