@@ -22,19 +22,32 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 # Folders whose tests share a result that takes minutes: they stay with one worker.
 TOGETHER = ("workflow",)
-# Folders that start processes, render whole captures or fit whole sequences; `make test-fast`
-# leaves them out, and what is marked `slow` elsewhere.
-SLOW_FOLDERS = ("bench", "commands", "object_track", "report", "scene", "stages", "workflow")
+# Folders and files that start processes, render whole captures or fit whole sequences;
+# `make test-fast` leaves them out, and what is marked `slow` elsewhere.
+SLOW = (
+    "bench",
+    "body/test_jacobian.py",
+    "body_fit/test_compiled.py",
+    "commands",
+    "energy/test_body_self.py",
+    "object_track",
+    "report",
+    "rigid/test_open3d_core.py",
+    "scene",
+    "stages",
+    "test_kernel_cache.py",
+    "workflow",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files stay together on one worker, for their fixtures; slow folders are marked."""
+    """Files stay together on one worker, for their fixtures; slow ones are marked."""
     for item in items:
         place = item.path.relative_to(PROJECT_ROOT / "tests")
         folder = place.parts[0]
         group = folder if folder in TOGETHER else str(place)
         item.add_marker(pytest.mark.xdist_group(group))
-        if folder in SLOW_FOLDERS:
+        if folder in SLOW or place.as_posix() in SLOW:
             item.add_marker(pytest.mark.slow)
 
 
