@@ -43,6 +43,7 @@ def use_kernel_cache() -> Path | None:
     where neither can be written, in the folder for temporary files. None where none can.
     """
     name = _folder_name()
+    folder: Path | None
     try:
         folder = _prepared(_chosen_base() / name)
     except OSError as error:
