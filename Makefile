@@ -1,5 +1,7 @@
 # make demo      three virtual recordings, everything computed, the report's path at the end
-# make test      the whole test suite
+# make test      the whole test suite, on all cores (PYTEST=-n0 for one process)
+# make test-fast what a developer runs after each edit: all tests but the slow ones, which start
+#                processes, render whole captures or fit whole sequences
 # make lint      ruff, import-linter, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track and the body's fit, those of config/body to
@@ -17,14 +19,18 @@ STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
-.PHONY: demo test lint ruff-check ruff-format imports snakefmt mypy snakemake-lint evaluate evaluate-quick bench docs \
-    environment clean
+.PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
+    evaluate evaluate-quick bench docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
 
+# A file's tests stay on one worker, and those that share a whole run: see tests/conftest.py.
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
+
+test-fast: $(STAMP)
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m "not slow" $(PYTEST)
 
 lint: ruff-check ruff-format imports snakefmt mypy snakemake-lint
 

@@ -5,9 +5,68 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from intercap_core.pipeline.job import THREAD_VARIABLES
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # the workers fill the cores; before numpy is imported
+    for variable in THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
+
 import pytest
+import torch
+
+from intercap_core.body.model import BodyModel
+from tests.helpers.bodies import open_body
 
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
+
+
+# Folders whose tests share a result that takes minutes: they stay with one worker.
+TOGETHER = ("workflow",)
+# Folders and files that start processes, render whole captures or fit whole sequences;
+# `make test-fast` leaves them out, and what is marked `slow` elsewhere.
+SLOW = (
+    "bench",
+    "body/test_jacobian.py",
+    "body_fit/test_compiled.py",
+    "commands",
+    "energy/test_body_self.py",
+    "object_track",
+    "report",
+    "rigid/test_open3d_core.py",
+    "scene",
+    "stages",
+    "test_kernel_cache.py",
+    "workflow",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files stay together on one worker, for their fixtures; slow ones are marked."""
+    for item in items:
+        place = item.path.relative_to(PROJECT_ROOT / "tests")
+        folder = place.parts[0]
+        group = folder if folder in TOGETHER else str(place)
+        item.add_marker(pytest.mark.xdist_group(group))
+        if folder in SLOW or place.as_posix() in SLOW:
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session")
+def body() -> BodyModel:
+    """The open body; tests must not change it."""
+    return open_body()
+
+
+@pytest.fixture(scope="session")
+def body64() -> BodyModel:
+    """The open body in double precision."""
+    return open_body(torch.float64)
+
+
+@pytest.fixture(scope="session")
+def model(body: BodyModel) -> BodyModel:
+    """The open body by the name that the fit gives it."""
+    return body
 
 
 def _sample(name: str) -> Path:

@@ -18,6 +18,7 @@ from pathlib import Path
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1]
 DECLARATIONS = frozenset({f"{PACKAGE}.{name}" for name in ("config", "schemas", "project")})
+NEUTRAL = frozenset({f"{PACKAGE}.kernel_cache"})  # where compiled code lies changes no result
 CONSTANTS = (".constants", "_constants")  # ends of modules that hold a room's numbers
 DATA_FOLDERS = ("data", "templates")
 
@@ -64,6 +65,8 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
     waiting = [(name, WHOLE) for name in (start, *_parents(start))]
     while waiting:
         name, used = waiting.pop()
+        if name in NEUTRAL:
+            continue
         if name not in DECLARATIONS and not name.endswith(CONSTANTS):
             used = WHOLE
         known = reached.get(name, frozenset())

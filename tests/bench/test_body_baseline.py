@@ -18,6 +18,7 @@ from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import BodyFitSettings
 from intercap_core.metrics.proximity import Sight
+from tests.helpers.bodies import open_body
 from tests.helpers.synthetic_capture import ring
 
 FRAMES, POINTS = 2, 300
@@ -35,7 +36,7 @@ def bodies(model: BodyModel) -> Tensor:
 
 @pytest.fixture(scope="module")
 def truth() -> tuple[BodyClip, Tensor]:
-    model = BodyModel.load()
+    model = open_body()
     rig, up_from_master = ring(3)
     vectors = bodies(model)
     target = apply(invert(up_from_master), np.array([0.0, 0.0, 0.9]))

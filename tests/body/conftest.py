@@ -13,7 +13,6 @@ import torch
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.maps import maps_path
-from intercap_core.body.model import BodyModel
 
 # A pickled dictionary, as published
 _JOINT_NUMBERS = np.array({name: i for i, name in enumerate(JOINT_NAMES)})
@@ -72,16 +71,6 @@ def gendered_file(
     folder = tmp_path_factory.mktemp(gender)
     yield save_body(folder / f"SMPLX_{gender.upper()}.npz", arrays)
     shutil.rmtree(folder)
-
-
-@pytest.fixture(scope="session")
-def body() -> BodyModel:
-    return BodyModel.load()
-
-
-@pytest.fixture(scope="session")
-def body64() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
 
 
 def random_vector(batch: int, size: int, seed: int, dtype: torch.dtype) -> torch.Tensor:

@@ -15,11 +15,6 @@ SHARED = 10 + 75 + 8
 MODEL_M = 0.001
 
 
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load()
-
-
 def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> Fit:
     """Equal frames of a random energy."""
     columns = columns_of(model, hands=True, face=True, betas=False)

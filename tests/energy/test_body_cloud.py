@@ -12,11 +12,7 @@ from intercap_core.body.normals import vertex_normals
 from intercap_core.energy import body_cloud as term
 from intercap_core.energy.body_samples import COVERINGS, Samples, choose_samples
 from intercap_core.energy.body_surface import Surface
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
+from tests.helpers.bodies import open_body, random_normal
 
 
 @pytest.fixture(scope="module")
@@ -24,20 +20,16 @@ def samples(model: BodyModel) -> Samples:
     return choose_samples(model)
 
 
-def _random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
 def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: Samples) -> None:
     ids, group = torch.as_tensor(samples.vertex), torch.as_tensor(samples.group)
-    x = 0.1 * _random(2, model.num_parameters)
-    u = 0.3 * _random(len(COVERINGS), seed=1)
+    x = 0.1 * random_normal(2, model.num_parameters)
+    u = 0.3 * random_normal(len(COVERINGS), seed=1)
     rest = torch.tensor([c.thickness for c in COVERINGS], dtype=torch.float64)
     count = len(samples.vertex)
     rows = term.CloudRows(
-        target=_random(2, count, seed=2),
-        normal=torch.nn.functional.normalize(_random(2, count, 3, seed=3), dim=2),
-        weight=_random(2, count, seed=4).abs(),
+        target=random_normal(2, count, seed=2),
+        normal=torch.nn.functional.normalize(random_normal(2, count, 3, seed=3), dim=2),
+        weight=random_normal(2, count, seed=4).abs(),
         distance=torch.zeros(2, count, dtype=torch.float64),
     )
     linear = model.linearise(model.parameters(x), vertex_ids=ids)
@@ -49,7 +41,7 @@ def test_gradient_by_pose_shape_and_covering(model: BodyModel, samples: Samples)
         return term.cost(points, rows, rest * u.exp(), group)
 
     torch.testing.assert_close(found.cost, cost(x, u))
-    step, direction, turn = 1e-6, _random(*x.shape, seed=5), _random(len(u), seed=6)
+    step, direction, turn = 1e-6, random_normal(*x.shape, seed=5), random_normal(len(u), seed=6)
     slope = (cost(x + step * direction, u) - cost(x - step * direction, u)) / (2 * step)
     torch.testing.assert_close((found.gradient * direction).sum(1), slope, rtol=1e-6, atol=1e-5)
     slope = (cost(x, u + step * turn) - cost(x, u - step * turn)) / (2 * step)
@@ -60,10 +52,10 @@ def test_cross_block_is_the_gauss_newton_product(model: BodyModel, samples: Samp
     group = torch.as_tensor(samples.group)
     count = len(group)
     thickness = torch.linspace(0.001, 0.01, len(COVERINGS), dtype=torch.float64)
-    by, points = _random(1, count, 4), _random(1, count, 3, seed=1)
+    by, points = random_normal(1, count, 4), random_normal(1, count, 3, seed=1)
     rows = term.CloudRows(
-        _random(1, count, seed=2), _random(1, count, 3, seed=3),
-        _random(1, count, seed=4).abs(), torch.zeros(1, count).double(),
+        random_normal(1, count, seed=2), random_normal(1, count, 3, seed=3),
+        random_normal(1, count, seed=4).abs(), torch.zeros(1, count).double(),
     )  # fmt: skip
     found = term.assemble(points, by, by, rows, thickness, group)
     pick = torch.zeros(count, len(thickness), dtype=torch.float64)
@@ -127,9 +119,9 @@ def test_samples_cover_the_outer_skin(model: BodyModel, samples: Samples) -> Non
 
 def _posed_bodies() -> tuple[BodyModel, Samples, Tensor]:
     """Four bodies (4,P) in single precision, bent anyhow, two metres before the camera."""
-    model = BodyModel.load()
+    model = open_body()
     x = model.zeros(4).vector().clone()
-    x[:, :165] += 0.3 * _random(4, 165).float()
+    x[:, :165] += 0.3 * random_normal(4, 165).float()
     x[:, 167] = 2.0
     return model, choose_samples(model), x
 

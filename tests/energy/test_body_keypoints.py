@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_keypoints as term
+from tests.helpers.bodies import random_normal
 
 K = 135
 
 
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
-
-
-def _random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
 def _vector(model: BodyModel, batch: int = 2) -> Tensor:
-    x = 0.15 * _random(batch, model.num_parameters)
+    x = 0.15 * random_normal(batch, model.num_parameters)
     x[:, 165:168] += torch.tensor([0.0, 0.0, 2.5], dtype=torch.float64)
     return x
 
@@ -30,10 +21,10 @@ def _vector(model: BodyModel, batch: int = 2) -> Tensor:
 def test_offset_keypoints_follow_their_bones(model: BodyModel) -> None:
     """Derivatives of displaced keypoints by every parameter match central differences."""
     carried = term.keypoint_set(model, range(K))
-    offsets = 0.02 * _random(K, 3, seed=1)
+    offsets = 0.02 * random_normal(K, 3, seed=1)
     x = _vector(model)
     found = term.evaluate(model, model.parameters(x), carried, offsets, derivatives=True)
-    direction = _random(*x.shape, seed=2)
+    direction = random_normal(*x.shape, seed=2)
     step = 1e-6
     ahead, back = (
         term.evaluate(
@@ -65,7 +56,7 @@ def _views(cameras: int = 3) -> tuple[Tensor, ...]:
     lenses[:, 12] = 1.7
     pose = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
     pose[:, 0, 3] = torch.linspace(-0.4, 0.4, cameras, dtype=torch.float64)
-    observed = 300 * _random(2, cameras, K, 2, seed=3) + 500
+    observed = 300 * random_normal(2, cameras, K, 2, seed=3) + 500
     confidence = torch.rand(
         2, cameras, K, dtype=torch.float64, generator=torch.Generator().manual_seed(4)
     )
@@ -78,9 +69,9 @@ def _views(cameras: int = 3) -> tuple[Tensor, ...]:
 def test_gradient_of_the_whole_term(model: BodyModel) -> None:
     """By pose, shape and offsets, through projection, robust weight and sums over views."""
     carried = term.keypoint_set(model, range(K))
-    offsets = 0.02 * _random(K, 3, seed=1)
+    offsets = 0.02 * random_normal(K, 3, seed=1)
     views, x = _views(), _vector(model)
-    shift = 0.01 * _random(2, 3, K, 3, seed=8)
+    shift = 0.01 * random_normal(2, 3, K, 3, seed=8)
 
     def cost(x: Tensor, offsets: Tensor) -> Tensor:
         found = term.evaluate(model, model.parameters(x), carried, offsets, derivatives=False)
@@ -95,22 +86,22 @@ def test_gradient_of_the_whole_term(model: BodyModel) -> None:
     assert cross.shape == (2, model.num_parameters, 75)
 
     step = 1e-6
-    direction = _random(*x.shape, seed=5)
+    direction = random_normal(*x.shape, seed=5)
     slope = (cost(x + step * direction, offsets) - cost(x - step * direction, offsets)) / (2 * step)
     torch.testing.assert_close((gradient * direction).sum(1), slope, rtol=1e-5, atol=1e-4)
     move = torch.zeros(K, 3, dtype=torch.float64)
-    move[:25] = _random(25, 3, seed=6)
+    move[:25] = random_normal(25, 3, seed=6)
     slope = (cost(x, offsets + step * move) - cost(x, offsets - step * move)) / (2 * step)
     torch.testing.assert_close(by_offset @ move[:25].reshape(-1), slope, rtol=1e-5, atol=1e-4)
 
 
 def test_triangulated_targets(model: BodyModel) -> None:
-    points, targets = _random(2, K, 3), _random(2, K, 3, seed=9)
+    points, targets = random_normal(2, K, 3), random_normal(2, K, 3, seed=9)
     confidence = torch.ones(2, K, dtype=torch.float64)
     confidence[:, 3] = 0
     targets[:, 3] = torch.nan
     result = term.triangulated(points, targets, confidence, sigma=0.5, scale=4.0)
-    step, direction = 1e-6, _random(2, K, 3, seed=10)
+    step, direction = 1e-6, random_normal(2, K, 3, seed=10)
     up, down = (
         term.triangulated(points + s * step * direction, targets, confidence, sigma=0.5, scale=4.0)
         for s in (1, -1)

@@ -9,11 +9,6 @@ from intercap_core.body.model import BodyModel
 from intercap_core.energy import body_priors
 
 
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
-
-
 @pytest.mark.parametrize("shape", [True, False])
 def test_gradient_matches_differences(model: BodyModel, shape: bool) -> None:
     generator = torch.Generator().manual_seed(0)

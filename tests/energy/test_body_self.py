@@ -22,11 +22,6 @@ from intercap_core.solve.levenberg_marquardt import minimise
 
 
 @pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load(dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
 def contact(model: BodyModel) -> term.SelfContact:
     return term.SelfContact.of(model, choose_samples(model))
 

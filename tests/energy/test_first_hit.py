@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.body.model import BodyModel
 from intercap_core.energy.first_hit import first_hits
 from intercap_core.rigid.normals import vertex_normals
 from intercap_core.rigid.open3d_core import o3d
+from tests.helpers.bodies import open_body
 
 
 def test_rays_through_the_body_and_from_it() -> None:
-    model = BodyModel.load()
+    model = open_body()
     points, faces = model.template.double().numpy(), model.faces.numpy()
     normals = vertex_normals(points, faces)
     at = np.arange(0, len(points), 17)

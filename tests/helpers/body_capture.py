@@ -15,6 +15,7 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply, invert, rigid
 from intercap_core.rigid.render import render
 from intercap_core.schemas import FRAMES, PERSON, SCENE
+from tests.helpers.synthetic_capture import put_frame_sets, ring_of
 
 COLOUR = Intrinsics(640, 360, 306.0, 306.0, 319.5, 179.5)
 DEPTH = Intrinsics(320, 288, 252.0, 252.0, 159.5, 143.5)
@@ -34,32 +35,24 @@ class Inputs:
 
 def ring(count: int, radius: float = 2.3, lens: Intrinsics = COLOUR) -> Rig:
     """Cameras at breast height around the origin of a z-up room; the first one is master."""
-    poses = []
-    for i in range(count):
-        angle = 2 * np.pi * i / count
-        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.4])
-        forward = np.array([0, 0, 0.95]) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        poses.append(rigid(np.stack([right, np.cross(forward, right), forward], 1), eye))
-    master = invert(poses[0])
-    return Rig(
-        tuple(
-            Camera(f"k{i + 1}", lens, DEPTH, BASELINE, master @ pose)
-            for i, pose in enumerate(poses)
-        )
-    )
+    return _ring(count, radius, lens)[0]
 
 
 def master_from_room(radius: float = 2.3) -> np.ndarray:
     """(4,4): the z-up room of :func:`ring` in the master camera's frame."""
-    eye = np.array([radius, 0, 1.4])
-    forward = np.array([0, 0, 0.95]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    return invert(rigid(np.stack([right, np.cross(forward, right), forward], 1), eye))
+    return invert(_ring(1, radius, COLOUR)[1])
+
+
+def _ring(count: int, radius: float, lens: Intrinsics) -> tuple[Rig, np.ndarray]:
+    return ring_of(
+        count,
+        radius=radius,
+        height=1.4,
+        target_height=0.95,
+        colour=lens,
+        depth=DEPTH,
+        colour_from_depth=BASELINE,
+    )
 
 
 def write_capture(
@@ -151,19 +144,9 @@ def _mask(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> bytes:
 def _write_frames(path, rig, surface, faces, times, present, depth, noise, random) -> None:
     count, cameras = len(times), len(rig)
     with artefacts.write(path, FRAMES, sequence="test", master="k1", fps=FPS) as writer:
-        for key, values in rig.datasets().items():
-            writer.put(key, values)
-        writer.put("master_from_colour", rig.master_from_colour)
-        writer.put("gravity", np.full((cameras, 3), np.nan))
-        writer.put("present", np.ones(cameras, bool))
-        writer.put("truncated", np.zeros(cameras, bool))
-        writer.put("note", [""] * cameras)
-        writer.put("times", times)
-        writer.put("dropped", np.zeros(count, bool))
         index = np.repeat(np.arange(count)[:, None], cameras, 1)
-        writer.put("colour_index", np.full_like(index, -1))
-        writer.put("depth_index", index if depth else np.full_like(index, -1))
-        writer.put("skew", np.zeros((count, cameras)))
+        none = np.full_like(index, -1)
+        put_frame_sets(writer, rig, times, colour_index=none, depth_index=index if depth else none)
         for c, camera in enumerate(rig):
             group = f"cameras/{camera.name}"
             writer.put(f"{group}/colour", np.zeros(0, np.uint8))

@@ -39,6 +39,8 @@ from intercap_core.schemas import (
     SCENE,
     TRUTH,
 )
+from tests.helpers.bodies import open_body
+from tests.helpers.synthetic_capture import put_frame_sets
 
 FPS = 15.0
 BODY_OFFSET_M = 0.010  # the fitted body stands this much beside the true one, down
@@ -118,7 +120,7 @@ def make_capture(
 ) -> Capture:
     """Write all artefacts of a capture of ``total`` frame sets into ``folder``."""
     torch.manual_seed(0)
-    model = BodyModel.load()
+    model = open_body()
     entry = object_entry(object_name)
     mesh = ObjectMesh.load(entry)
     params = _body(model, total)
@@ -179,19 +181,15 @@ def _write_frames(capture: Capture, views: Any, name: str) -> None:
     with artefacts.write(
         capture.paths["frames"], FRAMES, sequence=name, master="k1", fps=FPS
     ) as writer:
-        for key, value in rig.datasets().items():
-            writer.put(key, value)
-        writer.put("master_from_colour", rig.master_from_colour)
-        writer.put("gravity", np.tile([0.0, 1.0, 0.0], (count, 1)))
-        writer.put("present", np.ones(count, bool))
-        writer.put("truncated", np.zeros(count, bool))
-        writer.put("note", [""] * count)
-        writer.put("times", np.arange(total) / FPS)
-        writer.put("dropped", np.zeros(total, bool))
         index = np.repeat(np.arange(total)[:, None], count, 1)
-        writer.put("colour_index", index)
-        writer.put("depth_index", index)
-        writer.put("skew", np.zeros((total, count)))
+        put_frame_sets(
+            writer,
+            rig,
+            np.arange(total) / FPS,
+            colour_index=index,
+            depth_index=index,
+            gravity=np.tile([0.0, 1.0, 0.0], (count, 1)),
+        )
         _fill(writer, FRAMES, T=total, C=count)
         for c, camera in enumerate(rig):
             packets, depths = [], []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import os
 import shutil
 import subprocess
@@ -9,9 +11,33 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from numba.core.caching import _CacheLocator
+
+from intercap_core.kernel_cache import use_kernel_cache
+
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core")
+KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache beside the source
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
+
+
+def share_kernels(package: Path, cache: Path) -> None:
+    """Let a copy of the package at ``package`` keep its kernels in ``cache``, beside the project's.
+
+    Numba tells sources apart by their path. So for each folder of the copy there is a link to
+    where the project's own kernels of that folder lie; an edited copy has a cache of its own.
+    """
+    own = use_kernel_cache()
+    assert own is not None
+    shared = cache / own.name
+    shared.mkdir(parents=True)
+    for module in (ROOT / "intercap_core").rglob("*.py"):
+        copied = package / module.relative_to(ROOT / "intercap_core")
+        link = shared / _CacheLocator.get_suitable_cache_subpath(str(copied))
+        if not link.is_symlink():
+            target = own / _CacheLocator.get_suitable_cache_subpath(str(module))
+            target.mkdir(exist_ok=True)
+            link.symlink_to(target)
 
 
 @dataclass(frozen=True)
@@ -23,14 +49,21 @@ class Flow:
 
     @classmethod
     def copy(cls, folder: Path, settings: str = "config/test/config.yaml") -> Flow:
-        """Copy what a run needs; compiled caches come along."""
+        """Copy what a run needs; compiled kernels are shared with the project."""
         for name in COPIED:
             source = ROOT / name
             if source.is_dir():
-                shutil.copytree(source, folder / name)
+                shutil.copytree(source, folder / name, ignore=KERNELS)
             else:
                 shutil.copy2(source, folder / name)
+        share_kernels(folder / "intercap_core", folder / "kernels")
         return cls(folder, settings)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What the folder's own package is run with."""
+        kernels = str(self.folder / "kernels")
+        return {**os.environ, "PYTHONPATH": str(self.folder), "NUMBA_CACHE_DIR": kernels}
 
     @property
     def results(self) -> Path:
@@ -42,6 +75,17 @@ class Flow:
     def annotation(self, sequence: str) -> Path:
         return self.folder / Path(self.settings).parent / "annotations" / f"{sequence}.yaml"
 
+    def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """What `run` does, by a process that has started already: see `warm_snakemake`."""
+        given = ["--configfile", self.settings, "--cores", "2", *arguments]
+        output, errors = (self.folder / f"asked.{name}" for name in ("out", "err"))
+        server = _server(self)
+        assert server.stdin is not None and server.stdout is not None
+        server.stdin.write(json.dumps([given, str(output), str(errors)]) + "\n")
+        server.stdin.flush()
+        status = int(server.stdout.readline())
+        return subprocess.CompletedProcess(given, status, output.read_text(), errors.read_text())
+
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run Snakemake in the folder, with the folder's own package."""
         command = [
@@ -51,7 +95,7 @@ class Flow:
         return subprocess.run(
             command,
             cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(self.folder)},
+            env=self.environment,
             capture_output=True,
             text=True,
         )
@@ -66,14 +110,17 @@ class Flow:
         return subprocess.run(
             [sys.executable, "-m", "intercap_core.cli", *arguments],
             cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(self.folder), "COLUMNS": "400"},
+            env={**self.environment, "COLUMNS": "400"},
             capture_output=True,
             text=True,
         )
 
-    def pending(self) -> set[tuple[str, str]]:
-        """(sequence, rule) of every job that a run would start now; "" for the whole dataset."""
-        done = self.run("--summary")
+    def pending(self, *, anew: bool = False) -> set[tuple[str, str]]:
+        """(sequence, rule) of every job that a run would start now; "" for the whole dataset.
+
+        ``anew`` starts Snakemake for it, as a user does.
+        """
+        done = self.run("--summary") if anew else self.ask("--summary")
         assert done.returncode == 0, done.stderr
         header, *rows = [line.split("\t") for line in done.stdout.splitlines() if "\t" in line]
         entries = [dict(zip(header, row, strict=True)) for row in rows]
@@ -83,3 +130,16 @@ class Flow:
                 folder = Path(entry["log-file(s)"]).parent.name  # the sequence's or the dataset's
                 pending.add(("" if folder == self.results.name else folder, entry["rule"]))
         return pending
+
+
+@functools.cache
+def _server(flow: Flow) -> subprocess.Popen[str]:
+    """The process that answers for this folder; it ends with this one, when its input closes."""
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "tests" / "helpers" / "warm_snakemake.py")],
+        cwd=flow.folder,
+        env=flow.environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )

@@ -16,13 +16,19 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.artefacts import pack_ragged
 from intercap_core.camera.masks import encode
-from intercap_core.camera.rig import Camera, Rig
+from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert, rigid
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import render_scene
 from intercap_core.rigid.shots import Drawable
 from intercap_core.schemas import DETECTIONS, FRAMES, PERSON, SCENE
-from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH, looking_at
+from tests.helpers.synthetic_capture import (
+    COLOUR,
+    COLOUR_FROM_DEPTH,
+    DEPTH,
+    put_frame_sets,
+    ring_of,
+)
 
 FPS = 15.0
 COLOUR_HALF = COLOUR.scaled(0.5)
@@ -32,17 +38,17 @@ Detected = list[tuple[int, str, float, bytes]]
 
 def ring(count: int, radius: float = 2.2) -> tuple[Rig, np.ndarray]:
     """Cameras around the origin of a z-up room, and master_from_room (4, 4)."""
-    poses = []
-    for i in range(count):
-        angle = 2 * np.pi * i / count + 0.3
-        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.5])
-        poses.append(looking_at(eye, np.array([0, 0, 0.6])))
-    master = invert(poses[0])
-    cameras = tuple(
-        Camera(f"k{i + 1}", COLOUR_HALF, DEPTH_LENS, COLOUR_FROM_DEPTH, master @ pose)
-        for i, pose in enumerate(poses)
+    rig, room_from_master = ring_of(
+        count,
+        radius=radius,
+        height=1.5,
+        target_height=0.6,
+        first_angle=0.3,
+        colour=COLOUR_HALF,
+        depth=DEPTH_LENS,
+        colour_from_depth=COLOUR_FROM_DEPTH,
     )
-    return Rig(cameras), master
+    return rig, invert(room_from_master)
 
 
 @dataclass
@@ -150,18 +156,8 @@ class ObjectCapture:
         }
         index = np.tile(np.arange(count)[:, None], (1, cameras))
         with artefacts.write(paths["frames"], FRAMES, sequence="glide", master="k1", fps=FPS) as w:
-            for key, value in models.items():
-                w.put(key, value)
-            w.put("master_from_colour", extrinsics)
-            w.put("gravity", np.full((cameras, 3), np.nan))
-            for key in ("present", "truncated"):
-                w.put(key, np.full(cameras, key == "present"))
-            w.put("note", [""] * cameras)
-            w.put("times", times)
-            w.put("dropped", np.zeros(count, bool))
-            w.put("colour_index", np.full((count, cameras), -1))
-            w.put("depth_index", index)
-            w.put("skew", np.zeros((count, cameras)))
+            none = np.full_like(index, -1)
+            put_frame_sets(w, self.rig, times, colour_index=none, depth_index=index)
             for c, name in enumerate(names):
                 w.put(f"cameras/{name}/colour", np.zeros(0, np.uint8))
                 w.put(f"cameras/{name}/colour_offsets", np.zeros(1, np.int64))

@@ -37,19 +37,45 @@ def looking_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
     return rigid(np.stack([right, np.cross(forward, right), forward], 1), centre)
 
 
-def ring(count: int = 6, radius: float = 2.6, height: float = 1.7) -> tuple[Rig, np.ndarray]:
-    """A rig of ``count`` cameras and zup_from_master (4, 4); the floor is z = 0."""
+def ring_of(
+    count: int,
+    *,
+    radius: float,
+    height: float,
+    target_height: float,
+    colour: Intrinsics,
+    depth: Intrinsics,
+    colour_from_depth: np.ndarray,
+    first_angle: float = 0.0,
+) -> tuple[Rig, np.ndarray]:
+    """Equal cameras around the z axis of a room with z up, and room_from_master (4, 4).
+
+    All look at the axis at ``target_height``; the first one, at ``first_angle``, is the master.
+    """
     poses = []
     for index in range(count):
-        angle = 2 * np.pi * index / count
+        angle = 2 * np.pi * index / count + first_angle
         centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        poses.append(looking_at(centre, np.array([0, 0, 0.8])))
-    master_from_world = invert(poses[0])
+        poses.append(looking_at(centre, np.array([0, 0, target_height])))
+    master_from_room = invert(poses[0])
     cameras = tuple(
-        Camera(f"k{i + 1}", COLOUR, DEPTH, COLOUR_FROM_DEPTH, master_from_world @ pose)
+        Camera(f"k{i + 1}", colour, depth, colour_from_depth, master_from_room @ pose)
         for i, pose in enumerate(poses)
     )
     return Rig(cameras), poses[0]
+
+
+def ring(count: int = 6, radius: float = 2.6, height: float = 1.7) -> tuple[Rig, np.ndarray]:
+    """A rig of ``count`` cameras and zup_from_master (4, 4); the floor is z = 0."""
+    return ring_of(
+        count,
+        radius=radius,
+        height=height,
+        target_height=0.8,
+        colour=COLOUR,
+        depth=DEPTH,
+        colour_from_depth=COLOUR_FROM_DEPTH,
+    )
 
 
 def room_depth(
@@ -124,6 +150,32 @@ def extrinsics_error(rig: Rig, truth: Rig, centre: np.ndarray, side: float = 2.0
     return np.sqrt((np.stack(moved) ** 2).sum(-1).mean(-1))
 
 
+def put_frame_sets(
+    writer: artefacts.Writer,
+    rig: Rig,
+    times: np.ndarray,
+    *,
+    colour_index: np.ndarray,
+    depth_index: np.ndarray,
+    dropped: np.ndarray | None = None,
+    gravity: np.ndarray | None = None,
+) -> None:
+    """What a frames artefact holds besides images; indices (T, C), ``gravity`` (C, 3)."""
+    count = len(rig)
+    for key, values in rig.datasets().items():
+        writer.put(key, values)
+    writer.put("master_from_colour", rig.master_from_colour)
+    writer.put("gravity", np.full((count, 3), np.nan) if gravity is None else gravity)
+    writer.put("present", np.ones(count, bool))
+    writer.put("truncated", np.zeros(count, bool))
+    writer.put("note", [""] * count)
+    writer.put("times", times)
+    writer.put("dropped", np.zeros(len(times), bool) if dropped is None else dropped)
+    writer.put("colour_index", colour_index)
+    writer.put("depth_index", depth_index)
+    writer.put("skew", np.zeros((len(times), count)))
+
+
 def write_frames(
     path: Path,
     rig: Rig,
@@ -139,18 +191,15 @@ def write_frames(
     sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
     none = np.full((num_sets, count), -1)
     with artefacts.write(path, FRAMES, sequence="test", master="k1", fps=15.0) as writer:
-        for key, values in rig.datasets().items():
-            writer.put(key, values)
-        writer.put("master_from_colour", rig.master_from_colour)
-        writer.put("gravity", np.full((count, 3), np.nan) if gravity is None else gravity)
-        writer.put("present", np.ones(count, bool))
-        writer.put("truncated", np.zeros(count, bool))
-        writer.put("note", [""] * count)
-        writer.put("times", np.arange(num_sets) / 15.0)
-        writer.put("dropped", np.zeros(num_sets, bool) if dropped is None else dropped)
-        writer.put("colour_index", sets if colour_index is None else colour_index)
-        writer.put("depth_index", none if depths is None else sets)
-        writer.put("skew", np.zeros((num_sets, count)))
+        put_frame_sets(
+            writer,
+            rig,
+            np.arange(num_sets) / 15.0,
+            colour_index=sets if colour_index is None else colour_index,
+            depth_index=none if depths is None else sets,
+            dropped=dropped,
+            gravity=gravity,
+        )
         for index, name in enumerate(rig.names):
             if depths is not None:
                 writer.put(f"cameras/{name}/depth", depths[index])

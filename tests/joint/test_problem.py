@@ -28,11 +28,6 @@ LEFT_HAND = CONTACT_REGIONS.index("left_hand")
 
 
 @pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load()
-
-
-@pytest.fixture(scope="module")
 def box() -> ObjectMesh:
     mesh = trimesh.creation.box((0.1, 0.1, 0.1))
     return ObjectMesh(

@@ -16,6 +16,7 @@ from intercap_core.config import BodyFitSettings
 from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.joint.sightings import cloud_sightings, keypoint_sightings
 from intercap_core.joint.time_offsets import OffsetPrior, estimate_offsets
+from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import master_from_room, ring, write_capture
 
 FRAMES, CAMERAS, FPS = 12, 4, 15.0
@@ -40,7 +41,7 @@ def _moving(model: BodyModel, times: np.ndarray) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """A fitter and its problem at the true bodies, in a capture whose cameras are ``LATE``."""
-    model = BodyModel.load()
+    model = open_body()
     times = np.arange(FRAMES) / FPS
     seen = [model.forward(model.parameters(_moving(model, times + late))) for late in LATE]
     inputs = write_capture(

@@ -31,15 +31,11 @@ from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS, PERSON
 from intercap_core.solve.levenberg_marquardt import minimise
 from intercap_core.stages import body_fit
+from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import Inputs, master_from_room, ring, write_capture
 
 SUBJECT = SubjectEntry(subject="s01", gender="neutral")
 SETTINGS = BodyFitSettings(points_per_frame=800)
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load()
 
 
 def motion(model: BodyModel, frames: int, seed: int = 0) -> torch.Tensor:
@@ -160,8 +156,8 @@ def _normals(model: BodyModel, vertices: torch.Tensor) -> np.ndarray:
 
 def test_exact_keypoints_alone_give_the_parameters_back() -> None:
     """With next to no noise assumed, E_J alone returns body, hands and face to under 1 mm."""
-    model = BodyModel.load(dtype=torch.float64)
-    truth = motion(BodyModel.load(), 3).double()
+    model = open_body(torch.float64)
+    truth = motion(open_body(), 3).double()
     points = model.keypoints_of(model.parameters(truth))
     rig = ring(4)
     pose, lenses = torch.tensor(rig.colour_from_master), torch.tensor(rig.colour_parameters)
@@ -198,14 +194,14 @@ def test_exact_keypoints_alone_give_the_parameters_back() -> None:
 
 def test_normal_equations_of_the_whole_energy_match_differences() -> None:
     """Own and shared parameters, all terms together."""
-    model = BodyModel.load(dtype=torch.float64)
+    model = open_body(torch.float64)
     samples = body_samples.choose_samples(model)
     generator = torch.Generator().manual_seed(1)
 
     def random(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, dtype=torch.float64, generator=generator)
 
-    base = motion(BodyModel.load(), 2).double()
+    base = motion(open_body(), 2).double()
     rig = ring(3)
     count = len(samples.vertex)
     problem = BodyProblem(

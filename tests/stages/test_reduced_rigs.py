@@ -41,11 +41,6 @@ SETS = 3
 # --- the person and the body -------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return BodyModel.load()
-
-
 def detected(paths: dict[str, Path], rig: Rig, path: Path) -> Path:
     """Detections that hold exactly the keypoints and masks of a person artefact."""
     with artefacts.read(paths["person"], PERSON) as known:

@@ -13,6 +13,7 @@ from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings
+from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import FPS, master_from_room, ring
 
 FRAMES = 4
@@ -64,7 +65,7 @@ def _seen(model: BodyModel, truth: torch.Tensor) -> Observations:
 
 def test_hands_tell_the_detector_s_wrist_from_a_longer_forearm():
     """Held at what the body's keypoints alone say, the forearm is taken to be longer."""
-    model = BodyModel.load()
+    model = open_body()
     truth = _person(model)
     true = model.forward(model.parameters(truth)).joints.numpy()
     fit = Fitter(model, _seen(model, truth), [None] * FRAMES, BodyFitSettings()).run()

@@ -9,11 +9,6 @@ from intercap_core.studio.subjects import Subject, subject_names
 
 
 @pytest.fixture(scope="module")
-def body() -> BodyModel:
-    return BodyModel.load()
-
-
-@pytest.fixture(scope="module")
 def person() -> Subject:
     return Subject.load("s04")
 

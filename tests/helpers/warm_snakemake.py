@@ -1,0 +1,75 @@
+"""Runs Snakemake again and again without its start: one line of arguments in, one status out.
+
+Started in a copy of the project, by its own package. Every request is answered by a fork of this
+process, which has imported Snakemake and the package's settings and read the code's syntax trees.
+What it has read is kept by each file's date, so edits of the copy are seen; where a module that is
+imported here has itself been edited, the fork starts Snakemake anew.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+
+PRELOADED = (
+    "snakemake.cli",
+    "snakemake.api",
+    "snakemake.workflow",
+    "snakemake.executors.touch",
+    "pandas",
+    "intercap_core.pipeline.code_digest",
+    "intercap_core.capture.layouts",
+    "intercap_core.project",
+)
+
+
+def imported() -> dict[str, tuple[int, int]]:
+    """Date and size of each file of the package that this process has imported."""
+    paths = [
+        module.__file__
+        for name, module in sys.modules.items()
+        if name.partition(".")[0] == "intercap_core" and module.__file__
+    ]
+    return {path: (os.stat(path).st_mtime_ns, os.stat(path).st_size) for path in paths}
+
+
+def answer(arguments: list[str], output: str, errors: str, *, edited: bool) -> int:
+    """Run ``snakemake arguments`` in a fork, its output in two files; returns its exit status."""
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    status = 1
+    try:
+        for path, number in ((output, 1), (errors, 2)):
+            target = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(target, number)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        if edited:
+            os.execv(sys.executable, [sys.executable, "-m", "snakemake", *arguments])
+        sys.argv = ["snakemake", *arguments]
+        sys.modules["snakemake.cli"].main(arguments)
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def serve() -> None:
+    for name in PRELOADED:
+        importlib.import_module(name)
+    from intercap_core.pipeline.code_digest import code_digest
+    from intercap_core.stage_list import SEQUENCE_STAGES
+
+    for stage in (*SEQUENCE_STAGES, "export", "dataset"):
+        code_digest(f"stages.{stage}")
+    files = imported()
+    for line in sys.stdin:
+        print(answer(*json.loads(line), edited=imported() != files), flush=True)
+
+
+if __name__ == "__main__":
+    serve()
