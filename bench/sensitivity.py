@@ -93,8 +93,8 @@ def probe(replays: Replays, probes: Sequence[Probe]) -> str:
     constants = [find_constant(p.name) for p in probes]
     for constant in constants:
         if constant.room not in STAGES:
-            rooms = ", ".join(STAGES)
-            raise UserError(f"{constant.label}: its room has no stage to replay; rooms: {rooms}")
+            known = ", ".join(STAGES)
+            raise UserError(f"{constant.label}: its room has no stage to replay; rooms: {known}")
     rooms = sorted({c.room for c in constants})
     runs = [Run(room) for room in rooms]
     for one, constant in zip(probes, constants, strict=True):
