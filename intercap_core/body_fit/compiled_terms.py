@@ -49,8 +49,8 @@ from intercap_core.energy.body_surface_kernel import (
     add_self_equations,
 )
 from intercap_core.energy.sightings_kernel import KeypointObservations
-from intercap_core.solve.crew import Crew
 from intercap_core.solve.levenberg_marquardt import NormalEquations
+from intercap_core.solve.thread_pool import ThreadPool
 
 _SHAPE = TRANSL.stop
 
@@ -391,12 +391,12 @@ def _at_rest(selection: Selection, shape: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _crew(threads: int) -> Crew:
-    return Crew(threads)
+def _thread_pool(threads: int) -> ThreadPool:
+    return ThreadPool(threads)
 
 
 def _divide_frames(add_frames: Callable[[slice], None], count: int) -> None:
     """Call ``add_frames`` on all of so many frames, in equal parts for each thread."""
     threads = torch.get_num_threads()
     step = max(1, -(-count // threads))
-    _crew(threads).map(add_frames, [slice(i, i + step) for i in range(0, count, step)])
+    _thread_pool(threads).map(add_frames, [slice(i, i + step) for i in range(0, count, step)])

@@ -43,8 +43,8 @@ from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.energy.body_self import SelfContact
 from intercap_core.energy.body_surface import Surface
-from intercap_core.solve.crew import Crew
 from intercap_core.solve.robust import SIGMA_PER_MAD
+from intercap_core.solve.thread_pool import ThreadPool
 from intercap_core.solve.velocity import limited_velocity
 
 
@@ -103,7 +103,7 @@ class Evidence:
         self.sample_joints = carrier[self.samples.vertex]
         self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
         # frame by frame in compiled code, which threads can share
-        self._crew = Crew(torch.get_num_threads() if model.device.type == "cpu" else 1)
+        self._threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
         self.by_view: ViewDistances | None = None
@@ -336,7 +336,7 @@ class Evidence:
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)
         found = []
         for _, vertices, normals in self._bodies(problem.base):
-            found += self._crew.map(
+            found += self._threads.map(
                 lambda one: body_self.find(self.self_contact, *one),
                 list(zip(vertices, normals, strict=True)),
             )
@@ -367,7 +367,7 @@ class Evidence:
                     t, vertices, normals, where[t], late, expected, reach
                 )
 
-            self._crew.map(matched, seen)
+            self._threads.map(matched, seen)
         self.by_view = ViewDistances(of_views, points, normal)
         total = points.sum(1)
         mean = (of_views * points).sum(1) / total.clamp_min(1e-6)

@@ -51,7 +51,7 @@ def evidence_at(
         found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
         return found, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
 
-    found = renderer.crew.map(terms, fits)
+    found = renderer.pool.map(terms, fits)
     return PoseEvidence(
         np.array([h for (h, _), _ in found]),
         np.array([g for (_, g), _ in found]),

@@ -132,8 +132,8 @@ def fit_pose(
     done = False
     for number, steps in enumerate(rounds):
         if number == 0:
-            renderer.crew.map(ViewFit.choose, fits)
-        elif not any(renderer.crew.map(ViewFit.choose_again, fits)) and done:
+            renderer.pool.map(ViewFit.choose, fits)
+        elif not any(renderer.pool.map(ViewFit.choose_again, fits)) and done:
             break
         done = False
         last = np.zeros(6)
@@ -154,7 +154,7 @@ def fit_pose(
                 last, drawn_pose = np.zeros(6), pose
                 _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
     report_scale = REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1]
-    reports = renderer.crew.map(lambda fit: fit.report(report_scale), fits)
+    reports = renderer.pool.map(lambda fit: fit.report(report_scale), fits)
     return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), tuple(reports))
 
 
@@ -173,7 +173,7 @@ def _step(
         return fit.normal_equations(depth_scale, contour_scale, background)
 
     hessian, gradient = _prior_terms(prior, pose)
-    for h, g in renderer.crew.map(terms, fits):
+    for h, g in renderer.pool.map(terms, fits):
         hessian += h
         gradient += g
     damped = hessian + np.diag(FIT_DAMPING * np.diag(hessian) + 1e-9)
@@ -257,7 +257,7 @@ def assess_all(
             mesh, view, pose, silhouette, depth[0] if depth else None, min_overlap, labels
         )
 
-    reports = renderer.crew.map(compare, range(len(cases)))
+    reports = renderer.pool.map(compare, range(len(cases)))
     unknown = np.full((6, 6), np.nan)
     count = len(views)
     return [

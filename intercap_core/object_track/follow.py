@@ -26,7 +26,7 @@ from intercap_core.object_track.constants import (
     USUAL_SCORE_RATE,
 )
 from intercap_core.object_track.fit import Fit
-from intercap_core.object_track.lost import FrameResult, Named, judged
+from intercap_core.object_track.lost import DetectionSupport, FrameResult, judged
 from intercap_core.object_track.motion import expected, extrapolated, loose
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.search import same_pose
@@ -48,7 +48,7 @@ def follow(
     before, now = start.fit.pose, start.fit.pose
     usual = max(start.fit.score, LOST_SCORE)
     lost_for = 1 if start.lost else 0
-    named = Named(observer.mesh.centre_at(now))
+    support = DetectionSupport(observer.mesh.centre_at(now))
     searches = doubted_for = 0
     most = SEARCHES_MAX + len(frames) // SEARCH_EVERY_FRAMES
     for t in frames:
@@ -59,7 +59,7 @@ def follow(
             result = known[t]
         else:
             result = judged(observer.fit(t, start_pose, prior), observer.settings)
-        if not named.believes(observer.mesh.centre_at(result.fit.pose), result.fit):
+        if not support.believes(observer.mesh.centre_at(result.fit.pose), result.fit):
             result = replace(result, lost=True)
         leapt = False
         doubtful = result.lost or result.fit.score < DOUBTFUL_SCORE * usual
@@ -128,10 +128,10 @@ def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
     """Whether candidates of enough views show the object there: far from where it was one alone
     may be anything."""
     looked = sum(view.detected for view in fit.views)
-    named = sum(view.candidate >= 0 for view in fit.views)
+    supporting = sum(view.candidate >= 0 for view in fit.views)
     away = float(np.linalg.norm(observer.mesh.centre_at(fit.pose) - observer.mesh.centre_at(last)))
     far = away > NEAR_LAST_PLACE_M
-    return named >= min(RECOVERY_NAMED_VIEWS if far else 1, -(-looked // RECOVERY_VIEWS_EACH))
+    return supporting >= min(RECOVERY_NAMED_VIEWS if far else 1, -(-looked // RECOVERY_VIEWS_EACH))
 
 
 def _leap(mesh: ObjectMesh, last: np.ndarray, pose: np.ndarray) -> float:

@@ -61,7 +61,7 @@ def decided(gain: np.ndarray) -> bool:
     )
 
 
-class Named:
+class DetectionSupport:
     """The last place where a detection supported the track: depth alone also matches a floor.
 
     ``place`` (3,), metres, is where the track starts.
@@ -101,7 +101,7 @@ def doubted(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
 def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
     """Which frames (T) no candidate supports, seen from those before."""
     places = [mesh.centre_at(frame.fit.pose) for frame in frames]
-    named = Named(places[0])
+    named = DetectionSupport(places[0])
     believed = [named.believes(at, frame.fit) for at, frame in zip(places, frames, strict=True)]
     return ~np.array(believed)
 

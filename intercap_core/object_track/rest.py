@@ -25,23 +25,23 @@ from intercap_core.object_track.constants import (
     REST_VARIANCE_BOUNDS,
     UNSEEN_MOVING_COST,
 )
-from intercap_core.object_track.smooth import Looks
+from intercap_core.object_track.smooth import FrameEvidence
 from intercap_core.rigid.pose import rotation_exp
 from intercap_core.rigid.twist import step_between
 
 
-def resting(looks: Looks, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def resting(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Which frames (T,) rest, as segments numbered from 0, -1 where the object moves.
 
     Frames without evidence rest where those around them do at one pose.
     """
-    looks = looks.about(centre)
+    evidence = evidence.about(centre)
     count = len(times)
-    own = looks.own
-    poses = looks.poses.copy()
+    own = evidence.own
+    poses = evidence.poses.copy()
     poses[:, :3, :3] = rotation_exp(own[:, :3]) @ poses[:, :3, :3]
     poses[:, :3, 3] += own[:, 3:]
-    information = _without_blips(poses, looks.information)
+    information = _without_blips(poses, evidence.information)
     seen = np.trace(information, axis1=1, axis2=2) > 0
     step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
     share = min(1.0, step / ERROR_LASTING_S)
@@ -108,17 +108,17 @@ def _partition(
 
 def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Squared normalised distances (L,) of the first 1, 2, ... frames from their common pose."""
-    away = step_between(np.broadcast_to(poses[0], poses.shape), poses)
-    away[~seen] = 0
-    far = (np.abs(away) > REST_MAX_DISTANCE).any(1)
+    offset = step_between(np.broadcast_to(poses[0], poses.shape), poses)
+    offset[~seen] = 0
+    far = (np.abs(offset) > REST_MAX_DISTANCE).any(1)
     count = int(far.argmax()) if far.any() else len(poses)
-    away, information = away[:count], information[:count]
-    pulled = np.einsum("tij,tj->ti", information, away)
+    offset, information = offset[:count], information[:count]
+    weighted_offset = np.einsum("tij,tj->ti", information, offset)
     total = information.cumsum(0) + 1e-9 * np.eye(6)
-    pull = pulled.cumsum(0)
-    common = np.linalg.solve(total, pull[..., None])[..., 0]
-    squares = np.einsum("ti,ti->t", pulled, away).cumsum()
-    return np.maximum(squares - np.einsum("ti,ti->t", pull, common), 0.0)
+    gradient = weighted_offset.cumsum(0)
+    common = np.linalg.solve(total, gradient[..., None])[..., 0]
+    squares = np.einsum("ti,ti->t", weighted_offset, offset).cumsum()
+    return np.maximum(squares - np.einsum("ti,ti->t", gradient, common), 0.0)
 
 
 def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -127,11 +127,11 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
     result = segments.copy()
     for number in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == number)
-        away = step_between(poses[rest[[len(rest) // 2]]], poses[rest])
-        pull = np.einsum("tij,tj->i", information[rest], away)
-        common = np.linalg.solve(information[rest].sum(0) + 1e-9 * np.eye(6), pull)
+        offset = step_between(poses[rest[[len(rest) // 2]]], poses[rest])
+        gradient = np.einsum("tij,tj->i", information[rest], offset)
+        common = np.linalg.solve(information[rest].sum(0) + 1e-9 * np.eye(6), gradient)
         off = (
-            np.einsum("ti,tij,tj->t", away - common, information[rest], away - common)
+            np.einsum("ti,tij,tj->t", offset - common, information[rest], offset - common)
             > REST_EDGE_SQUARED
         )
         if off.all():
@@ -184,6 +184,6 @@ def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
 
 def _distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
     """Squared distances (N,) of frames a and b in the evidence of the one that says less."""
-    away = step_between(poses[a], poses[b])
-    both = [np.einsum("ni,nij,nj->n", away, information[i], away) for i in (a, b)]
+    offset = step_between(poses[a], poses[b])
+    both = [np.einsum("ni,nij,nj->n", offset, information[i], offset) for i in (a, b)]
     return np.minimum(*both)

@@ -35,7 +35,7 @@ BAND = 2  # nodes that an acceleration couples to the one before
 
 
 @dataclass(frozen=True)
-class Looks:
+class FrameEvidence:
     """The evidence of T frames: ``poses`` (T, 4, 4) at which each was looked at, J'J
     ``information`` (T, 6, 6) and J'r ``gradient`` (T, 6) there, of (turn on the left, shift)."""
 
@@ -43,7 +43,7 @@ class Looks:
     information: np.ndarray
     gradient: np.ndarray
 
-    def about(self, centre: np.ndarray) -> Looks:
+    def about(self, centre: np.ndarray) -> FrameEvidence:
         """The same with poses and steps about ``centre`` (3,) of the object instead of its origin:
         the translations are where the centre is."""
         # the origin's shift is the centre's and what the turn adds
@@ -51,7 +51,7 @@ class Looks:
         back = to_origin.transpose(0, 2, 1)
         poses = self.poses.copy()
         poses[:, :3, 3] += poses[:, :3, :3] @ centre
-        return Looks(
+        return FrameEvidence(
             poses,
             back @ self.information @ to_origin,
             np.einsum("tij,tj->ti", back, self.gradient),
@@ -65,7 +65,11 @@ class Looks:
 
 
 def smooth(
-    looks: Looks, start: np.ndarray, node: np.ndarray, times: np.ndarray, centre: np.ndarray
+    evidence: FrameEvidence,
+    start: np.ndarray,
+    node: np.ndarray,
+    times: np.ndarray,
+    centre: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (T, 4, 4) and covariances (T, 6, 6) of all frames together, from ``start`` (T, 4, 4).
 
@@ -74,8 +78,8 @@ def smooth(
     """
     count = int(node[-1]) + 1
     size = np.bincount(node)
-    looks = looks.about(centre)
-    information, own = looks.information, looks.own
+    evidence = evidence.about(centre)
+    information, own = evidence.information, evidence.own
     # of the frames of a rest the start is the one that knows most, not a guess
     order = np.lexsort((-np.trace(information, axis1=1, axis2=2), node))
     first = order[np.unique(node[order], return_index=True)[1]]
@@ -85,19 +89,21 @@ def smooth(
     state = _without_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
     for _ in range(SMOOTH_STEPS):
-        away = step_between(looks.poses, state[node])
-        distance = np.einsum("ti,tij,tj->t", away - own, information, away - own)
+        offset = step_between(evidence.poses, state[node])
+        distance = np.einsum("ti,tij,tj->t", offset - own, information, offset - own)
         weight = share * geman_mcclure_weight(distance, OUTLIER_SIGMAS)
         bands = np.zeros((BAND + 1, count, 6, 6))
-        pull = np.zeros((count, 6))
+        gradient = np.zeros((count, 6))
         np.add.at(bands[0], node, weight[:, None, None] * information)
         bands[0] += np.diag(UNKNOWN_SIGMA**-2)
-        force = looks.gradient + np.einsum("tij,tj->ti", information, away)
-        np.add.at(pull, node, weight[:, None] * force)
-        pull += away[first] * UNKNOWN_SIGMA**-2
-        _add_motion(state, node, times, bands, pull)
+        force = evidence.gradient + np.einsum("tij,tj->ti", information, offset)
+        np.add.at(gradient, node, weight[:, None] * force)
+        gradient += offset[first] * UNKNOWN_SIGMA**-2
+        _add_motion(state, node, times, bands, gradient)
         matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
-        step = -cho_solve_banded((matrix, True), pull.ravel(), check_finite=False).reshape(-1, 6)
+        step = -cho_solve_banded((matrix, True), gradient.ravel(), check_finite=False).reshape(
+            -1, 6
+        )
         step /= np.maximum(
             1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / SMOOTH_MAX_TURN_RAD
         )
@@ -140,7 +146,7 @@ def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def _add_motion(
-    state: np.ndarray, node: np.ndarray, times: np.ndarray, bands: np.ndarray, pull: np.ndarray
+    state: np.ndarray, node: np.ndarray, times: np.ndarray, bands: np.ndarray, gradient: np.ndarray
 ) -> None:
     """Add the accelerations of frames t-1, t, t+1 to the normal equations."""
     if len(node) < 3:
@@ -175,7 +181,7 @@ def _add_motion(
         weight[part] = 1 / (1 + size / IMPACT_SIGMAS**2)
     for i, row in enumerate((a, b, c)):
         weighted = parts[i].transpose(0, 2, 1) * weight[:, None]
-        np.add.at(pull, row, np.einsum("tij,tj->ti", weighted, residual))
+        np.add.at(gradient, row, np.einsum("tij,tj->ti", weighted, residual))
         for j, column in enumerate((a, b, c)):
             block = weighted @ parts[j]
             lower = row >= column  # the upper triangle is the transpose

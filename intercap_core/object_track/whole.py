@@ -29,7 +29,7 @@ from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.lost import FrameResult, judged
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
-from intercap_core.object_track.smooth import Looks, smooth
+from intercap_core.object_track.smooth import FrameEvidence, smooth
 from intercap_core.object_track.turns import angle_between, choose_turns, near_turns
 from intercap_core.rigid.pose import rotation_log
 from intercap_core.rigid.pose_interpolation import bridge_poses
@@ -128,9 +128,9 @@ class WholeTrack:
         far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
         other = np.where(far[of_frame], probability[nearest], 0.0)
         kept, rivals = turns[of_frame][:, None, :3, :3], turns[None, :, :3, :3]
-        away = rotation_log(kept.transpose(0, 1, 3, 2) @ rivals)
+        offset = rotation_log(kept.transpose(0, 1, 3, 2) @ rivals)
         doubt = other.sum(1) > AMBIGUOUS_PROBABILITY
-        spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], away, away)
+        spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], offset, offset)
         return result, doubt, spread
 
     def _decided(self, fits: list[Fit], lost: np.ndarray) -> list[Fit]:
@@ -195,8 +195,8 @@ class WholeTrack:
     def _apart(self, one: np.ndarray, two: np.ndarray) -> np.ndarray:
         """In which frames (T,) the object is elsewhere by poses (T, 4, 4) than by others."""
         centre = self._mesh.centre_at
-        away = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
-        return np.linalg.norm(away, axis=-1) > UNSURE_M
+        offset = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
+        return np.linalg.norm(offset, axis=-1) > UNSURE_M
 
     def _solved(
         self, looked: np.ndarray, found: list[PoseEvidence | None], start: np.ndarray
@@ -210,12 +210,12 @@ class WholeTrack:
             if evidence is not None:
                 information[t] = evidence.information.sum(0) / noise
                 gradient[t] = evidence.gradient.sum(0) / noise
-        looks = self._without_symmetry(Looks(looked, information, gradient))
+        combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
         centre = self._mesh.centre_of_mass
-        segment = resting(looks, self._times, centre)
+        segment = resting(combined, self._times, centre)
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])
-        poses, covariance = smooth(looks, start, node, self._times, centre)
+        poses, covariance = smooth(combined, start, node, self._times, centre)
         return poses, covariance, segment
 
     def _worth_a_look(self, segment: np.ndarray) -> list[int]:
@@ -254,17 +254,17 @@ class WholeTrack:
         turn = axes @ pose[:3, :3].T
         return np.concatenate([turn, -np.cross(turn, pose[:3, :3] @ offset)], axis=1)
 
-    def _without_symmetry(self, looks: Looks) -> Looks:
+    def _without_symmetry(self, evidence: FrameEvidence) -> FrameEvidence:
         """The evidence without what the facets of a round mesh pretend to know of its spin."""
-        information, gradient = looks.information.copy(), looks.gradient.copy()
-        for t, pose in enumerate(looks.poses):
+        information, gradient = evidence.information.copy(), evidence.gradient.copy()
+        for t, pose in enumerate(evidence.poses):
             for step in self._axes(pose):
                 row = information[t] @ step
                 size = float(step @ row)
                 if size > 1e-9:
                     gradient[t] -= row * (step @ gradient[t]) / size
                     information[t] -= np.outer(row, row) / size
-        return Looks(looks.poses, information, gradient)
+        return FrameEvidence(evidence.poses, information, gradient)
 
     def _free_axes(self, poses: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Axes (T, 3) about which a turn shows nothing; ``covariance`` becomes wide about them."""
@@ -295,8 +295,8 @@ def _noise(found: list[PoseEvidence]) -> float:
         total = evidence.information.sum(0) + np.diag(UNKNOWN_SIGMA**-2)
         inverse = np.linalg.inv(total)
         share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
-        pull = evidence.gradient
-        squares += float(np.einsum("vi,ij,vj->", pull, inverse, pull))
+        gradient = evidence.gradient
+        squares += float(np.einsum("vi,ij,vj->", gradient, inverse, gradient))
         freedom += float((6 * share * (1 - share)).sum())
     apart = squares / freedom if freedom > 1 else 1.0
     return COMMON_ERROR_VARIANCE * float(

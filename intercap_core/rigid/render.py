@@ -18,7 +18,7 @@ from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.errors import UserError
 from intercap_core.rigid import raster
 from intercap_core.rigid.shots import Drawable, Rendering, Shot, Surface
-from intercap_core.solve.crew import Crew
+from intercap_core.solve.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
     pass
@@ -29,11 +29,11 @@ Device = Literal["auto", "cpu", "cuda"]
 class Renderer(Protocol):
     """Draws one mesh in many views and poses at once. A shot's image does not depend on the others.
 
-    ``device`` names where it runs, ``crew`` are the threads that the host may use beside it.
+    ``device`` names where it runs, ``pool`` are the threads that the host may use beside it.
     """
 
     device: str
-    crew: Crew
+    pool: ThreadPool
 
     def draw(
         self, surface: Surface, shots: Sequence[Shot], *, margin_px: int = 0
@@ -55,7 +55,7 @@ class CpuRenderer:
     device = "cpu"
 
     def __init__(self, threads: int = 1) -> None:
-        self.crew = Crew(threads)
+        self.pool = ThreadPool(threads)
 
     def draw(
         self, surface: Surface, shots: Sequence[Shot], *, margin_px: int = 0
@@ -73,13 +73,13 @@ class CpuRenderer:
                 )
             )
 
-        return self.crew.map(one, shots)
+        return self.pool.map(one, shots)
 
     def visible(self, surface: Surface, shots: Sequence[Shot]) -> np.ndarray:
         """See :class:`Renderer`."""
         from intercap_core.rigid.visibility import OcclusionScene
 
-        scene = OcclusionScene(surface.vertices, surface.faces, threads=self.crew.threads)
+        scene = OcclusionScene(surface.vertices, surface.faces, threads=self.pool.threads)
         return np.array([scene.visible(shot.lens, shot.camera_from_mesh) for shot in shots])
 
 

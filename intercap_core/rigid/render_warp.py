@@ -20,7 +20,7 @@ from intercap_core.rigid import warp_kernels as kernels
 from intercap_core.rigid.constants import KEPT_ON_DEVICE, VISIBLE_OFFSET_M
 from intercap_core.rigid.normals import vertex_normals
 from intercap_core.rigid.shots import Rendering, Shot, Surface
-from intercap_core.solve.crew import Crew
+from intercap_core.solve.thread_pool import ThreadPool
 
 
 def has_cuda() -> bool:
@@ -33,7 +33,7 @@ class WarpRenderer:
 
     def __init__(self, device: str, *, threads: int = 1) -> None:
         self.device = device
-        self.crew = Crew(threads)
+        self.pool = ThreadPool(threads)
         self._lenses: list[tuple[tuple[Intrinsics, ...], _Lenses]] = []
         self._meshes: list[tuple[Surface, _Mesh]] = []
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.rest import resting
-from intercap_core.object_track.smooth import Looks, smooth
+from intercap_core.object_track.smooth import FrameEvidence, smooth
 from intercap_core.object_track.turns import choose_turns
 from intercap_core.rigid.twist import moved
 
@@ -16,15 +16,15 @@ CENTRE = np.array([0.02, -0.01, 0.05])
 FPS = 15.0
 
 
-def looks_at(poses: np.ndarray, sigma: np.ndarray = SIGMA, seed: int = 0) -> Looks:
-    """Independent honest looks at poses (T, 4, 4), each taken somewhere near the truth."""
+def looks_at(poses: np.ndarray, sigma: np.ndarray = SIGMA, seed: int = 0) -> FrameEvidence:
+    """Independent honest evidence at poses (T, 4, 4), each taken somewhere near the truth."""
     rng = np.random.default_rng(seed)
     information = np.tile(np.diag(sigma**-2.0), (len(poses), 1, 1))
     beside = rng.normal(size=(len(poses), 6)) * SIGMA
     noise = rng.normal(size=(len(poses), 6)) * sigma
     # the minimum lies at the truth + noise, seen from beside the truth
     gradient = np.einsum("tij,tj->ti", information, beside - noise)
-    return Looks(moved(poses, beside), information, gradient)
+    return FrameEvidence(moved(poses, beside), information, gradient)
 
 
 def lifted(count: int, starts: int, stops: int) -> np.ndarray:
@@ -47,9 +47,9 @@ def shift(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 def test_smoothing_helps_and_knows_how_sure_it_is() -> None:
     true = lifted(60, 5, 55)
     times = np.arange(60) / 30.0
-    looks = looks_at(true)
-    found, covariance = smooth(looks, looks.poses, np.arange(60), times, CENTRE)
-    alone = moved(looks.poses, looks.own)
+    evidence = looks_at(true)
+    found, covariance = smooth(evidence, evidence.poses, np.arange(60), times, CENTRE)
+    alone = moved(evidence.poses, evidence.own)
     assert shift(found, true).mean() < 0.7 * shift(alone, true).mean()
     error = found[:, :3, 3] - true[:, :3, 3]
     solved = np.linalg.solve(covariance[:, 3:, 3:], error[..., None])[..., 0]
@@ -58,11 +58,11 @@ def test_smoothing_helps_and_knows_how_sure_it_is() -> None:
 
 def test_frames_without_evidence_are_bridged_and_unsure() -> None:
     true = lifted(45, 5, 40)
-    looks = looks_at(true)
-    looks.information[20:24], looks.gradient[20:24] = 0, 0
-    looks.poses[20:24] = looks.poses[19]
-    start = looks.poses.copy()
-    found, covariance = smooth(looks, start, np.arange(45), np.arange(45) / FPS, CENTRE)
+    evidence = looks_at(true)
+    evidence.information[20:24], evidence.gradient[20:24] = 0, 0
+    evidence.poses[20:24] = evidence.poses[19]
+    start = evidence.poses.copy()
+    found, covariance = smooth(evidence, start, np.arange(45), np.arange(45) / FPS, CENTRE)
     assert shift(found, true)[20:24].max() < 0.03
     sigma = np.sqrt(covariance[:, 3, 3])
     assert sigma[21:23].min() > 3 * sigma[10]
@@ -70,9 +70,9 @@ def test_frames_without_evidence_are_bridged_and_unsure() -> None:
 
 def test_one_wrong_frame_does_not_drag_its_neighbours() -> None:
     true = lifted(45, 5, 40)
-    looks = looks_at(true)
-    looks.poses[20, :3, 3] += 0.15
-    found, _ = smooth(looks, looks.poses, np.arange(45), np.arange(45) / FPS, CENTRE)
+    evidence = looks_at(true)
+    evidence.poses[20, :3, 3] += 0.15
+    found, _ = smooth(evidence, evidence.poses, np.arange(45), np.arange(45) / FPS, CENTRE)
     assert shift(found, true).max() < 0.03
 
 
@@ -81,21 +81,21 @@ def test_a_leap_between_two_places_does_not_drag_what_is_sure(leap: float) -> No
     true = np.tile(np.eye(4), (20, 1, 1))
     true[:, 2, 3] = 2.0
     true[8:12, 0, 3] = leap  # wrong, then a frame that saw nothing, then right
-    looks = looks_at(true)
-    looks.information[11], looks.gradient[11] = 0, 0
-    start = looks.poses.copy()
+    evidence = looks_at(true)
+    evidence.information[11], evidence.gradient[11] = 0, 0
+    start = evidence.poses.copy()
     start[11, 0, 3] = leap / 2
-    found, _ = smooth(looks, start, np.arange(20), np.arange(20) / FPS, CENTRE)
+    found, _ = smooth(evidence, start, np.arange(20), np.arange(20) / FPS, CENTRE)
     assert np.delete(shift(found, true), 11).max() < 0.02
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_short_recordings(count: int) -> None:
     true = lifted(10, 8, 9)[:count]
-    looks = looks_at(true)
+    evidence = looks_at(true)
     times = np.arange(count) / FPS
-    segment = resting(looks, times, CENTRE)
-    found, covariance = smooth(looks, looks.poses, np.arange(count), times, CENTRE)
+    segment = resting(evidence, times, CENTRE)
+    found, covariance = smooth(evidence, evidence.poses, np.arange(count), times, CENTRE)
     assert segment.shape == (count,)
     assert shift(found, true).max() < 0.015
     assert np.isfinite(covariance).all()
@@ -106,8 +106,8 @@ def test_short_recordings(count: int) -> None:
 def test_rest_is_found_and_left_at_once(fps: float, seed: int) -> None:
     starts, stops, count = round(1.3 * fps), round(2.2 * fps), round(3.5 * fps)
     true = lifted(count, starts, stops)
-    looks = looks_at(true, seed=seed)
-    segment = resting(looks, np.arange(count) / fps, CENTRE)
+    evidence = looks_at(true, seed=seed)
+    segment = resting(evidence, np.arange(count) / fps, CENTRE)
     assert segment.max() == 1
     away = shift(true, np.tile(true[:1], (count, 1, 1)))
     first = np.flatnonzero(segment == 0)
@@ -122,13 +122,15 @@ def test_rest_is_found_and_left_at_once(fps: float, seed: int) -> None:
 def test_errors_that_last_are_no_motion() -> None:
     rng = np.random.default_rng(2)
     true = lifted(60, 58, 59)[:55]
-    looks = looks_at(true)
+    evidence = looks_at(true)
     # masks wrong by about one standard deviation for half a second at a time
     wrong = np.repeat(rng.normal(size=(11, 6)) * SIGMA, 5, axis=0)
-    looks.gradient[:] -= np.einsum("tij,tj->ti", looks.information, wrong)
-    segment = resting(looks, np.arange(55) / FPS, CENTRE)
+    evidence.gradient[:] -= np.einsum("tij,tj->ti", evidence.information, wrong)
+    segment = resting(evidence, np.arange(55) / FPS, CENTRE)
     assert (segment == 0).all()
-    found, covariance = smooth(looks, looks.poses, np.zeros(55, int), np.arange(55) / FPS, CENTRE)
+    found, covariance = smooth(
+        evidence, evidence.poses, np.zeros(55, int), np.arange(55) / FPS, CENTRE
+    )
     assert (found == found[0]).all()
     assert shift(found, true)[0] < 0.003
     # what lasts does not average out, so a long rest is no surer than a look
@@ -180,9 +182,9 @@ def test_a_turn_changes_where_the_track_was_lost() -> None:
 @pytest.mark.parametrize("width", [1, 2])
 def test_a_wrong_frame_does_not_end_a_rest(width: int) -> None:
     true = lifted(40, 38, 39)[:30]
-    looks = looks_at(true)
-    looks.poses[12 : 12 + width, :3, 3] += [0.1, 0.0, 0.02]
-    segment = resting(looks, np.arange(30) / FPS, CENTRE)
+    evidence = looks_at(true)
+    evidence.poses[12 : 12 + width, :3, 3] += [0.1, 0.0, 0.02]
+    segment = resting(evidence, np.arange(30) / FPS, CENTRE)
     assert (segment == 0).all()
 
 

@@ -100,7 +100,7 @@ def test_visible_vertices(objects, backend, request):
 
 
 def test_device_is_chosen_and_its_absence_told(monkeypatch):
-    assert open_renderer("cpu", threads=2).crew.threads == 2
+    assert open_renderer("cpu", threads=2).pool.threads == 2
     monkeypatch.setitem(sys.modules, "warp", None)
     monkeypatch.delitem(sys.modules, "intercap_core.rigid.render_warp", raising=False)
     monkeypatch.delattr("intercap_core.rigid.render_warp", raising=False)
@@ -122,5 +122,5 @@ def test_a_missing_gpu_is_told():
 def test_threads_of_the_job(monkeypatch):
     default_renderer.cache_clear()
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    assert default_renderer().crew.threads == 2
+    assert default_renderer().pool.threads == 2
     default_renderer.cache_clear()

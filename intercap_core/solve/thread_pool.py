@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class Crew:
+class ThreadPool:
     """``threads`` threads, the caller's own among them; one thread starts none."""
 
     def __init__(self, threads: int = 1) -> None:
