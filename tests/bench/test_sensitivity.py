@@ -51,14 +51,14 @@ def replays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Replays:
 
 
 def test_the_table_says_what_half_and_double_do(replays: Replays) -> None:
-    table = probe(replays, [Probe("object_track.SAME_ERRORS", "what views err together")])
-    row = next(line for line in table.splitlines() if "SAME_ERRORS" in line)
+    table = probe(replays, [Probe("object_track.COMMON_ERROR_VARIANCE", "what views err together")])
+    row = next(line for line in table.splitlines() if "COMMON_ERROR_VARIANCE" in line)
     assert "2: fails, object_track: nothing found" in row
     assert "8: object mm 1 → 2 | +3 | 2" in row
 
 
 def test_what_is_known_is_not_computed_again(replays: Replays, tmp_path: Path) -> None:
-    probes = [Probe("object_track.SAME_ERRORS")]
+    probes = [Probe("object_track.COMMON_ERROR_VARIANCE")]
     first = probe(replays, probes)
     assert len(replays.started) == 3  # type: ignore[attr-defined]
     again = Replays(Path("x.yaml"), ["a"], tmp_path / "known.json", 1)
