@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 from intercap_core.stage_list import STAGES
@@ -128,6 +129,7 @@ def rooms_of(stage: str) -> list[str]:
     return [own, *sorted(alone)]
 
 
+@cache
 def room_imports(root: Path = ROOT) -> Graph:
     """Rooms that the files of each room import, imports inside functions included."""
     rooms = sorted(path.parent.name for path in root.glob("*/__init__.py"))
