@@ -27,10 +27,10 @@ demo: $(STAMP)
 
 # A file's tests stay on one worker, and those that share a whole run: see tests/conftest.py.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 test-fast: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist loadgroup -m "not slow" $(PYTEST)
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow" $(PYTEST)
 
 lint: ruff-check ruff-format imports snakefmt mypy snakemake-lint
 

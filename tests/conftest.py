@@ -40,15 +40,29 @@ SLOW = (
 )
 
 
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Tests of one file stay with one worker, for their fixtures, those of ``TOGETHER`` by folder.
+
+    ``--dist loadgroup`` would need marks that xdist 3.8 no longer hands on under pytest 9.2.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            path = nodeid.partition("::")[0]
+            folder = path.split("/")[1]
+            return folder if folder in TOGETHER else path
+
+    return Scheduling(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files stay together on one worker, for their fixtures; slow ones are marked."""
-    for item in items:
-        place = item.path.relative_to(PROJECT_ROOT / "tests")
-        folder = place.parts[0]
-        group = folder if folder in TOGETHER else str(place)
-        item.add_marker(pytest.mark.xdist_group(group))
-        if folder in SLOW or place.as_posix() in SLOW:
+    """Slow tests are marked, and what shares a long run comes first: a worker is busy with it."""
+    places = {item: item.path.relative_to(PROJECT_ROOT / "tests") for item in items}
+    for item, place in places.items():
+        if place.parts[0] in SLOW or place.as_posix() in SLOW:
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: places[item].parts[0] not in TOGETHER)
 
 
 @pytest.fixture(scope="session")
