@@ -253,7 +253,7 @@ def assemble(term: PointTerm, keypoints: Keypoints) -> tuple[Tensor, Tensor]:
 def assemble_offsets(
     term: PointTerm, keypoints: Keypoints, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of the offsets of the first ``count`` keypoints.
+    """The part of the offsets of the first ``count`` keypoints (beyond the paper).
 
     Returns gradient (B,3 count), cross block (B,n,3 count) with the body's parameters, and the
     offsets' own block (B,3 count,3 count), block diagonal.
