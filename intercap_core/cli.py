@@ -327,7 +327,7 @@ def docs(
     root: Annotated[Path, typer.Argument(help="The project's root.")] = Path("."),
     check_only: Annotated[bool, typer.Option("--check", help="Only say what is stale.")] = False,
 ) -> None:
-    """Write what is generated from the code: config/README.md, JSON schemas, docs/artefacts.md."""
+    """Write what is generated from the code: settings, schemas, pages on artefacts and rooms."""
     from intercap_core.commands.docs import generate
 
     stale = generate(root, write=not check_only)

@@ -164,7 +164,7 @@ class JointSettings(Model):
     ground_weight: Annotated[float, Field(ge=0)] = 1.0
     """Weight of not sinking into the floor (lambda_G)."""
     penetration_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of body and object not entering each other (lambda_P)."""
+    """Weight of body and object not entering each other (without a symbol in equation 6)."""
     body_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the body's smooth motion (lambda_S)."""
     object_smoothness: Annotated[float, Field(ge=0)] = 1.0

@@ -1,4 +1,9 @@
-"""What is known about a body's pose before it is seen: soft terms with analytic Jacobians.
+"""Priors of equation 2, what is known about a body before it is seen, with analytic Jacobians.
+
+E_theta_b and E_theta_f (:func:`rest_pose`), E_theta_h (:func:`hand_pose`), E_alpha
+(:func:`bending`), E_beta and E_psi (:func:`shape`), and beyond the paper :func:`joint_limits`. They
+are weighed and summed in :mod:`intercap_core.energy.body_priors`; VPoser's E_theta_b is in
+:mod:`.vposer`.
 
 Every function takes parameter vectors (B,P) (order of `BodyParameters.vector`) and gives rows that
 add themselves to normal equations. Weights enter squared, as in SMPLify-X.
@@ -60,7 +65,7 @@ class LinearRows:
 
 
 def joint_limits(vector: Tensor) -> DiagonalRows:
-    """How far each axis-angle component is outside its anatomical range, in radians.
+    """How far each axis-angle component is outside its anatomical range, rad (beyond the paper).
 
     r = max(theta - upper, 0) + min(theta - lower, 0): zero inside, so it costs a healthy pose
     nothing. Ranges and their sources: `joint_limits.LIMITS_DEG`.
@@ -74,7 +79,7 @@ def joint_limits(vector: Tensor) -> DiagonalRows:
 
 
 def bending(vector: Tensor) -> DiagonalRows:
-    """Elbows and knees do not bend backward: r = exp(sign * theta), so the energy is sum exp^2."""
+    """E_alpha: elbows and knees do not bend backward, r = exp(sign * theta); its sum of squares."""
     columns = torch.tensor([c for c, _ in BENDING], device=vector.device)
     sign = torch.tensor([float(s) for _, s in BENDING], dtype=vector.dtype, device=vector.device)
     residuals = torch.exp(sign * vector[:, columns])
@@ -82,8 +87,8 @@ def bending(vector: Tensor) -> DiagonalRows:
 
 
 def rest_pose(vector: Tensor, *, first: int = 1) -> DiagonalRows:
-    """A weak pull to standing at ease: r = (theta - mean) / spread for the 21 body joints, the jaw
-    and the eyes, from joint ``first`` on.
+    """E_theta_b (21 body joints) and E_theta_f (jaw, eyes), from joint ``first`` on: a weak pull to
+    standing at ease, r = (theta - mean) / spread.
 
     Means and spreads are broad guesses of everyday poses (`joint_limits.REST_SPREAD_DEG`): they
     only hold what nothing has seen.
@@ -105,7 +110,7 @@ def hand_pose(
     side: int,
     count: int = 45,
 ) -> LinearRows:
-    """Gaussian over one hand's pose components: r = C (theta - mean) / deviation.
+    """E_theta_h: Gaussian over one hand's pose components, r = C (theta - mean) / deviation.
 
     mean (2,45), components (2,45,45) orthonormal rows, deviation (2,45) of the model; side 0 is the
     left hand; the first `count` components count.
@@ -117,7 +122,7 @@ def hand_pose(
 
 
 def shape(vector: Tensor) -> DiagonalRows:
-    """betas and expression are standard normal: r = value."""
+    """E_beta and E_psi: betas and expression are standard normal, r = value."""
     columns = torch.arange(NUM_POSE + 3, vector.shape[1], device=vector.device)
     residuals = vector[:, NUM_POSE + 3 :]
     return DiagonalRows(residuals, torch.ones_like(residuals), columns)

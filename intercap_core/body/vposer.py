@@ -1,4 +1,4 @@
-"""The decoder of VPoser (Pavlakos et al. 2019) from the user's own weights, both versions.
+"""E_theta_b of equation 2 by VPoser (Pavlakos et al. 2019), from the user's own weights.
 
 Version 1 (`TR00_E096.pt`) and version 2 (`V02_05`, a Lightning checkpoint) decode a 32-number code
 to the 21 body rotations by three linear layers; they differ in key names and in the leaky ReLU's
@@ -7,9 +7,10 @@ slope, and their codes are not interchangeable. A code's prior is a standard nor
 The fit keeps the pose itself as its parameter: a pose is what a code decodes to, give or take some
 degrees, so that observations can leave what the network rebuilds exactly,
 
-    E_theta_b(theta) = min over z of |z|^2 / 2 + |theta - decode(z)|^2 / 2 s^2,
+    E_theta_b(theta) = min over z of |z|^2 / 2 + |theta - decode(z)|^2 / (2 s^2),
 
-the paper's |z|^2 for s = 0. Around the best code that is a Gaussian over theta.
+with the code z and the spread s of a decoded pose; the paper's |z|^2, up to its weight, for s = 0.
+Around the best code that is a Gaussian over theta.
 """
 
 from __future__ import annotations

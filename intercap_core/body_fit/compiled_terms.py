@@ -1,4 +1,4 @@
-"""The terms of the body's energy E_B (equation 2) by compiled kernels, on the CPU.
+"""The terms of the body's energy E_B (equation 2 with 3 to 5) by compiled kernels, on the CPU.
 
 A frame's skeleton is posed once for all terms. Frames are divided among as many threads as torch
 uses; each term adds itself to its own frame's normal equations, so that the result does not depend

@@ -104,8 +104,8 @@ FRAMES_KEPT = 256
 
 # --- decision ---------------------------------------------------------------------------------
 
-# Priors on parameters that never change count once for so many frames: their data's errors persist
-# over frames. One frame of a shape of its own has 1. Tuned on the studio.
+# Priors on parameters that never change count so many times in every frame: their data's errors
+# persist over frames. One frame of a shape of its own has 1. Tuned on the studio.
 OFFSET_PRIOR_PER_FRAME = 0.3
 SHAPE_PRIOR_PER_FRAME = 1.0
 COVERING_PRIOR_PER_FRAME = 2.0

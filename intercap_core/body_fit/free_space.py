@@ -1,7 +1,8 @@
-"""The other direction of E_D: vertices that a camera should see, against what it measured there.
+"""The other direction of E_D (equation 4): from vertices that a camera should see to its depth.
 
-A vertex that faces a camera, and past which that camera measured something clearly farther away,
-sticks out of the person. It has to go in along its normal until the measured person begins:
+Beyond the paper. A vertex that faces a camera, and past which that camera measured something
+clearly farther away, sticks out of the person. It has to go in along its normal until the measured
+person begins:
 
     e = -d - c,    d = the way along -n, in the image, to the first pixel not seen through,
 

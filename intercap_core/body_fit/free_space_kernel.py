@@ -1,4 +1,4 @@
-"""The test of :mod:`.free_space`, compiled: one view, point by point."""
+"""The test of :mod:`.free_space` (beyond equation 4), compiled: one view, point by point."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Which parameters of E_B are fitted, where they stand, and the priors of the shared ones.
+"""Which parameters of E_B (equation 2) are fitted, and the priors of the shared ones.
 
 Own parameters of a frame are chosen columns of the body's parameter vector. Shared by all frames
 are, in this order: betas (where one shape is fitted), the offsets of the 25 body keypoints, and the
-logarithm u of the coverings' thickness.
+logarithm u of the coverings' thickness. Their priors are E_beta of a shared shape, and beyond the
+paper Gaussians of offsets and u.
 """
 
 from __future__ import annotations
@@ -97,8 +98,8 @@ class Layout:
     # --- priors of shared parameters ---------------------------------------------------------
 
     def prior_counts(self, like: Tensor) -> Tensor:
-        """How often the Gaussian of each shared parameter (m,) counts: once for so many frames,
-        whose data then weigh as much as one over it independent measurements."""
+        """How often the Gaussian of each shared parameter (m,) counts in every frame: all frames'
+        data then weigh as much as one over it independent measurements."""
         parts = []
         if self.one_shape:
             parts.append(like.new_full((self.num_betas,), SHAPE_PRIOR_PER_FRAME))

@@ -1,4 +1,4 @@
-"""The terms of the body's energy E_B (equation 2), one class each, stated in torch.
+"""The terms of the body's energy E_B (equation 2 and its parts 3 to 5), one class each, in torch.
 
 This is the readable form, and the one that runs on a GPU; :mod:`.compiled_terms` gives the same on
 the CPU. With a licensed body file, costs and gradients know pose blend shapes in full. The
@@ -47,10 +47,11 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class KeypointTerm:
-    """E_J = sum over views v, keypoints i of w_i^v rho( |Pi^v(X_i) - J_i^v| / sigma_i^v ) / 2.
+    """(3) E_J = sum over views v, keypoints i of w_i^v rho( |Pi^v(X_i) - J_i^v| / sigma_i^v ) / 2.
 
-    X_i is the model's keypoint with its offset in the frame of the bone that carries it, J_i^v the
-    detection, w its confidence, rho that of Geman and McClure. Triangulated keypoints, where there
+    X_i is the model's keypoint with its offset in the frame of the bone that carries it, Pi^v the
+    projection of view v, J_i^v the detection, w its confidence, sigma its standard deviation (the
+    paper's k is 1 / sigma^2), rho that of Geman and McClure. Triangulated keypoints, where there
     are any, count in the same way by their distance in metres. See
     :mod:`intercap_core.energy.body_keypoints`.
     """
@@ -131,7 +132,7 @@ class KeypointTerm:
 
 @dataclass(frozen=True)
 class CloudTerm:
-    """E_D = sum over samples s of weight_s e_s^2 / 2, e_s = target_s - n_s . v_s - c_g(s).
+    """(4) E_D = sum over samples s of weight_s e_s^2 / 2, e_s = target_s - n_s . v_s - c_g(s).
 
     v_s is a sample of the skin, n_s the surface's normal there, target_s the mean place along it of
     the person's points that were matched to the sample, c_g the thickness of its covering. See
@@ -186,7 +187,7 @@ class CloudTerm:
 
 @dataclass(frozen=True)
 class SelfPenetrationTerm:
-    """E_P_self = weight sum over pairs of rho(d) / 2, d = max(0, -n . (p - q) - tolerance).
+    """(5) E_P_self = weight sum over pairs of rho(d) / 2, d = max(0, -n . (p - q) - tolerance).
 
     p is a sample of one part of the body, q the point of another part that it is behind, n the
     normal there. See :mod:`intercap_core.energy.body_self`.
@@ -231,7 +232,8 @@ class SelfPenetrationTerm:
 class PriorTerm:
     """E_theta_b + E_theta_h + E_theta_f + E_alpha + E_psi, and E_beta of a frame's own shape.
 
-    See :mod:`intercap_core.energy.body_priors`.
+    The priors of equation 2, and joint limits beyond the paper: see
+    :mod:`intercap_core.energy.body_priors`. E_beta of a shared shape is in :mod:`.layout`.
     """
 
     model: BodyModel

@@ -1,4 +1,4 @@
-"""The body's likely-contact vertices (H of the appendix), subsampled and cut into patches."""
+"""The body's likely-contact vertices (H of E_C, A.4), subsampled and cut into patches."""
 
 from __future__ import annotations
 

@@ -2,8 +2,9 @@
 
 The table says where each equation of the InterCap paper (Huang et al. 2022; "A.n" of its appendix)
 is found, and what goes beyond the paper. Files are below ``intercap_core/``. A setting is the
-weight or switch of a term, "same" that of the row above, "-" where its strength follows from the
-noise of what is measured. Formulas and differences from the paper are in ``docs/equations.md``.
+weight or switch of a term, "same" that of the row above, "-" where no setting weighs it: its
+strength follows from the noise of what is measured or the spread of a prior. Formulas and
+differences from the paper are in ``docs/equations.md``.
 
 | paper | term | file | function or class | setting |
 | --- | --- | --- | --- | --- |
@@ -20,14 +21,15 @@ noise of what is measured. Formulas and differences from the paper are in ``docs
 | 2, 3 | E_J, compiled | energy/body_keypoints_kernel.py | add_equations | - |
 | 2, 4 | E_D | energy/body_cloud.py | residuals | body_fit.cloud_weight |
 | 2, 4 | E_D, compiled | energy/body_cloud_kernel.py | add_equations | same |
-| 2, 5 | E_P_self | energy/body_self.py | assemble | body_fit.self_penetration_weight |
-| 2, 5 | E_P_self, compiled | energy/body_surface_kernel.py | add_self_equations | same |
+| 2, 5, 6 | E_P_self | energy/body_self.py | assemble | body_fit.self_penetration_weight |
+| 2, 5, 6 | E_P_self, compiled | energy/body_surface_kernel.py | add_self_equations | same |
 | 2 | E_theta_b | body/priors.py | rest_pose | - |
 | 2 | E_theta_b with VPoser | body/vposer.py | VPoser | - |
 | 2 | E_theta_h | body/priors.py | hand_pose | - |
 | 2 | E_theta_f (jaw, eyes) | body/priors.py | rest_pose | - |
 | 2 | E_alpha | body/priors.py | bending | - |
 | 2 | E_beta, E_psi: sum of priors | energy/body_priors.py | assemble | - |
+| 2 | E_beta of a shared shape | body_fit/layout.py | Layout | - |
 | 2 | priors, compiled | energy/body_priors_kernel.py | add_priors | - |
 | beyond | joint limits | body/priors.py | joint_limits | - |
 | beyond | triangulated keypoints | energy/body_keypoints.py | triangulated | - |
@@ -39,6 +41,7 @@ noise of what is measured. Formulas and differences from the paper are in ``docs
 | 6 | E_O | joint/terms/object_data.py | ObjectData | - |
 | 6, A.4 | E_C: residuals | energy/contact.py | term | joint.contact_weight |
 | 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
+| 6 | Q_t, annotated | contact/detect.py | annotation_evidence | - |
 | beyond | Q_t, detected | contact/detect.py | contact_probability | joint.detect_contact |
 | beyond | body in object: residuals | energy/penetration.py | weights | joint.penetration_weight |
 | beyond | body in object | joint/terms/penetration.py | Penetration | joint.penetration_weight |

@@ -1,15 +1,16 @@
-"""Cloud term of the body's energy, E_D of equation 2.
+"""Cloud term of the body's energy, E_D: equation 4, a part of equation 2.
 
     E_D = sum over views v, points p of the person's cloud in v of min over visible vertices |v - p|
 
 Here the distance is taken along the surface's normal, to the vertex that is nearest in position and
 in orientation; a vertex can only be met by points whose surface faces the same way, which leaves
-the vertices that the point's camera sees. The measured surface is clothing and hair, not skin:
+the vertices that the point's camera sees. Beyond the paper: the measured surface is clothing and
+hair, not skin,
 
     e = n . (p - v) - c_g,      c_g = c0_g exp(u_g),   u_g ~ N(0, spread^2)
 
-with one thickness c_g > 0 for each kind of covering g (trunk, upper arms, thighs, head, ...),
-shared by all frames. c0_g are everyday garments; hands and face are bare.
+with n the surface's normal at v and one thickness c_g > 0 for each kind of covering g (trunk, upper
+arms, thighs, head, ...), shared by all frames. c0_g are everyday garments; hands and face are bare.
 
 The way back, from vertices that a camera should see to what it measured, is in
 :mod:`intercap_core.body_fit.free_space`.

@@ -1,4 +1,4 @@
-"""The normal equations of :mod:`.body_cloud`, compiled: a limb's samples touch few columns.
+"""E_D (equation 4) of :mod:`.body_cloud`, compiled: a limb's samples touch few columns.
 
 Equal to :func:`.body_cloud.assemble` to rounding, pose blend shapes included: see
 :mod:`.correctives_kernel`.

@@ -1,12 +1,12 @@
-"""Keypoint term of the body's energy, E_J of equation 2.
+"""Keypoint term of the body's energy, E_J: equation 3, a part of equation 2.
 
     E_J = sum over views v, keypoints i of k_i w_i^v rho_J( Pi^v(X_i(theta, beta, gamma)) - J_i^v )
 
-with Geman and McClure's rho_J, the detector's confidence w and a fixed precision k = 1 / sigma^2 by
-keypoint. X_i is the model's keypoint plus an offset o_i that is fixed in the frame of the bone that
-carries it: detectors and body models mean different points by the same name ("hip"), and that
-difference is the same in every frame. o_i is estimated with a Gaussian prior, see
-:mod:`.body_priors`.
+with Geman and McClure's rho_J, the projection Pi^v of view v, the detection J_i^v, the detector's
+confidence w and the precision k = 1 / sigma^2 of a keypoint. Beyond the paper: X_i is the model's
+keypoint plus an offset o_i that is fixed in the frame of the bone that carries it. Detectors and
+body models mean different points by the same name ("hip"), and that difference is the same in every
+frame. o_i is estimated with a Gaussian prior, see :mod:`intercap_core.body_fit.layout`.
 
 A view's residuals depend on the body through the 3D point alone, so the views are summed into one
 3 x 3 matrix and one 3-vector for each keypoint before the body's derivatives come in.
@@ -181,7 +181,7 @@ def reprojection(
     scale: float,
     shift: Tensor | None = None,
 ) -> PointTerm:
-    """E_J of points (B,K,3), master frame, in C views.
+    """E_J (equation 3) of points (B,K,3), master frame, in C views.
 
     observed (B,C,K,2) px; confidence (B,C,K), 0 = not detected; sigma (B,C,K) px; lenses
     (C,13) as :mod:`projection` takes them; colour_from_master (C,4,4). ``scale``: residuals beyond
@@ -221,7 +221,7 @@ def pixel_residuals(
 def triangulated(
     points: Tensor, targets: Tensor, confidence: Tensor, *, sigma: float, scale: float
 ) -> PointTerm:
-    """The same term on triangulated keypoints: where the fit starts.
+    """The same term on triangulated keypoints (beyond the paper): where the fit starts.
 
     points, targets (B,K,3), master frame, metres; confidence (B,K), 0 = no target; ``sigma`` in
     metres, ``scale`` in sigmas. cost = sum w rho(|(X - target) / sigma|^2) / 2.
@@ -253,7 +253,7 @@ def assemble(term: PointTerm, keypoints: Keypoints) -> tuple[Tensor, Tensor]:
 def assemble_offsets(
     term: PointTerm, keypoints: Keypoints, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of the offsets of the first ``count`` keypoints.
+    """The part of the offsets of the first ``count`` keypoints (beyond the paper).
 
     Returns gradient (B,3 count), cross block (B,n,3 count) with the body's parameters, and the
     offsets' own block (B,3 count,3 count), block diagonal.

@@ -1,4 +1,4 @@
-"""The keypoint term of :mod:`.body_keypoints`, compiled: one pass over each body's keypoints.
+"""E_J (equation 3) of :mod:`.body_keypoints`, compiled: one pass over each body's keypoints.
 
 A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
 the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.

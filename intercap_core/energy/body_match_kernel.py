@@ -1,8 +1,8 @@
-"""Normals, matching and touching of :mod:`.body_cloud` and :mod:`.body_self`, compiled.
+"""Correspondences of E_D (equation 4) and E_P_self (equation 5), compiled, and their normals.
 
-Equal to the plain versions there to rounding. What is looked for is found in groups that lie close
-together: a group whose bound is farther than the best so far is passed over. All arrays are of one
-floating type.
+Equal to the plain versions in :mod:`.body_cloud` and :mod:`.body_self` to rounding. What is looked
+for is found in groups that lie close together: a group whose bound is farther than the best so far
+is passed over. All arrays are of one floating type.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""Priors of the body's energy: E_theta_b, E_theta_h, E_theta_f, E_alpha, E_beta and E_psi of eq. 2.
+"""Priors of the body (equation 2): E_theta_b, E_theta_h, E_theta_f, E_alpha, E_beta and E_psi.
 
 The terms themselves are in :mod:`intercap_core.body.priors`; here they are weighed and summed. With
 observations weighed by their noise, Gaussian priors have weight one: they are in units of their own
-spread. E_theta_b is VPoser where the user has it; the open default is a broad Gaussian about
-standing at ease. Anatomical limits hold with either.
+spread, where the paper sets lambdas empirically. E_theta_b is VPoser where the user has it; the
+open default is a broad Gaussian about standing at ease. E_psi, of the expression, is the paper's
+curly E. E_beta of a shape that all frames share is in :mod:`intercap_core.body_fit.layout`. Beyond
+the paper: anatomical limits of the joints, which hold with either pose prior.
 """
 
 from __future__ import annotations

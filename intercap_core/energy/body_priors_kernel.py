@@ -1,4 +1,4 @@
-"""The priors of :mod:`.body_priors`, compiled: straight into the normal equations of each body."""
+"""The priors of equation 2 in :mod:`.body_priors`, compiled: into each body's normal equations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sparse set of skin vertices that clouds and contact are compared with, and what covers them.
+"""The sparse set of skin vertices that E_D and E_P_self (equations 4 and 5) use, and its coverings.
 
 Points of the measured clouds are gathered on these samples; a sample counts as one measurement.
 """

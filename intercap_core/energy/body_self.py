@@ -1,4 +1,4 @@
-"""Self-penetration of the body, E_P_self of equation 2.
+"""Self-penetration of the body, E_P = E_P_self: equation 5, a part of equations 2 and 6.
 
     E_P_self = sum over samples p inside another part of the body of w rho(d - tolerance) / 2
 
@@ -8,12 +8,12 @@ normal, and the surface is pushed the other way. The depth is
 
     d = -n_q . (p - q),
 
-with q the nearest vertex of another part, and rho is Geman and McClure's: where what the cameras
-see puts a part far inside another, either the observations are wrong in another way or the body is
-thinner than its model, and neither is mended by pushing. Parts are the trunk, the head, the
-segments of the limbs, the palms and the fingers. Where two parts join, skin meets skin in every
-pose: samples that are near to each other over the surface, for the thickness of what they lie on,
-never count as touching.
+with q the nearest vertex of another part, n_q the normal there and w the weight of a sample
+(``SELF_WEIGHT``), and rho is Geman and McClure's: where what the cameras see puts a part far inside
+another, either the observations are wrong in another way or the body is thinner than its model, and
+neither is mended by pushing. Parts are the trunk, the head, the segments of the limbs, the palms
+and the fingers. Where two parts join, skin meets skin in every pose: samples that are near to each
+other over the surface, for the thickness of what they lie on, never count as touching.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The part of the skin that samples and the patches around them need, posed with its normals."""
+"""The part of the skin that E_D (equation 4) and E_P_self (equation 5) look at, posed.
+
+Samples and the patches around them, with their normals.
+"""
 
 from __future__ import annotations
 

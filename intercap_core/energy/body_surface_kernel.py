@@ -1,4 +1,4 @@
-"""Terms of points on the skin, compiled: E_P_self of :mod:`.body_self`, and what E_D costs.
+"""E_P_self (equation 5) of :mod:`.body_self`, and the cost of E_D (equation 4), compiled.
 
 Equal to the plain terms to rounding; what pose blend shapes add to a gradient is left to
 :mod:`.correctives_kernel`. The normal equations of E_D are in :mod:`.body_cloud_kernel`.
@@ -57,7 +57,7 @@ def _along(c, b, i, n):
 
 @numba.njit(cache=True, nogil=True)
 def add_plane_cost(chain, normal, weight, target, thickness, group, frames, cost):
-    """Add sum w e^2 / 2, e = target - n . v - thickness, to cost (B,) of the frames (B,).
+    """Add E_D, sum w e^2 / 2, e = target - n . v - thickness, to cost (B,) of the frames (B,).
 
     normal (T,N,3), weight (T,N), 0 = no row, target (T,N); thickness (G,) of each group's points,
     (N,).

@@ -4,8 +4,8 @@
 
 CD is the Chamfer distance between H, the body's likely-contact vertices, and H', their closest
 points on the object: the signed distances of :mod:`.proximity`. Equation 6 weighs it by the binary
-Q_t, which is the probability that a region touches here, and adds an E_C without Q_t, which is left
-out: a body that does not touch is not drawn to the object.
+Q_t (here the probability that a region touches) times lambda_Q, and adds an E_C without Q_t, which
+is left out: a body that does not touch is not drawn to the object.
 
 Beyond the paper each region is cut into patches (a palm, each finger, a sole). The nearest patches
 carry the weight, within a patch the nearest vertices, and a patch that is far is an outlier

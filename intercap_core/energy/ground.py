@@ -3,7 +3,7 @@
     E_G = sum over vertices W of the body of || RL(n . (p - W)) ||^2
     E_G' = sum over vertices W' of the object of || RL(n . (p - W')) ||^2
 
-with p a point of the floor, n its upward normal and RL the rectifier max(0, x).
+with p a point of the floor, n its upward unit normal and RL the rectifier max(0, x).
 """
 
 from __future__ import annotations

@@ -1,10 +1,12 @@
-"""Depth term of the object's energy: lambda_depth || (R_D - D) * S ||^2 of equation 1.
+"""Depth term of E_O, the object's energy: lambda_depth || (R_D - D) * S ||^2 of equation 1.
 
-Where the paper compares depth along the ray, the residual here is the same difference taken along
-the normal of the rendered triangle (point to plane): the measured point's distance to the plane
-that the ray hits. It is the depth difference times the cosine of incidence, so that grazing
-surfaces do not dominate, and it is linear in small motions. What a fit runs, compiled and summed,
-is :mod:`.object_depth_kernel`; this is the plain form that it is tested against.
+R_D is the rendered depth, D the measured one, S the object's mask; lambda_depth is in
+:mod:`intercap_core.object_track.view_fit`. Where the paper compares depth along the ray, the
+residual here is the same difference taken along the normal of the rendered triangle (point to
+plane): the measured point's distance to the plane that the ray hits. It is the depth difference
+times the cosine of incidence, so that grazing surfaces do not dominate, and it is linear in small
+motions. What a fit runs, compiled and summed, is :mod:`.object_depth_kernel`; this is the plain
+form that it is tested against.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The depth term of :mod:`.object_depth` summed over a rendering, compiled and without temporaries.
+"""Depth term of E_O (equation 1, :mod:`.object_depth`) summed over a rendering, compiled.
 
 The same residual and Jacobian as the plain version, pixel by pixel, with robust weights, straight
-into the normal equations.
+into the normal equations, without temporaries.
 """
 
 from __future__ import annotations

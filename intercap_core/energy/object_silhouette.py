@@ -1,10 +1,12 @@
-"""Silhouette term of the object's energy: lambda_segm || (R_S - S) * S ||^2 of equation 1.
+"""Silhouette term of E_O, the object's energy: lambda_segm || (R_S - S) * S ||^2 of equation 1.
 
-One-sided as in the paper: only mask pixels that the render misses count, so what a hand hides
-costs nothing. Each such pixel of the mask's contour pulls the nearest rim point of the render. The
-optional background term is the same from the other side: rim points of the render that lie on
-known background are pulled to the nearest contour pixel of the mask. What a fit runs, compiled and
-summed, is :mod:`.object_silhouette_kernel`; this is the plain form that it is tested against.
+R_S is the rendered mask, S the detected one; lambda_segm is in
+:mod:`intercap_core.object_track.view_fit`. One-sided as in the paper: only mask pixels that the
+render misses count, so what a hand hides costs nothing. Each such pixel of the mask's contour pulls
+the nearest rim point of the render. Beyond the paper, the optional background term is the same from
+the other side: rim points of the render that lie on known background are pulled to the nearest
+contour pixel of the mask. What a fit runs, compiled and summed, is
+:mod:`.object_silhouette_kernel`; this is the plain form that it is tested against.
 """
 
 from __future__ import annotations

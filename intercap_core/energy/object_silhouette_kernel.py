@@ -1,4 +1,4 @@
-"""The silhouette term of :mod:`.object_silhouette` summed over a rendering, compiled.
+"""Silhouette term of E_O (equation 1, :mod:`.object_silhouette`) over a rendering, compiled.
 
 The same residual and Jacobian as the plain version with robust weights, straight into the normal
 equations; rims and nearest rim pixels without images in between.

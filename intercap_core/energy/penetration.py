@@ -1,10 +1,11 @@
-"""Penetration of body and object in equation 6: vertices of the body inside the object.
+"""Body in object, beside equation 6: vertices of the body inside the object.
 
     E = sum over vertices v of the body inside the object of (depth(v) - tolerance)^2
 
 Equation 6 sums E_P of equation 5, the body's self-penetration (:mod:`.body_self`), over frames, and
-the text adds "we also penalize the body-object interpenetration, as done in PROX". This is that
-term, against the moving object and its mesh's distance instead of a voxel grid.
+the text adds "we also penalize the body-object interpenetration, as done in PROX" without a symbol.
+This is that term: beyond the paper's formulas, against the moving object, and by the distance to
+its mesh instead of a voxel grid.
 """
 
 from __future__ import annotations

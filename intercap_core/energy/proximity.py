@@ -1,8 +1,8 @@
-"""Signed distances of body points to the moving object, with derivatives: shared by the terms of
-contact and penetration in equation 6.
+"""Signed distances of body points to the moving object, with derivatives: shared by E_C of equation
+6 (A.4) and the term of body in object, which goes beyond it.
 
 d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
-from q to x. Both terms of the paper are functions of this one distance.
+from q to x. Both terms are functions of this one distance.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""E_J of one keypoint, summed over views and its target, compiled: :mod:`.body_keypoints`."""
+"""E_J (equation 3) of one keypoint, summed over views and its triangulated target, compiled.
+
+Equal to :func:`.body_keypoints.reprojection` and :func:`.body_keypoints.triangulated` to rounding.
+"""
 
 from __future__ import annotations
 

@@ -3,8 +3,9 @@
     E_A = 1 / (T - 2) sum over t of || W'_(t-1) + W'_(t+1) - 2 W'_t ||^2  over object vertices W'
     E_S = 1 / (Q (T - 2)) sum over t of || z_(t+1) - z_t ||^2  over latents z of LEMO's network
 
-For a rigid body E_A depends on the vertices only through their mean and covariance, so six points
-with the same moments give the same energy. E_S is E_A's form over the body's joints, since LEMO's
+with T frames, A.2's latent vectors z and Q, the number of LEMO's virtual markers (not Q_t). For a
+rigid body E_A depends on the vertices only through their mean and covariance, so six points with
+the same moments give the same energy. E_S is E_A's form over the body's joints, since LEMO's
 weights are not free. Beyond the paper: both are robust, since a start, a stop or an impact is an
 outlier of smooth motion. Differences and jitter also serve the drift terms
 (:mod:`intercap_core.joint.terms.drift`).

@@ -1,10 +1,12 @@
 """The energy of equation 6 as an ordered tuple of terms, each in a file of :mod:`.terms`.
 
-    E = E_B + E_O + E_C + E_P + E_G + E_S + drift + E_A + drift + E_G'
+    E = E_B + E_O + lambda_Q Q_t E_C + body in object + lambda_G E_G
+        + lambda_S E_S + drift + lambda_A E_A + drift + lambda_G E_G'
 
-To read a term, open its file; to leave one out or add one, change :func:`joint_terms`. Every
-residual is divided by the standard deviation that its source leaves unexplained, so that a term's
-weight in the settings is 1 where it is as strong as its evidence. The table of all equations is in
+The paper's E_P (equation 5) is part of E_B; body in object and drift go beyond the paper. To read a
+term, open its file; to leave one out or add one, change :func:`joint_terms`. Every residual is
+divided by the standard deviation that its source leaves unexplained, so that a term's weight in the
+settings is 1 where it is as strong as its evidence. The table of all equations is in
 :mod:`intercap_core.energy`.
 """
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton fit of the object's pose to one frame set (equation 1 over all views).
+"""Gauss-Newton fit of the object's pose to one frame set: E_O of equation 1, summed over views.
 
 Correspondences are refreshed by rendering between steps: depth pixels against the plane of the
 triangle that they hit, mask contours against the render's rim. Weights are Geman-McClure with a
@@ -41,7 +41,10 @@ from intercap_core.rigid.twist import moved, step_between
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """Where the object is expected: keeps motions that nothing shows (a bottle's spin) at rest."""
+    """Where the object is expected: keeps motions that nothing shows (a bottle's spin) at rest.
+
+    Beyond the paper.
+    """
 
     pose: np.ndarray  # (4, 4) master_from_object
     sigma_m: float = PRIOR_SIGMA_M
@@ -114,13 +117,13 @@ def fit_pose(
 ) -> Fit:
     """Fit the pose (4, 4) to all views, starting from ``pose``.
 
-    Before each of the ``rounds`` (Gauss-Newton steps at most), every view keeps the candidate
-    that overlaps the render most, if by ``min_overlap``. ``background_term`` also penalises
-    render over known background. ``start_scale`` shrinks the first robust scale where the start is
-    known better than from a search. The pivot of the rotation is the mesh's origin. ``twist`` (6,)
-    is the object's turn and shift in a second (rad, m), by which each view sees it when it exposes;
-    None = at rest. To first order in what it moves meanwhile, a step of the pose is the same step
-    of what every view sees. ``renderer`` draws; None = the CPU.
+    Before each of the ``rounds`` (Gauss-Newton steps at most), every view keeps the candidate that
+    overlaps the render most, if by ``min_overlap``. ``background_term`` (beyond the paper) also
+    penalises render over known background. ``start_scale`` shrinks the first robust scale where the
+    start is known better than from a search. The pivot of the rotation is the mesh's origin.
+    ``twist`` (6,) is the object's turn and shift in a second (rad, m), by which each view sees it
+    when it exposes; None = at rest. To first order in what it moves meanwhile, a step of the pose
+    is the same step of what every view sees. ``renderer`` draws; None = the CPU.
     """
     renderer = renderer or default_renderer()
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]

@@ -4,7 +4,7 @@ Around the pose at which a frame was looked at, its evidence is a quadratic form
 Neighbouring frames are tied by the accelerations that hands and gravity cause; both are robust, so
 that a frame whose evidence was taken at a wrong pose and a kick or a drop cost little. Frames that
 share a node share one pose: an object at rest. Solved by Gauss-Newton with a banded Cholesky
-factor, whose inverse is the covariance.
+factor, whose inverse is the covariance. Beyond the paper, whose tracker ends with equation 1.
 """
 
 from __future__ import annotations

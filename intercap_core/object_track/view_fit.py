@@ -1,4 +1,17 @@
-"""One view's part of the object's energy while a pose is fitted."""
+"""One view's part of E_O (equation 1) while a pose is fitted: silhouette and depth, weighed.
+
+The paper's lambdas are set empirically; here they follow from noise and from how many pixels of a
+view err independently. A term counts as so many samples in units of their standard deviation:
+
+    lambda_depth = DEPTH_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / DEPTH_SIGMA_M^2
+    lambda_segm = trust CONTOUR_SAMPLES / m / CONTOUR_SIGMA_PX^2
+
+for each of n depth pixels and of m contour pixels (of the mask's contour or of the render's rim,
+whichever has more), with ``trust`` of a mask from CONTOUR_TRUST_MIN to 1 by its overlap with the
+render (CONTOUR_TRUST_OVERLAP, CONTOUR_TRUST_RANGE). All are in
+:mod:`intercap_core.object_track.constants`; the residuals are in
+:mod:`intercap_core.energy.object_depth` and :mod:`intercap_core.energy.object_silhouette`.
+"""
 
 from __future__ import annotations
 
@@ -106,7 +119,7 @@ class ViewFit:
     def normal_equations(
         self, depth_scale_m: float, contour_scale_px: float, background: bool
     ) -> NormalEquations:
-        """Both terms of equation 1; ``contour_scale_px`` is at full resolution."""
+        """Both terms of equation 1, weighed; ``contour_scale_px`` is at full resolution."""
         h_depth, g_depth = self._depth_terms(depth_scale_m)
         h_contour, g_contour, _ = self._contour_terms(contour_scale_px, background)
         return h_depth + h_contour, g_depth + g_contour

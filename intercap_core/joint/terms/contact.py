@@ -1,4 +1,4 @@
-"""Contact: Q_t E_C of equation 6, weighed by lambda_Q (setting ``contact_weight``).
+"""Contact: Q_t E_C of equation 6 (A.4), weighed by lambda_Q (setting ``contact_weight``).
 
 The residuals, and what differs from the paper, are in :mod:`intercap_core.energy.contact`. The
 paper's binary Q_t is the probability that each region touches, annotated or detected.

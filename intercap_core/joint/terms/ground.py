@@ -1,4 +1,4 @@
-"""Ground support: E_G (body) and E_G' (object) of equation 6, from the paper's appendix.
+"""Ground support: E_G (body, A.5) and E_G' (object, A.6) of equation 6.
 
 Weighed by lambda_G (setting ``ground_weight``); residuals in :mod:`intercap_core.energy.ground`.
 """

@@ -1,4 +1,4 @@
-"""Smooth motion: E_S (body) and E_A (object) of equation 6, from the paper's appendix.
+"""Smooth motion: E_S (body, A.1) and E_A (object, A.3) of equation 6.
 
 Weighed by lambda_S and lambda_A (settings ``body_smoothness`` and ``object_smoothness``); what
 differs from the paper is in :mod:`intercap_core.energy.smoothness`. Recordings of fewer than three

@@ -1,7 +1,8 @@
-"""Body inside the object: what equation 6 adds to E_P of equation 5 ("as done in PROX").
+"""Body in object: named in the text of equation 6 ("as done in PROX"), without a symbol there.
 
-Weighed by the setting ``penetration_weight``; residuals in
-:mod:`intercap_core.energy.penetration`. E_P_self itself is part of the body's data.
+Beyond the paper's formulas: its E_P is equation 5, the self-penetration. Weighed by the setting
+``penetration_weight``; residuals in :mod:`intercap_core.energy.penetration`. E_P_self itself is
+part of the body's data.
 """
 
 from __future__ import annotations
