@@ -1,4 +1,4 @@
-"""How the tracked object moves: where it is expected next, and how surely."""
+"""Motion model of the tracked object: the predicted pose and its standard deviations."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ class DepthSegmenter:
             for view, background in zip(views, backgrounds, strict=True)
         ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
-        # without a floor to take away, all of the scene is one thing
+        # without the floor removed, the whole scene is one component
         bottom = self._low if grounded else self._high
         self._static = find_static_things(views, backgrounds, bottom, self._high, everywhere)
         self._fixed = {c: self._static_points(number, c) for number, c in enumerate(self.cameras)}
@@ -180,7 +180,7 @@ class DepthSegmenter:
         points, local, index = points[inside], local[inside], index[inside]
         bones = bones_of(self._joints[t] + self._late[c] * self._velocity[t])
         away = outside(points, bones)
-        # what this view does not know as background, another one may
+        # background unknown to this view may be known to another one
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._static.surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
