@@ -169,12 +169,12 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
 
 
 def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Deviations (N,55), metres, with those of parts widened of which the fit is one of several.
+    """Deviations (N,55), metres, widened for parts whose fit is one of several minima.
 
     Where most observations contradict a part, the truth may be where they are: the deviation that
-    their distance, seen in two dimensions, amounts to is added, in squares. A limb that one view
-    alone sees may lean towards it or away, the more the fewer points it has. What is wrong of an
-    arm is wrong of its hand.
+    corresponds to their distance, seen in two dimensions, is added in quadrature. A limb that one
+    view alone sees may lean towards it or away, the more the fewer points it has. What is wrong of
+    an arm is wrong of its hand.
     """
     disputed = evidence.against.cpu().numpy() > DISAGREEING_SHARE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2

@@ -308,10 +308,10 @@ class Fitter:
         return solution
 
     def _extremities(self, problem: BodyProblem, *, hands: bool, face: bool) -> None:
-        """Wrists, fingers, jaw and expression, on a body that else stays.
+        """Wrists, fingers, jaw and expression; the rest of the body is fixed.
 
-        The cloud waits. Hands start far off, as nothing has turned the wrists yet: at first no
-        keypoint counts as an outlier.
+        No cloud yet. Hands start far off, as no wrist has been rotated yet: at first no keypoint
+        counts as an outlier.
         """
         columns = columns_of(self.model, hands=hands, face=face, betas=False)
         fixed = columns_of(self.model, hands=False, face=False, betas=False)

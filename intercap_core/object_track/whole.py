@@ -286,11 +286,11 @@ class WholeTrack:
 
 
 def _noise(found: list[PoseEvidence]) -> float:
-    """Variance of the evidence over what it states, from how far the views' pulls disagree.
+    """Factor of the evidence's stated variance, from how far the views' gradients disagree.
 
-    At the minimum each view v of a frame still pulls by g_v; if it errs independently with s^2
-    times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What all views
-    have in common (calibration, masks that are too large) does not show and comes on top.
+    At the minimum each view v of a frame still has a gradient g_v; if its errors are independent,
+    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What
+    all views have in common (calibration, masks that are too large) does not show and comes on top.
     """
     squares = freedom = 0.0
     for evidence in found:

@@ -1,9 +1,10 @@
 """The person's mask and candidates of the object from depth images alone, one moment at a time.
 
 Background subtraction: depth before the static background is foreground. Foreground within a body
-of average build around the triangulated keypoints is the person, the rest are things. Their points
-of all views are clustered in space into connected components, and each component is a candidate in
-every view that shows it. Four kinds of component are proposed, the object's track chooses:
+of average build around the triangulated keypoints is the person, the rest belongs to objects. Their
+points of all views are clustered in space into connected components, and each component is a
+candidate in every view that shows it. Four kinds of component are proposed, the object's track
+chooses:
 
 - moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
   ``FAR_CUT``), since where hand ends and thing begins is uncertain;
