@@ -151,7 +151,7 @@ UPRIGHT_TURNS = 24  # about the vertical of the standing pose, 15 degrees apart
 OUTLINE_DIRECTIONS = 16  # of the image in which a silhouette's reach is taken
 OUTLINE_MIN_DEPTH_M = 0.1  # smaller depths are clamped to this: keeps divisions finite
 ALIGNED_POINTS = 150  # of all views together
-ICP_STEPS = 6
+ICP_STEPS = 6  # iterations of the alignment
 ICP_SCALES_M = (0.08, 0.015)  # Geman-McClure scale: the grid's error at a hand's width, the noise
 ICP_MAX_TURN_RAD, ICP_MAX_SHIFT_M = np.radians(15), 0.05  # of a step
 ICP_DAMPING = 1e-3  # of the diagonal
@@ -248,7 +248,7 @@ BESIDE_FRAMES = 2  # in which something stands there while the object is elsewhe
 SIZE_CHECK_SETS = 6  # frame sets that are looked at, spread over the recording
 SIZE_CHECK_STRIDE = 3  # of the depth pixels
 SIZE_CHECK_MIN_POINTS = 8  # depth pixels under a mask
-SIZE_CHECK_MIN_MASKS = 5
+SIZE_CHECK_MIN_MASKS = 5  # fewer do not tell a size; tuned on the studio
 # A mask is smaller than the object where that is seen end on or hidden by a hand, and larger where
 # it also covers the person; most are neither, and a wrong unit is a factor of ten.
 SIZE_DOUBTFUL_RATIO = 4.0
