@@ -102,7 +102,7 @@ def _to_points(
     translation: np.ndarray,
     scale: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cost (N, P) of each point, normal matrix (N, 6, 6) and its right-hand side (N, 6)."""
+    """Cost (N, P) of each point, normal matrix (N, 6, 6) and gradient (N, 6)."""
     count = len(rotation)
     local = np.einsum("nji,npj->npi", rotation, cloud[None] - translation[:, None])
     closest = field.closest(local.reshape(-1, 3))

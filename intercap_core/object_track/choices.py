@@ -68,7 +68,8 @@ def best_sequence(mesh: ObjectMesh, options: list[list[Fit]], times: np.ndarray)
 
 
 def _values(options: list[Fit], usual: float) -> np.ndarray:
-    """Log-likelihood (N,) of each pose; nearly flat in a frame that no pose explains well."""
+    """Log-likelihood (N,) of each pose up to a constant; nearly flat in a frame that no pose
+    explains well."""
     scores = np.array([fit.score for fit in options])
     trust = min(scores.max() / max(usual, 1e-6), 1.0) ** 2
     return scores * trust / SEQUENCE_SCORE_SIGMA

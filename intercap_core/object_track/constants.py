@@ -273,9 +273,9 @@ DECIDED_RUN, DECIDED_FRAME = 0.01, 0.03
 SEQUENCE_SCORE_SIGMA = 0.02  # standard deviation of a frame's score, between poses of one fit
 SEQUENCE_MAX_MOTION_COST = 6.0  # minus log-likelihood of a motion that is none
 TURN_SCORE_SIGMA = 0.01  # of a key frame's score's difference between a turn and none
-# Additional evidence, over that for flagging a frame, that a correction by a right angle or more
-# needs: the scores of distant poses have independent errors, correlated over more than one key
-# frame.
+# Factor of TURN_SCORE_SIGMA for a correction by a right angle or more, not for flagging a frame:
+# the scores of distant poses have independent errors, correlated over more than one key frame.
+# Tuned on the studio.
 TURN_APART_FACTOR = 2.5
 # Minus log-likelihood of any change of the chosen rotation: in a tracked stretch, and where the
 # track was lost.

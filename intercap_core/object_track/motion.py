@@ -32,7 +32,7 @@ def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
 def expected(
     before: np.ndarray, now: np.ndarray, predicted: np.ndarray, lost_for: int
 ) -> MotionPrior:
-    """Standard deviations of the pose around the prediction: it may start to move, turn or stop.
+    """The prior around the prediction: the object may start to move, turn or stop.
 
     From rest, one frame of a hand's acceleration; in motion, half of the last step in addition;
     more for every frame since the object was last visible.

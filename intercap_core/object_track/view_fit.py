@@ -187,8 +187,8 @@ class ViewFit:
             self._pose[:3, 3],
             scale,
         )
-        # The robust weight also depends on the whole rim: outlier pixels of a rim that fits nearly
-        # everywhere weigh less than those of a rim that is off all around.
+        # Normalised by the size of the whole rim, not by the number of residuals: a few outlier
+        # pixels of a rim that fits elsewhere weigh less than a rim that is off all around.
         samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
         weight = self._contour_trust * samples / (CONTOUR_SIGMA_PX / geometry.step) ** 2
         return weight * hessian, weight * gradient, residuals

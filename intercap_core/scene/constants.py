@@ -83,7 +83,7 @@ SPEED_ERROR = 0.08  # of an offset: paths are smoothed too much or too little; t
 
 MAX_SAMPLES = 25  # sets of the background; bounds memory: this many depth images of one camera
 BACKGROUND_CELL_M = 0.03  # of thinned surfaces
-MOVING_CELL_M = 0.02  # of thinned moving surfaces, finer: limbs are thin; tuned on the studio
+MOVING_CELL_M = 0.02  # of thinned moving surfaces; tuned on the studio
 MOVING_MOMENTS = 16  # frame sets looked at, each with the one before and the one after
 MOVING_SEARCHES = 3  # nearest neighbours until the displacement along the normal settles
 NEIGHBOUR_PIXEL_STEP = 2  # every second pixel of the neighbouring sets, both ways, is enough

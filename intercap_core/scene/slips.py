@@ -127,8 +127,8 @@ def _apply(slip: np.ndarray, interval: Interval) -> None:
 def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
     """The best interval and those that it cannot have caused.
 
-    An unsynchronised camera makes others look so: weaker intervals near it in time are left to the
-    next round.
+    An unsynchronised camera makes others look so: much weaker intervals, and those near it in time,
+    are left to the next round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
     taken: list[Interval] = []
