@@ -142,8 +142,9 @@ class _Inputs(NamedTuple):
         place: np.ndarray,
         gradient: np.ndarray,
     ) -> None:
-        """Add what the terms' gradients by points at rest are by the pose, through the blend
-        shapes, to gradient (B,n); by_pose of :func:`.correctives_kernel.rotation_derivatives`."""
+        """Add to gradient (B,n) the terms' gradients by points of the rest pose, chained through
+        the blend shapes to the pose; by_pose of
+        :func:`.correctives_kernel.rotation_derivatives`."""
         if not self.has_correctives:
             return
         by_feature = np.zeros((len(by_pose), NUM_FEATURES), by_pose.dtype)

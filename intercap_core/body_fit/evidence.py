@@ -190,7 +190,8 @@ class Evidence:
         )
 
     def _shift(self, points: Tensor) -> Tensor | None:
-        """How far points (N,...,3) move until each camera exposes: (N,C,...,3), or None."""
+        """Shift (N,C,...,3) of points (N,...,3) from the frame's time to each camera's exposure, or
+        None."""
         offset = self.seen.time_offset
         if not np.any(offset):
             return None

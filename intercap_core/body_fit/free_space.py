@@ -6,9 +6,9 @@ person begins:
 
     e = -d - c,    d = the way along -n, in the image, to the first pixel not seen through,
 
-c the covering's thickness as in :mod:`intercap_core.energy.body_cloud`. The person's mask has no
-say, so one that is too small, or lacks a hand, draws nothing to it; what hides the vertex is nearer
-than it, and pixels without depth are unknown: neither has a residual.
+c the covering's thickness as in :mod:`intercap_core.energy.body_cloud`. The person's mask is not
+used, so one that is too small, or lacks a hand, adds no bias; an occluder is nearer than the
+vertex, and pixels without depth are unknown: neither has a residual.
 """
 
 from __future__ import annotations

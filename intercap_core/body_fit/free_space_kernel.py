@@ -10,8 +10,20 @@ from intercap_core.camera.projection_kernels import project_point
 
 @numba.njit(cache=True, nogil=True)
 def seen_through(
-    depth, top, left, lens, pose, bias, points, normals, behind, facing, nearest, reach, step
-):  # fmt: skip
+    depth,
+    top,
+    left,
+    lens,
+    pose,
+    bias,
+    points,
+    normals,
+    behind,
+    facing,
+    nearest,
+    reach,
+    step,
+):
     """Numbers (M,) of the points (N,3) that stick out, and how far (M,), metres, float64.
 
     ``depth`` (h,w) uint16 mm, its first pixel at row ``top``, column ``left`` of the image;

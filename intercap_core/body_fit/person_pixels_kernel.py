@@ -18,8 +18,20 @@ _ONE, _HALF = np.float32(1), np.float32(0.5)
 
 @numba.njit(cache=True, nogil=True)
 def person_pixels(
-    depth, background, before_mm, rows, columns, rays, pose, lens, size, ends, box, cell, hidden_m
-):  # fmt: skip
+    depth,
+    background,
+    before_mm,
+    rows,
+    columns,
+    rays,
+    pose,
+    lens,
+    size,
+    ends,
+    box,
+    cell,
+    hidden_m,
+):
     """Flat pixels (M,), ascending, of every second column of every second row of a window.
 
     ``depth`` (H,W) uint16 mm, part ``rows`` (first, end), ``columns`` (first, end) of it;

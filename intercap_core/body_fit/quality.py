@@ -76,7 +76,7 @@ def _carriers_of(part: str) -> list[int]:
 
 
 class PartEvidence(NamedTuple):
-    """How the observations of N frames bear out each of the 8 parts.
+    """How the observations of N frames support each of the 8 parts.
 
     against (N,8): share of a part's observations that are outliers, weighted by confidence, of arms
     and legs that of their worst point; NaN = nothing of it was seen. distance (N,8): their median
@@ -158,7 +158,8 @@ def unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
 
 
 def _leaning(evidence: PartEvidence) -> np.ndarray:
-    """How far (N,8), metres, parts may lean the wrong way that one view bears out, or none."""
+    """Standard deviation (N,8), metres, of parts that one view alone supports, whose mirrored pose
+    is as likely, or that no view supports."""
     known = np.clip(evidence.measured.cpu().numpy() / MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
     mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
@@ -168,12 +169,12 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
 
 
 def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Deviations (N,55), metres, with those of parts widened of which the fit is one of several.
+    """Deviations (N,55), metres, widened for parts whose fit is one of several minima.
 
     Where most observations contradict a part, the truth may be where they are: the deviation that
-    their distance, seen in two dimensions, amounts to is added, in squares. A limb that one view
-    alone sees may lean towards it or away, the more the fewer points it has. What is wrong of an
-    arm is wrong of its hand.
+    corresponds to their distance, seen in two dimensions, is added in quadrature. A limb that one
+    view alone sees may lean towards it or away, the more the fewer points it has. What is wrong of
+    an arm is wrong of its hand.
     """
     disputed = evidence.against.cpu().numpy() > DISAGREEING_SHARE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
@@ -189,7 +190,7 @@ def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
 
 
 def undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Parts (N,8) bool that the observations leave open, or that most of them contradict.
+    """Parts (N,8) bool that the observations do not determine, or that most of them contradict.
 
     sigma (N,55): stated deviation of the joints, metres.
     """

@@ -36,7 +36,7 @@ _WRISTS = ("left_wrist", "right_wrist")
 
 @dataclass(frozen=True)
 class Settled:
-    """What a fit found to be the same in all frames, beside the shape.
+    """Quantities estimated once for all frames, beside the shape.
 
     offsets (25,3) m of the body keypoints in the frames of their bones; covering (G,) logarithm of
     each covering's thickness over the usual one; keypoint_sigma (K,) m; cloud_noise (G,) m;
@@ -173,7 +173,7 @@ class Fitter:
         )  # fmt: skip
 
     def observe(self, problem: BodyProblem) -> None:
-        """Take correspondences, visibility and pixel sigmas anew at the problem's bodies."""
+        """Update correspondences, visibility and pixel sigmas at the problem's bodies."""
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, CLOUD_REACH_M[-1])
         problem.touching = self.evidence.touch(problem)
@@ -275,8 +275,8 @@ class Fitter:
     def _lifted(self) -> Targets | None:
         """The body's keypoints that depth alone places, which one view's pixels cannot.
 
-        They hold the body until its cloud does. Those that something covers are far off: their
-        pixels, trusted widely at first, bring the limbs where they belong.
+        They constrain the body until its cloud does. Occluded ones are far off: their pixels, with
+        a wide sigma at first, bring the limbs to the right place.
         """
         seen = self.evidence.seen
         joints = seen.joints[self.frames][:, BODY]
@@ -308,10 +308,10 @@ class Fitter:
         return solution
 
     def _extremities(self, problem: BodyProblem, *, hands: bool, face: bool) -> None:
-        """Wrists, fingers, jaw and expression, on a body that else stays.
+        """Wrists, fingers, jaw and expression; the rest of the body is fixed.
 
-        The cloud waits. Hands start far off, as nothing has turned the wrists yet: at first no
-        keypoint counts as an outlier.
+        No cloud yet. Hands start far off, as no wrist has been rotated yet: at first no keypoint
+        counts as an outlier.
         """
         columns = columns_of(self.model, hands=hands, face=face, betas=False)
         fixed = columns_of(self.model, hands=False, face=False, betas=False)

@@ -17,7 +17,7 @@ from intercap_core.camera.transforms import apply
 
 MIN_PARALLAX_DEG = 4.0  # two rays closer in direction than this do not give a depth
 REFINE_STEPS = 4
-HUBER_PX_AT_1080P = 4.0  # about what good 2D detectors scatter by
+HUBER_PX_AT_1080P = 4.0  # typical standard deviation of good 2D detectors
 PARTNERS = 5  # of each camera, whose rays are crossed with its own before those of others
 BEST_PARALLAX_DEG = 70.0
 _BLOCK = 20_000  # points at once: bounds memory at some 100 MB with six views

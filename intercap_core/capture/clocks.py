@@ -1,4 +1,4 @@
-"""Device clocks that do not run straight: resets, single wrong times, drift."""
+"""Irregular device clocks: resets, single wrong times, drift."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def epochs(times_us: np.ndarray) -> np.ndarray:
 def best_epoch(
     times_us: np.ndarray, stretch: np.ndarray, reference_us: np.ndarray, within_us: float
 ) -> int:
-    """Return the stretch that lies in the others' time; the longest where none does.
+    """Return the stretch that overlaps the others' times; the longest where none does.
 
     ``stretch`` (N,) is what :func:`epochs` says of ``times_us`` (N,); ``reference_us`` (M,) are
     increasing times of the others. A reset takes a clock out of step with them, so that of several

@@ -1,4 +1,4 @@
-"""One camera's images into the frames artefact, as recorded, with what is wrong with them."""
+"""Copies one camera's images into the frames artefact, as recorded, and notes their defects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FINGERPRINT_BYTES = 256  # of each image's end: entropy-coded, so that no two im
 
 @dataclass
 class View:
-    """What is known of one camera: its lenses, the times of its images, and what is wrong.
+    """One camera: its lenses, the times of its images, and their defects.
 
     ``colour_times`` and ``depth_times`` are device times, microseconds, in the order of the
     artefact's images; ``depth_delay_us`` is not taken off. Images that no frame set may use are

@@ -82,7 +82,7 @@ class Recording:
         self.broken_packets = 0
         truncated = _is_truncated(self.path)
         try:
-            # The tracks' heads say all there is to know; probing would buffer packets instead.
+            # the tracks' headers are complete; probing would only buffer packets
             self._container = av.open(
                 str(self.path), options={"probesize": "32768"}, metadata_errors="replace"
             )

@@ -109,9 +109,23 @@ def _add_squares(rows, weights, block):
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    chain, limbs, normal, weight, target, thickness, group, frames, place, place_u,
-    cost, gradient, hessian, rest_gradient, tables, by_pose,
-):  # fmt: skip
+    chain,
+    limbs,
+    normal,
+    weight,
+    target,
+    thickness,
+    group,
+    frames,
+    place,
+    place_u,
+    cost,
+    gradient,
+    hessian,
+    rest_gradient,
+    tables,
+    by_pose,
+):
     """Add the normal equations of E_D to those of the frames (B,).
 
     ``limbs``: as :attr:`.Selection.limbs`; normal (T,N,3), weight (T,N), 0 = no row, target (T,N);

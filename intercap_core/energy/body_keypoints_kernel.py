@@ -47,7 +47,7 @@ class Pieces(NamedTuple):
 
     @classmethod
     def of(cls, model: BodyModel, chosen: KeypointSet) -> Pieces:
-        """Those of a set of keypoints."""
+        """The pieces of a set of keypoints."""
         rest = model.linearise(model.zeros(), vertex_ids=chosen.vertices, joints=True)
         points = rest.selection
         weights = points.weights.double().numpy()
@@ -203,9 +203,20 @@ def _add_offset(turn, slope, matrix, weighted, to, first, gradient, hessian):
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    skeleton, pieces, rest, observed, frames, place, first_offset, offsets,
-    cost, gradient, hessian, rest_gradient, by_pose,
-):  # fmt: skip
+    skeleton,
+    pieces,
+    rest,
+    observed,
+    frames,
+    place,
+    first_offset,
+    offsets,
+    cost,
+    gradient,
+    hessian,
+    rest_gradient,
+    by_pose,
+):
     """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
     (B,E,3).
 

@@ -1,8 +1,8 @@
 """Correspondences of E_D (equation 4) and E_P_self (equation 5), compiled, and their normals.
 
-Equal to the plain versions in :mod:`.body_cloud` and :mod:`.body_self` to rounding. What is looked
-for is found in groups that lie close together: a group whose bound is farther than the best so far
-is passed over. All arrays are of one floating type.
+Equal to the plain versions there to rounding. Nearest neighbours are searched in spatial groups: a
+group whose bound is farther than the best match so far is skipped. All arrays are of one floating
+type.
 """
 
 from __future__ import annotations
@@ -44,9 +44,19 @@ def vertex_normals(vertices, faces, starts, around, out):
 
 @numba.njit(cache=True, nogil=True)
 def match(
-    points, point_normals, vertices, normals, samples, patch, order, starts, length, reach, aside,
+    points,
+    point_normals,
+    vertices,
+    normals,
+    samples,
+    patch,
+    order,
+    starts,
+    length,
+    reach,
+    aside,
     turned,
-):  # fmt: skip
+):
     """Sample (M,), signed distance (M,) and whether it counts (M,), as :func:`.body_cloud.match`.
 
     points and point_normals (M,3); ``order`` (S,) lists the samples group by group, from
@@ -147,9 +157,19 @@ def _nearest_of_patch(point, vertices, patch):
 
 @numba.njit(cache=True, nogil=True)
 def find(
-    parts, margin, vertices, normals, samples, patch, part, patch_part, hand, apart, deepest,
+    parts,
+    margin,
+    vertices,
+    normals,
+    samples,
+    patch,
+    part,
+    patch_part,
+    hand,
+    apart,
+    deepest,
     sideways,
-):  # fmt: skip
+):
     """Vertices (K,) of samples inside another part and of the surface there, as
     :func:`.body_self.find`.
 

@@ -56,7 +56,7 @@ class Priors(NamedTuple):
         for first, hand_mean in zip(_HANDS, model.hand_mean.numpy(), strict=True):
             mean[first : first + 45] = hand_mean
         ranges = np.deg2rad(np.array(LIMITS_DEG)).reshape(NUM_POSE, 2).astype(dtype)
-        ranges[:3] = -np.inf, np.inf  # where the body stands and looks is free
+        ranges[:3] = -np.inf, np.inf  # global position and orientation have no prior
         return cls(
             mean, own, np.stack([(jacobian.T @ jacobian).numpy() for jacobian in hands]),
             ranges, outside**2, np.array([c for c, _ in priors.BENDING]),

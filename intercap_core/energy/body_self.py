@@ -9,11 +9,11 @@ normal, and the surface is pushed the other way. The depth is
     d = -n_q . (p - q),
 
 with q the nearest vertex of another part, n_q the normal there and w the weight of a sample
-(``SELF_WEIGHT``), and rho is Geman and McClure's: where what the cameras see puts a part far inside
-another, either the observations are wrong in another way or the body is thinner than its model, and
-neither is mended by pushing. Parts are the trunk, the head, the segments of the limbs, the palms
-and the fingers. Where two parts join, skin meets skin in every pose: samples that are near to each
-other over the surface, for the thickness of what they lie on, never count as touching.
+(``SELF_WEIGHT``), and rho is Geman and McClure's: where the observations
+put one part deep inside another, either they are outliers or the body is thinner than its model,
+and a repulsion would correct neither. Parts are the trunk, the head, the segments of the limbs, the
+palms and the fingers. Where two parts join, skin meets skin in every pose: samples that are near to
+each other over the surface, for the thickness of what they lie on, never count as touching.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ _HINGED = _hinged()
 
 @dataclass(frozen=True)
 class SelfContact:
-    """What may touch what on a body, for the N samples of the cloud term.
+    """Which samples of a body may touch each other, for the N samples of the cloud term.
 
     vertex (N,) and patch (N,20) as in :class:`Samples`; part (N,) of each sample and patch_part
     (N,20) of the vertices around it; hand (N,): 0 left, 1 right, -1 none; apart (N,N) bool: the two
@@ -314,13 +314,13 @@ def assemble(
 
 
 def _residuals(points: Tensor, pairs: Pairs) -> Tensor:
-    """How much deeper than the tolerance (M,), metres, of points (F,U,3); 0 = outside."""
+    """Depth (M,) beyond the tolerance, metres, of points (F,U,3); 0 = outside."""
     gap = points[pairs.frame, pairs.inner] - points[pairs.frame, pairs.outer]
     return (-(pairs.normal * gap).sum(1) - SELF_TOLERANCE_M).clamp_min(0)
 
 
 def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
-    """How far (N,) it is through the body from each vertex, along its normal, metres."""
+    """Thickness (N,) of the body at each vertex, along its normal, metres."""
     from intercap_core.energy.first_hit import first_hits
     from intercap_core.rigid.normals import vertex_normals
 

@@ -74,7 +74,7 @@ def add_plane_cost(chain, normal, weight, target, thickness, group, frames, cost
 
 @numba.njit(cache=True, nogil=True)
 def _depth(chain, pairs, b, at):
-    """How much deeper than the tolerance pair ``at`` is, metres; not positive = apart."""
+    """Depth of pair ``at`` beyond the tolerance, metres; not positive = no contact."""
     n = pairs.normal[at]
     outer = _along(chain, b, pairs.outer[at], n)
     return outer - _along(chain, b, pairs.inner[at], n) - pairs.tolerance
@@ -144,7 +144,7 @@ def add_self_equations(chain, pairs, frames, place, cost, gradient, hessian, res
         for r in range(count):
             for q in range(m):
                 dense[r, q] = root[r] * rows[r, used[q]]
-        # by hand: a library's product would wake its threads for each frame
+        # written out: a BLAS product would start its threads for each frame
         block = np.zeros((m, m), hessian.dtype)
         for r in range(count):
             for p in range(m):

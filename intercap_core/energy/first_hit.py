@@ -1,7 +1,7 @@
 """Where rays first meet a mesh, compiled: for some thousand rays at once, without a tree.
 
-Triangles are looked at in groups that lie close together; a ray that passes a group's sphere, or
-has met something before it, passes it over. Moeller and Trumbore 1997, double precision.
+Triangles are looked at in groups that lie close together; a group is skipped where the ray misses
+its bounding sphere or has hit something nearer. Moeller and Trumbore 1997, double precision.
 """
 
 from __future__ import annotations

@@ -12,8 +12,19 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def normal_equations(
-    rendered, face, shift, measured, points, trust, face_normals, rotation, origin, eye, gate, scale
-):  # fmt: skip
+    rendered,
+    face,
+    shift,
+    measured,
+    points,
+    trust,
+    face_normals,
+    rotation,
+    origin,
+    eye,
+    gate,
+    scale,
+):
     """J'WJ (6, 6), J'Wr (6,) of equation 1's depth term and how many pixels count in it.
 
     ``rendered``, ``face`` (h, w) of a rendering whose pixel (u, v) is pixel (u, v) + ``shift`` of

@@ -61,8 +61,18 @@ def nearest(pixels, starts, x, y, limit):
 
 @numba.njit(cache=True, nogil=True)
 def correspondences(
-    face, corner, inside, person, window, contour, mask_rim, mask_starts, background, limit, least
-):  # fmt: skip
+    face,
+    corner,
+    inside,
+    person,
+    window,
+    contour,
+    mask_rim,
+    mask_starts,
+    background,
+    limit,
+    least,
+):
     """Rim pixels of the render (N, 2), the pixels of the mask (N, 2) that each should reach, how
     many of them come from mask pixels that the render misses, and the size of the render's rim.
 
@@ -132,8 +142,16 @@ def sees_past(at, depth, corner, rays, depth_from_colour, lens, measured, place,
 
 @numba.njit(cache=True, nogil=True)
 def normal_equations(
-    at, target, depth, corner, rays, parameters, master_from_colour, origin, scale
-):  # fmt: skip
+    at,
+    target,
+    depth,
+    corner,
+    rays,
+    parameters,
+    master_from_colour,
+    origin,
+    scale,
+):
     """J'WJ (6, 6), J'Wr (6,) of equation 1's silhouette term and the residuals (N,), pixels.
 
     ``at``, ``target`` (N, 2) as of :func:`correspondences`; ``depth`` (h, w) of the render, which

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import radians
 
-# --- measurement noise: what a true fit leaves over, in the joint energy
+# --- measurement noise: residuals of a correct fit, in the joint energy
 
 # Distance of a patch that truly touches, after errors of skin, mesh and calibration, metres.
 # Tuned on the studio.
@@ -24,7 +24,7 @@ MIN_STANDING_VERTICES = 4
 TRACK_FLOOR_TURN = radians(0.1)
 TRACK_FLOOR_SHIFT = 0.001
 # What is added where different poses explain a frame equally well, rad and metres: it is nearly
-# always the turn (on which side the handle is). Tuned on the studio.
+# always the rotation (on which side the handle is). Tuned on the studio.
 AMBIGUOUS_TURN = radians(10.0)
 AMBIGUOUS_SHIFT = 0.002
 

@@ -1,4 +1,5 @@
-"""The joint fit: contact is estimated, the energy lowered, and so on until nothing changes."""
+"""The joint fit: alternates between estimating contact and minimising the energy, until neither
+changes."""
 
 from __future__ import annotations
 

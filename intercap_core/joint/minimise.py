@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where the energy was left, the equations there, the energy of each term at the start, the
-    number of accepted steps, and whether the last one gained little."""
+    """The final state, the equations there, the energy of each term at the start, the number of
+    accepted steps, and whether the last one gained little."""
 
     state: State
     equations: NormalEquations
@@ -77,7 +77,7 @@ def minimise(
 
 
 def _limited(step: np.ndarray) -> np.ndarray:
-    """Keep every frame's step within what a linearisation can promise."""
+    """Limit every frame's step to the range in which the linearisation holds."""
 
     def largest(*columns: slice) -> np.ndarray:
         return np.maximum.reduce([np.abs(step[:, part]).max(axis=1) for part in columns])

@@ -18,7 +18,7 @@ from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
 from intercap_core.metrics.truth import Truth
 from intercap_core.schemas import SCENE
 
-EVERY = 5  # frames of which one is compared with its points: neighbours say nothing new
+EVERY = 5  # one frame in so many is compared with its points: neighbours are redundant
 SURFACE_SAMPLES = 4000  # of the body, spread over its area
 CLOUD_POINTS = 3000  # at most, evenly thinned
 CLOUD_KEYS = (
@@ -92,6 +92,6 @@ class BodyClouds:
         sight = Sight([(true, self._faces), (object_, truth.object_faces)])
         points = self._samples.of(true, self._faces)
         normals = face_normals(true, self._faces)[self._samples.faces]
-        # what furniture hides, the truth of the whole rig knows
+        # occlusion by furniture is known from the truth of the whole rig
         anyhow = self._samples.of(truth.visible[t].astype(np.float32), self._faces) > 0.5
         return anyhow & sight.seen(points, normals, cameras)

@@ -1,4 +1,4 @@
-"""How far estimated camera poses move points from where the true poses put them."""
+"""Displacement of points by the errors of estimated camera poses."""
 
 from __future__ import annotations
 

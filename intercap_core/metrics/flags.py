@@ -1,4 +1,4 @@
-"""Which frames should not be trusted, and why."""
+"""Flags of unreliable frames, with their reasons."""
 
 from __future__ import annotations
 

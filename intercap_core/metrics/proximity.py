@@ -1,4 +1,4 @@
-"""Signed distances between a posed body and a posed object, and what cameras see of them."""
+"""Signed distances between a posed body and a posed object, and their visibility to the cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from intercap_core.camera.transforms import apply
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.open3d_core import o3d
 
-REACH_M = 0.25  # distances are capped here: nothing that is reported looks further
+REACH_M = 0.25  # distances are capped here: no reported figure needs larger ones
 _LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own triangle
 
 
@@ -58,7 +58,7 @@ def _within_reach(
 
 
 class Sight:
-    """What the rig's cameras see of meshes that hide each other, in one frame."""
+    """Visibility to the rig's cameras, in one frame, of meshes that occlude each other."""
 
     def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
         self._scene = o3d.t.geometry.RaycastingScene()

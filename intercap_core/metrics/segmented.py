@@ -15,8 +15,8 @@ from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.schemas import PERSON
 
-# Depth pixels are looked at only this far around the projected meshes: a fit that is further off
-# than this has an error that needs no exact figure.
+# Only depth pixels within this distance of the projected meshes are used: larger errors of a fit
+# need no exact figure.
 MARGIN_M = 0.25
 _POINTS_PER_VIEW = 12000  # beyond it every second, third, ... pixel of a regular grid is taken
 

@@ -102,7 +102,7 @@ def _to_points(
     translation: np.ndarray,
     scale: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cost (N, P) of each point, normal matrix (N, 6, 6) and what it takes a step to (N, 6)."""
+    """Cost (N, P) of each point, normal matrix (N, 6, 6) and gradient (N, 6)."""
     count = len(rotation)
     local = np.einsum("nji,npj->npi", rotation, cloud[None] - translation[:, None])
     closest = field.closest(local.reshape(-1, 3))
@@ -111,7 +111,7 @@ def _to_points(
     gap = local - points
     along = (gap * normals).sum(-1)
     distance = np.linalg.norm(gap, axis=-1)
-    # a measured point cannot lie on a face that looks away from the camera
+    # a measured point cannot lie on a back-facing triangle
     to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
     facing = (to_eye * normals).sum(-1) > 0
     weight = geman_mcclure_weight(distance**2, scale) * np.where(facing, 1.0, FACING_AWAY_WEIGHT)

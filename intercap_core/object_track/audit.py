@@ -1,8 +1,8 @@
-"""A second look at the track: now and then the object is searched for as if nothing was known.
+"""Audits the track: in selected frames the object is searched for without using the track.
 
-A tracker that slid into a wrong pose while a hand hid the object keeps it afterwards, and what
-depth it has fits it passably. Where a search finds another pose the track is followed from there
-both ways, and the images of all frames in which the two differ decide.
+A tracker that drifted into a wrong pose while a hand occluded the object keeps that pose
+afterwards, and the visible depth fits it passably. Where a search finds another pose the track is
+followed from there both ways, and the images of all frames in which the two differ decide.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from intercap_core.object_track.turns import near_turns
 
 
 def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> list[FrameResult]:
-    """The track (T) with the frames replaced that another pose explains better, and those flagged
-    that it explains as well; ``times`` (T,) seconds."""
+    """The track (T): frames that another pose explains better are replaced, frames that it explains
+    equally well are flagged ambiguous; ``times`` (T,) seconds."""
     result = list(track)
     windows = [
         range(start, min(start + AUDIT_WINDOW_FRAMES, observer.count))
@@ -53,7 +53,8 @@ def audited(observer: Observer, track: list[FrameResult], times: np.ndarray) -> 
 
 
 def _look(observer: Observer, track: list[FrameResult], t: int, times: np.ndarray) -> None:
-    """Search frame t; where that finds another pose, decide about the frames around it."""
+    """Search frame t; where the search finds another pose, decide which of the two the frames
+    around it keep."""
     own = track[t]
     value = 0.0 if own.lost else observer.value(t, own.fit)
     others = [
@@ -74,8 +75,8 @@ def _look(observer: Observer, track: list[FrameResult], t: int, times: np.ndarra
 
 
 def _may_be_there(observer: Observer, t: int, own: FrameResult, fit: Fit) -> bool:
-    """Whether what a search found may be the object: images alone would prefer a twin in plain
-    sight to the object in a hand."""
+    """Whether a searched pose may be the object: the images alone would prefer a fully visible
+    object of the same kind to the partly occluded one in a hand."""
     there = observer.mesh.centre_at(fit.pose)
     away = float(np.linalg.norm(there - observer.mesh.centre_at(own.fit.pose)))
     if not own.lost and away < NEAR_LAST_PLACE_M:
@@ -87,7 +88,8 @@ def _may_be_there(observer: Observer, t: int, own: FrameResult, fit: Fit) -> boo
 def _undecided(
     observer: Observer, track: list[FrameResult], rival: dict[int, FrameResult]
 ) -> list[int]:
-    """The frames in which the two are quite different and the images around do not decide."""
+    """The frames in which the two poses are far apart and the images of the frames around do not
+    decide between them."""
     run = sorted(rival)
     gain = np.array([rival[u].score - track[u].score for u in run])
     symmetry = observer.mesh.symmetry
@@ -108,7 +110,8 @@ def _preferred(
     rival: dict[int, FrameResult],
     times: np.ndarray,
 ) -> list[int]:
-    """The frames in which the rival explains the images better, for the object's inertia."""
+    """The frames in which the rival hypothesis explains the images better, given the object's
+    inertia."""
     run = range(max(min(rival) - 1, 0), min(max(rival) + 2, len(track)))
     options: list[list[tuple[Fit, bool]]] = []
     for u in run:
@@ -122,8 +125,8 @@ def _preferred(
 
 
 def _is_turn(observer: Observer, own: Fit, other: Fit) -> bool:
-    """Whether the two poses differ by a turn that hardly changes the object: which of those it is
-    all frames of the track decide together."""
+    """Whether the two poses differ by a near symmetry of the object; that ambiguity is resolved
+    later, over all frames (:mod:`.turns`)."""
     turned = own.pose[:3, :3] @ near_turns(observer.mesh)[:, :3, :3]
     error = observer.mesh.symmetry.rotation_error_deg(turned, other.pose[:3, :3])
     return bool(np.min(error) < AUDIT_NEAR_TURN_DEG)

@@ -1,4 +1,4 @@
-"""Candidates that hold the person beside the object: what is left of them without the person."""
+"""Candidates whose mask covers both person and object: the object's part of the mask."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from intercap_core.object_track.reduced_mask import ReducedMask
 
 
 def without_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedMask | None:
-    """The largest part of a blob of person and object off the person.
+    """The largest part, outside the person's mask, of a candidate that covers person and object.
 
-    None where the candidate is no such blob, or the person alone. ``step`` is the reduction of
-    both masks; slivers along the person's border are no object.
+    None where the candidate does not cover the person, or is the person alone. ``step`` is the
+    reduction of both masks; slivers along the person's silhouette are discarded.
     """
     if not mask.area or not person.area:
         return None

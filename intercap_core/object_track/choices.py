@@ -1,4 +1,4 @@
-"""Frames in which little is seen: several poses explain them, neighbours decide between them.
+"""Weakly observed frames: several hypotheses explain the images, the neighbouring frames decide.
 
 A tracker keeps the pose that its start leads to. Where a frame agrees with the images much less
 than the track usually does, it is also fitted from poses turned a little each way; the sequence of
@@ -52,7 +52,7 @@ def other_fits(
 
 
 def best_sequence(mesh: ObjectMesh, options: list[list[Fit]], times: np.ndarray) -> list[int]:
-    """Which of each frame's options belong together: indices [T]."""
+    """The most likely sequence of hypotheses: the index of the one chosen in each frame, [T]."""
     usual = float(np.median([own[0].score for own in options]))
     totals, came = [_values(options[0], usual)], []
     for t in range(1, len(options)):
@@ -68,7 +68,8 @@ def best_sequence(mesh: ObjectMesh, options: list[list[Fit]], times: np.ndarray)
 
 
 def _values(options: list[Fit], usual: float) -> np.ndarray:
-    """What each pose explains (N,); a frame that no pose explains well says little."""
+    """Log-likelihood (N,) of each pose up to a constant; nearly flat in a frame that no pose
+    explains well."""
     scores = np.array([fit.score for fit in options])
     trust = min(scores.max() / max(usual, 1e-6), 1.0) ** 2
     return scores * trust / SEQUENCE_SCORE_SIGMA

@@ -58,9 +58,9 @@ DEPTH_HALF_SAMPLES_PX = 120
 # Overlap (IoU) of candidate and render up to which the contour has the least weight, the range over
 # which its weight grows to 1, and the least. Tuned on the studio.
 CONTOUR_TRUST_OVERLAP, CONTOUR_TRUST_RANGE, CONTOUR_TRUST_MIN = 0.3, 0.4, 0.1
-# Variance of what views err together and apart over what they err apart; the same of turns: what
-# all views have in common (calibration, masks that are too large) shifts rather than turns. Tuned
-# on the studio.
+# Total variance of the views' errors (common and independent) over the independent part; the same
+# of rotations: errors common to all views (calibration, masks that are too large) shift the object
+# rather than rotate it. Tuned on the studio.
 COMMON_ERROR_VARIANCE = 4.0
 COMMON_TURN_VARIANCE = 1.5
 # Variance of the views' errors over the stated one is taken as at least this: a few views may agree
@@ -93,20 +93,20 @@ ACCELERATION_RAD_S2 = 20.0
 # Standard deviation of speeds between frames, where a sequence of hypotheses is chosen: a hand that
 # carries something moves at about 1.5 m/s, 4 rad/s. Tuned on the studio.
 SEQUENCE_SPEED_RAD_S, SEQUENCE_SPEED_M_S = 4.0, 1.5
-# By which a tracked turn slides from the true one in a second, standard deviation. Tuned on the
+# Drift of a tracked rotation from the true one in a second, standard deviation. Tuned on the
 # studio.
 SLIDE_RAD_S = np.radians(80)
-# The object moved as no hand moves it in one frame: 4.5 m/s at 30 Hz.
+# Motion in one frame that no hand can cause: 4.5 m/s at 30 Hz.
 JUMP_M, JUMP_DEG = 0.15, 45.0
 # Shortest rest, seconds. Tuned on the studio.
 MIN_REST_S = 0.25
-# Frames in which an object cannot go somewhere and come back: a tenth of a second at 30 Hz.
+# Frames within which an object cannot move away and back: a tenth of a second at 30 Hz.
 BLIP_FRAMES = 2
-# About from the nearest joint to the object's surface, metres: at hand, and out of reach. Tuned on
-# the studio.
+# Distance from the nearest joint to the object's surface, metres: within reach, and out of reach.
+# Tuned on the studio.
 AT_HAND_M, OUT_OF_REACH_M = 0.10, 0.45
-# Quantile of the frames' distances that says how near the person comes: nobody is at the object all
-# the time. Tuned on the studio.
+# Quantile, over frames, of the distance to the person that counts as their approach: nobody is near
+# the object all the time. Tuned on the studio.
 NEAREST_QUANTILE = 0.1
 
 # --- solver effort: images -----------------------------------------------------------------------
@@ -149,9 +149,9 @@ GRID_ROTATIONS = 240  # of a trivial group: about 40 degrees apart, inside the f
 GRID_SPACING_DEG = 12.0  # equivalent rotations nearer than this are one; twice that with an axis
 UPRIGHT_TURNS = 24  # about the vertical of the standing pose, 15 degrees apart
 OUTLINE_DIRECTIONS = 16  # of the image in which a silhouette's reach is taken
-OUTLINE_MIN_DEPTH_M = 0.1  # what is nearer is taken to lie here: only keeps divisions finite
+OUTLINE_MIN_DEPTH_M = 0.1  # smaller depths are clamped to this: keeps divisions finite
 ALIGNED_POINTS = 150  # of all views together
-ICP_STEPS = 6
+ICP_STEPS = 6  # iterations of the alignment
 ICP_SCALES_M = (0.08, 0.015)  # Geman-McClure scale: the grid's error at a hand's width, the noise
 ICP_MAX_TURN_RAD, ICP_MAX_SHIFT_M = np.radians(15), 0.05  # of a step
 ICP_DAMPING = 1e-3  # of the diagonal
@@ -248,7 +248,7 @@ BESIDE_FRAMES = 2  # in which something stands there while the object is elsewhe
 SIZE_CHECK_SETS = 6  # frame sets that are looked at, spread over the recording
 SIZE_CHECK_STRIDE = 3  # of the depth pixels
 SIZE_CHECK_MIN_POINTS = 8  # depth pixels under a mask
-SIZE_CHECK_MIN_MASKS = 5
+SIZE_CHECK_MIN_MASKS = 5  # fewer do not tell a size; tuned on the studio
 # A mask is smaller than the object where that is seen end on or hidden by a hand, and larger where
 # it also covers the person; most are neither, and a wrong unit is a factor of ten.
 SIZE_DOUBTFUL_RATIO = 4.0
@@ -273,10 +273,12 @@ DECIDED_RUN, DECIDED_FRAME = 0.01, 0.03
 SEQUENCE_SCORE_SIGMA = 0.02  # standard deviation of a frame's score, between poses of one fit
 SEQUENCE_MAX_MOTION_COST = 6.0  # minus log-likelihood of a motion that is none
 TURN_SCORE_SIGMA = 0.01  # of a key frame's score's difference between a turn and none
-# To turn the track by a right angle or more takes so much more than to doubt it: images of poses
-# far apart err apart, and for longer than a key frame.
+# Factor of TURN_SCORE_SIGMA for a correction by a right angle or more, not for flagging a frame:
+# the scores of distant poses have independent errors, correlated over more than one key frame.
+# Tuned on the studio.
 TURN_APART_FACTOR = 2.5
-# Minus log-likelihood of any change of turn: in a sound track, and where it was lost.
+# Minus log-likelihood of any change of the chosen rotation: in a tracked stretch, and where the
+# track was lost.
 TURN_JUMP_COST, TURN_BROKEN_COST = 10.0, 1.0
 TURN_MAX_LOSS = 0.01  # of the score, that a turn may cost a run of frames which others decide
 SAME_AXIS_COSINE = float(np.cos(np.radians(10)))  # principal axes nearer to the frame's are these

@@ -41,7 +41,7 @@ from intercap_core.rigid.twist import moved, step_between
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """Where the object is expected: keeps motions that nothing shows (a bottle's spin) at rest.
+    """Prior on the pose around the prediction: keeps unobserved motions (a bottle's spin) at rest.
 
     Beyond the paper.
     """
@@ -283,6 +283,6 @@ def _limited(step: np.ndarray) -> np.ndarray:
 
 
 def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
-    """The pose that each view shows: the same array where it exposes at the frame set's time."""
+    """The pose at each view's exposure: the same array where it exposes at the frame set's time."""
     late = [0.0 if twist is None else view.geometry.time_offset_s for view in views]
     return [pose if not t or twist is None else moved(pose, t * twist) for t in late]

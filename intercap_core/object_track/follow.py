@@ -1,4 +1,5 @@
-"""One pass over the frames: each pose starts the next, what is lost is searched for again."""
+"""One pass over the frames: each pose initialises the next, and a lost object is searched for
+again."""
 
 from __future__ import annotations
 
@@ -91,7 +92,8 @@ def _is_due(doubted_for: int) -> bool:
 
 
 def _better_start(observer: Observer, t: int, predicted: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """The prediction or the last pose, whichever agrees better where they differ much."""
+    """The start of the next fit: the prediction, or the last pose where the two differ much and it
+    agrees better with the images."""
     if same_pose(observer.mesh, predicted, now):
         return predicted
     options = [observer.assess(t, pose) for pose in (predicted, now)]
@@ -125,8 +127,8 @@ def min_value(observer: Observer, t: int) -> float:
 
 
 def _named(observer: Observer, last: np.ndarray, fit: Fit) -> bool:
-    """Whether candidates of enough views show the object there: far from where it was one alone
-    may be anything."""
+    """Whether candidates of enough views support the object there: far from its last place a single
+    candidate is not trusted."""
     looked = sum(view.detected for view in fit.views)
     supporting = sum(view.candidate >= 0 for view in fit.views)
     away = float(np.linalg.norm(observer.mesh.centre_at(fit.pose) - observer.mesh.centre_at(last)))

@@ -51,7 +51,8 @@ class Sighting:
     outline: Outline | None
 
     def away(self, point: np.ndarray, diameter: float) -> float:
-        """How far the candidate is from a place (3,), in units of what still is one object."""
+        """Distance of the candidate from a place (3,), in units of the largest distance within one
+        object."""
         if self.centre is not None:
             return float(np.linalg.norm(self.centre - point)) / (
                 SAME_OBJECT_SHARE * diameter + GROUP_SLACK_M
@@ -137,7 +138,8 @@ def _different(groups: list[Group], limit: int) -> list[Group]:
 
 
 def _crossings(outlined: list[Sighting], diameter: float) -> list[np.ndarray]:
-    """Points (3,) where the rays of two views' masks meet that both fit the object's size."""
+    """Points (3,) where the rays through two views' masks intersect and both masks have the size
+    that the object would have there."""
     found = []
     for a, b in combinations(outlined, 2):
         if a.view == b.view:
@@ -150,7 +152,8 @@ def _crossings(outlined: list[Sighting], diameter: float) -> list[np.ndarray]:
 
 
 def _could_be(view: View) -> list[Candidate]:
-    """All but those on the person: labels err, so none is left out for its label alone."""
+    """All candidates that are not the person: labels err, so none is left out for its label
+    alone."""
     found = []
     for candidate in view.candidates:
         mask = candidate.mask
@@ -160,7 +163,9 @@ def _could_be(view: View) -> list[Candidate]:
             large = (
                 candidate.label == PERSON_LABEL or mask.area > PERSON_SIZED_SHARE * view.person.area
             )
-            if not (on_person and large):  # what is held before the body may lie in its mask
+            if not (
+                on_person and large
+            ):  # an object held before the body may lie in the person's mask
                 found.append(candidate)
     return found
 

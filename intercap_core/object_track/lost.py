@@ -1,4 +1,4 @@
-"""Which poses are not to be believed."""
+"""Which poses count as lost."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ class DetectionSupport:
         self._frames = 0
 
     def believes(self, place: np.ndarray, fit: Fit) -> bool:
-        """Whether the object may be at ``place`` (3,): some view's candidate shows it, or one did
-        a few frames ago, or there; where no detector looked, always."""
+        """Whether the object may be at ``place`` (3,): a candidate of some view supports it, or one
+        did a few frames ago or near this place. Always true where no detector ran."""
         looked = any(view.detected for view in fit.views)
         if not looked or any(view.candidate >= 0 for view in fit.views):
             self._place, self._frames = place, 0
@@ -107,8 +107,9 @@ def _unnamed(mesh: ObjectMesh, frames: list[FrameResult]) -> np.ndarray:
 
 
 def _deviations(mesh: ObjectMesh, fit: Fit) -> tuple[float, float]:
-    """Standard deviations of the centre, metres, in its worst direction, and of the turn, radians,
-    about its second worst axis: on which side a handle is, about one axis, is decided elsewhere."""
+    """Standard deviations of the centre, metres, in its worst direction, and of the rotation,
+    radians, about its second worst axis: the ambiguity about a single axis (on which side a handle
+    is) is resolved in :mod:`.turns`."""
     arm = fit.pose[:3, :3] @ mesh.centre_of_mass
     about = np.cross(np.eye(3), arm)  # row i: shift of the centre by a turn about axis i
     to_centre = np.concatenate([about.T, np.eye(3)], axis=1)

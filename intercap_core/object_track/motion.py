@@ -1,4 +1,4 @@
-"""How the tracked object moves: where it is expected next, and how surely."""
+"""Motion model of the tracked object: the predicted pose and its standard deviations."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
 def expected(
     before: np.ndarray, now: np.ndarray, predicted: np.ndarray, lost_for: int
 ) -> MotionPrior:
-    """How far the object may be from the prediction: it may start to move, turn or stop.
+    """The prior around the prediction: the object may start to move, turn or stop.
 
-    From rest one frame of a hand's acceleration, in motion half of the last step beside that, and
-    more for every frame since it was last seen.
+    From rest, one frame of a hand's acceleration; in motion, half of the last step in addition;
+    more for every frame since the object was last visible.
     """
     shift = float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
     turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())

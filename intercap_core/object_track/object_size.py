@@ -1,4 +1,5 @@
-"""Whether the detector knows the object at all, and whether the mesh has that thing's size.
+"""Checks before tracking: whether the detector knows the object's class, and whether the mesh has
+the size of the detected object.
 
 A mesh in decimetres, or one scaled by mistake, passes every check of the file alone. Where depth
 lies under a candidate's mask, the mask's extent in pixels is one in metres.

@@ -1,4 +1,4 @@
-"""The object's pose over time: a seed frame, tracking both ways from it, and a second opinion.
+"""The object's pose over time: a seed frame, tracking both ways from it, and a second pass.
 
 From the seed the track runs to both ends; then from the ends back over all frames. Where the two
 passes end in different poses the images decide, and where they do not the frames are flagged.
@@ -75,7 +75,7 @@ class Tracker:
             seed_frame, seed = find_seed(self._observer)
         self._observer.places.claim(self._mesh.centre_at(seed.pose))
         merged = self._passes(seed_frame, seed)
-        if self._at_another(merged):  # which only later frames have shown
+        if self._at_another(merged):  # known only once later frames were tracked
             merged = self._passes(seed_frame, seed)
         sure = seed_frame if initial is not None and borne_out else None
         refined = WholeTrack(self._observer, self._times, sure).refine(merged)
@@ -167,7 +167,7 @@ def _recovered(mesh: ObjectMesh, frames: list[FrameResult], seed_frame: int) -> 
 
 
 def _jumped(mesh: ObjectMesh, before: FrameResult, now: FrameResult) -> bool:
-    """Whether the object moved as no hand moves it in one frame."""
+    """Whether the object moved farther in one frame than a hand can move it."""
     shift = float(np.linalg.norm(now.fit.pose[:3, 3] - before.fit.pose[:3, 3]))
     turn = mesh.symmetry.rotation_error_deg(now.fit.pose[:3, :3], before.fit.pose[:3, :3])
     return bool(shift > JUMP_M or turn > JUMP_DEG)

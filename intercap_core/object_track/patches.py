@@ -147,9 +147,22 @@ def _own(border, person):
 
 @numba.njit(cache=True, nogil=True)
 def _lift(
-    image, rays, left, top, right, bottom, colour_from_depth, master_from_depth, colour, mask, mx,
-    my, person, px, py,
-):  # fmt: skip
+    image,
+    rays,
+    left,
+    top,
+    right,
+    bottom,
+    colour_from_depth,
+    master_from_depth,
+    colour,
+    mask,
+    mx,
+    my,
+    person,
+    px,
+    py,
+):
     """Depth, points, trust and on_person of a :class:`DepthPatch`; masks with their first pixels.
 
     ``colour`` (13,) is the reduced colour lens, in whose pixels the masks are.

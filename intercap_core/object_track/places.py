@@ -1,9 +1,10 @@
-"""Where in the room the object may be, over the whole recording: which of several like ones it is.
+"""Prior of places in the room over the whole recording: which of several similar things is the
+object.
 
-Another chair, a second cup: what has the object's class and size is not always the object. The
-object is what the person handles: it moves, or the person is at it. What stands in one place from
-the first frame to the last while nobody comes near is another, and so is what stands there while
-the object is soundly tracked elsewhere.
+Another chair, a second cup: not everything of the object's class and size is the object. The object
+is the one that the person handles: it moves, or the person is near it. A thing that stays in one
+place from the first frame to the last with nobody near is another one, and so is a thing that is
+visible in its place while the object is reliably tracked elsewhere.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Standing:
 
 
 class Places:
-    """What was seen where, and how likely what is there is the object.
+    """Places where candidates were seen, each with the prior that the thing there is the object.
 
     ``joints`` (T, K, 3) of the person, NaN unknown, metres, master frame; None where no person is
     known.
@@ -85,7 +86,7 @@ class Places:
         return places, [frames[i] for i in order if best[i] > 0]
 
     def prior(self, t: int, place: np.ndarray) -> float:
-        """How likely what is at ``place`` (3,) in frame t is the object: 0.1 to 1."""
+        """Prior, 0.1 to 1, that the thing at ``place`` (3,) in frame t is the object."""
         found = self._nearest(place)
         if found is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
@@ -93,18 +94,19 @@ class Places:
         return MIN_PLACE_PRIOR if len(standing.beside) >= BESIDE_FRAMES else place_prior
 
     def taken(self, place: np.ndarray) -> bool:
-        """Whether another thing stands at ``place`` (3,): the object was elsewhere meanwhile."""
+        """Whether the thing at ``place`` (3,) is another one: it was visible there while the object
+        was elsewhere."""
         found = self._nearest(place)
         return found is not None and len(found[0].beside) >= BESIDE_FRAMES
 
     def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
-        """What stands at ``place`` (3,) and its prior."""
+        """The known place at ``place`` (3,), if any, and its prior."""
         away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
         nearest = int(np.argmin(away)) if away else 0
         return self._standing[nearest] if away and away[nearest] < self._same else None
 
     def claim(self, place: np.ndarray) -> None:
-        """What is at ``place`` (3,) is the object, whoever comes near."""
+        """Mark the thing at ``place`` (3,) as the object, wherever the person is."""
         self._standing = [
             (s, place_prior)
             for s, place_prior in self._standing
@@ -112,7 +114,7 @@ class Places:
         ]
 
     def tracked(self, t: int, place: np.ndarray) -> None:
-        """The object is at ``place`` (3,) in frame t beyond doubt."""
+        """Record that the object is reliably tracked at ``place`` (3,) in frame t."""
         for s, _ in self._standing:
             if t in s.frames and np.linalg.norm(s.place - place) >= self._same:
                 s.beside.add(t)
@@ -134,7 +136,8 @@ class Places:
 
 
 def _closeness(gaps: np.ndarray) -> float:
-    """From the nearest of the gaps (N,), metres: 1 at hand, 0.1 far away or unknown."""
+    """Prior from the smallest of the distances (N,), metres: 1 within reach, 0.1 far away or
+    unknown."""
     gap = float(np.quantile(gaps, NEAREST_QUANTILE)) if len(gaps) else np.inf
     return float(
         np.clip((OUT_OF_REACH_M - gap) / (OUT_OF_REACH_M - AT_HAND_M), MIN_PLACE_PRIOR, 1.0)

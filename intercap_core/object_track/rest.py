@@ -73,7 +73,8 @@ def _partition(
     began = np.zeros(count + 1, int)
     rested_before = np.zeros(count + 1, bool)
     residual = np.zeros(count + 1)
-    # forwards: what ends before frame a is known when segments that begin there are tried
+    # in ascending order: the cheapest partition of the frames before a is known when segments from
+    # a are tried
     for a in range(count):
         if a:
             stay, go = best_move[a - 1], best_rest[a - 1]
@@ -122,8 +123,8 @@ def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.
 
 
 def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """The segments (T,) without frames at their ends that are on their way: errors that last do
-    not begin just when a motion does."""
+    """The segments (T,) without frames at their ends in which the object already moves: correlated
+    errors do not begin just when a motion does."""
     result = segments.copy()
     for number in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == number)
@@ -147,8 +148,8 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
 def _joined(
     segments: np.ndarray, poses: np.ndarray, information: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """The segments (T,) with two that a blip or the longest rest parted made one again, where one
-    pose explains both."""
+    """The segments (T,), with neighbours merged where one pose explains both: rests split by a
+    single outlier or by the limit on a rest's length."""
     result = np.full_like(segments, -1)
     number, last = -1, np.zeros(0, int)
     for old in range(segments.max(initial=-1) + 1):
@@ -167,7 +168,8 @@ def _joined(
 
 
 def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """The information (T, 6, 6), none where a frame or two are elsewhere between equal ones."""
+    """The information (T, 6, 6), zero for outliers: one or two frames at another pose between
+    frames at equal ones."""
     result = information.copy()
     for width in range(1, BLIP_FRAMES + 1):
         inner = np.arange(1, len(poses) - width)

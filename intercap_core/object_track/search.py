@@ -165,7 +165,7 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
 
 
 def plausibility(fit: Fit, up: np.ndarray | None) -> float:
-    """A fit's confidence, and a little more where the object stands as it does when let go.
+    """A fit's confidence, with a small bonus where the object stands upright.
 
     Decides between poses that the images hardly tell apart: a mug is seldom upside down.
     """

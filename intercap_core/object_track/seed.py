@@ -1,4 +1,4 @@
-"""The pose that tracking starts from, found with nothing to start from."""
+"""The initial pose for tracking, found without any prior pose."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""On which side a nearly symmetric object is: decided over all frames together.
+"""Orientation of a nearly symmetric object among its near symmetries, decided over all frames.
 
 A mug looks much the same with its handle elsewhere, a box from its back. One frame may not show the
-difference, a hand hides it for a second, and a tracker then slides away with nothing to notice.
-Which turns are hard to tell apart follows from the mesh: those that bring its surface nearly back
-onto itself. Every few frames all of them are compared with the images, and dynamic programming
-(Viterbi 1967) finds the sequence of turns that explains all frames best while the object turns no
-faster than objects do; it may change freely only where the track was lost.
+difference, a hand may occlude it for a second, and the tracker then drifts to another rotation
+unnoticed. Which turns are hard to tell apart follows from the mesh: those that bring its surface
+nearly back onto itself. Every few frames all of them are compared with the images, and dynamic
+programming (Viterbi 1967) finds the sequence of turns that explains all frames best while the
+object turns no faster than objects do; it may change freely only where the track was lost.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def near_turns(mesh: ObjectMesh) -> np.ndarray:
         half = [
             _placed(field, points, _about(axis, a), far) for a in angles[: NEAR_TURN_STEPS // 2 + 1]
         ]
-        # turned back as much it has moved as much
+        # the inverse rotation moves the surface as far
         placed = half + [(np.linalg.inv(turn), share) for turn, share in half[-2:0:-1]]
         moved = np.array([share for _, share in placed])
         if moved.max() < NEAR_TURN_CHANGED_SHARE and mesh.symmetry.axis is None:
@@ -86,7 +86,7 @@ def choose_turns(
     ``scores`` (K, N) of every turned pose, NaN rows where nothing is known; ``gaps`` (K-1,) seconds
     to the next key frame; ``broken`` (K-1,) whether the track was lost between.
     """
-    # what agrees badly with every turn says little about which
+    # a frame that agrees badly with every turn is little evidence for one
     usual = max(float(np.nanmedian(scores.max(1))), 1e-6)
     trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
     between = angle_between(turns[:, None], turns[None])

@@ -10,7 +10,7 @@ from intercap_core.object_track.view import View
 
 
 class ViewCache:
-    """Calls ``load(t)`` for the views of frame t, and again only when others took its place."""
+    """Calls ``load(t)`` for the views of frame t once, and again only after they were evicted."""
 
     def __init__(
         self, load: Callable[[int], list[View]], max_bytes: int = VIEW_CACHE_BYTES

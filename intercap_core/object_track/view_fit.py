@@ -94,7 +94,7 @@ class ViewFit:
         self._cut()
 
     def choose_again(self) -> bool:
-        """Look at the candidates again from a new pose; whether another one is kept now."""
+        """Choose the candidate anew at the current pose; returns whether it has changed."""
         found = choose(self._view, self._silhouette, self._min_overlap, self._labels)
         if found is self._candidate:
             return False
@@ -154,7 +154,7 @@ class ViewFit:
         """The normal equations and the residuals (N,) in pixels of the reduced image."""
         nothing = np.zeros((6, 6)), np.zeros(6), np.zeros(0)
         patch, drawn, geometry = self._contour_patch, self._silhouette, self._view.geometry
-        # moved out of the evidence: depth alone leads until it is cut anew
+        # the render has left the mask's window: depth alone is used until the window is cut again
         if patch is None or not patch.holds(drawn):
             return nothing
         scale = scale_px / geometry.step
@@ -200,8 +200,8 @@ class ViewFit:
             self._pose[:3, 3],
             scale,
         )
-        # Weights go by the whole rim: a rim that fits nearly everywhere must not let the few
-        # pixels that do not count as much as a rim that is off all around.
+        # Normalised by the size of the whole rim, not by the number of residuals: a few outlier
+        # pixels of a rim that fits elsewhere weigh less than a rim that is off all around.
         samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
         weight = self._contour_trust * samples / (CONTOUR_SIGMA_PX / geometry.step) ** 2
         return weight * hessian, weight * gradient, residuals

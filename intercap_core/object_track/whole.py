@@ -53,9 +53,9 @@ class WholeTrack:
     def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
-        A lost frame's pose is a guess: it is found again where its neighbours lead to a pose that
-        the images support. Where they pull a frame far from what it shows, it is lost unless the
-        images support that.
+        A lost frame's pose is a guess; the frame is recovered where interpolation of its neighbours
+        leads to a pose that the images support. A frame that smoothing moves far from its own fit
+        becomes lost, unless the images support the smoothed pose.
         """
         lost = np.array([frame.lost for frame in frames])
         if lost.all():
@@ -174,7 +174,9 @@ class WholeTrack:
         motion = twists(track, np.ones(len(fits), bool), self._times)
         motion[segment >= 0] = 0
         looked = poses.copy()
-        for t in reversed(self._worth_a_look(segment)):  # what was read last is still there
+        for t in reversed(
+            self._worth_a_look(segment)
+        ):  # the images read last are still in the cache
             again = self._observer.evidence(t, track[t], motion[t])
             before = found[t]
             if before is None or _score(again) >= RELOOK_MIN_SCORE * _score(before):
@@ -193,7 +195,7 @@ class WholeTrack:
         return result, segment, free, pulled
 
     def _apart(self, one: np.ndarray, two: np.ndarray) -> np.ndarray:
-        """In which frames (T,) the object is elsewhere by poses (T, 4, 4) than by others."""
+        """Frames (T,) bool in which two tracks' poses (T, 4, 4) differ."""
         centre = self._mesh.centre_at
         offset = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
         return np.linalg.norm(offset, axis=-1) > UNSURE_M
@@ -255,7 +257,7 @@ class WholeTrack:
         return np.concatenate([turn, -np.cross(turn, pose[:3, :3] @ offset)], axis=1)
 
     def _without_symmetry(self, evidence: FrameEvidence) -> FrameEvidence:
-        """The evidence without what the facets of a round mesh pretend to know of its spin."""
+        """The evidence without the spurious information of a round mesh's facets about its spin."""
         information, gradient = evidence.information.copy(), evidence.gradient.copy()
         for t, pose in enumerate(evidence.poses):
             for step in self._axes(pose):
@@ -284,11 +286,11 @@ class WholeTrack:
 
 
 def _noise(found: list[PoseEvidence]) -> float:
-    """Variance of the evidence over what it states, from how far the views' pulls disagree.
+    """Factor of the evidence's stated variance, from how far the views' gradients disagree.
 
-    At the minimum each view v of a frame still pulls by g_v; if it errs independently with s^2
-    times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What all views
-    have in common (calibration, masks that are too large) does not show and comes on top.
+    At the minimum each view v of a frame still has a gradient g_v; if its errors are independent,
+    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What
+    all views have in common (calibration, masks that are too large) does not show and comes on top.
     """
     squares = freedom = 0.0
     for evidence in found:

@@ -1,4 +1,4 @@
-"""Stage ``person``: which detections are the subject, left and right put right, points in space.
+"""Stage ``person``: the subject's detections, left and right corrected, keypoints triangulated.
 
 In the order of a run:
 

@@ -147,7 +147,7 @@ def _perpendicular(vectors: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def _cosine(weighted: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Product (T,) of vectors with unit directions, at most one in size; 0 where unknown.
+    """Scalar product (T,) of vectors, shortened to length one, and unit directions; 0 = unknown.
 
     ``weighted`` keeps its length where that is less than one.
     """

@@ -1,7 +1,7 @@
 """Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
 
 Depth measures the skin, a keypoint is a joint inside the body: the point lies deeper on the pixel's
-ray by an inset of its own. An occluded joint would be placed too near or too far: pixels of the
+ray by an inset of its own. The depth at an occluded joint is of another surface: pixels of the
 scene's background are skipped, and where a side view shows both shoulders or hips in one place, the
 one that the detector trusts less is occluded and left out with its limb.
 """

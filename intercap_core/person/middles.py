@@ -17,8 +17,9 @@ _MIDDLES = tuple(
 def fill_middles(points: np.ndarray) -> None:
     """Fill in place what is NaN in ``points`` (..., 135, 3) from shoulders and hips, if known.
 
-    In space, not in the images: a body's start and its volume then know them, while the fit, which
-    takes points in images as evidence, does not get the shoulders' and hips' errors twice.
+    Only in space, not in the images: the body's initial pose and its volume use them, while the
+    fit, whose evidence is the keypoints in images, does not count the shoulders' and hips' errors
+    twice.
     """
     for middle, ends in _MIDDLES:
         at = points[..., middle, :]

@@ -1,4 +1,4 @@
-"""What the page says of one body's fit: what it rests on, how sure it is of every joint."""
+"""The page's section on one body's fit: its evidence, and the stated deviation of every joint."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def read_fit(
             with Frames.open(frames) as images:
                 faces = model.faces.numpy()
                 sheet = body_sheet(images.showing(image_of), rig, bodies, faces, detected)
-        except UserError as error:  # one broken image must not cost the whole report
+        except UserError as error:  # one unreadable image must not prevent the report
             note = str(error)
         untrusted = fit["failed"] | fit["bridged"]
         return BodyFacts(

@@ -1,4 +1,4 @@
-"""What the page says of one capture: its time, its cameras, their pairs, the floor."""
+"""The page's section on one capture: its time, its cameras, their pairs, the floor."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def read_capture(frames: Path, scene: Path) -> CaptureFacts:
         pictures, note = None, ""
         try:
             pictures = draw_capture(Frames(recorded), refined)
-        except UserError as error:  # one image that does not decode must not cost the whole report
+        except UserError as error:  # one image that does not decode must not prevent the report
             note = str(error)
         names = recorded.text("camera_names")
         times, fps = recorded["times"], float(recorded.attributes["fps"])

@@ -1,4 +1,4 @@
-"""A sheet of small pictures: moments in rows, cameras in columns, cells that others fill."""
+"""A sheet of small pictures: moments in rows, cameras in columns; callers draw the cells."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the page says of one object's track: where it started, what it rests on, how sure it is."""
+"""The page's section on one object's track: its start, its evidence, its stated deviation."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _sheet(
     kept: Callable[[int, int], bytes],
     overlap: np.ndarray,
 ) -> tuple[Sheet | None, str]:
-    """The sheet, or None and why: one broken image must not cost the whole report."""
+    """The sheet, or None and why: one unreadable image must not prevent the report."""
     try:
         with artefacts.read(scene, SCENE) as setting, Frames.open(frames) as images:
             moments = images.showing(setting["image_of"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # --- object: sizes and motion -------------------------------------------------------------------
 
-# Lengths of what people handle, metres; beyond the second pair the file is in another unit.
+# Sizes of objects that people handle, metres; outside the second pair the file is in another unit.
 HANDLED_MAX_M, HANDLED_MIN_M = 3.0, 0.02
 MAX_EXTENT_M, MIN_EXTENT_M = 5.0, 0.01
 # Share of its bounding cube that a body fills; less is a flat sheet with rounding errors.
@@ -12,7 +12,7 @@ MIN_FILLED = 1e-8
 # Share of edges that do not join two faces: a quarter of a lidless box's of few faces; above the
 # limit the faces are loose, and inside and outside mean nothing.
 MAX_OPEN_EDGES = 0.35
-# A thrown or kicked object, m/s and rad/s; what is faster is a track that jumps.
+# Fastest thrown or kicked object, m/s and rad/s; anything faster is a jump of the track.
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
 
 # --- sensor: images -----------------------------------------------------------------------------

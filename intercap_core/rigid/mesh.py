@@ -154,7 +154,7 @@ def _read(path: Path) -> trimesh.Trimesh:
     try:
         mesh: Any = trimesh.load(path, process=False, force="mesh")
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    except Exception as error:  # the readers of trimesh raise whatever a broken file provokes
+    except Exception as error:  # trimesh's readers raise any kind of exception on a broken file
         raise UserError(
             f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again as "
             ".ply or .obj"

@@ -1,4 +1,4 @@
-"""Poses ``a_from_b`` of SO(3) x R^3, and the small motions that the solvers step by.
+"""Poses ``a_from_b`` of SO(3) x R^3, and the increments by which the solvers update them.
 
 A pose maps points of frame b to frame a: x_a = R x_b + t, metres. A step is six numbers, a turn
 w (rad) about the object's own origin, from the left, and a shift d (m) of that origin, in frame a::
@@ -33,7 +33,7 @@ class Pose:
 
     @classmethod
     def identity(cls, *batch: int) -> Pose:
-        """The pose that moves nothing, of shape ``batch``."""
+        """The identity, of shape ``batch``."""
         return cls(np.tile(np.eye(3), (*batch, 1, 1)), np.zeros((*batch, 3)))
 
     @classmethod

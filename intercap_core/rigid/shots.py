@@ -1,4 +1,4 @@
-"""What is drawn and what comes of it: meshes, views of them, and images cut to a window."""
+"""Inputs and outputs of rendering: meshes, views of them, and images cut to a window."""
 
 from __future__ import annotations
 

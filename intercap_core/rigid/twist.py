@@ -13,7 +13,7 @@ def twists(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarra
     """Turn (rad/s, from the left) and shift of the origin (m/s) in a second: (T, 6).
 
     ``poses`` (T, 4, 4) master_from_object, believed where ``known`` (T,); ``times`` (T,) seconds.
-    Zero where nothing is known; a single jump moves no neighbour much.
+    Zero where nothing is known; limited, so that a single jump hardly affects its neighbours.
     """
     if len(poses) < 2:
         return np.zeros((len(poses), 6))

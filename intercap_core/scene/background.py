@@ -1,9 +1,9 @@
 """The static scene as each depth camera sees it.
 
-What moves in front of the scene is nearer than it, so a pixel's background is the *farthest*
-depth that it holds steadily, not the median: someone who stands still for most of a recording
-does not become background. Someone who never leaves does not either, as long as the keypoints
-tell where (:mod:`.person_space`); a thing that never moves does: nothing tells it from furniture.
+What moves in front of the scene is nearer than it, so a pixel's background is the *farthest* depth
+that it holds steadily, not the median: someone who stands still for most of a recording does not
+become background. Someone who never leaves does not either, as long as the keypoints tell where
+(:mod:`.person_space`); a thing that never moves does: it cannot be told from furniture.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def background_of(frames: Frames, c: int, joints: np.ndarray | None = None) -> B
 
 def steady_background(images: np.ndarray, somebody: np.ndarray | None = None) -> Background:
     """The background of depth images (S, H, W) uint16 mm of one camera; ``somebody`` (S, H, W)
-    bool: a person may be there, which says nothing about what is behind."""
+    bool: a person may be there, so that the sample is no evidence of the background."""
     samples, height, width = images.shape
     told = np.full(height * width, samples)
     if somebody is not None:

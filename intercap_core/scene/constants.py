@@ -83,7 +83,7 @@ SPEED_ERROR = 0.08  # of an offset: paths are smoothed too much or too little; t
 
 MAX_SAMPLES = 25  # sets of the background; bounds memory: this many depth images of one camera
 BACKGROUND_CELL_M = 0.03  # of thinned surfaces
-MOVING_CELL_M = 0.02
+MOVING_CELL_M = 0.02  # of thinned moving surfaces; tuned on the studio
 MOVING_MOMENTS = 16  # frame sets looked at, each with the one before and the one after
 MOVING_SEARCHES = 3  # nearest neighbours until the displacement along the normal settles
 NEIGHBOUR_PIXEL_STEP = 2  # every second pixel of the neighbouring sets, both ways, is enough
@@ -141,11 +141,11 @@ NEAR_FLOOR_M = 0.06  # of the floor at poses that are not yet refined; tuned on 
 FLOOR_FIRST_GATE_M = 0.06  # of the plane's refinement, closing to the setting's tolerance
 MIN_FLOOR_POINTS = 200  # of a camera's 3 cm cells: a fifth of a square metre
 FLOOR_EFFECTIVE_POINTS = 10.0  # of one camera: its errors are those of its lens and bias
-FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03
+FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
 BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
 BELOW_FLOOR_COST = 3.0  # how many inliers such a point outweighs; tuned on the studio
 MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
-MIN_FOOT_SETS = 5
+MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
 MIN_ANNOTATED_SPREAD_M = 0.02  # annotated points this close to one line give no plane
 
 # --- decision: offsets and slips ------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Refined camera poses of one recording, or the start where nothing better can be shown."""
+"""Refined camera poses of one recording, or the given ones where no improvement can be shown."""
 
 from __future__ import annotations
 

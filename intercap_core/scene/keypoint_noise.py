@@ -1,8 +1,8 @@
-"""How a detector's errors hang together over time, measured on the residuals themselves.
+"""Temporal covariance of a detector's errors, estimated from the residuals themselves.
 
-A series' covariance is that of a constant of any size, a process that lasts, and what changes from
-image to image. The kind and length of the lasting part are chosen by likelihood from a short list,
-all keypoints and views together.
+A series' covariance is the sum of three: a constant of any size, a process correlated over time,
+and white noise of each image. The kind and length of the correlated part are chosen by likelihood
+from a short list, for all keypoints and views together.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class TimeNoise:
 
 
 def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeNoise:
-    """Choose the noise of ``series`` (N, T), unit scatter, from those that are nearly whole."""
+    """Choose the noise model for ``series`` (N, T) of unit variance, from those with few gaps."""
     whole = np.flatnonzero(valid.mean(1) >= MIN_VALID_SHARE)
     if len(whole) < 10 or len(times) < 8:
         return TimeNoise("rough", 0.5, 0.25, 1.0)
@@ -60,7 +60,7 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
                 covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
                 low = np.linalg.cholesky(covariance)
                 energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
-                # Median over series: some are of hidden joints, some of a camera out of step.
+                # Median over series: some are of occluded joints, some of an unsynchronised camera.
                 scale = max(float(np.median(energy)) / max(len(times) - 1.7, 1), 1e-6)
                 found = -np.log(np.diag(low)).sum() - len(times) / 2 * np.log(scale)
                 if found > best:

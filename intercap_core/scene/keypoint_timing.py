@@ -28,7 +28,7 @@ from intercap_core.scene.constants import (
 from intercap_core.scene.keypoint_motion import Motion, build_motion
 from intercap_core.scene.keypoint_noise import TimeNoise, fit_noise
 
-# Which of POINTS err together: each of the body's on its own, each hand, the face.
+# Groups of POINTS with correlated errors: each body point on its own, each hand, the face.
 CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
 
@@ -61,7 +61,7 @@ def keypoint_offsets(
 
 
 def offsets_of(motion: Motion, master: int) -> Offsets:
-    """The offsets that a motion's residuals say."""
+    """The time offsets that explain a motion's residuals."""
     views = len(motion.rig)
     matrices, vectors = keypoint_equations(motion, motion.residual, _columns(motion))
     prior = np.r_[np.full(views, OFFSET_SIGMA_S**-2.0), np.tile(POSE_SIGMA**-2.0, views)]
@@ -97,7 +97,7 @@ def _inflation(
     free: np.ndarray,
     own: np.ndarray,
 ) -> float:
-    """How much more the offsets scatter than the noise's model says.
+    """Factor by which the offsets' variance exceeds that of the noise model.
 
     From how the keypoints disagree at the solution (the sandwich estimator with clusters: a hand's
     or the face's points err together), as a mean over the cameras.

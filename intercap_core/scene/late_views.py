@@ -1,7 +1,7 @@
-"""The subject in images that are frames late: not where the other views see it, but where it was.
+"""Finds the subject in images that are whole frames late, by where the other views saw it before.
 
-The search for the subject asks that views agree within a set. Somebody who walks is, in an image a
-quarter of a second late, a step behind, and is taken for another person.
+The search for the subject asks that views agree within a set. In an image a quarter of a second
+late somebody who walks is a step behind, and the search takes them for another person.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from intercap_core.scene.constants import MAX_SLIP, SAME_PERSON_PX_AT_1080P
 
 
 class People(Protocol):
-    """Detections, as far as they are asked for here."""
+    """The part of the detections that is used here."""
 
     def people(self, t: int, c: int) -> np.ndarray:
         """Keypoints (P, 135, 3) of the image's people."""

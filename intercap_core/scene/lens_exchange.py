@@ -2,9 +2,9 @@
 
 The InterCap release holds two sets of files in which the focal lengths and principal points of
 cameras 4 and 5 are exchanged, distortion not. Where depth lies on the colour grid, a wrong lens
-bends every surface that the camera measures, so the background says it beyond doubt; where a
-camera has no depth, the keypoints must (:mod:`.lenses`). Devices that bring their own lenses are
-left alone.
+bends every surface that the camera measures, so the background shows it reliably; where a camera
+has no depth, the keypoints are used (:mod:`.lenses`). Devices that bring their own lenses are left
+alone.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _best_exchange(
     given = _residuals(rig, backgrounds, subject, times, master)
     if not given:
         return None
-    # A wrong lens spoils the poses of its neighbours, too: the good quarter says what is usual.
+    # a wrong lens biases its neighbours' poses, too: the lowest quartile is the usual residual.
     usual = np.quantile(list(given.values()), 0.25)
     suspects = [c for c in cameras if _of(given, c) > SUSPICIOUS * usual]
     suspects = sorted(sorted(suspects, key=lambda c: -_of(given, c))[:MAX_SUSPECTS])

@@ -86,7 +86,7 @@ def _moving(
 
 
 def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
-    """The depth image (H, W) uint16 mm where it is before the background, 0 elsewhere."""
+    """The depth image (H, W) uint16 mm where it is in front of the background, 0 elsewhere."""
     assert image is not None
     behind = background.depth
     limit = behind * (1 - BEFORE_BACKGROUND_SHARE) - BEFORE_BACKGROUND_MM

@@ -1,7 +1,7 @@
 """Which pixels of a depth image a person may be in, from the triangulated keypoints alone.
 
-Somebody who stands in one place for a whole recording is as steady as furniture: only the
-keypoints tell.
+The depth of somebody who stands in one place for a whole recording is as constant as that of
+furniture: only the keypoints tell them apart.
 """
 
 from __future__ import annotations

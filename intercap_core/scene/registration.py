@@ -71,7 +71,7 @@ MOVING = SurfaceKind(MOVING_EFFECTIVE_POINTS, PAIR_QUERIES, rounded=True)
 
 @dataclass(frozen=True)
 class Layer:
-    """What the cameras see at one moment: surfaces by camera index, depth camera's frame."""
+    """Surfaces seen at one moment: surfaces by camera index, depth camera's frame."""
 
     surfaces: dict[int, Surface]
     kind: SurfaceKind

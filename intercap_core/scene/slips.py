@@ -1,10 +1,10 @@
-"""Images that are whole frames older than their device times say, found by the body's motion.
+"""Detects images that are whole frames older than their device times, from the body's motion.
 
 While a camera's images are late, every keypoint that moves is seen where it was a while ago. For
 each camera, each number of frames and each interval of sets, the gain in log likelihood of the
-keypoints is worked out under the detector's own noise over time. The best intervals are taken, the
-images are put where they belong, and the search is repeated until nothing is left that is beyond
-doubt. While nobody moves a slip cannot be seen, and none is reported.
+keypoints is worked out under the detector's own noise over time. The best intervals are taken,
+their images reassigned to the sets that they show, and the search is repeated until no interval is
+significant. While nobody moves a slip cannot be seen, and none is reported.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Interval:
 
     @property
     def beyond_doubt(self) -> bool:
-        """Whether it gains more than chance ever would."""
+        """Whether its gain is significant: above what chance produces."""
         return self.sure >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (self.last - self.first + 1)
 
 
@@ -72,7 +72,7 @@ def find_slips(
     """Find slips of up to ``max_slip`` frames in any camera, for a while or always.
 
     ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``times``
-    (T,) s. What all images of a camera are late by is counted from the ``master``'s.
+    (T,) s. A delay of all images of a camera is relative to the ``master``'s.
     """
     slip = np.zeros(keypoints.shape[:2], np.int32)
     if len(times) < MIN_TIMING_SETS or len(rig) < 2:
@@ -113,7 +113,7 @@ def _whole(interval: Interval, sets: int) -> bool:
 
 
 def _constant(slip: np.ndarray) -> np.ndarray:
-    """What all images of each camera (C,) are late by."""
+    """The delay common to all images of each camera (C,), in frames."""
     return np.where((slip != 0).all(0), np.median(slip, 0), 0).astype(np.int32)
 
 
@@ -125,9 +125,10 @@ def _apply(slip: np.ndarray, interval: Interval) -> None:
 
 
 def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
-    """The best interval and those that it cannot have brought about.
+    """The best interval and those that it cannot have caused.
 
-    A camera that is out of step makes others look so: weaker ones and those near it in time wait.
+    An unsynchronised camera makes others look so: much weaker intervals, and those near it in time,
+    are left to the next round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
     taken: list[Interval] = []
@@ -171,7 +172,8 @@ def _polished(
 
 
 def _tolerant(motion: Motion, moved: np.ndarray) -> Motion:
-    """The motion with what any slip would explain as valid, too; ``moved`` (S, T, C, K, 2) px."""
+    """The motion, where residuals that a slip would explain count as valid, too; ``moved`` (S, T,
+    C, K, 2) px."""
     size = np.linalg.norm(motion.residual, axis=-1)
     for late in moved:
         size = np.minimum(size, np.linalg.norm(motion.residual - late, axis=-1))
@@ -184,7 +186,7 @@ def _sure(gains: np.ndarray) -> float:
 
 
 class _Evidence:
-    """What the residuals say for slips of ``steps`` frames."""
+    """Evidence of the residuals for slips of ``steps`` frames."""
 
     def __init__(self, motion: Motion, steps: list[int], fps: float) -> None:
         self._steps = steps
@@ -199,7 +201,7 @@ class _Evidence:
         self._precisions = [precisions(self._motion, noise, part) for part, _ in self._parts]
 
     def best(self, camera: int) -> Interval | None:
-        """The interval of one camera that gains most, if it is beyond doubt."""
+        """The interval of one camera with the greatest gain, if significant."""
         sets = len(self._motion.times)
         root, series = _own_series(self._motion, camera)
         always = {step: np.zeros(series.shape[1]) for step in self._steps}
@@ -229,13 +231,13 @@ class _Evidence:
 
 
 def _best_of_window(cases: dict[int, _Slipped]) -> Interval | None:
-    """The interval, by place in the window, that gains most, if it is beyond doubt."""
+    """The interval, by place in the window, with the greatest gain, if significant."""
     found = [case.best(step) for step, case in cases.items()]
     found = [interval for interval in found if interval.beyond_doubt]
     if not found:
         return None
     most = max(found, key=lambda i: i.gain)
-    # The gain tells best that and when images are late, the misfit by how much.
+    # the gain shows best that and when images are late, the misfit by how much
     return min(found, key=lambda i: cases[i.slip].misfit(most.first, most.last + 1))
 
 
@@ -249,7 +251,7 @@ def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
     both = slice(2 * camera, 2 * camera + 2)
     scale = np.where(motion.valid[:, camera], 1 / motion.sigma[camera], 0.0)[..., None, None]
     block = motion.projector[:, :, both, both] / np.maximum(scale, 1e-12)
-    # Two views leave but one direction: a hair of the other keeps the root invertible.
+    # two views constrain one direction only: a small ridge keeps the root invertible
     block = block + 1e-6 * np.eye(2)
     determinant = np.sqrt(np.maximum(np.linalg.det(block), 0))[..., None, None]
     trace = np.trace(block, axis1=2, axis2=3)[..., None, None]
@@ -268,7 +270,7 @@ class _Window:
     precision: np.ndarray
 
     def slipped(self, late: np.ndarray) -> _Slipped:
-        """The case that keypoints are displaced by ``late`` (W, K, 2) px."""
+        """The hypothesis that keypoints are displaced by ``late`` (W, K, 2) px."""
         change = np.einsum("tkij,tkj->ktj", self.root, late)
         weighted = self.precision @ np.swapaxes(self.series, 0, 1)
         series = np.swapaxes(self.series, 0, 1)

@@ -1,8 +1,9 @@
-"""Paths of points from noisy positions: as smooth as the points themselves say.
+"""Smooth paths of points from noisy positions, the smoothness chosen by likelihood.
 
 Whittaker's smoother (Eilers, Analytical Chemistry 75, 2003) with third differences; each point's
-stiffness follows from the one of greatest restricted likelihood. A path that is too stiff shows too
-low speeds, one that follows the noise too high ones: both would bias what is told from speeds.
+stiffness follows from the one of greatest restricted likelihood. A path that is too stiff
+underestimates speeds, one that follows the noise overestimates them: both would bias estimates from
+speeds.
 """
 
 from __future__ import annotations

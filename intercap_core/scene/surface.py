@@ -101,7 +101,7 @@ def thinned(surface: Surface, cell_m: float) -> Surface:
 
     normals = mean(surface.normals)
     length = np.linalg.norm(normals, axis=1)
-    whole = length > 0.8  # a cell over an edge has no one normal
+    whole = length > 0.8  # a cell across an edge has no single normal
     normals = normals[whole] / length[whole, None]
     speed = np.bincount(inverse, surface.speed, len(counts)) / counts
     return Surface(mean(surface.points)[whole], normals, mean(surface.rays)[whole], speed[whole])

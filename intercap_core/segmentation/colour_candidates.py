@@ -63,7 +63,8 @@ class ColourSegmenter:
             return None
         camera = self._rig[c]
         moved = before(image, *background)
-        # clothes of the wall's colour, or a place that the person never left: the body is there
+        # clothes of the wall's colour, or a place that the person never left: take the body's
+        # volume
         person = drawn(bones, camera, moved.shape, 0)
         person |= moved & drawn(bones, camera, moved.shape, MASK_MARGINS)
         things = moved & ~drawn(bones, camera, moved.shape, THING_MARGINS)

@@ -119,8 +119,8 @@ LARGEST_M = 2.2  # anything larger is no thing that one person handles; tuned
 LAYER_M, LEVEL_SHARE, ABOVE_M = 0.02, 0.12, 0.012
 
 # --- decision: scores of candidates, 0 to 1
-# How likely a component is a thing that somebody handles, where nothing speaks of its size: what
-# moves, by how far off the person it reaches; of the static scene little speaks for any. The scores
-# are shaped by the studio: no recording was annotated to calibrate them.
+# Prior that a component is a handled thing, whatever its size: of moving components, by how far
+# they reach from the person; low for all of the static scene. The scores are shaped by the studio:
+# no recording was annotated to calibrate them.
 ON_TOP_SCORE, STATIC_SCORE, PARTLY_MOVED_SCORE, TWO_ENDS_SCORE = 0.3, 0.2, 0.4, 0.5
 COLOUR_SCORE = 0.5

@@ -1,9 +1,10 @@
 """The person's mask and candidates of the object from depth images alone, one moment at a time.
 
 Background subtraction: depth before the static background is foreground. Foreground within a body
-of average build around the triangulated keypoints is the person, the rest are things. Their points
-of all views are clustered in space into connected components, and each component is a candidate in
-every view that shows it. Four kinds of component are proposed, the object's track chooses:
+of average build around the triangulated keypoints is the person, the rest belongs to objects. Their
+points of all views are clustered in space into connected components, and each component is a
+candidate in every view that shows it. Four kinds of component are proposed, the object's track
+chooses:
 
 - moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
   ``FAR_CUT``), since where hand ends and thing begins is uncertain;
@@ -136,7 +137,7 @@ class DepthSegmenter:
             for view, background in zip(views, backgrounds, strict=True)
         ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
-        # without a floor to take away, all of the scene is one thing
+        # without the floor removed, the whole scene is one component
         bottom = self._low if grounded else self._high
         self._static = find_static_things(views, backgrounds, bottom, self._high, everywhere)
         self._fixed = {c: self._static_points(number, c) for number, c in enumerate(self.cameras)}
@@ -180,7 +181,7 @@ class DepthSegmenter:
         points, local, index = points[inside], local[inside], index[inside]
         bones = bones_of(self._joints[t] + self._late[c] * self._velocity[t])
         away = outside(points, bones)
-        # what this view does not know as background, another one may
+        # background unknown to this view may be known to another one
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._static.surface.holds(points[rest])]
         moving = np.ones(len(points), bool)

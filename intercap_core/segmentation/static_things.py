@@ -1,6 +1,6 @@
 """Things that never move: components of the static scene above the floor, near the person's path.
 
-A chair that is sat on, a mug left on its table: nothing tells them apart from furniture, so every
+A chair that is sat on, a mug left on its table: they cannot be told from furniture, so every
 connected component of the background that the person comes near is a candidate. What stands on a
 level surface (a table) is segmented from it by height.
 """

@@ -45,8 +45,12 @@ class HandShape:
         )
 
 
-def shape(fingers: tuple[float, float, float], thumb: tuple[float, float, float],
-          opposition: float, spread: float = 3.0,) -> HandShape:  # fmt: skip
+def shape(
+    fingers: tuple[float, float, float],
+    thumb: tuple[float, float, float],
+    opposition: float,
+    spread: float = 3.0,
+) -> HandShape:
     """A shape with the same flexion in all four fingers."""
     flexion = np.array([fingers] * 4 + [thumb], float)
     flexion[1:4] += np.array([[2.0, 2, 1], [6, 4, 2], [4, 3, 2]])  # towards the little finger
@@ -146,8 +150,12 @@ class Hand:
             for j in range(3):
                 moved = self.moved[f][j]
 
-                def least(angles: np.ndarray, f: int = f, j: int = j,
-                          moved: np.ndarray = moved,) -> np.ndarray:  # fmt: skip
+                def least(
+                    angles: np.ndarray,
+                    f: int = f,
+                    j: int = j,
+                    moved: np.ndarray = moved,
+                ) -> np.ndarray:
                     trial = np.tile(flexion[f], (len(angles), 1))
                     trial[:, j] = angles
                     poses = np.tile(self.local(replace(start, flexion=flexion)),
@@ -180,8 +188,13 @@ class Hand:
         ]
         return closed, np.array(gaps)
 
-    def gap(self, hand: HandShape, surface: DistanceField, object_from_wrist: np.ndarray,
-            ids: np.ndarray | slice = slice(None),) -> float:  # fmt: skip
+    def gap(
+        self,
+        hand: HandShape,
+        surface: DistanceField,
+        object_from_wrist: np.ndarray,
+        ids: np.ndarray | slice = slice(None),
+    ) -> float:
         """Least signed distance of the hand, or of its vertices ``ids``, to the object, metres."""
         skin = self.skin(self.local(hand)[None])[:, ids]
         return float(self._distance(skin, surface, object_from_wrist)[0])

@@ -61,8 +61,13 @@ class Detector:
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return cls(noise, frames, direction * size[:, None] * noise.scale)
 
-    def detect(self, camera: Camera, points: np.ndarray, axes: np.ndarray,
-               hidden: np.ndarray,) -> np.ndarray:  # fmt: skip
+    def detect(
+        self,
+        camera: Camera,
+        points: np.ndarray,
+        axes: np.ndarray,
+        hidden: np.ndarray,
+    ) -> np.ndarray:
         """Keypoints (T, 135, 3) x, y, confidence of the subject in one camera.
 
         ``points`` (T, 135, 3) true points and ``axes`` (T, 3, 3) the pelvis's rotation, both in
@@ -111,8 +116,12 @@ class Detector:
         depth = points[:, 8] @ pose[2, :3] + pose[2, 3]
         return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
 
-    def _confidence(self, rng: np.random.Generator, error: np.ndarray,
-                    hidden: np.ndarray,) -> np.ndarray:  # fmt: skip
+    def _confidence(
+        self,
+        rng: np.random.Generator,
+        error: np.ndarray,
+        hidden: np.ndarray,
+    ) -> np.ndarray:
         """(T, 135) in [0, 1]: falls with the error, but knows only part of it."""
         size = np.linalg.norm(error, axis=-1)
         chance = self.noise.process(rng, self.frames, 135, 0.3)
@@ -122,8 +131,12 @@ class Detector:
         confidence[:, 25:67] -= 0.12
         return np.clip(confidence, 0.02, 0.98)
 
-    def _swapped(self, rng: np.random.Generator, pixels: np.ndarray,
-                 confidence: np.ndarray,) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    def _swapped(
+        self,
+        rng: np.random.Generator,
+        pixels: np.ndarray,
+        confidence: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Left and right of the whole body or of the legs, exchanged for a short while."""
         chance = np.full((self.frames, 2), SWAP_PROBABILITY)
         shared = self.noise.process(rng, self.frames, 1, SWAP_S)[:, 0]

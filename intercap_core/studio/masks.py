@@ -85,8 +85,13 @@ class Segmenter:
 class CameraMasks:
     """Candidates of one camera, frame by frame in any order."""
 
-    def __init__(self, network: Segmenter, name: str, clutter: np.ndarray | None,
-                 size: tuple[int, int],) -> None:  # fmt: skip
+    def __init__(
+        self,
+        network: Segmenter,
+        name: str,
+        clutter: np.ndarray | None,
+        size: tuple[int, int],
+    ) -> None:
         noise, frames = network.noise, network.frames
         self.network, self.noise, self.size = network, noise, size
         self._rng = rng = noise.rng("masks", name)

@@ -155,8 +155,15 @@ class Puppet:
         pelvis[:, 2] -= SETTLE_M * np.logaddexp(0, excess / SETTLE_M)
         return replace(trunk, pelvis=pelvis)
 
-    def legs(self, world: np.ndarray, pelvis: np.ndarray, ankle: np.ndarray, heading: np.ndarray,
-             pitch: np.ndarray, splay: float = SPLAY,) -> None:  # fmt: skip
+    def legs(
+        self,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        ankle: np.ndarray,
+        heading: np.ndarray,
+        pitch: np.ndarray,
+        splay: float = SPLAY,
+    ) -> None:
         """Set the legs for ankles (N, 2, 3), foot headings and pitch (N, 2), in place.
 
         The knees point between the pelvis's and the foot's heading, ``splay`` rad outward.
@@ -191,8 +198,13 @@ class Puppet:
             at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
         return at
 
-    def idle_wrist(self, world: np.ndarray, pelvis: np.ndarray, side: int,
-                   swing: np.ndarray,) -> Pose:  # fmt: skip
+    def idle_wrist(
+        self,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        side: int,
+        swing: np.ndarray,
+    ) -> Pose:
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
         # where the chest's left is: its front may point down and back in a deep stoop
@@ -236,8 +248,14 @@ class Puppet:
                 bend = bend + 0.9 * change
         return Trunk(trunk.pelvis, trunk.heading, bend, trunk.head)
 
-    def arm_to(self, world: np.ndarray, pelvis: np.ndarray, side: int, wrist: Pose,
-               raised: np.ndarray | float = 0.0,) -> None:  # fmt: skip
+    def arm_to(
+        self,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        side: int,
+        wrist: Pose,
+        raised: np.ndarray | float = 0.0,
+    ) -> None:
         """Set one arm for a wrist pose, in place; ``raised`` (N,) lifts the elbow outward."""
         name, sign = SIDES[side], (1.0, -1.0)[side]
         shoulder = self.arm_root(world, pelvis, side)
@@ -267,8 +285,12 @@ class Puppet:
             parent = hand.wrist if joint % 3 == 0 else hand.first + joint - 1
             world[:, hand.first + joint] = world[:, parent] @ local[:, joint]
 
-    def finger_track(self, side: int, start: HandShape,
-                     keys: list[tuple[np.ndarray, HandShape]],) -> np.ndarray:  # fmt: skip
+    def finger_track(
+        self,
+        side: int,
+        start: HandShape,
+        keys: list[tuple[np.ndarray, HandShape]],
+    ) -> np.ndarray:
         """Rotation vectors (N, 15, 3): from ``start`` to each shape in turn by its share (N,)."""
         hand = self.hands[side]
         vectors = hand.local(start)[None]

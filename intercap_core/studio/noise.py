@@ -35,8 +35,13 @@ class NoiseSource:
         """A generator of its own for what ``name`` says."""
         return np.random.default_rng([self.seed, zlib.crc32(repr(name).encode())])
 
-    def process(self, rng: np.random.Generator, frames: int, channels: int,
-                correlation_s: float,) -> np.ndarray:  # fmt: skip
+    def process(
+        self,
+        rng: np.random.Generator,
+        frames: int,
+        channels: int,
+        correlation_s: float,
+    ) -> np.ndarray:
         """(frames, channels): zero mean, unit variance, correlated over ``correlation_s``."""
         if self.family == "b":
             correlation_s *= FAMILY_B_SLOWER
@@ -51,8 +56,13 @@ class NoiseSource:
             [np.convolve(white[:, k], kernel, "valid") for k in range(channels)], 1
         ).reshape(frames, channels)
 
-    def _first_order(self, rng: np.random.Generator, frames: int, channels: int,
-                     correlation_s: float,) -> np.ndarray:  # fmt: skip
+    def _first_order(
+        self,
+        rng: np.random.Generator,
+        frames: int,
+        channels: int,
+        correlation_s: float,
+    ) -> np.ndarray:
         keep = np.exp(-1 / max(correlation_s * self.fps, 1e-3))
         steps = rng.normal(size=(frames, channels))
         path = np.empty_like(steps)

@@ -163,8 +163,14 @@ class Kinect:
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
 
-    def _write_keypoints(self, folder: CaptureFolder, detector: Detector, moment: Moment,
-                         points: np.ndarray, hidden: np.ndarray,) -> None:  # fmt: skip
+    def _write_keypoints(
+        self,
+        folder: CaptureFolder,
+        detector: Detector,
+        moment: Moment,
+        points: np.ndarray,
+        hidden: np.ndarray,
+    ) -> None:
         master = self.stage.rig.master_from_stage[:3, :3]
         subject = detector.detect(
             self.true, self.stage.to_master(points), master @ moment.pelvis, hidden

@@ -97,8 +97,14 @@ def shade(normals: np.ndarray) -> np.ndarray:
 class View:
     """One lens of one camera: its rays and what it sees of the empty room."""
 
-    def __init__(self, lens: Intrinsics, stage_from_camera: np.ndarray, room: Room,
-                 *, coloured: bool,) -> None:  # fmt: skip
+    def __init__(
+        self,
+        lens: Intrinsics,
+        stage_from_camera: np.ndarray,
+        room: Room,
+        *,
+        coloured: bool,
+    ) -> None:
         self.lens = lens
         self.camera_from_stage = np.linalg.inv(stage_from_camera)
         self.rotation = stage_from_camera[:3, :3].astype(np.float32)
@@ -172,8 +178,20 @@ class View:
 
 
 @numba.njit(cache=True)
-def _interpolate(here, pixels, face, rays, camera_from_mesh, vertices, faces, normals, colours,
-                 stage_from_mesh, normal, colour,):  # fmt: skip
+def _interpolate(
+    here,
+    pixels,
+    face,
+    rays,
+    camera_from_mesh,
+    vertices,
+    faces,
+    normals,
+    colours,
+    stage_from_mesh,
+    normal,
+    colour,
+):
     """Fill rows ``here`` of ``normal`` and ``colour`` (n, 3) from the corners of the triangles hit.
 
     A corner's weight is the volume that the ray spans with the two other corners.

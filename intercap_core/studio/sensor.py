@@ -126,8 +126,12 @@ class DepthSensor:
         depth.ravel()[at] = here + share * (far[at] - near[at]) * towards
 
 
-def _blotches(rng: np.random.Generator, shape: tuple[int, ...], size: float,
-              contrast: float,) -> np.ndarray:  # fmt: skip
+def _blotches(
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+    size: float,
+    contrast: float,
+) -> np.ndarray:
     """Values in [0, 1] (H, W) that change over ``size`` pixels."""
     smooth = cv2.GaussianBlur(gaussian(rng, shape), (0, 0), size)
     return 0.5 + 0.5 * np.tanh(smooth / contrast / 1.2)

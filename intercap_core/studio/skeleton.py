@@ -47,8 +47,12 @@ def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([x, y, np.cross(x, y)], -1)
 
 
-def carry(from_first: np.ndarray, from_second: np.ndarray, to_first: np.ndarray,
-          to_second: np.ndarray,) -> np.ndarray:  # fmt: skip
+def carry(
+    from_first: np.ndarray,
+    from_second: np.ndarray,
+    to_first: np.ndarray,
+    to_second: np.ndarray,
+) -> np.ndarray:
     """Rotations that take one pair of directions to another (the second as far as possible)."""
     return frame(to_first, to_second) @ np.swapaxes(frame(from_first, from_second), -1, -2)
 

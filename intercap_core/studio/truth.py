@@ -25,8 +25,14 @@ OFF_SURFACE_M = 0.001
 ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 5
 
 
-def write_truth(path: Path, stage: Stage, moment: Moment, sequence: str, capture: StudioCapture,
-                recorded: Sequence[Recorded],) -> np.ndarray:  # fmt: skip
+def write_truth(
+    path: Path,
+    stage: Stage,
+    moment: Moment,
+    sequence: str,
+    capture: StudioCapture,
+    recorded: Sequence[Recorded],
+) -> np.ndarray:
     """Write the truth artefact of the set times' ``moment``; ``recorded`` by each camera.
 
     Returns the true region contact (T, R).

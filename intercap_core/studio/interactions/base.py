@@ -114,8 +114,13 @@ def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
     return transform(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([x, y, z]))
 
 
-def held_object(puppet: Puppet, world: np.ndarray, pelvis: np.ndarray, side: int,
-                object_from_wrist: np.ndarray,) -> np.ndarray:  # fmt: skip
+def held_object(
+    puppet: Puppet,
+    world: np.ndarray,
+    pelvis: np.ndarray,
+    side: int,
+    object_from_wrist: np.ndarray,
+) -> np.ndarray:
     """stage_from_object (N, 4, 4) of what a hand holds: the posed wrist's own place decides."""
     wrist = np.broadcast_to(np.eye(4), (len(world), 4, 4)).copy()
     index = puppet.hands[side].wrist

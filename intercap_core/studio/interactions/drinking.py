@@ -131,8 +131,14 @@ class Drinking(Handling):
         thing = thing.towards(drinking, ramp(times, ATTACH_S, 1.72), lift)
         return thing.towards(Pose.still(self.put, count), ramp(times, 2.02, RELEASE_S - 0.03), lift)
 
-    def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
-              thing: np.ndarray,) -> Pose:  # fmt: skip
+    def wrist(
+        self,
+        side: int,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        times: np.ndarray,
+        thing: np.ndarray,
+    ) -> Pose:
         """The right hand handles the vessel; the left only comes near."""
         wrist = super().wrist(side, world, pelvis, times, thing)
         if side == RIGHT:

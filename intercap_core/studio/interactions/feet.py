@@ -29,8 +29,13 @@ class Foot:
         posed = self._part.skin(local, np.zeros((len(places), 3))).vertices
         return posed - self.subject.rest_joints[self.ankle] + places[:, None, :3]
 
-    def backed_off(self, place: np.ndarray, way: np.ndarray, gap: float,
-                   distance: Callable[[np.ndarray], float],) -> np.ndarray:  # fmt: skip
+    def backed_off(
+        self,
+        place: np.ndarray,
+        way: np.ndarray,
+        gap: float,
+        distance: Callable[[np.ndarray], float],
+    ) -> np.ndarray:
         """The place (5,) moved along ``way`` (5,) until the skin is ``gap`` metres off by
         ``distance`` of skin (n, 3)."""
         low, high = 0.0, 1.0

@@ -79,8 +79,16 @@ class Approach:
     along: float = ALONG_FINGERS_M
     floor: float = -np.inf
 
-    def wrist(self, puppet: Puppet, side: int, hand_shape: HandShape, surface: DistanceField,
-              stage_from_object: np.ndarray, *, thumb: bool = False,) -> np.ndarray:  # fmt: skip
+    def wrist(
+        self,
+        puppet: Puppet,
+        side: int,
+        hand_shape: HandShape,
+        surface: DistanceField,
+        stage_from_object: np.ndarray,
+        *,
+        thumb: bool = False,
+    ) -> np.ndarray:
         """The wrist (4, 4) of the stage once the palm or a finger (with ``thumb``: or the thumb) is
         pressed against the thing."""
         hand = puppet.hands[side]
@@ -101,8 +109,13 @@ def around_wall(at: np.ndarray, floor: float) -> Iterator[Approach]:
         yield Approach(at, np.array([sin, cos, -0.10]), np.array([-cos, sin, 0.0]), along, floor)
 
 
-def laid_on(puppet: Puppet, side: int, surface: DistanceField, stage_from_object: np.ndarray,
-            approach: Approach,) -> Grip:  # fmt: skip
+def laid_on(
+    puppet: Puppet,
+    side: int,
+    surface: DistanceField,
+    stage_from_object: np.ndarray,
+    approach: Approach,
+) -> Grip:
     """A flat hand laid on the thing, the thumb along it, fingers bent until they meet it."""
     hand = puppet.hands[side]
     wrist = approach.wrist(puppet, side, LAID, surface, stage_from_object, thumb=True)
@@ -111,8 +124,14 @@ def laid_on(puppet: Puppet, side: int, surface: DistanceField, stage_from_object
     return Grip(LAID, closed, pose, gaps)
 
 
-def wrapped(puppet: Puppet, side: int, open_shape: HandShape, surface: DistanceField,
-            stage_from_object: np.ndarray, approaches: Iterable[Approach],) -> Grip:  # fmt: skip
+def wrapped(
+    puppet: Puppet,
+    side: int,
+    open_shape: HandShape,
+    surface: DistanceField,
+    stage_from_object: np.ndarray,
+    approaches: Iterable[Approach],
+) -> Grip:
     """Palm against the thing, fingers around it, then the thumb from where it has room.
 
     Of ``approaches`` the first is kept in which all fingers meet the thing or nearly do, else the

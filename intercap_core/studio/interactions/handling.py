@@ -73,8 +73,13 @@ class Handling(Interaction):
             LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
         )
 
-    def table(self, middle: tuple[float, float], half: tuple[float, float], top: float,
-              heading: float = 0.0,) -> None:  # fmt: skip
+    def table(
+        self,
+        middle: tuple[float, float],
+        half: tuple[float, float],
+        top: float,
+        heading: float = 0.0,
+    ) -> None:
         """Place a block: ``middle`` and ``half`` its sizes on the floor, its ``top``, metres."""
         low = (middle[0] - half[0], middle[1] - half[1], 0.0)
         high = (middle[0] + half[0], middle[1] + half[1], top)
@@ -113,8 +118,13 @@ class Handling(Interaction):
         head[:, 0] += 0.10 + look
         return Trunk(pelvis, track[:, 3], bend, head)
 
-    def before_chest(self, world: np.ndarray, origin: np.ndarray, offset: np.ndarray,
-                     about: np.ndarray,) -> Pose:  # fmt: skip
+    def before_chest(
+        self,
+        world: np.ndarray,
+        origin: np.ndarray,
+        offset: np.ndarray,
+        about: np.ndarray,
+    ) -> Pose:
         """The thing (N) held before the person: ``offset`` (3,) metres to the left, up and ahead
         of ``origin`` (N, 3), turned by ``about`` (N, 3) from how it was taken."""
         person = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
@@ -123,8 +133,14 @@ class Handling(Interaction):
 
     # --- playing ----------------------------------------------------------------------------
 
-    def wrist(self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray,
-              thing: np.ndarray,) -> Pose:  # fmt: skip
+    def wrist(
+        self,
+        side: int,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        times: np.ndarray,
+        thing: np.ndarray,
+    ) -> Pose:
         """The wrist (N) of a hand: to the ``thing`` (N, 4, 4), with it, away from it."""
         swing = self.arm_swing(times)[:, SIDES.index(side)]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)

@@ -217,8 +217,13 @@ class Sitting(Interaction):
         out = AROUND_M * 4 * share * (1 - share) * (1, -1)[side]
         return Pose(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
 
-    def left_wrist(self, idle: Pose, world: np.ndarray, pelvis: np.ndarray,
-                   times: np.ndarray,) -> Pose:  # fmt: skip
+    def left_wrist(
+        self,
+        idle: Pose,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        times: np.ndarray,
+    ) -> Pose:
         """The left wrist (N) until the person rises."""
         return idle.towards(self.on_thigh(world, pelvis, LEFT), ramp(times, 0.50, 1.10))
 

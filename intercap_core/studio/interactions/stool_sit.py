@@ -34,8 +34,13 @@ class StoolSit(Sitting):
         place = np.array([0.02, 0.20, self.seat_top - 0.02]) - rotation @ hand.knuckles.mean(0)
         return self.approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), hover)
 
-    def left_wrist(self, idle: Pose, world: np.ndarray, pelvis: np.ndarray,
-                   times: np.ndarray,) -> Pose:  # fmt: skip
+    def left_wrist(
+        self,
+        idle: Pose,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        times: np.ndarray,
+    ) -> Pose:
         count = len(times)
         place = self.hover_place
         aside = place.copy()
