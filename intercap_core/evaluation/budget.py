@@ -19,8 +19,9 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 BUDGET_MINUTES = {"sequences": 11, "captures": 13, "objects": 31, "bodies": 15}
 BUDGET_CORES = 2
 STUDIO = "studio"
-# CPU seconds a frame of six 720P views on one core of an AMD EPYC (Zen 4), and of a process start
-# (imports, compiled code from the cache). Measured on config/object, config/demo and config/test.
+# CPU seconds a frame of six 720P views on one core of an Intel Xeon at 2.5 GHz, and of a process
+# start (imports, compiled code from the cache). Measured while other work ran; the quick set took
+# twice as long.
 SECONDS_PER_FRAME = {
     STUDIO: 0.75, "frames": 0.03, "detections": 0.01, "scene": 0.28, "person": 0.26,
     "object_track": 0.40, "body_fit": 0.17, "joint": 0.30, "metrics": 0.26,
