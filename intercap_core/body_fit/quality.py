@@ -120,9 +120,9 @@ def compare(
         # a correct elbow does not imply a correct wrist
         result.against[:, column] = share if share.ndim == 1 else _worst(share)
         result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
-        borne_out = ((weight > 0) & good).sum(1)
-        result.seen[:, column] = (borne_out > 0).to(weight).mean(1)
-        result.views[:, column] = borne_out.to(weight).median(1).values
+        inliers = ((weight > 0) & good).sum(1)
+        result.seen[:, column] = (inliers > 0).to(weight).mean(1)
+        result.views[:, column] = inliers.to(weight).median(1).values
         if samples is not None:
             on_part = np.isin(samples[0], _carriers_of(part))
             result.measured[:, column] = (samples[1][:, on_part] > 0).to(weight).mean(1)

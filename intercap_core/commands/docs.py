@@ -103,8 +103,10 @@ def settings_page() -> str:
         "`intercap docs`. Relative paths are relative to the file that holds them; an entry that",
         "is not listed here is refused. `intercap check` says what is wrong before a run.",
         "",
-        "`demo/` holds the settings of `make demo`, `evaluation/` those of `make evaluate`,",
-        "`bench/` those of `make bench`, `test/` a tiny capture for the tests.",
+        "`demo/` holds the settings of `make demo`; `evaluation/`, `capture/`, `object/` and",
+        "`body/` those of `make evaluate`, to the end, to the scene, to the object's track and to",
+        "the body's fit; `bench/` those of `make bench`, `test/` a tiny capture for the tests.",
+        "`objects/` holds the meshes of `objects.yaml`.",
     ]
     for model, file, purpose in ENTRIES.values():
         schema = model.model_json_schema()

@@ -155,7 +155,7 @@ def add_equations(
             m, filled = width[limb], 0
             local, local_u, to = all_local[limb], all_local_u[limb], all_to[limb]
             rows, block = np.empty((_TOGETHER, m), dtype), np.zeros((m, m), dtype)
-            slope = np.zeros(m, dtype)
+            sample_gradient = np.zeros(m, dtype)
             of_limb = np.flatnonzero(moved_by[limb, 1:]) + 1
             for at in range(starts[limb], starts[limb + 1]):
                 i = order[at]
@@ -171,7 +171,7 @@ def add_equations(
                 total += w * e * e / 2
                 weighted[0] = w * e
                 for q in range(m):
-                    slope[q] -= weighted[0] * row[q]
+                    sample_gradient[q] -= weighted[0] * row[q]
                 if len(rest_gradient):
                     back = turned_back(chain, b, i, n)
                     for d in range(3):
@@ -188,7 +188,7 @@ def add_equations(
                     rows[r] = 0
                 _add_squares(rows, weights, block)
             for p in range(m):
-                gradient[b, to[p]] += slope[p]
+                gradient[b, to[p]] += sample_gradient[p]
                 for q in range(p):
                     block[q, p] = block[p, q]
             for p in range(m):

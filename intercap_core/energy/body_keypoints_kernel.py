@@ -154,14 +154,16 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_correctives(skeleton, pieces, b, k, slope, rest_gradient, rows, local, joints, by_pose):
+def _add_correctives(
+    skeleton, pieces, b, k, by_keypoint, rest_gradient, rows, local, joints, by_pose
+):
     """Add the gradient by the pieces of keypoint k at rest, and to its rows (3,m) what ``joints``
-    change by pose blend shapes; slope (3,): gradient of the cost by the keypoint."""
+    change by pose blend shapes; by_keypoint (3,): the cost's gradient by the keypoint."""
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
         turn = skeleton.rotations[b, pieces.bone[e]]
         for i in range(3):
             for d in range(3):
-                rest_gradient[b, e, d] += turn[i, d] * slope[i]
+                rest_gradient[b, e, d] += turn[i, d] * by_keypoint[i]
             add_to_row(rows[i], local, joints, turn[i], pieces.posedirs[e], by_pose)
 
 
@@ -184,12 +186,12 @@ def _add_product(rows, weighted, block):
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_offset(turn, slope, matrix, weighted, to, first, gradient, hessian):
+def _add_offset(turn, by_keypoint, matrix, weighted, to, first, gradient, hessian):
     """Add the part of a keypoint's offset, whose three columns start at ``first``; turn (3,3) of
     the bone that carries it."""
     for d in range(3):
         r0, r1, r2 = turn[0, d], turn[1, d], turn[2, d]
-        gradient[first + d] += r0 * slope[0] + r1 * slope[1] + r2 * slope[2]
+        gradient[first + d] += r0 * by_keypoint[0] + r1 * by_keypoint[1] + r2 * by_keypoint[2]
         for e in range(3):
             for i in range(3):
                 hessian[first + d, first + e] += turn[i, e] * (
@@ -228,7 +230,7 @@ def add_equations(
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     moved = np.empty((3, len(place) - _SHAPE), dtype)
-    slope, matrix = np.empty(3), np.empty((3, 3))
+    by_keypoint, matrix = np.empty(3), np.empty((3, 3))
     narrow = np.empty((3, 3), dtype)
     limbs = len(pieces.limb_starts) - 1
     all_local = np.empty((limbs, len(place)), np.int64)
@@ -245,13 +247,15 @@ def add_equations(
             for at in range(pieces.limb_starts[limb], pieces.limb_starts[limb + 1]):
                 k = pieces.order[at]
                 p = _point(skeleton, pieces, rest, b, k)
-                cost[b] += evaluate_keypoint(observed, frames[b], k, p, True, slope, matrix)
+                cost[b] += evaluate_keypoint(observed, frames[b], k, p, True, by_keypoint, matrix)
                 if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
                     continue
                 _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)
                 for q in range(m):
                     gradient[b, to[q]] += (
-                        rows[0, q] * slope[0] + rows[1, q] * slope[1] + rows[2, q] * slope[2]
+                        rows[0, q] * by_keypoint[0]
+                        + rows[1, q] * by_keypoint[1]
+                        + rows[2, q] * by_keypoint[2]
                     )
                 if len(rest_gradient):
                     _add_correctives(
@@ -259,7 +263,7 @@ def add_equations(
                         pieces,
                         b,
                         k,
-                        slope,
+                        by_keypoint,
                         rest_gradient,
                         rows,
                         local,
@@ -274,7 +278,9 @@ def add_equations(
                 if k < offsets:
                     turn = skeleton.rotations[b, pieces.bone[pieces.carrier[k]]]
                     first = first_offset + 3 * k
-                    _add_offset(turn, slope, matrix, weighted, to, first, gradient[b], hessian[b])
+                    _add_offset(
+                        turn, by_keypoint, matrix, weighted, to, first, gradient[b], hessian[b]
+                    )
             for p in range(m):
                 for q in range(p):
                     block[q, p] = block[p, q]

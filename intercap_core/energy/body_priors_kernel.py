@@ -70,13 +70,13 @@ def _add_block(deviation, precision, first, place, gradient, hessian, derivative
     """Add the Gaussian of neighbouring parameters, ``deviation`` (m,) from its mean; its cost."""
     total = 0.0
     for i in range(len(deviation)):
-        slope = np.float64(0)
+        derivative = np.float64(0)
         for j in range(len(deviation)):
-            slope += precision[i, j] * deviation[j]
-        total += 0.5 * slope * deviation[i]
+            derivative += precision[i, j] * deviation[j]
+        total += 0.5 * derivative * deviation[i]
         p = place[first + i]
         if derivatives and p >= 0:
-            gradient[p] += slope
+            gradient[p] += derivative
             for j in range(len(deviation)):
                 if place[first + j] >= 0:
                     hessian[p, place[first + j]] += precision[i, j]
@@ -93,16 +93,16 @@ def add_priors(prior, vectors, frames, place, derivatives, cost, gradient, hessi
         total = 0.0
         for p in range(len(place)):
             deviation = x[p] - prior.mean[p]
-            slope, curve = prior.own[p] * deviation, prior.own[p]
-            total += 0.5 * slope * deviation
+            derivative, curve = prior.own[p] * deviation, prior.own[p]
+            total += 0.5 * derivative * deviation
             if p < len(prior.ranges):
                 beyond = max(x[p] - prior.ranges[p, 1], 0) + min(x[p] - prior.ranges[p, 0], 0)
                 if beyond != 0:
                     total += 0.5 * prior.outside * beyond * beyond
-                    slope += prior.outside * beyond
+                    derivative += prior.outside * beyond
                     curve += prior.outside
             if derivatives and place[p] >= 0:
-                g[place[p]] += slope
+                g[place[p]] += derivative
                 h[place[p], place[p]] += curve
         for r in range(len(prior.bends)):
             p = place[prior.bends[r]]

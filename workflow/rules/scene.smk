@@ -23,28 +23,3 @@ rule scene:
         "{wildcards.sequence}: refining the cameras, finding the floor"
     script:
         "../scripts/stage.py"
-
-
-rule person:
-    """The subject over views, and the triangulated keypoints."""
-    input:
-        **artefacts_read("person"),
-    output:
-        person=f"{RESULTS}/{{sequence}}/person.h5",
-    log:
-        f"{LOGS}/{{sequence}}/person.log",
-    benchmark:
-        f"{BENCHMARKS}/{{sequence}}/person.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        mem_mb=memory(2000),
-        runtime=30,
-    params:
-        settings=settings_of("person"),
-        code=code_of("person"),
-    message:
-        "{wildcards.sequence}: finding the subject in all views"
-    script:
-        "../scripts/stage.py"
