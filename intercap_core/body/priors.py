@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.joint_limits import LIMITS_DEG, REST_SPREAD_DEG
-from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.parameters import NUM_POSE
 
 # Elbows and knees (Bogo et al. 2016, SMPLify, "unnatural bending"): full-pose column, sign of the
@@ -126,8 +125,3 @@ def shape(vector: Tensor) -> DiagonalRows:
     columns = torch.arange(NUM_POSE + 3, vector.shape[1], device=vector.device)
     residuals = vector[:, NUM_POSE + 3 :]
     return DiagonalRows(residuals, torch.ones_like(residuals), columns)
-
-
-def pose_columns(*joints: str) -> Tensor:
-    """The parameter columns of named joints, three each."""
-    return torch.cat([3 * JOINT_INDEX[j] + torch.arange(3) for j in joints])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.transforms import invert, is_rigid, rigid
 from intercap_core.errors import UserError
@@ -112,7 +113,7 @@ def _read_release_folder(folder: Path) -> Extrinsics:
                 "camera again"
             )
         check_distance(path, "the camera", shift)
-        poses[f"k{number}"] = invert(rigid(rotation_matrix(turn), shift))
+        poses[f"k{number}"] = invert(rigid(Rotation.from_rotvec(turn).as_matrix(), shift))
     return relative_to("k1", poses)
 
 
@@ -132,16 +133,6 @@ def relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrin
     poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
     poses[master] = np.eye(4)
     return Extrinsics(master, poses)
-
-
-def rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula: rotation vector (3,), radians, to matrix (3, 3)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.extrinsics_files import (
     CAMERA_NAME,
     Extrinsics,
     check_distance,
     relative_to,
-    rotation_matrix,
 )
 from intercap_core.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.camera.projection import radial_fraction
@@ -199,7 +199,7 @@ def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> 
             "x_world + T, metres"
         )
     r, t = _numbers(turn, where, "R"), _numbers(shift, where, "T").ravel()
-    r = rotation_matrix(r.ravel()) if r.size == 3 else r
+    r = Rotation.from_rotvec(r.ravel()).as_matrix() if r.size == 3 else r
     if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
         raise UserError(
             f"{where}: R is no rotation (3x3, or a vector of 3) or T no vector of 3; correct it"

@@ -14,6 +14,7 @@ import numpy as np
 
 from intercap_core.config import Symmetry
 from intercap_core.rigid.constants import MAX_DISCRETE, SAME_TRANSFORM
+from intercap_core.rigid.pose import rotation_exp
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class SymmetryGroup:
         if self.axis is None or self.sphere:
             return self.discrete.copy()
         turns = [
-            self._about_axis(_rotation_about(self.axis, angle))
+            self._about_axis(rotation_exp(angle * self.axis))
             for angle in 2 * np.pi * np.arange(steps) / steps
         ]
         return (self.discrete[:, None] @ np.array(turns)[None]).reshape(-1, 4, 4)
@@ -141,8 +142,8 @@ class SymmetryGroup:
         m = np.swapaxes(reference, -1, -2)[..., None, :, :] @ options
         along = np.einsum("i,...ij,j->...", self.axis, m, self.axis)
         cosine = np.trace(m, axis1=-2, axis2=-1) - along
-        sine = np.einsum("...ij,ji->...", m, _cross_matrix(self.axis))
-        return options @ _rotation_about(self.axis, np.arctan2(sine, cosine))
+        sine = np.einsum("...ij,ji->...", m, np.cross(np.eye(3), self.axis))
+        return options @ rotation_exp(np.arctan2(sine, cosine)[..., None] * self.axis)
 
 
 def _closure(generators: np.ndarray) -> np.ndarray:
@@ -161,18 +162,6 @@ def _closure(generators: np.ndarray) -> np.ndarray:
             )
         queue += [candidate @ generator for generator in generators]
     return np.array(elements)
-
-
-def _cross_matrix(axis: np.ndarray) -> np.ndarray:
-    x, y, z = axis
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def _rotation_about(axis: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
-    """Rodrigues' formula: rotations (..., 3, 3) about a unit axis by angles (...)."""
-    k = _cross_matrix(axis)
-    angle = np.asarray(angle)[..., None, None]
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
 
 
 def _transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -54,16 +54,3 @@ class OcclusionScene:
             )
             seen[ids[hidden.numpy()]] = False
         return seen
-
-
-def visible_vertices(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    intrinsics: Intrinsics,
-    camera_from_mesh: np.ndarray,
-    *,
-    occluders: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-) -> np.ndarray:
-    """Whether one camera sees each vertex (V,) bool; :class:`OcclusionScene` for several."""
-    scene = OcclusionScene(vertices, faces, occluders)
-    return scene.visible(intrinsics, camera_from_mesh)

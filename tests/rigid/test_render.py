@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.rigid.render import render, render_scene
 from intercap_core.rigid.shots import Drawable
-from intercap_core.rigid.visibility import visible_vertices
+from intercap_core.rigid.visibility import OcclusionScene
 
 PINHOLE = Intrinsics(640, 576, 504.0, 505.0, 321.3, 287.6)
 LENS = Intrinsics(  # a Kinect's colour lens at half size: strong rational distortion
@@ -139,7 +139,7 @@ def test_visible_vertices_of_a_sphere_and_behind_a_screen():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
     vertices = np.asarray(ball.vertices)
     pose = _pose((0, 0, 2.0))
-    seen = visible_vertices(vertices, ball.faces, PINHOLE, pose)
+    seen = OcclusionScene(vertices, ball.faces).visible(PINHOLE, pose)
     horizon = -0.1 * 0.1 / 2.0  # z of the tangent circle in the ball's frame
     clear = np.abs(vertices[:, 2] - horizon) > 0.003
     np.testing.assert_array_equal(seen[clear], (vertices[:, 2] < horizon)[clear])
@@ -147,7 +147,7 @@ def test_visible_vertices_of_a_sphere_and_behind_a_screen():
     screen = trimesh.creation.box((0.2, 0.4, 0.01))
     screen.apply_translation((-0.1, 0, -0.5))  # hides the left half
     occluder = (np.asarray(screen.vertices), np.asarray(screen.faces))
-    behind = visible_vertices(vertices, ball.faces, PINHOLE, pose, occluders=[occluder])
+    behind = OcclusionScene(vertices, ball.faces, [occluder]).visible(PINHOLE, pose)
     assert not behind[vertices[:, 0] < -0.003].any()
     right = clear & (vertices[:, 0] > 0.003)
     np.testing.assert_array_equal(behind[right], seen[right])

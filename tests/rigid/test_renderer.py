@@ -16,7 +16,7 @@ from intercap_core.rigid.render import (
     render,
 )
 from intercap_core.rigid.shots import Shot, Surface
-from intercap_core.rigid.visibility import visible_vertices
+from intercap_core.rigid.visibility import OcclusionScene
 from tests.rigid.test_render import LENS, PINHOLE
 
 BOUNDARY_PX = 2  # of an image, where fused multiplications may decide otherwise
@@ -93,8 +93,9 @@ def test_visible_vertices(objects, backend, request):
     renderer = CpuRenderer() if backend == "cpu" else request.getfixturevalue("warp_renderer")
     mesh, shots = objects["stool"], _shots(6, seed=5)
     seen = renderer.visible(Surface.of(mesh), shots)
+    rays = OcclusionScene(mesh.vertices, mesh.faces)
     for shot, found in zip(shots, seen, strict=True):
-        expected = visible_vertices(mesh.vertices, mesh.faces, shot.lens, shot.camera_from_mesh)
+        expected = rays.visible(shot.lens, shot.camera_from_mesh)
         assert (found != expected).mean() < 0.002
     assert 0.1 < seen[0].mean() < 0.6 and not seen[-1].any()
 
