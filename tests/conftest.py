@@ -27,7 +27,8 @@ TOGETHER = ("workflow",)
 SLOW = (
     "bench",
     "body/test_jacobian.py",
-    "body_fit/test_compiled.py",
+    "body_fit/test_recover.py",
+    "body_fit/test_terms.py",
     "commands",
     "energy/test_body_self.py",
     "object_track",
@@ -35,6 +36,9 @@ SLOW = (
     "rigid/test_open3d_core.py",
     "scene",
     "stages",
+    "studio/test_capture.py",
+    "studio/test_interactions.py",
+    "studio/test_layouts.py",
     "test_kernel_cache.py",
     "workflow",
 )
