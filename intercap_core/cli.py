@@ -216,16 +216,26 @@ def evaluate(
             help="A fixed small set to the end in ten minutes, beside its recorded figures.",
         ),
     ] = False,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Draw people, motions, rooms and errors anew; results go to results/seed_<N>.",
+        ),
+    ] = None,
     cores: Cores = 0,
 ) -> None:
     """Run the evaluation captures and print the tables against truth.
 
-    Examples: intercap evaluate; intercap evaluate --only bodies --output body.json
+    Examples: intercap evaluate; intercap evaluate --only bodies --output body.json;
+    intercap evaluate --only objects --seed 7 --output results/seed_7/evaluation.json
     """
     from intercap_core.evaluation.evaluate import evaluate as run_evaluation
     from intercap_core.evaluation.evaluate import evaluate_quick
 
     _check_output(output, replace_any=True)
+    if quick and seed is not None:
+        raise UserError("--quick is a fixed set; leave out --quick or --seed")
     if quick:
         raise typer.Exit(evaluate_quick(output, cores=cores))
     parts = {
@@ -235,7 +245,7 @@ def evaluate(
         Part.bodies: bodies,
     }
     chosen = {part.value: some for part, some in parts.items() if only in (None, part)}
-    raise typer.Exit(run_evaluation(chosen, output, cores=cores))
+    raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))
 
 
 @app.command(rich_help_panel=WHOLE)

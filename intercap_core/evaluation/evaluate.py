@@ -13,6 +13,7 @@ from typing import Any
 from intercap_core.evaluation import bodies, budget, captures, objects, sequences
 from intercap_core.evaluation.part import Figures, Part, require_truth
 from intercap_core.evaluation.reference import REFERENCE, compare
+from intercap_core.evaluation.seeds import drawn_anew
 from intercap_core.evaluation.workflows import bring_up_to_date
 from intercap_core.project import load_project
 
@@ -29,6 +30,7 @@ def evaluate(
     *,
     cores: int = 0,
     reference: Path | None = None,
+    seed: int | None = None,
 ) -> int:
     """Bring the evaluation's recordings up to date, print the tables and write ``output``.
 
@@ -38,11 +40,13 @@ def evaluate(
     figure has one, ``area.measure_spread``: areas of annotated recordings end in ``_annotated``,
     those of ``captures`` have their dataset's name, that of ``objects`` is ``object``, that of
     ``bodies`` is ``body``; ``time`` holds minutes. The figures are compared with those of
-    ``reference`` where one is given. Returns 1 where a stage failed; recordings that failed are
-    left out of the figures and named. Raises UserError where a project's settings are wrong, or
-    none of its sequences has a result.
+    ``reference`` where one is given. ``seed`` draws all recordings anew (:mod:`.seeds`). Returns 1
+    where a stage failed; recordings that failed are left out of the figures and named. Raises
+    UserError where a project's settings are wrong, or none of its sequences has a result.
     """
     begin = time.monotonic()
+    if seed is not None:
+        settings = drawn_anew(settings, seed)
     projects = {
         name: [load_project(path) for path in paths] for name, paths in settings.items() if paths
     }  # faults are told before any work

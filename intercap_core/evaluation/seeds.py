@@ -1,0 +1,86 @@
+"""The same recordings with everything that is random drawn anew: figures that nothing was tuned on.
+
+Other people play the same scripts, with other motions, rooms and errors. Settings and tables are
+written below ``results/seed_<N>/settings``, what is computed beside them.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from intercap_core.project import Project, load_project, read_yaml, tidy
+
+TABLES = ("sequences", "subjects")
+
+
+def drawn_anew(settings: Mapping[str, Sequence[Path]], seed: int) -> dict[str, list[Path]]:
+    """Settings files like those of each part, with all seeds drawn anew by ``seed``.
+
+    Raises UserError where one of the given files is wrong.
+    """
+    return {
+        part: [_written(load_project(path), seed) for path in paths]
+        for part, paths in settings.items()
+    }
+
+
+def _written(project: Project, seed: int) -> Path:
+    root = project.config.results / f"seed_{seed}"
+    folder = root / "settings"
+    folder.mkdir(parents=True, exist_ok=True)
+    people = _people(project, seed)
+    values: dict[str, Any] = read_yaml(project.path)
+    values |= {
+        "results": root.as_posix(),
+        "objects": os.path.abspath(project.path.parent / project.config.objects),
+        "annotations": os.path.abspath(project.path.parent / project.config.annotations),
+    }
+    for capture in ((values.get("studio") or {}).get("captures") or {}).values():
+        drawn = np.random.SeedSequence([int(capture["seed"]), seed]).generate_state(1)[0]
+        capture |= {"seed": int(drawn >> 1), "subject": people[capture["subject"]]}
+    for table in TABLES:
+        source = tidy(project.path.parent / getattr(project.config, table))
+        values[table] = f"{project.config.dataset}_{table}.tsv"
+        rows = _rows(source)
+        if table == "sequences":
+            rows = [_moved(row, source.parent, project, root, people) for row in rows]
+        with open(folder / values[table], "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0], delimiter="\t", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    path = folder / f"{project.config.dataset}.yaml"
+    path.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def _people(project: Project, seed: int) -> dict[str, str]:
+    """Who plays whose part: the subjects of the table in another order, each another one."""
+    names = sorted(project.subjects)
+    by = 1 + seed % max(len(names) - 1, 1)
+    return {name: names[(i + by) % len(names)] for i, name in enumerate(names)}
+
+
+def _rows(table: Path) -> list[dict[str, str]]:
+    with open(table, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file, delimiter="\t"))
+
+
+def _moved(
+    row: dict[str, str], folder: Path, project: Project, root: Path, people: Mapping[str, str]
+) -> dict[str, str]:
+    """A row of the table of sequences with other people, and what lies in the results where the new
+    results are."""
+    results = Path(os.path.abspath(project.config.results))
+    moved = dict(row, subject=people[row["subject"]])
+    for column, value in row.items():
+        path = Path(os.path.abspath(folder / value))
+        if value and path.is_relative_to(results):
+            moved[column] = os.path.abspath(root / path.relative_to(results))
+    return moved
