@@ -19,7 +19,7 @@ from intercap_core.metrics import object_pose
 from intercap_core.metrics.truth import Truth
 from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.passes import Tracker
+from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
@@ -96,6 +96,11 @@ class ObjectClip:
         """The first frame's pose (4, 4) as a person might set it: off by 10 mm and 5 degrees."""
         pose = rigid(self.true_rotation[0], self.true_translation[0])
         return moved(pose, ANNOTATION_ERROR)
+
+    @property
+    def step_s(self) -> float:
+        """Seconds between frames."""
+        return float(np.median(np.diff(self.times)))
 
     def tracker(self) -> Tracker:
         """The project's tracker on these frames."""

@@ -35,10 +35,9 @@ from bench.object_scaling import tracking_scaling
 from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
 from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
+from intercap_core.object_track.constants import FIT_ROUNDS
 from intercap_core.object_track.fit import MotionPrior
-from intercap_core.object_track.follow import follow
-from intercap_core.object_track.lost import judged
-from intercap_core.object_track.motion import extrapolated
+from intercap_core.object_track.motion import expected, extrapolated
 from intercap_core.object_track.view import View
 from intercap_core.project import load_project
 
@@ -137,15 +136,17 @@ def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEA
 
 
 def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
-    """The tracker's first pass alone: each frame fitted once and in order, as the paper goes."""
+    """Each frame fitted once and in order, as the paper goes: the fit alone."""
     seconds, poses = [], np.zeros(0)
     for _ in range(REPEATS):
         observer = clip.observer()
         begin = time.perf_counter()
-        seed = observer.fit(0, start, MotionPrior(start), rounds=(4, 5), scale=1.0)
-        first = judged(seed, clip.settings)
-        rest = follow(observer, range(1, len(clip)), first, may_search=False)
-        poses = np.array([first.fit.pose, *(frame.fit.pose for _, frame in rest)])
+        fit = observer.fit(0, start, MotionPrior(start), rounds=FIT_ROUNDS, scale=1.0)
+        found = [fit.pose, fit.pose]  # before the first frame it rested
+        for t in range(1, len(clip)):
+            guess = extrapolated(*found[-2:])
+            found.append(observer.fit(t, guess, expected(*found[-2:], guess, clip.step_s)).pose)
+        poses = np.array(found[1:])
         seconds.append(time.perf_counter() - begin)
     return Run.of(clip, poses, statistics.median(seconds))
 

@@ -163,13 +163,14 @@ PERSON = Schema(
 
 OBJECT_TRACK = Schema(
     name="object_track",
-    version=3,
+    version=4,
     stage="object_track",
     attributes={
         "sequence": "sequence name",
         "object": "object name",
         "seed_frame": "frame that the track started from",
         "seed_source": "'annotated', 'annotated against the images' or 'search'",
+        "doubts": "what speaks against the mesh or its labels, in words; empty = nothing",
     },
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
@@ -182,9 +183,9 @@ OBJECT_TRACK = Schema(
         "views": Field(("T",), "int8", "views that the pose rests on"),
         "covariance": Field(("T", "6", "6"), "float64", "of (rotation vector, translation), rotation applied on the left", "rad, m", "master"),
         "lost": Field(("T",), "bool", "the tracker does not believe its pose"),
-        "recovered": Field(("T",), "bool", "first frame that is not lost after lost ones, or after a search found a better pose"),
-        "disagree": Field(("T",), "bool", "forward and backward passes end apart and the images do not decide between them"),
-        "ambiguous": Field(("T",), "bool", "a quite different pose explains the images nearly as well"),
+        "recovered": Field(("T",), "bool", "first frame that is not lost after lost ones"),
+        "probability": Field(("T",), "float32", "of the pose, among all that were found, given all frames"),
+        "ambiguous": Field(("T",), "bool", "a quite different pose may be the true one, by images and motion of all frames"),
         "resting": Field(("T",), "bool", "the object does not move"),
         "free_axis": Field(("T", "3"), "float64", "unit axis through the object's origin about which a turn changes nothing that was seen; 0 = none", "1", "master"),
     },

@@ -158,7 +158,6 @@ def _flag_reasons(geometry: Geometry, state: State, flags: Flags) -> list[str]:
         (flags.filled, "body not seen well enough, filled in"),
         (flags.uncertain, "body not determined by what was seen"),
         (flags.lost, "object lost, filled in"),
-        (flags.disagree, "object passes disagree"),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
     )

@@ -32,13 +32,12 @@ class Flags:
     """Frames (T,) that a sequential fit has flagged.
 
     ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
-    was seen; ``lost``, ``disagree`` and ``ambiguous``: the object track's.
+    was seen; ``lost`` and ``ambiguous``: the object track's.
     """
 
     filled: np.ndarray
     uncertain: np.ndarray
     lost: np.ndarray
-    disagree: np.ndarray
     ambiguous: np.ndarray
 
 
@@ -66,7 +65,6 @@ class SequentialFits:
             filled=failed | body["bridged"],
             uncertain=body["uncertain"],
             lost=lost,
-            disagree=track["disagree"],
             ambiguous=track["ambiguous"],
         )
         resting = track["resting"]
@@ -75,7 +73,7 @@ class SequentialFits:
             state.translation,
             track["covariance"],
             lost,
-            flags.disagree | flags.ambiguous,
+            flags.ambiguous,
             resting,
             visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
             times=scene["times"],

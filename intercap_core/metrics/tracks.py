@@ -76,7 +76,7 @@ def read_object(path: Path, stage: str) -> ObjectTrack:
     """Poses of the ``"object_track"`` or ``"joint"`` artefact; raises UserError as reading does."""
     with artefacts.read(path, OBJECT_TRACK if stage == "object_track" else JOINT) as artefact:
         first = stage == "object_track"
-        flags = ("lost", "disagree", "ambiguous") if first else ("flagged",)
+        flags = ("lost", "ambiguous") if first else ("flagged",)
         return ObjectTrack(
             artefact["rotation"],
             artefact["translation"],

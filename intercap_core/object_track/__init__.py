@@ -9,28 +9,20 @@ Files in the order of a run:
 3. Where the object may be: ``groups`` joins candidates of several views, ``outlines`` has their
    silhouettes, ``places`` tells the object from other things like it over the whole recording.
 4. A frame with nothing known: ``search`` aligns a grid of rotations (``alignment``) and fits the
-   best; ``seed`` chooses the frame and the pose to start from.
+   best.
 5. The fit of a frame: ``candidates`` chooses the mask that overlaps the render, ``patches`` cuts
    the image around it, ``view_fit`` has the terms of equation 1 in one view, ``fit`` minimises them
    over all views, ``view_report`` says how a view agrees. ``evidence`` is the same quadratic form
    at a given pose, without steps.
-6. From frame to frame: ``follow`` starts each frame where ``motion`` expects it, ``lost`` says
-   which poses are not believed, ``audit`` searches anew where the track is doubtful, ``passes``
-   (Tracker) runs all of it both ways and merges.
-7. All frames together: ``whole`` asks ``turns`` for the side of a nearly symmetric object,
-   ``choices`` for the hypothesis of weakly seen frames, ``rest`` for when the object is at rest and
-   ``smooth`` for the most probable track and its covariance.
+6. How likely a pose is: ``likelihood`` has the images' log-likelihood ratio, ``prior`` what is
+   known beside them.
+7. From frame to frame: ``hypotheses`` follows fits through time, each from where ``motion`` expects
+   it; ``proposals`` says where else to look (a search, an annotation, ``turns`` of a nearly
+   symmetric object); ``decoder`` decides over all frames; ``tracker`` (Tracker) runs all of it.
+8. All frames together: ``whole`` asks ``rest`` for when the object is at rest and ``smooth`` for
+   the most probable track and its covariance. ``frame_result`` has the flags.
 
-``constants`` has the numbers of all of them. Poses are master_from_object, metres.
-
-How good a pose is, 0 to 1 without unit, each from the one before:
-
-- ``score``: agreement of a fit with the images (overlap of masks, share of agreeing depth), views
-  weighted by the pixels that they could show.
-- ``confidence``: the score times 1 - 2^-n for n views that support the pose.
-- ``plausibility``: the confidence and a small bonus where the object stands upright (up to 1.03).
-- ``value``: the plausibility times the place's prior; hypotheses of a frame are compared by it.
-
-Priors: ``label_prior`` of a candidate by its class, ``place_prior`` (:meth:`Places.prior`) of a
-place in the room, 0.1 to 1. Flags of a frame are defined at :class:`.lost.FrameResult`.
+``constants`` has the numbers of all of them. Poses are master_from_object, metres. How good a pose
+is has one measure, nats: ``log_ratio`` by the images of a frame alone, ``weigh`` with what is known
+beside them.
 """

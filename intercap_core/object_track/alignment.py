@@ -10,17 +10,21 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.camera.transforms import rigid
 from intercap_core.object_track import outlines
 from intercap_core.object_track.constants import (
     ALIGNED_POINTS,
     FACING_AWAY_MIN_M,
     FACING_AWAY_WEIGHT,
+    ICP_COARSE_STEPS,
     ICP_DAMPING,
+    ICP_KEPT,
     ICP_MAX_RESIDUAL_M,
     ICP_MAX_SHIFT_M,
     ICP_MAX_TURN_RAD,
     ICP_SCALES_M,
     ICP_STEPS,
+    ICP_THINNED,
     OUTLINE_ALIGNED_VIEWS,
 )
 from intercap_core.object_track.groups import Group, centre_of
@@ -36,25 +40,29 @@ def align(
     group: Group,
     views: list[View],
     rotations: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Align every rotation (N, 3, 3): poses (N, 4, 4) and robust mean residual (N,) in metres."""
-    count = len(rotations)
+) -> np.ndarray:
+    """Poses (M, 4, 4), the best first, that rotations (N, 3, 3) lead to; hopeless ones are left out
+    on the way (successive halving)."""
     cloud, eyes = _cloud(group, views)
     few = len(group) <= OUTLINE_ALIGNED_VIEWS
-    shapes = [s.outline for s in group if s.outline and (few or s.centre is None)]
+    shapes = [s.outline for s in group if (few or s.centre is None) and s.outline]
     hull = outlines.hull_vertices(mesh) if shapes else np.zeros((0, 3))
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     middle = (area[:, None] * (a + b + c) / 3).sum(0) / area.sum()
     rotation = rotations.copy()
     translation = centre_of(group) - rotation @ middle
-    scales = np.geomspace(*ICP_SCALES_M, ICP_STEPS)
-    residual = np.zeros(count)
-    for scale in [*scales, scales[-1]]:
+    scales = [*np.geomspace(*ICP_SCALES_M, ICP_STEPS), ICP_SCALES_M[-1]]
+    residual = np.zeros(len(rotation))
+    for number, scale in enumerate(scales):
+        few_points = slice(None, None, ICP_THINNED if number < ICP_COARSE_STEPS else 1)
+        count = len(rotation)
         hessian, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
         costs = []
         if len(cloud):
-            cost, h, g = _to_points(field, cloud, eyes, rotation, translation, scale)
+            cost, h, g = _to_points(
+                field, cloud[few_points], eyes[few_points], rotation, translation, scale
+            )
             hessian, gradient = hessian + h, gradient + g
             costs.append(cost)
         for shape in shapes:
@@ -73,10 +81,11 @@ def align(
         # the step moves the object in its own frame: pose <- pose * exp(step)
         translation = translation + np.einsum("nij,nj->ni", rotation, step[:, 3:])
         rotation = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotation
-    poses[:, :3, 3] = translation
-    return poses, residual
+        order = np.argsort(residual, kind="stable")
+        if number in ICP_KEPT:
+            order = order[: ICP_KEPT[number]]
+        rotation, translation = rotation[order], translation[order]
+    return rigid(rotation, translation)
 
 
 def _cloud(group: Group, views: list[View]) -> tuple[np.ndarray, np.ndarray]:

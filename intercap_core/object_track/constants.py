@@ -80,24 +80,22 @@ PRIOR_SIGMA_M, PRIOR_SIGMA_RAD = 0.06, float(np.radians(15))
 # Slower than this in a frame the object rests: no motion is predicted. Above the jitter of fits;
 # tuned on the studio.
 STILL_M, STILL_RAD = 0.004, np.radians(1.5)
-# Standard deviation of a frame's motion from rest, metres and radians. Tuned on the studio.
-ONSET_M, ONSET_RAD = 0.02, np.radians(5)
+# Standard deviation of how the velocity changes from one frame to the next, m/s and rad/s. Tuned on
+# the studio.
+ONSET_M_S, ONSET_RAD_S = 0.6, np.radians(150)
+# A fit that ends so many of the prior's standard deviations away is fitted again with a prior this
+# many times as wide: something set out or stopped.
+PRIOR_CONTRADICTED, PRIOR_WIDENED = 1.5, 4.0
+# From a wrist to the surface of what the hand may hold, metres: a hand's length.
+HOLDING_REACH_M = 0.20
 # Share of the last step that may be missing or added in the next. Tuned on the studio.
 ONSET_STEP_SHARE = 0.5
-# Standard deviation added for every lost frame: 1.2 m/s at 30 Hz. Tuned on the studio.
-GROWTH_LOST_M, GROWTH_LOST_RAD = 0.04, np.radians(8)
+# Standard deviation added for every second that the object is not seen. Tuned on the studio.
+GROWTH_LOST_M_S, GROWTH_LOST_RAD_S = 1.2, np.radians(240)
 # Standard deviation of accelerations of a carried object (m/s^2, rad/s^2); a kick is an outlier.
 # Tuned on the studio.
 ACCELERATION_M_S2 = 6.0
 ACCELERATION_RAD_S2 = 20.0
-# Standard deviation of speeds between frames, where a sequence of hypotheses is chosen: a hand that
-# carries something moves at about 1.5 m/s, 4 rad/s. Tuned on the studio.
-SEQUENCE_SPEED_RAD_S, SEQUENCE_SPEED_M_S = 4.0, 1.5
-# Drift of a tracked rotation from the true one in a second, standard deviation. Tuned on the
-# studio.
-SLIDE_RAD_S = np.radians(80)
-# Motion in one frame that no hand can cause: 4.5 m/s at 30 Hz.
-JUMP_M, JUMP_DEG = 0.15, 45.0
 # Shortest rest, seconds. Tuned on the studio.
 MIN_REST_S = 0.25
 # Frames within which an object cannot move away and back: a tenth of a second at 30 Hz.
@@ -152,6 +150,8 @@ OUTLINE_DIRECTIONS = 16  # of the image in which a silhouette's reach is taken
 OUTLINE_MIN_DEPTH_M = 0.1  # smaller depths are clamped to this: keeps divisions finite
 ALIGNED_POINTS = 150  # of all views together
 ICP_STEPS = 6  # iterations of the alignment
+ICP_COARSE_STEPS, ICP_THINNED = 2, 3  # the first of them use every third point
+ICP_KEPT = {1: 96, 3: 48}  # iteration to the number of rotations that go on after it
 ICP_SCALES_M = (0.08, 0.015)  # Geman-McClure scale: the grid's error at a hand's width, the noise
 ICP_MAX_TURN_RAD, ICP_MAX_SHIFT_M = np.radians(15), 0.05  # of a step
 ICP_DAMPING = 1e-3  # of the diagonal
@@ -161,33 +161,30 @@ FACING_AWAY_WEIGHT = 0.1
 FACING_AWAY_MIN_M = 0.01
 ICP_MAX_RESIDUAL_M = 0.05  # residuals beyond count as this much
 OUTLINE_ALIGNED_VIEWS = 2  # up to so many views silhouettes also align where depth measures
-SEARCH_COMPARED = 16  # poses rendered after ICP
-SEARCH_FITTED = 6  # poses fitted after rendering
+# Poses rendered after the alignment and fitted after that: with all rotations, and with few.
+FULL_SEARCH, NEAR_SEARCH = (16, 5), (6, 2)
+NEAR_TURN_SEARCH_RAD = np.radians(35)  # by which the rotations of a near search are apart
 OWN_TURN_STEPS = 12  # angles of a full turn about each axis of the best pose, compared with it
 TURNS_FITTED = 4  # of them
 MAX_GROUPS = 3  # groups of candidates that are searched
-SEARCH_GOOD_VALUE = (
-    0.55  # value above which less likely groups are not searched; tuned on the studio
-)
+# Nats of a pose in a trusted place, above which less likely groups are not searched, and the prior
+# of such a place. Tuned on the studio.
+SEARCH_GOOD_LOG_RATIO, TRUSTED_PLACE = 25.0, 0.5
 
 # --- solver effort: the track --------------------------------------------------------------------
 
-# Searches of a pass are due after so many frames in doubt, and then every SEARCH_EVERY_FRAMES.
-RECOVERY_WAIT_FRAMES = (0, 2, 5, 9, 14, 20, 30, 45, 60)
-SEARCH_EVERY_FRAMES = 30
-SEARCHES_MAX = 12  # that find nothing, and one more in SEARCH_EVERY_FRAMES: a pass must end
 SEED_SEARCHES = 3  # frames searched for the seed, more while nothing is found
 SEED_SEARCHES_MAX = 10
-SEED_RIVALS = 5  # hypotheses of the seed frame, compared over its neighbours
-SEED_RIVAL_FRAMES = 3  # neighbours on each side
+ROUNDS = 6  # of deciding and of looking for more
+SEARCHES_MIN, SEARCH_EVERY_S = 6, 0.5  # frames searched with all rotations, and one in this time
+LOOK_NEAR_S = 0.3  # a frame in doubt is searched by the poses of frames no farther away, seconds
+BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
+UNSEEN_S = 0.8  # seconds that an object is followed without being seen
+MAX_HYPOTHESES = 6  # of a frame
+TURNS_FOLLOWED = 2  # of a key frame
 ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
 SURVEYED_FRAMES = 12  # looked at before tracking, spread over the recording
 SURVEYED_GROUPS = 6  # groups of candidates in each of them
-AUDIT_WINDOW_FRAMES = 12  # one search in each
-# Audits of a recording, the least sound windows first; of a long one, one in so many frames.
-AUDITS_MIN, AUDIT_EVERY_FRAMES = 8, 45
-WEAK_FRAME_TURN_RAD = np.radians(25)  # by which the starts of a weakly seen frame are turned
-WEAK_FRAME_FITS = 2  # of the turned starts, fitted beside the pose itself
 KEY_FRAME_S = 0.2  # seconds between the frames in which turns are compared
 NEAR_TURN_STEPS = 12  # angles of a full turn that are tried for a near symmetry
 NEAR_TURN_FINE_RAD = np.pi / NEAR_TURN_STEPS  # beside no turn, where a slow slide is caught first
@@ -212,6 +209,49 @@ LIKELY_LABEL_BONUS = 0.05  # of overlap: breaks ties between candidates. Tuned o
 ASSESS_MIN_OVERLAP = 0.1  # of a candidate that a pose is compared with, before it is fitted
 SEARCH_MIN_OVERLAP = 0.2  # of a candidate that a searched pose is fitted to, at most
 
+# --- decision: how likely an image is ------------------------------------------------------------
+
+# Deviation of measured depth from the object's surface: systematic error, calibration, and the
+# mesh's own error, metres. Tuned on the studio.
+DEPTH_LIKELY_SIGMA_M = 0.008
+# Where the object is not, depth is measured anywhere within this range of where it would be.
+CLUTTER_RANGE_M = 0.3
+# Log of the share of a surface's pixels that the sensor looks past (flying pixels, edges), and of
+# those that something other than a person hides.
+LOG_SEEN_PAST, LOG_HIDDEN = float(np.log(0.03)), float(np.log(0.15))
+# Log of how often a detector misses an object all of which is visible; half of that counts where
+# so many pixels are visible.
+LOG_MISSED, MISSED_HALF_PX = float(np.log(0.1)), 300
+# Mean cost of an outline (half a squared normalised distance, at most the second) at which a mask
+# says nothing: chance has outlines of that distance nearby.
+MASK_AGREES, OUTLINE_COST_MAX = 2.0, 4.5
+# What a view's depth, and its outline, count as at most, in independent samples; half of that at so
+# many pixels of the outline. Tuned on the studio.
+VIEW_SAMPLES, OUTLINE_HALF_SAMPLES_PX = 4.0, 60
+LABEL_LOG_RATIO = 1.0  # of a candidate with the right label over one with another
+
+# --- decision: which hypothesis is true (tuned on the studio) -------------------------------------
+
+# Of the motion between frames, standard deviations: a hand that carries something.
+MOVING_M_S, MOVING_TURN_RAD_S = 1.5, 4.0
+# Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
+# its coming back.
+JUMP_COST, VANISH_COST, APPEAR_COST = 10.0, 4.0, 4.0
+# Nats that the images of one frame say for a pose: from which it is seen; from which it is good
+# enough to start from or to stop a search; below which it is no hypothesis.
+SEEN_LOG_RATIO, SEED_SURE_LOG_RATIO, CONTRADICTED_LOG_RATIO = 3.0, 40.0, -6.0
+RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow
+UPRIGHT_LOG_RATIO = (
+    2.0  # times the cosine of the angle to its standing pose: few mugs are upside down
+)
+ANNOTATION_LOG_RATIO = 10.0  # of the pose that a person gave, of one frame on its own
+RELOOK_LOG_RATIO = 2.0  # nats by which a smoothed pose may be less likely and is looked at again
+APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite different: lost
+# Probabilities: of no hypothesis, from which a frame is lost; of quite different ones, from which
+# it is ambiguous; of the chosen one, below which more is looked for.
+LOST_PROBABILITY, AMBIGUOUS_PROBABILITY, DOUBTFUL_PROBABILITY = 0.5, 0.35, 0.9
+DOUBTFUL_SHARE = 0.5  # of the usual nats, below which more is looked for
+
 # --- decision: which candidates may be the object ------------------------------------------------
 
 # Extents, of the object's diameter, of a candidate that may be it, partly hidden or with something
@@ -229,7 +269,6 @@ RAY_MISS_SHARE = 0.35  # of the diameter: a ray through a mask's middle from the
 OUTLINE_MIN_WIDTH, OUTLINE_MAX_WIDTH = 0.12, 1.25
 OTHER_LABEL_PRIOR = 0.5  # of a candidate with another class's label; detectors err
 NO_LABEL_PRIOR = 0.8  # of one that no detector named
-NEAR_COST_PER_M = 2.0  # of a group away from where the object was seen, in labelled candidates
 SHARED_SIGHTINGS = 0.5  # share of a group's candidates in another one, up to which they are two
 
 # --- decision: where in the room the object may be (tuned on the studio) -------------------------
@@ -240,6 +279,8 @@ SAME_PLACE_SHARE, SAME_PLACE_M = 0.3, 0.05
 # Shares of the frames: always there, there for a while only.
 ALWAYS_PRESENT, SOMETIMES_PRESENT = 0.85, 0.5
 MOVED_PRIOR = 0.8  # of what was not in this place all the time, wherever the person is
+UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against what moves with nobody near
+SUREST_PLACE = 1 - 1e-6  # prior of a place, at most: its log-odds have to end somewhere
 MIN_PLACE_PRIOR = 0.1  # of what stands apart all the time
 BESIDE_FRAMES = 2  # in which something stands there while the object is elsewhere: another thing
 
@@ -256,31 +297,16 @@ SIZE_DOUBTFUL_RATIO = 4.0
 SIZE_LARGEST_PERCENTILE, SIZE_SMALLEST_PERCENTILE = 90, 25
 LABELS_TOLD = 8  # labels named in a warning
 
+# After tracking: the surest frames are fitted with meshes of other sizes, one of which must be
+# better by so many nats a frame to be told. Of the studio a tenth costs a cup 6 and others 20.
+CHECK_FRAMES, CHECK_SCALES, CHECK_GAIN = 6, (0.9, 1.1), 5.0
+# Nats of half of the frames, below which the mesh is hardly that object: wrong meshes of like size
+# have 5 to 19, right ones 40 to 100, a cup at twice the noise 14. Tuned on the studio.
+LIKENESS_LOG_RATIO = 10.0
+
 # --- decision: which of several poses (tuned on the studio) --------------------------------------
 
 SAME_POSE_M, SAME_POSE_DEG = 0.02, 12.0  # poses nearer than this are one hypothesis
-STANDING_BONUS = 0.03  # of confidence, where the object stands
-STANDING_COSINE = float(np.cos(np.radians(12)))  # of the angle between its z axis and the vertical
-CLEARLY_BETTER = 1.15  # times the value, for which another frame or pose is preferred
-SEED_SURE_VALUE = 0.65  # good enough to stop looking for a better seed frame
-SEED_RIVAL_SHARE = 0.80  # of the best hypothesis' value
-LEAP_COST_PER_M, LEAP_MAX_COST_M = 0.1, 0.1  # of value, for a searched pose away from the last one
-LEAP_COST_HALF_TURN, LEAP_MAX_COST_TURN = 0.05, 0.05  # the same for a turn of 180 degrees
-PASSES_AGREE_M, PASSES_AGREE_DEG = 0.02, 10.0  # passes farther apart differ
-# By how much the mean score of one pose has to be better than another's, over all frames of a long
-# run and over one: errors of masks last several frames and agree over views.
-DECIDED_RUN, DECIDED_FRAME = 0.01, 0.03
-SEQUENCE_SCORE_SIGMA = 0.02  # standard deviation of a frame's score, between poses of one fit
-SEQUENCE_MAX_MOTION_COST = 6.0  # minus log-likelihood of a motion that is none
-TURN_SCORE_SIGMA = 0.01  # of a key frame's score's difference between a turn and none
-# Factor of TURN_SCORE_SIGMA for a correction by a right angle or more, not for flagging a frame:
-# the scores of distant poses have independent errors, correlated over more than one key frame.
-# Tuned on the studio.
-TURN_APART_FACTOR = 2.5
-# Minus log-likelihood of any change of the chosen rotation: in a tracked stretch, and where the
-# track was lost.
-TURN_JUMP_COST, TURN_BROKEN_COST = 10.0, 1.0
-TURN_MAX_LOSS = 0.01  # of the score, that a turn may cost a run of frames which others decide
 SAME_AXIS_COSINE = float(np.cos(np.radians(10)))  # principal axes nearer to the frame's are these
 # A point of the surface that a turn moves farther, metres and share of the diameter, could be
 # noticed; the share of such points below which a turn is hard to see; flips nearer than the angle
@@ -288,29 +314,11 @@ SAME_AXIS_COSINE = float(np.cos(np.radians(10)))  # principal axes nearer to the
 NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE = 0.003, 0.01
 NEAR_TURN_CHANGED_SHARE = 0.3
 NEAR_TURN_DISTINCT_DEG = 45.0
-AUDIT_RIVAL_MARGIN = 0.03  # of the value: a found pose this much worse is a rival
-AUDIT_NEAR_TURN_DEG = 20.0  # from a turn that hardly changes the object
-AUDIT_DIFFERENT_M, AUDIT_DIFFERENT_DEG = 0.05, 30.0  # poses of which one must be wrong
-AUDIT_NEIGHBOURS = 3  # frames on each side, whose images decide together
 
 # --- decision: which poses are believed (tuned on the studio) ------------------------------------
 
-LOST_SCORE = 0.20  # below, a pose is lost
-DOUBTFUL_SCORE = 0.55  # of the usual score: below, a search may find better
-WEAK_SCORE = 0.8  # of the usual score: below, a frame is weakly seen
-USUAL_SCORE_RATE = 0.1  # of the running mean of the scores, a frame
-RECOVERY_VALUE = 0.40  # of a searched pose that is believed, with a ring of cameras ...
-RING_VIEWS = 6  # ... of so many; one camera less doubles what may agree by chance
-RECOVERY_NAMED_VIEWS, RECOVERY_VIEWS_EACH = 2, 3  # views with a candidate, and of so many each
-NEAR_LAST_PLACE_M = 0.4  # farther from where the object was it needs RECOVERY_NAMED_VIEWS
-UNSURE_M, UNSURE_RAD = 0.03, np.radians(15)  # standard deviations that are as good as lost
-# Frames that the object is followed without any candidate, and metres that it may have moved then.
-UNNAMED_FRAMES, UNNAMED_M = 4, 0.05
-SOUND_VIEWS, SOUND_AGREEMENT = 3, 0.8  # views that agree this well, in mask and depth: no audit
-QUITE_DIFFERENT_RAD = np.radians(20)  # turns farther apart may make a frame ambiguous
-AMBIGUOUS_PROBABILITY = 0.35  # of quite different turns, from which a frame is ambiguous
-RELOOK_MIN_SCORE = 0.97  # of the score, below which a smoothed pose is not where to look again
-FOUND_AGAIN_SCORE = 0.7  # of the usual score, with which a lost frame is found between neighbours
+# Standard deviations that are as good as lost: one frame in six would be off by more.
+UNSURE_M, UNSURE_RAD = 0.035, np.radians(15)
 FREE_AXIS_SIGMA_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
 TOLD_SHARE = 0.5  # of the frames, from which a track's faults are told
 

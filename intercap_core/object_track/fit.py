@@ -20,7 +20,6 @@ from intercap_core.object_track.constants import (
     FIT_MAX_STEP_M,
     FIT_MAX_STEP_RAD,
     FIT_ROUNDS,
-    MIN_RENDERED_PX,
     PRIOR_SIGMA_M,
     PRIOR_SIGMA_RAD,
     REDRAWN_M,
@@ -60,30 +59,9 @@ class Fit:
     views: tuple[ViewReport, ...]
 
     @property
-    def score(self) -> float:
-        """Agreement over all views, 0 to 1, each view by the pixels it could show.
-
-        A view without a candidate counts with overlap 0: a pose that no detector supports is not
-        as good as one that six do. Where no detector has looked, depth alone counts.
-        """
-        total, weight = 0.0, 0.0
-        for view in self.views:
-            if view.visible_px < MIN_RENDERED_PX:
-                continue
-            overlap = 0.0 if np.isnan(view.overlap) else view.overlap
-            agreement = overlap if np.isnan(view.depth_agreement) else view.depth_agreement
-            if not view.detected:
-                if np.isnan(view.depth_agreement):
-                    continue
-                overlap = agreement
-            total += view.visible_px * 0.5 * (overlap + agreement)
-            weight += view.visible_px
-        return total / weight if weight else 0.0
-
-    @property
-    def confidence(self) -> float:
-        """:attr:`score`, less where few views support it: one view can agree by chance."""
-        return self.score * (1 - 0.5**self.support)
+    def log_ratio(self) -> float:
+        """Log-likelihood ratio of all views, nats: see :mod:`.likelihood`."""
+        return float(sum(view.log_ratio for view in self.views))
 
     @property
     def mean_overlap(self) -> float:

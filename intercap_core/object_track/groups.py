@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -20,7 +21,6 @@ from intercap_core.object_track.constants import (
     CLOUD_PERCENTILE,
     GROUP_SLACK_M,
     MAX_GROUPS,
-    NEAR_COST_PER_M,
     NO_LABEL_PRIOR,
     ON_PERSON_SHARE,
     OTHER_LABEL_PRIOR,
@@ -39,16 +39,21 @@ from intercap_core.rigid.mesh import ObjectMesh
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One candidate of one image: its ``outline`` (None where all of it is cut off) and, where the
-    view has depth, the measured ``points`` (N, 3), master frame, with their ``centre`` (3,).
-    ``label_prior``: 1 where its label is one of the object's, less else."""
+    """One candidate of one ``image``, that of view number ``view``, and, where that has depth, the
+    measured ``points`` (N, 3), master frame, with their ``centre`` (3,). ``label_prior``: 1 where
+    its label is one of the object's, less else."""
 
     view: int
     candidate: Candidate
     label_prior: float
     points: np.ndarray
     centre: np.ndarray | None
-    outline: Outline | None
+    image: View
+
+    @cached_property
+    def outline(self) -> Outline | None:
+        """Its outline; None where all of it is cut off. Few searches ask for it."""
+        return Outline.of(self.image, self.candidate)
 
     def away(self, point: np.ndarray, diameter: float) -> float:
         """Distance of the candidate from a place (3,), in units of the largest distance within one
@@ -80,13 +85,12 @@ def find_groups(
     views: list[View],
     labels: tuple[str, ...],
     place_prior: Callable[[np.ndarray], float] | None = None,
-    near: np.ndarray | None = None,
     limit: int = MAX_GROUPS,
 ) -> list[Group]:
     """The first ``limit`` groups of candidates that may be the object, the most likely first.
 
     ``labels`` are the classes that the object may be given; ``place_prior`` says of a place (3,)
-    how likely what is there is the object; ``near`` (3,) prefers candidates near a place.
+    how likely what is there is the object.
     """
     measured = _measured(views, mesh.diameter, labels)
     outlined = _outlined(views, labels)
@@ -105,8 +109,6 @@ def find_groups(
         value = sum(s.label_prior for s in group)
         if place_prior is not None:
             value *= place_prior(centre_of(group))
-        if near is not None:
-            value -= NEAR_COST_PER_M * float(np.linalg.norm(place - near))
         groups.append((value, group))
     groups.sort(key=lambda item: -item[0])
     return _different([group for _, group in groups], limit)
@@ -181,13 +183,10 @@ def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
     found = []
     for number, view in enumerate(views):
         for candidate in _could_be(view) if view.depth is None else ():
-            outline = (
-                Outline.of(view, candidate) if candidate.mask.area >= SIGHTING_MIN_POINTS else None
-            )
-            if outline is not None:
-                label_prior = _label_prior(candidate.label, labels)
-                nothing = np.zeros((0, 3))
-                found.append(Sighting(number, candidate, label_prior, nothing, None, outline))
+            label_prior = _label_prior(candidate.label, labels)
+            one = Sighting(number, candidate, label_prior, np.zeros((0, 3)), None, view)
+            if candidate.mask.area >= SIGHTING_MIN_POINTS and one.outline is not None:
+                found.append(one)
     return found
 
 
@@ -224,6 +223,5 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
             if spread > CLOUD_MAX_SPREAD * diameter:
                 continue
             label_prior = _label_prior(candidate.label, labels)
-            outline = Outline.of(view, candidate)
-            found.append(Sighting(number, candidate, label_prior, points, centre, outline))
+            found.append(Sighting(number, candidate, label_prior, points, centre, view))
     return found

@@ -17,10 +17,12 @@ from intercap_core.object_track.fit import (
     assess_all,
     fit_pose,
 )
+from intercap_core.object_track.motion import carried
 from intercap_core.object_track.places import Places
-from intercap_core.object_track.search import plausibility, rank_frames, search
+from intercap_core.object_track.search import rank_frames, search
 from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import Renderer, open_renderer
 
@@ -76,17 +78,25 @@ class Observer:
             for view in self.labels_by_view[t]
         )
 
-    def search(self, t: int, near: np.ndarray | None = None) -> list[Fit]:
-        """Fitted hypotheses of frame t, the best first; ``near`` (3,) prefers a place."""
+    @cached_property
+    def field(self) -> DistanceField:
+        """Distances to the object's surface."""
+        mesh = self.mesh
+        return DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
+
+    def search(self, t: int, rotations: np.ndarray | None = None) -> list[Fit]:
+        """Fitted hypotheses of frame t, the likeliest first; ``rotations`` (N, 3, 3) are tried, or
+        all there are."""
         return search(
             self.mesh,
+            self.field,
             self.views(t),
             labels=self.labels,
             up=self.up,
             min_overlap=self.settings.min_overlap,
             background_term=self.settings.background_term,
             place_prior=partial(self.places.prior, t),
-            near=near,
+            rotations=rotations,
             renderer=self.renderer,
         )
 
@@ -127,6 +137,13 @@ class Observer:
             renderer=self.renderer,
         )
 
+    def carried(self, t: int, u: int, pose: np.ndarray) -> np.ndarray:
+        """Poses (N, 4, 4) of frame u of what hands may hold at ``pose`` (4, 4) in frame t."""
+        if self.joints is None:
+            return np.zeros((0, 4, 4))
+        centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
+        return carried(self.joints[[t, u]], pose, centre, radius)
+
     def assess(self, t: int, pose: np.ndarray) -> Fit:
         """How well a pose (4, 4) agrees with frame t as it is."""
         return self.assess_all(t, pose[None])[0]
@@ -141,11 +158,3 @@ class Observer:
             labels=self.labels,
             renderer=self.renderer,
         )
-
-    def plausibility(self, fit: Fit) -> float:
-        """A fit's confidence, a little more where the object stands."""
-        return plausibility(fit, self.up)
-
-    def value(self, t: int, fit: Fit) -> float:
-        """:meth:`plausibility`, less where what is there in frame t is hardly the object."""
-        return self.plausibility(fit) * self.places.prior(t, self.mesh.centre_at(fit.pose))

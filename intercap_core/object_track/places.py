@@ -25,8 +25,10 @@ from intercap_core.object_track.constants import (
     SAME_PLACE_M,
     SAME_PLACE_SHARE,
     SOMETIMES_PRESENT,
+    SUREST_PLACE,
     SURVEYED_FRAMES,
     SURVEYED_GROUPS,
+    UNHANDLED_LOG_RATIO,
 )
 from intercap_core.object_track.groups import centre_of, find_groups
 from intercap_core.object_track.view import View
@@ -37,12 +39,11 @@ _BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what th
 
 @dataclass(eq=False)
 class Standing:
-    """A place (3,), metres, master frame, where something was in ``share`` of the surveyed frames:
-    in ``frames``, and in those of ``beside`` while the object was elsewhere."""
+    """A place (3,), metres, master frame, where something was in ``share`` of the surveyed frames,
+    and in the frames of ``beside`` while the object was elsewhere."""
 
     place: np.ndarray
     share: float
-    frames: frozenset[int] = frozenset()
     beside: set[int] = field(default_factory=set)
 
 
@@ -93,11 +94,20 @@ class Places:
         standing, place_prior = found
         return MIN_PLACE_PRIOR if len(standing.beside) >= BESIDE_FRAMES else place_prior
 
-    def taken(self, place: np.ndarray) -> bool:
-        """Whether the thing at ``place`` (3,) is another one: it was visible there while the object
-        was elsewhere."""
+    def weigh(self, t: int, place: np.ndarray, ratio: float, share: float) -> float:
+        """What is left of ``ratio`` nats for the object at ``place`` (3,) in frame t.
+
+        Where a thing stands for most of the recording, the images count no more than what is known
+        of it: another thing of the object's class looks like the object. What is away from any
+        such place moves, and mostly somebody moves it. ``share`` is how many independent
+        observations a frame is.
+        """
         found = self._nearest(place)
-        return found is not None and len(found[0].beside) >= BESIDE_FRAMES
+        if found is None or found[0].share < SOMETIMES_PRESENT:
+            gaps = self._gaps(place, slice(t, t + 1))
+            return ratio - (UNHANDLED_LOG_RATIO * (1 - _closeness(gaps)) if len(gaps) else 0.0)
+        prior = min(self.prior(t, place), SUREST_PLACE)
+        return min(ratio, float(np.log(prior / (1 - prior))) / share)
 
     def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
         """The known place at ``place`` (3,), if any, and its prior."""
@@ -113,11 +123,12 @@ class Places:
             if np.linalg.norm(s.place - place) >= self._same
         ]
 
-    def tracked(self, t: int, place: np.ndarray) -> None:
-        """Record that the object is reliably tracked at ``place`` (3,) in frame t."""
-        for s, _ in self._standing:
-            if t in s.frames and np.linalg.norm(s.place - place) >= self._same:
-                s.beside.add(t)
+    def seen_beside(self, t: int, place: np.ndarray, object_at: np.ndarray) -> None:
+        """Record that something looks like the object at ``place`` (3,) in frame t, in which the
+        object itself is at ``object_at`` (3,)."""
+        found = self._nearest(place)
+        if found is not None and np.linalg.norm(found[0].place - object_at) >= self._same:
+            found[0].beside.add(t)
 
     def _standing_prior(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
@@ -161,7 +172,6 @@ def _clusters(
         if counts[best] < 2:
             break
         members = together[best]
-        there = frozenset(frame[members].tolist())
-        found.append(Standing(places[members].mean(0), counts[best] / max(looked, 1), there))
+        found.append(Standing(places[members].mean(0), counts[best] / max(looked, 1)))
         free &= ~members
     return found

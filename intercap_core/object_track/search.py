@@ -16,23 +16,22 @@ from intercap_core.detections.instance import PERSON_LABEL
 from intercap_core.object_track.alignment import align
 from intercap_core.object_track.constants import (
     ASSESS_MIN_OVERLAP,
+    FULL_SEARCH,
     GRID_ROTATIONS,
     GRID_SPACING_DEG,
+    NEAR_SEARCH,
     OWN_TURN_STEPS,
     SAME_AXIS_COSINE,
     SAME_POSE_DEG,
     SAME_POSE_M,
-    SEARCH_COMPARED,
-    SEARCH_FITTED,
-    SEARCH_GOOD_VALUE,
+    SEARCH_GOOD_LOG_RATIO,
     SEARCH_MIN_OVERLAP,
-    STANDING_BONUS,
-    STANDING_COSINE,
+    TRUSTED_PLACE,
     TURNS_FITTED,
     UPRIGHT_TURNS,
 )
 from intercap_core.object_track.fit import Fit, assess_all, fit_pose
-from intercap_core.object_track.groups import find_groups
+from intercap_core.object_track.groups import centre_of, find_groups
 from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
@@ -42,6 +41,7 @@ from intercap_core.rigid.symmetry import SymmetryGroup
 
 def search(
     mesh: ObjectMesh,
+    field: DistanceField,
     views: list[View],
     *,
     labels: tuple[str, ...],
@@ -49,22 +49,17 @@ def search(
     min_overlap: float,
     background_term: bool,
     place_prior: Callable[[np.ndarray], float] | None = None,
-    near: np.ndarray | None = None,
+    rotations: np.ndarray | None = None,
     renderer: Renderer | None = None,
 ) -> list[Fit]:
-    """Fitted hypotheses of the pose, the most plausible first; none where nothing is detected.
+    """Fitted hypotheses of the pose, the likeliest first; none where nothing is detected.
 
-    ``labels`` are the detector classes that the object may be given (empty: any but a person);
-    ``up`` (3,) is the vertical in the master frame, to try the standing poses more finely;
-    ``place_prior`` says of a place (3,) how likely what is there is the object, 0 to 1; ``near``
-    (3,) prefers candidates near a place where the object was seen; ``renderer`` draws, None = the
-    CPU.
+    ``field`` is the mesh's distance field; ``labels`` are the detector classes that the object may
+    be given (empty: any but a person); ``up`` (3,) is the vertical in the master frame, to try the
+    standing poses more finely; ``place_prior`` says of a place (3,) how likely what is there is the
+    object, 0 to 1; ``rotations`` (N, 3, 3) are tried alone where they are known roughly;
+    ``renderer`` draws, None = the CPU.
     """
-
-    def value(fit: Fit) -> float:
-        return plausibility(fit, up) * (
-            1.0 if place_prior is None else place_prior(mesh.centre_at(fit.pose))
-        )
 
     def fitted(starts: list[Fit]) -> list[Fit]:
         return [
@@ -82,27 +77,28 @@ def search(
         ]
 
     def compared(poses: np.ndarray) -> list[Fit]:
-        return assess_all(
+        found = assess_all(
             mesh, views, poses, min_overlap=ASSESS_MIN_OVERLAP, labels=labels, renderer=renderer
         )
+        return sorted(found, key=lambda fit: -fit.log_ratio)
 
-    groups = find_groups(mesh, views, labels, place_prior, near)
-    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
-    rotations = rotation_grid(mesh.symmetry, up)
+    known = rotations is not None
+    number_compared, number_fitted = NEAR_SEARCH if known else FULL_SEARCH
+    if rotations is None:
+        rotations = rotation_grid(mesh.symmetry, up)
     found: list[Fit] = []
-    for group in groups:
-        if found and max(map(value, found)) > SEARCH_GOOD_VALUE:
+    for group in find_groups(mesh, views, labels, place_prior):
+        poses = align(mesh, field, group, views, rotations)
+        here = fitted(compared(_distinct(mesh, poses, number_compared))[:number_fitted])
+        found += here
+        trusted = place_prior is None or place_prior(centre_of(group)) > TRUSTED_PLACE
+        if trusted and max(fit.log_ratio for fit in here) > SEARCH_GOOD_LOG_RATIO:
             break
-        poses, residual = align(mesh, field, group, views, rotations)
-        distinct = _distinct(mesh, poses, np.argsort(residual, kind="stable"), SEARCH_COMPARED)
-        likely = sorted(compared(poses[distinct]), key=lambda fit: -fit.confidence)
-        found += fitted(likely[:SEARCH_FITTED])
-    found.sort(key=lambda fit: -value(fit))
-    if found and not mesh.symmetry.sphere:
+    found.sort(key=lambda fit: -fit.log_ratio)
+    if found and not known and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
-        turned = compared(found[0].pose @ own_turns(mesh, OWN_TURN_STEPS))
-        found += fitted(sorted(turned, key=lambda fit: -fit.score)[:TURNS_FITTED])
-        found.sort(key=lambda fit: -value(fit))
+        found += fitted(compared(found[0].pose @ own_turns(mesh, OWN_TURN_STEPS))[:TURNS_FITTED])
+        found.sort(key=lambda fit: -fit.log_ratio)
     kept: list[Fit] = []
     for fit in found:
         if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):
@@ -164,17 +160,6 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
     return order
 
 
-def plausibility(fit: Fit, up: np.ndarray | None) -> float:
-    """A fit's confidence, with a small bonus where the object stands upright.
-
-    Decides between poses that the images hardly tell apart: a mug is seldom upside down.
-    """
-    if up is None:
-        return fit.confidence
-    upright = float(fit.pose[:3, 2] @ up) / float(np.linalg.norm(up))
-    return fit.confidence + (STANDING_BONUS if upright > STANDING_COSINE else 0.0)
-
-
 def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
     """Rotations (N, 3, 3) that cover SO(3) modulo the group, and the upright ones."""
     if symmetry.sphere:
@@ -199,11 +184,17 @@ def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
     return np.array(kept)
 
 
-def same_pose(mesh: ObjectMesh, a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two poses (4, 4) are one, up to symmetry and a small difference."""
+def same_pose(
+    mesh: ObjectMesh,
+    a: np.ndarray,
+    b: np.ndarray,
+    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
+) -> bool:
+    """Whether two poses (4, 4) are one, up to symmetry and a difference of ``limits``, metres and
+    degrees."""
     angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
     shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
-    return angle < SAME_POSE_DEG and shift < SAME_POSE_M
+    return shift < limits[0] and angle < limits[1]
 
 
 def _super_fibonacci(count: int) -> np.ndarray:
@@ -226,12 +217,12 @@ def _standing(up: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], 1)
 
 
-def _distinct(mesh: ObjectMesh, poses: np.ndarray, order: np.ndarray, count: int) -> list[int]:
-    """The first ``count`` poses of ``order`` that are not the same as one before."""
-    kept: list[int] = []
-    for index in order:
-        if not any(same_pose(mesh, poses[index], poses[other]) for other in kept):
-            kept.append(int(index))
+def _distinct(mesh: ObjectMesh, poses: np.ndarray, count: int) -> np.ndarray:
+    """The first ``count`` of the poses (N, 4, 4) that are not the same as one before."""
+    kept: list[np.ndarray] = []
+    for pose in poses:
+        if not any(same_pose(mesh, pose, other) for other in kept):
+            kept.append(pose)
             if len(kept) == count:
                 break
-    return kept
+    return np.array(kept)

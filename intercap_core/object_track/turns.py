@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp
 
 from intercap_core.object_track.constants import (
     NEAR_TURN_CHANGED_SHARE,
@@ -25,11 +24,6 @@ from intercap_core.object_track.constants import (
     NEAR_TURN_POINT_WEIGHT,
     NEAR_TURN_POINTS,
     NEAR_TURN_STEPS,
-    SLIDE_RAD_S,
-    TURN_APART_FACTOR,
-    TURN_BROKEN_COST,
-    TURN_JUMP_COST,
-    TURN_SCORE_SIGMA,
 )
 from intercap_core.object_track.search import own_axes
 from intercap_core.rigid.distance import DistanceField
@@ -37,16 +31,15 @@ from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.solve.robust import geman_mcclure_weight
 
 
-def near_turns(mesh: ObjectMesh) -> np.ndarray:
+def near_turns(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
     """Turns (N, 4, 4) of the object that hardly change it, the identity first.
 
     All angles about an axis of near symmetry, and single angles where the surface comes back to
-    itself; elements of the symmetry group left out.
+    itself; elements of the symmetry group left out. ``field`` is the mesh's distance field.
     """
     found = [np.eye(4)]
     if mesh.symmetry.sphere:
         return found[0][None]
-    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
     points = _surface(mesh)
     far = max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
     angles = 2 * np.pi * np.arange(NEAR_TURN_STEPS) / NEAR_TURN_STEPS
@@ -77,51 +70,11 @@ def near_turns(mesh: ObjectMesh) -> np.ndarray:
     return np.array(kept)
 
 
-def choose_turns(
-    scores: np.ndarray, turns: np.ndarray, gaps: np.ndarray, broken: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Index (K,) of the turn (N, 4, 4) that each of K key frames is best corrected by, and the
-    probability (K, N) of each turn given all frames.
-
-    ``scores`` (K, N) of every turned pose, NaN rows where nothing is known; ``gaps`` (K-1,) seconds
-    to the next key frame; ``broken`` (K-1,) whether the track was lost between.
-    """
-    # a frame that agrees badly with every turn is little evidence for one
-    usual = max(float(np.nanmedian(scores.max(1))), 1e-6)
-    trust = np.minimum(scores.max(1, keepdims=True) / usual, 1.0) ** 2
-    between = angle_between(turns[:, None], turns[None])
-    sigma = TURN_SCORE_SIGMA * (
-        1 + (TURN_APART_FACTOR - 1) * np.minimum(between[0] / (np.pi / 2), 1.0)
-    )
-    likely = np.nan_to_num((scores - scores[:, :1]) * trust / TURN_SCORE_SIGMA)
-    value = likely * TURN_SCORE_SIGMA / sigma
-    costs = [
-        np.minimum(
-            0.5 * (between / (SLIDE_RAD_S * gap)) ** 2, TURN_BROKEN_COST if gone else TURN_JUMP_COST
-        )
-        for gap, gone in zip(gaps, broken, strict=True)
-    ]
-    best, ahead, came = [value[0]], [likely[0]], []
-    for k, cost in enumerate(costs, 1):
-        through = best[-1][:, None] - cost
-        came.append(through.argmax(0))
-        best.append(through.max(0) + value[k])
-        ahead.append(logsumexp(ahead[-1][:, None] - cost, axis=0) + likely[k])
-    path = [int(best[-1].argmax())]
-    for back in reversed(came):
-        path.append(int(back[path[-1]]))
-    behind = [np.zeros(len(turns))]
-    for cost, after in zip(reversed(costs), likely[:0:-1], strict=True):
-        behind.append(logsumexp(behind[-1] + after - cost, axis=1))
-    log = np.array(ahead) + np.array(behind[::-1])
-    probability = np.exp(log - logsumexp(log, axis=1, keepdims=True))
-    return np.array(path[::-1]), probability
-
-
-def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle (...) in radians between the rotations of turns a and b (..., 4, 4)."""
-    chord = np.linalg.norm(a[..., :3, :3] - b[..., :3, :3], axis=(-1, -2))
-    return 2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1))
+def changed_share(mesh: ObjectMesh, field: DistanceField, motion: np.ndarray) -> float:
+    """Share of the surface that a motion (4, 4) of the object brings clearly off the surface."""
+    moved = _surface(mesh) @ motion[:3, :3].T + motion[:3, 3]
+    far = max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
+    return float((field.distance(moved) > far).mean())
 
 
 def _about(axis: np.ndarray, angle: float) -> np.ndarray:

@@ -34,6 +34,7 @@ from intercap_core.object_track.constants import (
     MIN_RENDERED_PX,
     REPORT_DEPTH_M,
 )
+from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
 from intercap_core.object_track.view import Candidate, View
@@ -237,6 +238,16 @@ class ViewFit:
             agreement, free = depth_agreement(gap, across, patch.on_person[row, column])
             visible = unhidden(image, visible, free, len(gap))
         number = self._candidate.index if self._candidate is not None else -1
+        ratio = log_ratio(
+            self._mesh,
+            view,
+            self._pose,
+            image,
+            self._drawn_depth,
+            self._candidate,
+            visible,
+            self._labels,
+        )
         return ViewReport(
-            number, overlap, depth_residual, contour, visible, agreement, view.detected
+            number, overlap, depth_residual, contour, visible, agreement, view.detected, ratio
         )

@@ -9,6 +9,7 @@ import numpy as np
 from intercap_core.energy import object_depth_kernel
 from intercap_core.object_track.candidates import choose, mask_overlap, visible_pixels
 from intercap_core.object_track.constants import AGREEMENT_SCALE_M, FREE_SPACE_M, MIN_RENDERED_PX
+from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.view import View
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.shots import Rendering
@@ -31,6 +32,7 @@ class ViewReport:
     visible_px: int
     depth_agreement: float
     detected: bool = True
+    log_ratio: float = 0.0
 
 
 def quick_report(
@@ -66,7 +68,8 @@ def quick_report(
         visible = unhidden(silhouette, visible, free, compared)
     number = candidate.index if candidate else -1
     nothing = float("nan")
-    return ViewReport(number, overlap, nothing, nothing, visible, agreement, view.detected)
+    ratio = log_ratio(mesh, view, pose, silhouette, drawn_depth, candidate, visible, labels)
+    return ViewReport(number, overlap, nothing, nothing, visible, agreement, view.detected, ratio)
 
 
 def depth_agreement(

@@ -1,37 +1,28 @@
-"""The track decided over all frames: turns, weakly seen frames, rest, smoothness, uncertainty."""
+"""The decided track over all frames together: rest, smoothness, uncertainty."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
-from intercap_core.object_track.choices import best_sequence, other_fits, weak_frames
 from intercap_core.object_track.constants import (
-    AMBIGUOUS_PROBABILITY,
     COMMON_ERROR_VARIANCE,
     COMMON_TURN_VARIANCE,
-    FOUND_AGAIN_SCORE,
     FREE_AXIS_SIGMA_RAD,
-    KEY_FRAME_S,
     MIN_NOISE_VARIANCE,
-    QUITE_DIFFERENT_RAD,
-    RELOOK_MIN_SCORE,
+    RELOOK_LOG_RATIO,
     REST_FRAMES_SEEN_AGAIN,
-    TURN_MAX_LOSS,
+    SEEN_LOG_RATIO,
     UNKNOWN_SIGMA,
     UNSURE_M,
 )
 from intercap_core.object_track.evidence import PoseEvidence
-from intercap_core.object_track.fit import Fit, MotionPrior
-from intercap_core.object_track.lost import FrameResult, judged
+from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
-from intercap_core.object_track.turns import angle_between, choose_turns, near_turns
-from intercap_core.rigid.pose import rotation_log
 from intercap_core.rigid.pose_interpolation import bridge_poses
 from intercap_core.rigid.twist import twists
 
@@ -39,13 +30,9 @@ _TURNS_LESS = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 
 
 
 class WholeTrack:
-    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds.
+    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds."""
 
-    In the frame ``sure``, annotated by a person, the object is not turned.
-    """
-
-    def __init__(self, observer: Observer, times: np.ndarray, sure: int | None = None) -> None:
-        self._sure = sure
+    def __init__(self, observer: Observer, times: np.ndarray) -> None:
         self._observer = observer
         self._mesh = observer.mesh
         self._times = times
@@ -53,106 +40,27 @@ class WholeTrack:
     def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
-        A lost frame's pose is a guess; the frame is recovered where interpolation of its neighbours
-        leads to a pose that the images support. A frame that smoothing moves far from its own fit
-        becomes lost, unless the images support the smoothed pose.
+        A lost frame is found again where interpolation of its neighbours leads to a pose that the
+        images support. A frame that smoothing moves far from its own fit becomes lost, unless they
+        support the smoothed pose.
         """
         lost = np.array([frame.lost for frame in frames])
-        if lost.all():
-            return frames
+        spread = np.array([frame.spread for frame in frames])
         fits = [frame.fit for frame in frames]
-        fits, doubt, spread = self._turned(fits, lost, np.array([f.leapt for f in frames]))
-        fits = self._decided(fits, lost)
         fits, segment, free_axis, pulled = self._smoothed(fits, lost, spread)
         guessed = lost | pulled
-        known = [fit.score for fit, unknown in zip(fits, lost, strict=True) if not unknown]
-        enough = FOUND_AGAIN_SCORE * float(np.median(known))
         return [
             replace(
                 frame,
                 fit=fit,
-                lost=bool(guess)
-                and (fit.score < enough or judged(fit, self._observer.settings).lost),
-                ambiguous=frame.ambiguous or bool(unsure and not frame.lost),
+                lost=bool(guess) and fit.log_ratio < SEEN_LOG_RATIO,
                 resting=bool(number >= 0),
                 free_axis=axis,
             )
-            for frame, fit, number, axis, unsure, guess in zip(
-                frames, fits, segment, free_axis, doubt, guessed, strict=True
+            for frame, fit, number, axis, guess in zip(
+                frames, fits, segment, free_axis, guessed, strict=True
             )
         ]
-
-    # --- which of several poses ----------------------------------------------------------------
-
-    def _turned(
-        self, fits: list[Fit], lost: np.ndarray, broken: np.ndarray
-    ) -> tuple[list[Fit], np.ndarray, np.ndarray]:
-        """The fits, those on the wrong side turned and fitted anew; the frames (T,) in which a
-        quite different turn may be the true one, and what that adds to the variance of their turns
-        (T, 3, 3), object frame."""
-        count = len(fits)
-        doubt, spread = np.zeros(count, bool), np.zeros((count, 3, 3))
-        turns = near_turns(self._mesh)
-        if len(turns) == 1:
-            return fits, doubt, spread
-        step = float(np.median(np.diff(self._times))) if count > 1 else KEY_FRAME_S
-        keys = np.arange(0, count, max(1, round(KEY_FRAME_S / step)))
-        if self._sure is not None:
-            keys = np.union1d(keys, self._sure)
-        scores = np.full((len(keys), len(turns)), np.nan)
-        for k, t in enumerate(keys):
-            if not lost[t]:
-                found = self._observer.assess_all(int(t), fits[t].pose @ turns)
-                scores[k] = [self._observer.plausibility(fit) for fit in found]
-        if self._sure is not None:
-            scores[keys == self._sure, 1:] = 0.0
-        if np.isnan(scores).all():
-            return fits, doubt, spread
-        jumped = lost | broken
-        between = [bool(jumped[a : b + 1].any()) for a, b in pairwise(keys)]
-        gaps = np.diff(self._times[keys])
-        chosen, probability = choose_turns(scores, turns, gaps, np.array(between, bool))
-        nearest = np.abs(np.arange(count)[:, None] - keys).argmin(1)
-        result = list(fits)
-        of_frame = np.where(lost, 0, chosen[nearest])
-        for run in np.split(np.arange(count), 1 + np.flatnonzero(np.diff(of_frame))):
-            if of_frame[run[0]]:
-                turn = turns[of_frame[run[0]]]
-                found = [self._fit_near(int(t), fits[t].pose @ turn) for t in run]
-                gain = [fit.score - fits[t].score for fit, t in zip(found, run, strict=True)]
-                if np.mean(gain) > -TURN_MAX_LOSS:
-                    result[run[0] : run[-1] + 1] = found
-                else:
-                    of_frame[run] = 0
-        # turns that are not the chosen one's neighbours
-        far = angle_between(turns[:, None], turns[None]) > QUITE_DIFFERENT_RAD
-        other = np.where(far[of_frame], probability[nearest], 0.0)
-        kept, rivals = turns[of_frame][:, None, :3, :3], turns[None, :, :3, :3]
-        offset = rotation_log(kept.transpose(0, 1, 3, 2) @ rivals)
-        doubt = other.sum(1) > AMBIGUOUS_PROBABILITY
-        spread = np.einsum("tn,tni,tnj->tij", other * doubt[:, None], offset, offset)
-        return result, doubt, spread
-
-    def _decided(self, fits: list[Fit], lost: np.ndarray) -> list[Fit]:
-        """The fits, in weakly seen frames those that the neighbours prefer among several."""
-        if self._mesh.symmetry.sphere:
-            return fits
-        weak = weak_frames(np.array([fit.score for fit in fits]), lost)
-        if not weak.any():
-            return fits
-        options = [[fit] for fit in fits]
-        for t in map(int, np.flatnonzero(weak)[::-1]):
-            options[t] += other_fits(
-                self._mesh,
-                fits[t].pose,
-                partial(self._observer.assess_all, t),
-                partial(self._fit_near, t),
-            )
-        path = best_sequence(self._mesh, options, self._times)
-        return [own[i] for own, i in zip(options, path, strict=True)]
-
-    def _fit_near(self, t: int, pose: np.ndarray) -> Fit:
-        return self._observer.fit(t, pose, MotionPrior(pose))
 
     # --- all frames together -------------------------------------------------------------------
 
@@ -161,8 +69,7 @@ class WholeTrack:
     ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray]:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
         (T, 3) about which nothing was seen, and which frames (T,) end far from what they show;
-        ``spread`` (T, 3, 3) is the variance of the turns by which the object may be other than it
-        was fitted, object frame."""
+        ``spread`` (T, 6, 6) is the covariance that other hypotheses add."""
         poses = self._unwrapped(np.array([fit.pose for fit in fits]))
         poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
         motion = twists(poses, ~lost, self._times)
@@ -179,18 +86,18 @@ class WholeTrack:
         ):  # the images read last are still in the cache
             again = self._observer.evidence(t, track[t], motion[t])
             before = found[t]
-            if before is None or _score(again) >= RELOOK_MIN_SCORE * _score(before):
+            if before is None or _ratio(again) > _ratio(before) - RELOOK_LOG_RATIO:
                 found[t], looked[t] = again, track[t]
         track, covariance, segment = self._solved(looked, found, track)
         covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
-        covariance[:, :3, :3] += track[:, :3, :3] @ spread @ track[:, :3, :3].transpose(0, 2, 1)
+        covariance += spread
         free = self._free_axes(track, covariance)
         result = [
-            replace(fit, pose=pose, covariance=spread, views=seen.reports if seen else fit.views)
-            for fit, pose, spread, seen in zip(fits, track, covariance, found, strict=True)
+            replace(fit, pose=pose, covariance=own, views=seen.reports if seen else fit.views)
+            for fit, pose, own, seen in zip(fits, track, covariance, found, strict=True)
         ]
         pulled = self._apart(looked, track) & np.array([seen is not None for seen in found])
-        for t in map(int, np.flatnonzero(pulled)):
+        for t in map(int, np.flatnonzero(pulled | lost)):
             result[t] = replace(result[t], views=self._observer.assess(t, track[t]).views)
         return result, segment, free, pulled
 
@@ -306,5 +213,5 @@ def _noise(found: list[PoseEvidence]) -> float:
     )
 
 
-def _score(evidence: PoseEvidence) -> float:
-    return Fit(np.eye(4), np.eye(6), evidence.reports).score
+def _ratio(evidence: PoseEvidence) -> float:
+    return sum(view.log_ratio for view in evidence.reports)

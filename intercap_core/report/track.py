@@ -37,7 +37,7 @@ VIEW_STATES = {
 TRACK_STATES = {
     "moving": "tracked",
     "resting": "at rest",
-    "doubtful": "passes disagree, or ambiguous",
+    "doubtful": "another pose may be the true one",
     "lost": "lost",
 }
 
@@ -92,7 +92,7 @@ def read_track(
             overlap=track["overlap"],
             depth=track["depth_residual"],
             contour=track["silhouette_residual"],
-            state=_states(track["lost"], track["disagree"] | track["ambiguous"], track["resting"]),
+            state=_states(track["lost"], track["ambiguous"], track["resting"]),
             sigma_mm=1e3 * _largest(covariance[:, 3:, 3:]),
             sigma_deg=np.degrees(_largest(covariance[:, :3, :3])),
             recovered=np.flatnonzero(track["recovered"]).tolist(),

@@ -136,8 +136,7 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
     with artefacts.read(person, PERSON) as artefact:
         missing = artefact["missing"]
     with artefacts.read(object_track, OBJECT_TRACK) as artefact:
-        lost, disagree = artefact["lost"], artefact["disagree"]
-        ambiguous = artefact["ambiguous"]
+        lost, ambiguous = artefact["lost"], artefact["ambiguous"]
     with artefacts.read(body_fit, BODY_FIT) as artefact:
         failed, bridged = artefact["failed"], artefact["bridged"]
         uncertain = artefact["uncertain"]
@@ -150,7 +149,6 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
             (unseen, "no images"),
             (missing & ~unseen, "person seen in fewer than two views, without depth"),
             (lost & alone, "object lost"),
-            (disagree & ~lost & alone, "object passes disagree"),
             (ambiguous & ~lost & alone, "object pose ambiguous"),
             (failed & alone, "body fit failed"),
             (bridged & ~failed & alone, "body filled in from neighbouring frames"),

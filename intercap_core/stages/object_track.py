@@ -23,8 +23,8 @@ from intercap_core.object_track.constants import (
     TRACKING_FACES,
 )
 from intercap_core.object_track.object_size import label_doubt, size_doubt
-from intercap_core.object_track.passes import Track, Tracker
-from intercap_core.object_track.seed import NotFound
+from intercap_core.object_track.proposals import NotFound
+from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.view import View, ViewGeometry, distances
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
@@ -149,6 +149,9 @@ def run(
                 f"annotate 'object_pose'{'. Note: '.join(['', *filter(None, doubts)])}"
             ) from None
         names = list(recording.rig.names)
+    told = [*(doubt for doubt in doubts if doubt), *track.doubts]
+    for doubt in track.doubts:
+        log.warning("sequence %s: object %r: %s", sequence, object_.name, doubt)
     _tell(track, sequence)
     with artefacts.write(
         output,
@@ -158,6 +161,7 @@ def run(
         object=object_.name,
         seed_frame=track.seed_frame,
         seed_source=_source(track),
+        doubts="; ".join(told),
     ) as writer:
         for key, values in _datasets(track, source.cameras, len(names)).items():
             writer.put(key, values)
@@ -188,7 +192,7 @@ def _tell(track: Track, sequence: str) -> None:
     """What whoever runs the stage should know of a track that is not sound."""
     count = len(track.frames)
     lost = sum(frame.lost for frame in track.frames)
-    doubtful = sum(frame.ambiguous or frame.disagree for frame in track.frames)
+    doubtful = sum(frame.ambiguous for frame in track.frames)
     if not track.borne_out:
         log.warning(
             "sequence %s: the images do not agree with the annotated object_pose (frame %d looked "
@@ -238,7 +242,7 @@ def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndar
         "covariance": np.array([frame.fit.covariance for frame in track.frames]),
         "lost": np.array([frame.lost for frame in track.frames]),
         "recovered": np.array([frame.recovered for frame in track.frames]),
-        "disagree": np.array([frame.disagree for frame in track.frames]),
+        "probability": np.array([frame.probability for frame in track.frames], np.float32),
         "ambiguous": np.array([frame.ambiguous for frame in track.frames]),
         "resting": np.array([frame.resting for frame in track.frames]),
         "free_axis": np.array([frame.free_axis for frame in track.frames]),

@@ -315,7 +315,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
     lost[0] = True
     with artefacts.write(
         capture.paths["object_track"], OBJECT_TRACK, sequence=name,
-        object=capture.object_.name, seed_frame=0, seed_source="search",
+        object=capture.object_.name, seed_frame=0, seed_source="search", doubts="",
     ) as writer:  # fmt: skip
         writer.put("camera_names", rig.names)
         writer.put("rotation", capture.rotation)
@@ -329,8 +329,9 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("covariance", np.repeat(np.eye(6)[None] * 0.004**2, total, 0))
         writer.put("lost", lost)
         writer.put("recovered", np.zeros(total, bool))
-        for key in ("disagree", "ambiguous", "resting"):
+        for key in ("ambiguous", "resting"):
             writer.put(key, np.zeros(total, bool))
+        writer.put("probability", np.ones(total))
         writer.put("free_axis", np.zeros((total, 3)))
         _fill(writer, OBJECT_TRACK, T=total, C=count)
     identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}

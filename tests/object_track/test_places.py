@@ -5,8 +5,8 @@ import pytest
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.passes import Tracker
 from intercap_core.object_track.places import Places, Standing
+from intercap_core.object_track.tracker import Tracker
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.helpers.harsh_capture import FPS, HarshCapture
 from tests.rigid.conftest import catalogue
@@ -45,14 +45,14 @@ def test_a_brief_visit_is_not_being_handled(bottle):
 
 
 def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
-    twin = Standing(APART, 0.8, frozenset({8, 12, 16}))
+    twin = Standing(APART, 0.8)
     places = Places(bottle, [twin], _joints(APART, 20))  # the person walks past it
     assert places.prior(3, APART) == 1.0
-    places.tracked(8, HANDLED)
-    places.tracked(9, HANDLED)  # nobody looked at what stands where in this frame
-    places.tracked(12, APART + 0.01)  # the object itself
+    places.seen_beside(8, APART, HANDLED)
+    places.seen_beside(8, APART, HANDLED)  # one frame counts once
+    places.seen_beside(12, APART, APART + 0.01)  # the object itself
     assert places.prior(3, APART) == 1.0
-    places.tracked(16, HANDLED)
+    places.seen_beside(16, APART, HANDLED)
     assert places.prior(3, APART) == 0.1
 
 

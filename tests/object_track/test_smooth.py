@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
-from intercap_core.object_track.turns import choose_turns
 from intercap_core.rigid.twist import moved
 
 SIGMA = np.repeat([np.radians(1.0), 0.003], 3)
@@ -142,41 +141,6 @@ def test_a_slow_carry_is_no_rest() -> None:
     true[:, 1, 3] = 0.1 + 0.05 * np.arange(45) / FPS  # five centimetres a second
     segment = resting(looks_at(true), np.arange(45) / FPS, CENTRE)
     assert (segment == -1).all()
-
-
-def about_z(degrees: list[float]) -> np.ndarray:
-    turns = np.tile(np.eye(4), (len(degrees), 1, 1))
-    turns[:, :3, :3] = Rotation.from_euler(
-        "z", np.array(degrees)[:, None], degrees=True
-    ).as_matrix()
-    return turns
-
-
-def test_a_turn_is_decided_by_all_frames() -> None:
-    turns = about_z([0, 90, 180, 270])
-    rng = np.random.default_rng(3)
-    scores = 0.7 + 0.02 * rng.normal(size=(20, 4))
-    scores[:, 2] += 0.02  # hardly visible in one frame
-    chosen, probability = choose_turns(scores, turns, np.full(19, 0.2), np.zeros(19, bool))
-    assert (chosen == 2).all()
-    assert np.allclose(probability.sum(1), 1)
-    assert probability[:, 2].min() > 0.9
-    alone, unsure = choose_turns(scores[:1] * 0 + 0.7, turns, np.zeros(0), np.zeros(0, bool))
-    assert alone.shape == (1,) and np.allclose(unsure, 0.25)
-
-
-def test_a_turn_changes_where_the_track_was_lost() -> None:
-    turns = about_z([0, 180])
-    scores = np.full((10, 2), 0.7)
-    scores[:5, 0] += 0.03
-    scores[5:, 1] += 0.03
-    scores[4:6] = np.nan
-    broken = np.zeros(9, bool)
-    whole, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
-    assert len(set(whole)) == 1 or np.diff(whole).nonzero()[0].size == 1
-    broken[4] = True
-    chosen, _ = choose_turns(scores, turns, np.full(9, 0.2), broken)
-    assert (chosen[[0, 3, 6, 9]] == [0, 0, 1, 1]).all()
 
 
 @pytest.mark.parametrize("width", [1, 2])

@@ -25,7 +25,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
         scene["image_of"][...] = np.arange(SETS)[:, None]
     with h5py.File(found.paths["object_track"], "r+") as file:
         file["lost"][...] = np.arange(SETS) == 1
-        file["disagree"][...] = np.arange(SETS) == 2
+        file["ambiguous"][...] = np.arange(SETS) == 2
         file["resting"][...] = np.arange(SETS) > 2
         file["recovered"][2] = True
         file["overlap"][...] = np.nan

@@ -1,0 +1,89 @@
+"""Which hypothesis is true in every frame: a hidden Markov model over all frames.
+
+The states of a frame are its hypotheses and, last, that none of them is true: the object is not
+seen. Probabilities come from the forward-backward algorithm, the most likely sequence from that of
+Viterbi (Rabiner, Proceedings of the IEEE 77(2), 1989).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from intercap_core.object_track.constants import (
+    APPEAR_COST,
+    JUMP_COST,
+    MOVING_M_S,
+    MOVING_TURN_RAD_S,
+    VANISH_COST,
+)
+from intercap_core.rigid.mesh import ObjectMesh
+
+NOT_SEEN = -1
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """``path`` (T,) the index of the most likely hypothesis, :data:`NOT_SEEN` where none is true;
+    ``probability`` [T] of each hypothesis and, last, of none, given all frames."""
+
+    path: np.ndarray
+    probability: list[np.ndarray]
+
+
+def decode(emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray]) -> Decoded:
+    """The model's states of T frames.
+
+    ``emissions`` [T] (K_t,) log-likelihoods of the hypotheses, against that none is true; ``steps``
+    [T - 1] (K_t + 1, K_t+1 + 1) log-probabilities of going from one state to the next.
+    """
+    values = [np.append(own, 0.0) for own in emissions]
+    best, ahead, came = [values[0]], [values[0]], []
+    for step, value in zip(steps, values[1:], strict=True):
+        reach = best[-1][:, None] + step
+        came.append(reach.argmax(0))
+        best.append(reach.max(0) + value)
+        ahead.append(logsumexp(ahead[-1][:, None] + step, axis=0) + value)
+    behind = [np.zeros(len(values[-1]))]
+    for step, value in zip(reversed(steps), reversed(values[1:]), strict=True):
+        behind.append(logsumexp(step + (behind[-1] + value), axis=1))
+    chosen = [int(best[-1].argmax())]
+    for back in reversed(came):
+        chosen.append(int(back[chosen[-1]]))
+    path = np.array(chosen[::-1])
+    path[path == [len(own) for own in emissions]] = NOT_SEEN
+    log = [a + b for a, b in zip(ahead, reversed(behind), strict=True)]
+    return Decoded(path, [np.exp(one - logsumexp(one)) for one in log])
+
+
+def step_costs(
+    mesh: ObjectMesh,
+    before: np.ndarray,
+    after: np.ndarray,
+    seconds: float,
+    carried: np.ndarray,
+) -> np.ndarray:
+    """Log-probabilities (K + 1, L + 1) of the steps from poses ``before`` (K, 4, 4) to ``after``
+    (L, 4, 4), up to a constant.
+
+    The object rests, moves as one of the hands does, by ``carried`` (H, 3) metres in these
+    ``seconds``, or freely; a step that is none of these is a fault of the track before or after.
+    """
+    costs = np.zeros((len(before) + 1, len(after) + 1))
+    costs[:-1, -1], costs[-1, :-1] = -VANISH_COST, -APPEAR_COST
+    if len(before) and len(after):
+        turn = np.radians(
+            mesh.symmetry.rotation_error_deg(before[:, None, :3, :3], after[None, :, :3, :3])
+        )
+        centres = [
+            poses[:, :3, :3] @ mesh.centre_of_mass + poses[:, :3, 3] for poses in (before, after)
+        ]
+        shift = centres[1][None] - centres[0][:, None]
+        ways = np.concatenate([np.zeros((1, 3)), carried])
+        shift_m = np.linalg.norm(shift[..., None, :] - ways, axis=-1).min(-1)
+        size = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift_m / (MOVING_M_S * seconds)) ** 2
+        costs[:-1, :-1] = -np.minimum(0.5 * size, JUMP_COST)
+    return costs

@@ -1,0 +1,123 @@
+"""Hypotheses of every frame: local optima of the images' likelihood, followed through time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from intercap_core.object_track.constants import (
+    BASIN,
+    CONTRADICTED_LOG_RATIO,
+    MAX_HYPOTHESES,
+    PRIOR_CONTRADICTED,
+    PRIOR_WIDENED,
+    RIVAL_LOG_RATIO,
+    SEEN_LOG_RATIO,
+    UNSEEN_S,
+)
+from intercap_core.object_track.fit import Fit, MotionPrior
+from intercap_core.object_track.motion import expected, extrapolated
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.prior import Prior
+from intercap_core.object_track.search import same_pose
+from intercap_core.rigid.twist import step_between
+
+
+class Hypotheses:
+    """The fits [T] that may be true, each frame's in the order in which they were found.
+
+    ``share`` is how many independent observations a frame is; ``step_s`` the seconds between two.
+    """
+
+    def __init__(self, observer: Observer, prior: Prior, share: float, step_s: float) -> None:
+        self._observer = observer
+        self._prior = prior
+        self._share = share
+        self._step_s = step_s
+        self._patience = max(1, round(UNSEEN_S / step_s))
+        self.fits: list[list[Fit]] = [[] for _ in range(observer.count)]
+
+    def known(self, t: int, pose: np.ndarray) -> int | None:
+        """The hypothesis of frame t at this pose (4, 4), if there is one."""
+        for k, fit in enumerate(self.fits[t]):
+            if same_pose(self._observer.mesh, fit.pose, pose):
+                return k
+        return None
+
+    def seen(self, t: int, pose: np.ndarray) -> int | None:
+        """:meth:`known`, where the images support it."""
+        k = self.known(t, pose)
+        return k if k is not None and self.fits[t][k].log_ratio > SEEN_LOG_RATIO else None
+
+    def best(self, t: int) -> float:
+        """What speaks for frame t's likeliest hypothesis, nats; 0 where nothing does."""
+        return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
+
+    def add(self, t: int, fit: Fit) -> None:
+        """Add a hypothesis of frame t; of two at one pose the likelier stays, of too many the least
+        likely goes."""
+        own = self.fits[t]
+        k = self.known(t, fit.pose)
+        if k is None:
+            own.append(fit)
+            if len(own) > MAX_HYPOTHESES:
+                del own[int(self._prior.weigh(t, own).argmin())]
+        elif fit.log_ratio > own[k].log_ratio:
+            own[k] = fit
+
+    def follow(self, t: int, fit: Fit) -> None:
+        """Add a fit of frame t and where it leads in the frames before and after, until it meets
+        what is known, is not seen for long or is hopelessly worse than another."""
+        self.add(t, fit)
+        for frames in (range(t + 1, self._observer.count), range(t - 1, -1, -1)):
+            self._follow(t, fit.pose, frames)
+
+    def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
+        before = now = pose
+        unseen, deficit = 0, 0.0
+        for t in frames:
+            predicted = self._likeliest(t, last, before, now)
+            last = t
+            if self.seen(t, predicted) is not None:
+                return
+            prior = expected(before, now, predicted, self._step_s, unseen * self._step_s)
+            fit = self._fit(t, predicted, prior)
+            if self.seen(t, fit.pose) is not None:
+                return
+            weights = self._prior.weigh(t, [fit, *self.fits[t]])
+            if fit.log_ratio > CONTRADICTED_LOG_RATIO:
+                self.add(t, fit)
+            deficit += self._share * float(weights.max(initial=0.0) - weights[0])
+            if deficit > RIVAL_LOG_RATIO or unseen >= self._patience:
+                return
+            if fit.log_ratio > SEEN_LOG_RATIO:
+                before, now = (fit.pose if unseen else now), fit.pose
+                unseen = 0
+            else:
+                before = now = predicted
+                unseen += 1
+
+    def _likeliest(self, t: int, last: int, before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        """The pose (4, 4) expected in frame t that its images support best: as in frame ``last``,
+        at constant velocity, or carried by a hand."""
+        starts = [now]
+        for pose in (extrapolated(before, now), *self._observer.carried(last, t, now)):
+            if not any(same_pose(self._observer.mesh, pose, other, BASIN) for other in starts):
+                starts.append(pose)
+        if len(starts) == 1:
+            return extrapolated(before, now)
+        found = self._observer.assess_all(t, np.array(starts))
+        return max(found, key=lambda one: one.log_ratio).pose
+
+    def _fit(self, t: int, start: np.ndarray, prior: MotionPrior) -> Fit:
+        """The fit of frame t from ``start`` (4, 4), its prior widened where the images contradict
+        it."""
+        fit = self._observer.fit(t, start, prior)
+        step = np.abs(step_between(prior.pose, fit.pose))
+        limit = np.repeat([prior.sigma_rad, prior.sigma_m], 3) * PRIOR_CONTRADICTED
+        if fit.log_ratio < SEEN_LOG_RATIO or (step < limit).all():
+            return fit
+        wide = (PRIOR_WIDENED * prior.sigma_m, PRIOR_WIDENED * prior.sigma_rad)
+        again = self._observer.fit(t, fit.pose, MotionPrior(prior.pose, *wide))
+        return again if again.log_ratio > fit.log_ratio else fit

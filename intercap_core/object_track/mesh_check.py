@@ -1,0 +1,93 @@
+"""Checks after tracking: whether the images show this mesh, in this size, with this symmetry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from intercap_core.object_track.constants import (
+    CHECK_FRAMES,
+    CHECK_GAIN,
+    CHECK_SCALES,
+    LIKENESS_LOG_RATIO,
+    NEAR_TURN_CHANGED_SHARE,
+    PASS_ROUNDS,
+    PASS_SCALE,
+)
+from intercap_core.object_track.fit import fit_pose
+from intercap_core.object_track.frame_result import FrameResult
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.turns import changed_share
+from intercap_core.rigid.mesh import ObjectMesh
+
+
+def mesh_doubts(observer: Observer, frames: list[FrameResult]) -> list[str]:
+    """What speaks against the mesh, in words; ``frames`` (T) are the final track."""
+    believed = [t for t, frame in enumerate(frames) if not frame.lost]
+    found = []
+    if believed:
+        likely = float(np.median([frames[t].fit.log_ratio for t in believed]))
+        if likely < LIKENESS_LOG_RATIO:
+            found.append(
+                f"the images hardly show this mesh ({likely:.0f} nats in half of the frames, "
+                f"expected {LIKENESS_LOG_RATIO:.0f} and more); check that it is this object"
+            )
+    return found + _scale_doubt(observer, frames, believed) + symmetry_doubt(observer)
+
+
+def symmetry_doubt(observer: Observer) -> list[str]:
+    """Whether the mesh changes by a motion that is declared to leave it as it is."""
+    mesh = observer.mesh
+    worst = max((changed_share(mesh, observer.field, s) for s in mesh.symmetry.elements(8)[1:]),
+                default=0.0)  # fmt: skip
+    if mesh.symmetry.sphere or worst < NEAR_TURN_CHANGED_SHARE:
+        return []
+    return [
+        f"its symmetry moves {worst:.0%} of the surface elsewhere; check 'symmetry' in objects.yaml"
+    ]
+
+
+def _scale_doubt(observer: Observer, frames: list[FrameResult], believed: list[int]) -> list[str]:
+    """Whether a clearly larger or smaller mesh fits the surest frames clearly better."""
+    surest = sorted(believed, key=lambda t: -frames[t].fit.log_ratio)[:CHECK_FRAMES]
+    if not surest:
+        return []
+
+    def ratio(mesh: ObjectMesh) -> float:
+        return float(
+            np.mean(
+                [
+                    fit_pose(
+                        mesh,
+                        observer.views(t),
+                        frames[t].fit.pose,
+                        prior=None,
+                        min_overlap=observer.settings.min_overlap,
+                        background_term=observer.settings.background_term,
+                        labels=observer.labels,
+                        rounds=PASS_ROUNDS,
+                        start_scale=PASS_SCALE,
+                        renderer=observer.renderer,
+                    ).log_ratio
+                    for t in surest
+                ]
+            )
+        )
+
+    own = ratio(observer.mesh)
+    gains = {scale: ratio(scaled(observer.mesh, scale)) - own for scale in CHECK_SCALES}
+    scale = max(gains, key=lambda scale: gains[scale])
+    if gains[scale] < CHECK_GAIN:
+        return []
+    word = "larger" if scale > 1 else "smaller"
+    return [
+        f"the images fit a mesh {abs(scale - 1):.0%} {word} better (by {gains[scale]:.0f} nats a "
+        "frame); check the mesh's size"
+    ]
+
+
+def scaled(mesh: ObjectMesh, scale: float) -> ObjectMesh:
+    """The mesh ``scale`` times as large about its centre of mass."""
+    centre = mesh.centre_of_mass
+    return replace(mesh, vertices=centre + scale * (mesh.vertices - centre))

@@ -1,0 +1,229 @@
+"""Where hypotheses come from: an annotation, a search, the frames around, near symmetries."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from intercap_core.object_track.constants import (
+    ANNOTATION_FRAMES,
+    DOUBTFUL_PROBABILITY,
+    DOUBTFUL_SHARE,
+    FIT_ROUNDS,
+    KEY_FRAME_S,
+    LOOK_NEAR_S,
+    NEAR_TURN_SEARCH_RAD,
+    RIVAL_LOG_RATIO,
+    SEARCH_EVERY_S,
+    SEARCH_GOOD_LOG_RATIO,
+    SEARCHES_MIN,
+    SEED_SEARCHES,
+    SEED_SEARCHES_MAX,
+    SEED_SURE_LOG_RATIO,
+    SEEN_LOG_RATIO,
+    TURNS_FOLLOWED,
+)
+from intercap_core.object_track.decoder import NOT_SEEN, Decoded
+from intercap_core.object_track.fit import Fit, MotionPrior
+from intercap_core.object_track.hypotheses import Hypotheses
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.prior import Prior
+from intercap_core.object_track.turns import near_turns
+from intercap_core.rigid.pose import rotation_exp
+from intercap_core.rigid.twist import moved, step_between
+
+log = logging.getLogger(__name__)
+
+
+class NotFound(Exception):
+    """No frame shows anything that could be the object."""
+
+
+class Proposals:
+    """Adds hypotheses; ``times`` (T,) seconds, ``step_s`` between frames."""
+
+    def __init__(
+        self,
+        observer: Observer,
+        hypotheses: Hypotheses,
+        prior: Prior,
+        times: np.ndarray,
+        step_s: float,
+    ) -> None:
+        self._observer = observer
+        self._hypotheses = hypotheses
+        self._prior = prior
+        self._times = times
+        self._step_s = step_s
+        self._searched: set[int] = set()
+        self._looked: set[int] = set()
+
+    # --- where to start ------------------------------------------------------------------------
+
+    def start(self) -> int:
+        """Search the most promising frames and follow what is found; the best one's number.
+
+        Raises NotFound where nothing is.
+        """
+        seen: list[tuple[float, int, list[Fit]]] = []
+        for tried, t in enumerate(self._observer.frames_to_search()):
+            if tried >= SEED_SEARCHES_MAX or (tried >= SEED_SEARCHES and seen):
+                break
+            self._searched.add(t)
+            found = self._observer.search(t)
+            if found:
+                best = float(self._prior.weigh(t, found).max())
+                seen.append((best, t, found))
+                if best > SEED_SURE_LOG_RATIO:
+                    break
+        if not seen:
+            raise NotFound
+        seen.sort(key=lambda one: -one[0])
+        best, first, found = seen[0]
+        if best < SEEN_LOG_RATIO:
+            # no match near the person: take the best match, wherever it is
+            likeliest = max(found, key=lambda fit: fit.log_ratio)
+            self._observer.places.claim(self._observer.mesh.centre_at(likeliest.pose))
+        for _, t, found in seen:
+            self._follow(t, found)
+        log.info("first frame %d, %.0f nats", first, best)
+        return first
+
+    def annotated(self, frame: int, pose: np.ndarray) -> int | None:
+        """The frame, at or beside the annotated one, in which the annotated ``pose`` (4, 4) is
+        seen, after following it; None where the images show it in none."""
+        near = range(
+            max(frame - ANNOTATION_FRAMES, 0),
+            min(frame + ANNOTATION_FRAMES + 1, self._observer.count),
+        )
+        found: tuple[int, Fit] | None = None
+        for t in sorted(near, key=lambda t: abs(t - frame)):
+            fit = self._observer.fit(t, pose, MotionPrior(pose), rounds=FIT_ROUNDS, scale=1.0)
+            if found is None or fit.log_ratio > found[1].log_ratio + RIVAL_LOG_RATIO:
+                found = t, fit
+            if found[1].log_ratio > SEED_SURE_LOG_RATIO:
+                break
+        if found is None or found[1].log_ratio < SEEN_LOG_RATIO:
+            return None
+        t, fit = found
+        self._prior.annotated = (t, fit.pose)
+        self._observer.places.claim(self._observer.mesh.centre_at(fit.pose))
+        self._hypotheses.follow(t, fit)
+        return t
+
+    # --- where it is not sure ------------------------------------------------------------------
+
+    def look(self, decoded: Decoded) -> bool:
+        """Look for the object in the frames in doubt; whether something new was found.
+
+        First with the rotations that the frames around lead to, outwards from where it is sure;
+        then, in some, with all.
+        """
+        fits = self._hypotheses.fits
+        ratio, sure = np.zeros(len(fits)), np.zeros(len(fits))
+        for t, k in enumerate(decoded.path):
+            ratio[t] = 0.0 if k == NOT_SEEN else self._prior.weigh(t, fits[t])[k]
+            sure[t] = decoded.probability[t][k]
+        usual = float(np.median(ratio[ratio > 0])) if (ratio > 0).any() else 0.0
+        poor = DOUBTFUL_SHARE * usual
+        doubt = (ratio < poor) | (sure < DOUBTFUL_PROBABILITY) | (decoded.path == NOT_SEEN)
+        known = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubt)}
+        new = False
+        waiting = [int(t) for t in np.flatnonzero(doubt)]
+        for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
+            if self._hypotheses.best(t) < poor and t not in self._looked:
+                new |= self._look_near(t, known)
+        if new:
+            return True
+        most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
+        apart = max(1, round(SEARCH_EVERY_S / self._step_s)) // 2
+        while len(self._searched) < most and not new:
+            waiting = [
+                t
+                for t in waiting
+                if self._hypotheses.best(t) < poor
+                and min((abs(t - u) for u in self._searched), default=apart) >= apart
+            ]
+            if not waiting:
+                break
+            t = max(waiting, key=self._observer.promise)
+            self._searched.add(t)
+            new = self._follow(t, self._observer.search(t))
+        return new
+
+    def _look_near(self, t: int, known: dict[int, np.ndarray]) -> bool:
+        """Search frame t with the rotations that the frames around lead to, ``known`` poses (4, 4)
+        by frame; whether something new was found."""
+        starts = self._expected(t, known)
+        if not len(starts):
+            return False
+        self._looked.add(t)
+        first = max(self._observer.assess_all(t, starts), key=lambda one: one.log_ratio)
+        found = [self._observer.fit(t, first.pose, MotionPrior(first.pose), FIT_ROUNDS, 1.0)]
+        if found[0].log_ratio < SEARCH_GOOD_LOG_RATIO:
+            turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
+            around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
+            found += self._observer.search(t, around.reshape(-1, 3, 3))
+        return self._follow(t, found)
+
+    def _expected(self, t: int, known: dict[int, np.ndarray]) -> np.ndarray:
+        """Poses (N, 4, 4) of frame t by those of the frames around: as they are, at constant
+        velocity from either side, and between."""
+        fits, reach = self._hypotheses.fits, max(1, round(LOOK_NEAR_S / self._step_s))
+        poses = {}
+        for u in range(max(t - reach, 0), min(t + reach + 1, len(fits))):
+            if u in known:
+                poses[u] = known[u]
+            elif u != t and self._hypotheses.best(u) > SEARCH_GOOD_LOG_RATIO:
+                poses[u] = fits[u][int(self._prior.weigh(u, fits[u]).argmax())].pose
+        before = [u for u in poses if u < t][:-3:-1]
+        after = [u for u in poses if u > t][:2]
+        found = []
+        for near in (before, after):
+            if near:
+                found.append(poses[near[0]])
+            if len(near) > 1:
+                rate = step_between(poses[near[1]], poses[near[0]]) / (
+                    self._times[near[0]] - self._times[near[1]]
+                )
+                ahead = self._times[t] - self._times[near[0]]
+                found.append(moved(poses[near[0]], rate * ahead))
+        if before and after:
+            a, b = before[0], after[0]
+            part = (self._times[t] - self._times[a]) / (self._times[b] - self._times[a])
+            found.append(moved(poses[a], part * step_between(poses[a], poses[b])))
+        return np.array(found).reshape(-1, 4, 4)
+
+    # --- near symmetries -----------------------------------------------------------------------
+
+    def turn(self, decoded: Decoded) -> bool:
+        """Follow turns of a nearly symmetric object from where they look as likely; whether one is
+        new."""
+        turns = near_turns(self._observer.mesh, self._observer.field)
+        fits, new = self._hypotheses.fits, False
+        for t in range(0, len(fits), max(1, round(KEY_FRAME_S / self._step_s))):
+            k = decoded.path[t]
+            if k == NOT_SEEN or len(turns) == 1:
+                continue
+            own = fits[t][k]
+            found = self._observer.assess_all(t, own.pose @ turns[1:])
+            found = [one for one in found if one.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
+            found.sort(key=lambda one: -one.log_ratio)
+            for other in found[:TURNS_FOLLOWED]:
+                if self._hypotheses.known(t, other.pose) is None:
+                    fit = self._observer.fit(t, other.pose, MotionPrior(other.pose))
+                    new |= self._follow(t, [fit])
+        return new
+
+    def _follow(self, t: int, found: list[Fit]) -> bool:
+        """Follow those of the fits of frame t that may be true; whether one was new."""
+        own = self._hypotheses.fits[t]
+        weights = self._prior.weigh(t, [*found, *own])
+        least = max(float(weights.max(initial=0.0)) - RIVAL_LOG_RATIO, SEEN_LOG_RATIO)
+        new = False
+        for fit, weight in zip(found, weights, strict=False):
+            if weight > least and self._hypotheses.seen(t, fit.pose) is None:
+                self._hypotheses.follow(t, fit)
+                new = True
+        return new

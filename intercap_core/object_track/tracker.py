@@ -1,0 +1,183 @@
+"""The object's pose over time: hypotheses in every frame, one decision over all of them.
+
+What a search finds in a few frames is followed both ways; a hidden Markov model says what is true
+in every frame and how surely; where it is not sure, more is looked for and it decides again. The
+continuous estimates follow from it: rest, smoothness, covariance (:mod:`.whole`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.constants import (
+    AMBIGUOUS_PROBABILITY,
+    APART_M,
+    APART_RAD,
+    DOUBTFUL_PROBABILITY,
+    ERROR_LASTING_S,
+    LOST_PROBABILITY,
+    ROUNDS,
+    SEARCH_GOOD_LOG_RATIO,
+)
+from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode, step_costs
+from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.frame_result import FrameResult, flagged
+from intercap_core.object_track.hypotheses import Hypotheses
+from intercap_core.object_track.mesh_check import mesh_doubts
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.prior import Prior, things
+from intercap_core.object_track.proposals import NotFound, Proposals
+from intercap_core.object_track.search import same_pose
+from intercap_core.object_track.view import View
+from intercap_core.object_track.whole import WholeTrack
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.twist import step_between
+
+log = logging.getLogger(__name__)
+
+_WRISTS = (4, 7)  # of BODY_25
+
+
+@dataclass(frozen=True)
+class Track:
+    """All frames (T), the frame that the track started from and how its pose was found:
+    ``borne_out``, whether the images support the annotation. ``doubts`` say in words what speaks
+    against the mesh."""
+
+    frames: list[FrameResult]
+    seed_frame: int
+    annotated: bool
+    borne_out: bool = True
+    doubts: tuple[str, ...] = ()
+
+
+class Tracker:
+    """Tracks one object through one recording.
+
+    ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
+    labels alone; ``times`` (T,) of the frames, seconds; ``labels`` the classes the object may be
+    given; ``up`` (3,) the vertical; ``joints`` (T, 135, 3) of the person, who handles the object.
+    """
+
+    def __init__(
+        self,
+        mesh: ObjectMesh,
+        load: Callable[[int], list[View]],
+        labels_by_view: list[list[list[str]]],
+        settings: ObjectTrackSettings,
+        *,
+        times: np.ndarray,
+        labels: tuple[str, ...],
+        up: np.ndarray | None,
+        joints: np.ndarray | None = None,
+    ) -> None:
+        self._observer = Observer(mesh, load, labels_by_view, settings, labels, up, joints)
+        self._mesh = mesh
+        self._times = times
+        self._joints = joints
+        step = float(np.median(np.diff(times))) if len(times) > 1 else ERROR_LASTING_S
+        self._share = min(1.0, step / ERROR_LASTING_S)
+        self._prior = Prior(self._observer, self._share)
+        self._hypotheses = Hypotheses(self._observer, self._prior, self._share, step)
+        self._proposals = Proposals(self._observer, self._hypotheses, self._prior, times, step)
+
+    def run(self, initial: tuple[int, np.ndarray] | None = None) -> Track:
+        """Track from an annotated (frame, pose (4, 4)), or from what is searched for.
+
+        Raises NotFound where no frame shows what could be the object.
+        """
+        seed = None if initial is None else self._proposals.annotated(*initial)
+        if seed is None:
+            seed = self._proposals.start()
+        decoded = self._decode()
+        for _ in range(ROUNDS):
+            if not self._proposals.look(decoded):
+                break
+            decoded = self._decode()
+        if self._proposals.turn(decoded):
+            decoded = self._decode()
+        if (decoded.path == NOT_SEEN).all():
+            raise NotFound
+        frames = self._results(decoded)
+        given = self._prior.annotated
+        borne_out = initial is None or (
+            given is not None and same_pose(self._mesh, frames[seed].fit.pose, given[1])
+        )
+        refined = WholeTrack(self._observer, self._times).refine(frames)
+        final = flagged(self._mesh, refined)
+        doubts = mesh_doubts(self._observer, final)
+        return Track(final, seed, initial is not None, borne_out, tuple(doubts))
+
+    def _decode(self) -> Decoded:
+        """Decide over all frames, and tell the places' prior where the object surely was."""
+        fits = self._hypotheses.fits
+        weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
+        poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
+        steps = [
+            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._carried(t))
+            for t, gap in enumerate(np.diff(self._times))
+        ]
+        decoded = decode([self._share * weight for weight in weights], steps)
+        for t, k in enumerate(decoded.path):
+            if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
+                thing, here = things(fits[t]), self._mesh.centre_at(fits[t][k].pose)
+                for other, fit in enumerate(fits[t]):
+                    if thing[other] != thing[k] and fit.log_ratio > SEARCH_GOOD_LOG_RATIO:
+                        place = self._mesh.centre_at(fit.pose)
+                        self._observer.places.seen_beside(t, place, here)
+        return decoded
+
+    def _carried(self, t: int) -> np.ndarray:
+        """Motions (H, 3) of the known hands from frame t to the next, metres."""
+        if self._joints is None:
+            return np.zeros((0, 3))
+        step = self._joints[t + 1, _WRISTS] - self._joints[t, _WRISTS]
+        return step[np.isfinite(step).all(1)]
+
+    # --- the outcome ---------------------------------------------------------------------------
+
+    def _results(self, decoded: Decoded) -> list[FrameResult]:
+        """The chosen hypotheses (T), what speaks against each and what the others add to its
+        covariance."""
+        result = []
+        for t, (own, k) in enumerate(zip(self._hypotheses.fits, decoded.path, strict=True)):
+            probability = decoded.probability[t]
+            if k == NOT_SEEN:
+                result.append(FrameResult(self._guess(t), True, probability=0.0))
+                continue
+            symmetry, pose = self._mesh.symmetry, own[k].pose
+            poses = np.array([symmetry.nearest_equivalent_pose(fit.pose, pose) for fit in own])
+            steps = step_between(np.broadcast_to(pose, poses.shape), poses)
+            centres = np.array([self._mesh.centre_at(pose) for pose in poses])
+            far = np.linalg.norm(steps[:, :3], axis=1) > APART_RAD
+            far |= np.linalg.norm(centres - centres[k], axis=1) > APART_M
+            other = float(probability[:-1][far].sum())
+            overlap = own[k].mean_overlap
+            lost = (
+                probability[-1] > LOST_PROBABILITY
+                or 0 < overlap < self._observer.settings.lost_overlap
+            )
+            rivals = np.where(far, probability[:-1], 0.0) * (other > AMBIGUOUS_PROBABILITY / 2)
+            result.append(
+                FrameResult(
+                    own[k],
+                    bool(lost),
+                    ambiguous=other > AMBIGUOUS_PROBABILITY and not lost,
+                    probability=float(probability[k]),
+                    spread=np.einsum("k,ki,kj->ij", rivals, steps, steps),
+                )
+            )
+        return result
+
+    def _guess(self, t: int) -> Fit:
+        """A frame in which nothing is believed: the nearest frame's pose, as it agrees here."""
+        fits = self._hypotheses.fits
+        u = min((u for u, own in enumerate(fits) if own), key=lambda u: abs(u - t))
+        weights = self._prior.weigh(u, fits[u])
+        found = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
+        return Fit(found.pose, np.eye(6), found.views)

@@ -1,0 +1,94 @@
+"""The decision over all frames: against all sequences by hand, and on worked cases."""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from intercap_core.object_track.constants import JUMP_COST
+from intercap_core.object_track.decoder import NOT_SEEN, decode, step_costs
+from intercap_core.rigid.mesh import ObjectMesh
+from tests.rigid.conftest import catalogue
+
+NO_HAND = np.zeros((0, 3))
+
+
+@pytest.fixture(scope="module")
+def cup() -> ObjectMesh:
+    return ObjectMesh.load(catalogue()["cup"])
+
+
+def poses_of(places: list[float], degrees: float = 0.0) -> np.ndarray:
+    """Poses (N, 4, 4) along x, turned about z."""
+    found = np.tile(np.eye(4), (len(places), 1, 1))
+    found[:, 0, 3] = places
+    found[:, :3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return found
+
+
+def test_it_is_the_sum_over_all_sequences() -> None:
+    rng = np.random.default_rng(4)
+    counts = [2, 0, 3, 1]
+    emissions = [rng.normal(size=n) for n in counts]
+    steps = [rng.normal(size=(a + 1, b + 1)) for a, b in pairwise(counts)]
+    found = decode(emissions, steps)
+    values = [np.append(own, 0.0) for own in emissions]
+    likely, shares = {}, [np.zeros(n + 1) for n in counts]
+    for states in product(*(range(n + 1) for n in counts)):
+        log = sum(values[t][s] for t, s in enumerate(states))
+        log += sum(steps[t][states[t], states[t + 1]] for t in range(len(steps)))
+        likely[states] = log
+        for t, s in enumerate(states):
+            shares[t][s] += np.exp(log)
+    best = max(likely, key=lambda states: likely[states])
+    expected = [NOT_SEEN if s == n else s for s, n in zip(best, counts, strict=True)]
+    assert found.path.tolist() == expected
+    for own, share in zip(found.probability, shares, strict=True):
+        np.testing.assert_allclose(own, share / share.sum(), rtol=1e-10)
+
+
+def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
+    found = decode([np.array([2.0, 1.0])], [])
+    assert found.path.tolist() == [0]
+    assert found.probability[0] == pytest.approx(np.exp([2, 1, 0]) / np.exp([2, 1, 0]).sum())
+    nothing = decode([np.zeros(0)] * 3, [np.zeros((1, 1))] * 2)
+    assert (nothing.path == NOT_SEEN).all() and all(p == [1.0] for p in nothing.probability)
+
+
+def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: ObjectMesh) -> None:
+    """Two poses half a turn apart; the images prefer the second from frame 5 on."""
+    both = np.concatenate([poses_of([0.0]), poses_of([0.0], 180)])
+    steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 9
+
+    def path(gain: float) -> list[int]:
+        emissions = [np.array([5.0, 2.0])] * 5 + [np.array([5.0, 5.0 + gain])] * 5
+        return decode(emissions, steps).path.tolist()
+
+    assert path(1.0) == [0] * 10
+    assert path(3.0) == [0] * 5 + [1] * 5
+
+
+def test_a_hand_carries_it_and_nothing_else_moves_so_far(cup: ObjectMesh) -> None:
+    here, there = poses_of([0.0]), poses_of([0.0, 0.02, 0.6])
+    costs = step_costs(cup, here, there, 1 / 15, NO_HAND)[0]
+    assert costs[0] == 0 and -0.1 < costs[1] < 0 and costs[2] == -JUMP_COST
+    carried = step_costs(cup, here, there, 1 / 15, np.array([[0.6, 0.0, 0.0]]))[0]
+    assert carried[0] == 0 and carried[2] == pytest.approx(0)
+
+
+def test_what_a_symmetry_hides_is_no_motion() -> None:
+    bottle = ObjectMesh.load(catalogue()["bottle"])
+    spun = step_costs(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
+    assert spun[0, 0] == pytest.approx(0, abs=1e-9)
+
+
+def test_equal_evidence_is_even_odds(cup: ObjectMesh) -> None:
+    """Handle left or right, nothing decides: the probabilities say so in every frame."""
+    both = np.concatenate([poses_of([0.0], 60), poses_of([0.0], -60)])
+    steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 7
+    found = decode([np.array([6.0, 6.0])] * 8, steps)
+    for own in found.probability:
+        assert own[:2] == pytest.approx([0.5, 0.5], abs=1e-2)
