@@ -175,7 +175,7 @@ SEARCH_GOOD_LOG_RATIO, TRUSTED_PLACE = 25.0, 0.5
 
 SEED_SEARCHES = 3  # frames searched for the seed, more while nothing is found
 SEED_SEARCHES_MAX = 10
-ROUNDS = 6  # of deciding and of looking for more
+ROUNDS = 15  # of deciding and of looking for more
 SEARCHES_MIN, SEARCH_EVERY_S = 6, 0.5  # frames searched with all rotations, and one in this time
 LOOK_NEAR_S = 0.3  # a frame in doubt is searched by the poses of frames no farther away, seconds
 BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
@@ -195,6 +195,7 @@ NEAR_TURN_POINT_WEIGHT = 0.05  # of point-to-point beside point-to-plane residua
 REST_FRAMES_SEEN_AGAIN = 12  # frames of a rest that are looked at again
 MAX_REST_FRAMES = 900  # tested against one pose
 SMOOTH_STEPS = 12  # Gauss-Newton
+TYPICAL_REACH_M = 0.03  # frames of a rest farther apart than this do not show one place
 SMOOTH_CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
 SMOOTH_MAX_TURN_RAD = 0.5  # of a step
 INVERTED_NODES, INVERTED_MARGIN = 64, 40  # nodes inverted at once, and neighbours that matter
@@ -233,7 +234,7 @@ LABEL_LOG_RATIO = 1.0  # of a candidate with the right label over one with anoth
 # --- decision: which hypothesis is true (tuned on the studio) -------------------------------------
 
 # Of the motion between frames, standard deviations: a hand that carries something.
-MOVING_M_S, MOVING_TURN_RAD_S = 1.5, 4.0
+MOVING_M_S, MOVING_TURN_RAD_S = 2.5, 7.0
 # Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
 # its coming back.
 JUMP_COST, VANISH_COST, APPEAR_COST = 10.0, 4.0, 4.0

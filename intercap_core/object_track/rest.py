@@ -135,9 +135,10 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
             np.einsum("ti,tij,tj->t", offset - common, information[rest], offset - common)
             > REST_EDGE_SQUARED
         )
-        if off.all():
+        # nothing says that a frame at its end, in which nothing is seen, still rests
+        inside = np.flatnonzero(~off & (np.trace(information[rest], axis1=1, axis2=2) > 0))
+        if not len(inside):
             continue
-        inside = np.flatnonzero(~off)
         if rest[0] > 0:
             result[rest[: inside[0]]] = -1
         if rest[-1] < len(segments) - 1:

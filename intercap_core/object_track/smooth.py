@@ -25,6 +25,7 @@ from intercap_core.object_track.constants import (
     SMOOTH_CONVERGED,
     SMOOTH_MAX_TURN_RAD,
     SMOOTH_STEPS,
+    TYPICAL_REACH_M,
     UNKNOWN_SIGMA,
 )
 from intercap_core.rigid.pose import rotation_log
@@ -80,9 +81,7 @@ def smooth(
     size = np.bincount(node)
     evidence = evidence.about(centre)
     information, own = evidence.information, evidence.own
-    # of the frames of a rest the start is the one that knows most, not a guess
-    order = np.lexsort((-np.trace(information, axis1=1, axis2=2), node))
-    first = order[np.unique(node[order], return_index=True)[1]]
+    first = _typical_frames(evidence, node)
     share = np.minimum(1.0, REST_SAMPLES / size)[node]
     state = start.copy()
     state[:, :3, 3] += state[:, :3, :3] @ centre
@@ -116,6 +115,24 @@ def smooth(
     poses[:, :3, 3] -= arms
     to_origin = with_turn(arms)
     return poses, to_origin @ covariance @ to_origin.transpose(0, 2, 1)
+
+
+def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
+    """The frame (N,) of each node that most of its evidence is near: a robust fit would believe the
+    one wrong frame of a rest that it starts from."""
+    weight = np.sqrt(np.trace(evidence.information, axis1=1, axis2=2))
+    place = evidence.poses[:, :3, 3]
+    found = np.zeros(int(node[-1]) + 1, int)
+    for number, members in enumerate(
+        np.split(np.arange(len(node)), np.flatnonzero(np.diff(node)) + 1)
+    ):
+        apart = np.linalg.norm(place[members, None] - place[members], axis=-1)
+        cost = np.minimum(apart, TYPICAL_REACH_M) @ weight[members]
+        near = np.flatnonzero(
+            cost <= cost.min() + 1e-9 + 0.1 * weight[members].sum() * TYPICAL_REACH_M
+        )
+        found[number] = members[near[weight[members][near].argmax()]]
+    return found
 
 
 def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:

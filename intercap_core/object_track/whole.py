@@ -86,7 +86,8 @@ class WholeTrack:
         ):  # the images read last are still in the cache
             again = self._observer.evidence(t, track[t], motion[t])
             before = found[t]
-            if before is None or _ratio(again) > _ratio(before) - RELOOK_LOG_RATIO:
+            least = SEEN_LOG_RATIO if before is None else _ratio(before) - RELOOK_LOG_RATIO
+            if _ratio(again) > least:
                 found[t], looked[t] = again, track[t]
         track, covariance, segment = self._solved(looked, found, track)
         covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
