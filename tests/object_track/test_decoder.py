@@ -72,10 +72,10 @@ def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: O
 
 
 def test_a_hand_carries_it_and_nothing_else_moves_so_far(cup: ObjectMesh) -> None:
-    here, there = poses_of([0.0]), poses_of([0.0, 0.02, 0.6])
+    here, there = poses_of([0.0]), poses_of([0.0, 0.02, 1.0])
     costs = step_costs(cup, here, there, 1 / 15, NO_HAND)[0]
     assert costs[0] == 0 and -0.1 < costs[1] < 0 and costs[2] == -JUMP_COST
-    carried = step_costs(cup, here, there, 1 / 15, np.array([[0.6, 0.0, 0.0]]))[0]
+    carried = step_costs(cup, here, there, 1 / 15, np.array([[1.0, 0.0, 0.0]]))[0]
     assert carried[0] == 0 and carried[2] == pytest.approx(0)
 
 
