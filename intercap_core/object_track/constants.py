@@ -196,6 +196,7 @@ REST_FRAMES_SEEN_AGAIN = 12  # frames of a rest that are looked at again
 MAX_REST_FRAMES = 900  # tested against one pose
 SMOOTH_STEPS = 12  # Gauss-Newton
 TYPICAL_REACH_M = 0.03  # frames of a rest farther apart than this do not show one place
+TYPICAL_SLACK = 0.1  # of the largest cost, within which the frame that knows most is typical
 SMOOTH_CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
 SMOOTH_MAX_TURN_RAD = 0.5  # of a step
 INVERTED_NODES, INVERTED_MARGIN = 64, 40  # nodes inverted at once, and neighbours that matter

@@ -73,7 +73,7 @@ def _depth(
     assert colour_from_depth is not None
     person = view.person
     mask = candidate.mask if candidate is not None else EMPTY
-    total, count, _ = depth_log_ratio(
+    total, count = depth_log_ratio(
         drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth, geometry.depth_lens.rays,
         mesh.face_normals, geometry.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,

@@ -32,8 +32,8 @@ def depth_log_ratio(
     log_past,
     log_hidden,
 ):
-    """Sum over a rendering's pixels of log p(depth | object there) - log p(depth | it is not), how
-    many were measured, and how many of them something hides.
+    """Sum over a rendering's pixels of log p(depth | object there) - log p(depth | it is not), and
+    how many were measured.
 
     The rendering's pixel (u, v) is pixel (u + x0, v + y0) of ``measured`` (H, W), 0 where none;
     ``rays`` (H, W, 2) of its lens; ``rotation`` (3, 3) camera_from_object; ``person`` and the
@@ -42,7 +42,7 @@ def depth_log_ratio(
     anywhere within ``clutter_m``; it is seen past with ``log_past``, hidden by what is no person
     with ``log_hidden``. What a person explains is no evidence, outside the mask.
     """
-    total, count, hidden = 0.0, 0, 0
+    total, count = 0.0, 0
     agrees = np.log(clutter_m / (sigma * np.sqrt(2 * np.pi)))
     to_colour = colour_from_depth
     for v in range(rendered.shape[0]):
@@ -65,8 +65,6 @@ def depth_log_ratio(
             if gap > 0 and found <= 0:
                 total += max(found, log_past)
                 continue
-            if found <= 0:
-                hidden += 1
             x, y = rx * z, ry * z
             column, row = project_point(
                 to_colour[0, 0] * x + to_colour[0, 1] * y + to_colour[0, 2] * z + to_colour[0, 3],
@@ -80,7 +78,7 @@ def depth_log_ratio(
             i, j = x - px, y - py
             if own or not (0 <= i < person.shape[1] and 0 <= j < person.shape[0] and person[j, i]):
                 total += max(found, log_hidden)
-    return total, count, hidden
+    return total, count
 
 
 @numba.njit(cache=True, nogil=True)

@@ -12,10 +12,7 @@ from intercap_core.object_track.constants import (
     CHECK_SCALES,
     LIKENESS_LOG_RATIO,
     NEAR_TURN_CHANGED_SHARE,
-    PASS_ROUNDS,
-    PASS_SCALE,
 )
-from intercap_core.object_track.fit import fit_pose
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import changed_share
@@ -23,7 +20,8 @@ from intercap_core.rigid.mesh import ObjectMesh
 
 
 def mesh_doubts(observer: Observer, frames: list[FrameResult]) -> list[str]:
-    """What speaks against the mesh, in words; ``frames`` (T) are the final track."""
+    """What speaks against the mesh, in words, none where nothing does; ``frames`` (T) are the final
+    track."""
     believed = [t for t, frame in enumerate(frames) if not frame.lost]
     found = []
     if believed:
@@ -55,25 +53,8 @@ def _scale_doubt(observer: Observer, frames: list[FrameResult], believed: list[i
         return []
 
     def ratio(mesh: ObjectMesh) -> float:
-        return float(
-            np.mean(
-                [
-                    fit_pose(
-                        mesh,
-                        observer.views(t),
-                        frames[t].fit.pose,
-                        prior=None,
-                        min_overlap=observer.settings.min_overlap,
-                        background_term=observer.settings.background_term,
-                        labels=observer.labels,
-                        rounds=PASS_ROUNDS,
-                        start_scale=PASS_SCALE,
-                        renderer=observer.renderer,
-                    ).log_ratio
-                    for t in surest
-                ]
-            )
-        )
+        fits = [observer.fit(t, frames[t].fit.pose, None, mesh=mesh) for t in surest]
+        return float(np.mean([fit.log_ratio for fit in fits]))
 
     own = ratio(observer.mesh)
     gains = {scale: ratio(scaled(observer.mesh, scale)) - own for scale in CHECK_SCALES}

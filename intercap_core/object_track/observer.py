@@ -104,14 +104,15 @@ class Observer:
         self,
         t: int,
         pose: np.ndarray,
-        prior: MotionPrior,
+        prior: MotionPrior | None,
         rounds: tuple[int, ...] = PASS_ROUNDS,
         scale: float = PASS_SCALE,
-        twist: np.ndarray | None = None,
+        mesh: ObjectMesh | None = None,
     ) -> Fit:
-        """The pose (4, 4) of frame t fitted from one that is nearly right."""
+        """The pose (4, 4) of frame t fitted from one that is nearly right; ``mesh`` instead of the
+        object's own."""
         return fit_pose(
-            self.mesh,
+            mesh or self.mesh,
             self.views(t),
             pose,
             prior=prior,
@@ -120,7 +121,6 @@ class Observer:
             labels=self.labels,
             rounds=rounds,
             start_scale=scale,
-            twist=twist,
             renderer=self.renderer,
         )
 

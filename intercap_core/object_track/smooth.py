@@ -26,6 +26,7 @@ from intercap_core.object_track.constants import (
     SMOOTH_MAX_TURN_RAD,
     SMOOTH_STEPS,
     TYPICAL_REACH_M,
+    TYPICAL_SLACK,
     UNKNOWN_SIGMA,
 )
 from intercap_core.rigid.pose import rotation_log
@@ -118,8 +119,8 @@ def smooth(
 
 
 def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
-    """The frame (N,) of each node that most of its evidence is near: a robust fit would believe the
-    one wrong frame of a rest that it starts from."""
+    """The frame (N,) int of each of N nodes that most of its evidence is near, ``node`` (T,) as in
+    :func:`smooth`: a robust fit would believe the one wrong frame of a rest that it starts from."""
     weight = np.sqrt(np.trace(evidence.information, axis1=1, axis2=2))
     place = evidence.poses[:, :3, 3]
     found = np.zeros(int(node[-1]) + 1, int)
@@ -128,9 +129,8 @@ def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
     ):
         apart = np.linalg.norm(place[members, None] - place[members], axis=-1)
         cost = np.minimum(apart, TYPICAL_REACH_M) @ weight[members]
-        near = np.flatnonzero(
-            cost <= cost.min() + 1e-9 + 0.1 * weight[members].sum() * TYPICAL_REACH_M
-        )
+        slack = TYPICAL_SLACK * TYPICAL_REACH_M * weight[members].sum()
+        near = np.flatnonzero(cost <= cost.min() + slack)
         found[number] = members[near[weight[members][near].argmax()]]
     return found
 

@@ -7,7 +7,6 @@ continuous estimates follow from it: rest, smoothness, covariance (:mod:`.whole`
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,6 +28,7 @@ from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult, flagged
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.mesh_check import mesh_doubts
+from intercap_core.object_track.motion import FOREARMS
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior, things
 from intercap_core.object_track.proposals import NotFound, Proposals
@@ -38,9 +38,7 @@ from intercap_core.object_track.whole import WholeTrack
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.twist import step_between
 
-log = logging.getLogger(__name__)
-
-_WRISTS = (4, 7)  # of BODY_25
+_WRISTS = [wrist for _, wrist in FOREARMS]
 
 
 @dataclass(frozen=True)

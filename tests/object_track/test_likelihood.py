@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core.object_track.constants import LABEL_LOG_RATIO, LOG_MISSED
 from intercap_core.object_track.fit import Fit, assess_all
 from intercap_core.object_track.likelihood_kernel import outline_cost
-from intercap_core.object_track.reduced_mask import EMPTY
 from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.helpers.object_capture import ObjectCapture
@@ -129,4 +128,3 @@ def test_outlines_by_hand() -> None:
     covered[:, 10:] = True
     agreed, fewer = cost(square(20), half, (50, 50), covered)
     assert agreed == 0.0 and 0 < fewer < 100
-    assert EMPTY.area == 0
