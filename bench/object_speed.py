@@ -124,7 +124,7 @@ class Run:
 
 
 def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEATS) -> Run:
-    """All that the stage does: both ways, twice, exposure times, flags; no start: a search too."""
+    """All that the stage does: hypotheses, decision, exposure times, flags; no start: a search."""
     seconds, poses = [], np.zeros(0)
     for _ in range(repeats if start is not None else 1):
         tracker = clip.tracker()
