@@ -163,7 +163,7 @@ PERSON = Schema(
 
 OBJECT_TRACK = Schema(
     name="object_track",
-    version=4,
+    version=5,
     stage="object_track",
     attributes={
         "sequence": "sequence name",
@@ -182,6 +182,7 @@ OBJECT_TRACK = Schema(
         "silhouette_residual": Field(("T", "C"), "float32", "median contour distance; NaN = none", "px"),
         "views": Field(("T",), "int8", "views that the pose rests on"),
         "covariance": Field(("T", "6", "6"), "float64", "of (rotation vector, translation), rotation applied on the left", "rad, m", "master"),
+        "spread": Field(("T", "6", "6"), "float64", "the part of covariance that other possible poses add: without it, what the images say near this one", "rad, m", "master"),
         "lost": Field(("T",), "bool", "the tracker does not believe its pose"),
         "recovered": Field(("T",), "bool", "first frame that is not lost after lost ones"),
         "probability": Field(("T",), "float32", "of the pose, among all that were found, given all frames"),

@@ -71,7 +71,7 @@ class SequentialFits:
         tracked = TrackedPoses.from_track(
             state.rotation,
             state.translation,
-            track["covariance"],
+            track["covariance"] - track["spread"],
             lost,
             flags.ambiguous,
             resting,

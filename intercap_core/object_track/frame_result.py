@@ -17,9 +17,10 @@ class FrameResult:
 
     ``lost``: none of the hypotheses is believed; ``ambiguous``: a quite different pose may be the
     true one; ``probability`` of the pose's hypothesis given all frames; ``spread`` (6, 6), the
-    covariance of (turn on the left, shift) that the other hypotheses add; ``recovered``: the first
-    frame that is not lost after lost ones; ``free_axis`` (3,), master frame: a turn about it
-    through the object's origin changes nothing that was seen, 0 = there is none.
+    covariance of (turn on the left, shift) that the other hypotheses add to the fit's;
+    ``recovered``: the first frame that is not lost after lost ones; ``free_axis`` (3,), master
+    frame: a turn about it through the object's origin changes nothing that was seen, 0 = there is
+    none.
     """
 
     fit: Fit
@@ -38,7 +39,7 @@ def flagged(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
     result: list[FrameResult] = []
     for frame in frames:
         # other hypotheses count by their probability, not by how far away they are
-        shift, turn = _deviations(mesh, frame.fit.pose, frame.fit.covariance - frame.spread)
+        shift, turn = _deviations(mesh, frame.fit.pose, frame.fit.covariance)
         lost = frame.lost or shift > UNSURE_M
         unsure = frame.ambiguous or turn > UNSURE_RAD
         recovered = bool(result) and result[-1].lost and not lost

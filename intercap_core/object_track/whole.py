@@ -45,9 +45,8 @@ class WholeTrack:
         support the smoothed pose.
         """
         lost = np.array([frame.lost for frame in frames])
-        spread = np.array([frame.spread for frame in frames])
         fits = [frame.fit for frame in frames]
-        fits, segment, free_axis, pulled = self._smoothed(fits, lost, spread)
+        fits, segment, free_axis, pulled = self._smoothed(fits, lost)
         guessed = lost | pulled
         return [
             replace(
@@ -65,11 +64,10 @@ class WholeTrack:
     # --- all frames together -------------------------------------------------------------------
 
     def _smoothed(
-        self, fits: list[Fit], lost: np.ndarray, spread: np.ndarray
+        self, fits: list[Fit], lost: np.ndarray
     ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray]:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
-        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show;
-        ``spread`` (T, 6, 6) is the covariance that other hypotheses add."""
+        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show."""
         poses = self._unwrapped(np.array([fit.pose for fit in fits]))
         poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
         motion = twists(poses, ~lost, self._times)
@@ -91,7 +89,6 @@ class WholeTrack:
                 found[t], looked[t] = again, track[t]
         track, covariance, segment = self._solved(looked, found, track)
         covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
-        covariance += spread
         free = self._free_axes(track, covariance)
         result = [
             replace(fit, pose=pose, covariance=own, views=seen.reports if seen else fit.views)

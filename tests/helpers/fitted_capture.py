@@ -332,6 +332,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         for key in ("ambiguous", "resting"):
             writer.put(key, np.zeros(total, bool))
         writer.put("probability", np.ones(total))
+        writer.put("spread", np.zeros((total, 6, 6)))
         writer.put("free_axis", np.zeros((total, 3)))
         _fill(writer, OBJECT_TRACK, T=total, C=count)
     identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}

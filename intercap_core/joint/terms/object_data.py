@@ -5,9 +5,10 @@ there. E_O is taken as the quadratic form of the two,
 
     E_O = d^T C^-1 d / 2,    d = offset (turn, shift) from the tracked pose, C its covariance,
 
-so the joint fit need not compare images again. A frame in which the object is lost has a wide C: it
-stays near the interpolated pose unless contact or its neighbours move it. No setting weighs E_O:
-its strength is the covariance.
+so the joint fit need not compare images again. What other possible poses add to a covariance is
+left out: between two of them the images support nothing. A frame in which the object is lost has a
+wide C: it stays near the interpolated pose unless contact or its neighbours move it. No setting
+weighs E_O: its strength is the covariance.
 """
 
 from __future__ import annotations
@@ -69,8 +70,9 @@ class TrackedPoses:
     ) -> TrackedPoses:
         """Take over an object track whose lost frames are interpolated.
 
-        ``covariance`` (T, 6, 6); ``lost``, ``ambiguous`` and ``resting`` (T,); ``visible`` (T, C)
-        the views that show the object; ``times`` (T,) and ``time_offset`` (C,) seconds.
+        ``covariance`` (T, 6, 6) around these poses alone; ``lost``, ``ambiguous`` and ``resting``
+        (T,); ``visible`` (T, C) the views that show the object; ``times`` (T,) and ``time_offset``
+        (C,) seconds.
         """
         tracked = ~lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
