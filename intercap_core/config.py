@@ -233,6 +233,8 @@ class StudioCapture(Model):
     """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
     room: Literal["random", "furnished", "bare"] = "random"
     """With walls and furniture, or only a floor; by chance one capture in five is bare."""
+    look: Literal["random", "mesh", "plain", "printed"] = "random"
+    """Colours of the object: its mesh's, one for all, or printed in a way that no scan knows."""
     layout: LayoutName = "k4a"
     """How the recordings are laid out; the same as in the table of sequences."""
     depth: bool = True

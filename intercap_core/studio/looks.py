@@ -1,4 +1,4 @@
-"""What the subject's surface looks like: skin, hair, shirt, trousers, shoes."""
+"""What surfaces look like: the subject's skin and clothes, an object of one colour or printed."""
 
 from __future__ import annotations
 
@@ -13,6 +13,30 @@ SHIRTS = ((0.25, 0.38, 0.62), (0.60, 0.62, 0.64), (0.55, 0.22, 0.20), (0.20, 0.4
           (0.80, 0.72, 0.45))  # fmt: skip
 TROUSERS = ((0.13, 0.15, 0.24), (0.30, 0.28, 0.25), (0.10, 0.10, 0.11), (0.42, 0.40, 0.36))
 SHOES = ((0.12, 0.12, 0.13), (0.75, 0.75, 0.74), (0.35, 0.20, 0.12))
+
+PAINTS = ((0.92, 0.91, 0.88), (0.13, 0.13, 0.14), (0.70, 0.12, 0.13), (0.11, 0.28, 0.60),
+          (0.84, 0.42, 0.17), (0.16, 0.46, 0.31), (0.88, 0.76, 0.24),
+          (0.50, 0.51, 0.53))  # fmt: skip
+PRINTS = (3, 7)  # spots of another colour on a printed object, at least and below
+PRINT_RADIUS = (0.15, 0.45)  # of a spot, in parts of the object's radius
+
+
+def object_colours(
+    look: str, vertices: np.ndarray, colours: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Colours (V, 3) RGB in [0, 1] of a true object whose mesh has ``colours`` (V, 3): those
+    ('mesh'), one for all ('plain') or one with spots of others that no scan knows ('printed')."""
+    if look == "mesh":
+        return colours
+    first, *others = np.array(PAINTS)[rng.permutation(len(PAINTS))]
+    found = np.tile(first, (len(vertices), 1))
+    if look == "printed":
+        radius = np.linalg.norm(vertices - vertices.mean(0), axis=1).max()
+        for paint in others[: rng.integers(*PRINTS)]:
+            middle = vertices[rng.integers(len(vertices))]
+            reach = radius * rng.uniform(*PRINT_RADIUS)
+            found[np.linalg.norm(vertices - middle, axis=1) < reach] = paint
+    return found
 
 
 def body_colours(subject: Subject, rng: np.random.Generator) -> np.ndarray:

@@ -27,6 +27,7 @@ AMBIENT = 0.42
 VOID = 0.04  # grey of what lies beyond the room
 # Directions to the lamps and their strength: two ceiling lamps
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
+CAMERA_GAMMA = 2.2  # light adds up, grey levels are its power 1 / 2.2, as sRGB's nearly are
 SENSOR_NOISE = 2.0  # grey levels
 EDGE_BLUR_PX = 0.55
 JPEG_QUALITY = 85
@@ -86,12 +87,12 @@ def scene_of(*meshes: tuple[np.ndarray, np.ndarray]) -> o3d.t.geometry.Raycastin
 
 
 def shade(normals: np.ndarray) -> np.ndarray:
-    """Brightness (...,) of surfaces with unit normals (..., 3)."""
+    """Factor (...,) of the grey levels of surfaces with unit normals (..., 3)."""
     light = np.full(normals.shape[:-1], AMBIENT, np.float32)
     for direction, strength in LAMPS:
         lamp = np.array(direction, np.float32) / np.float32(np.linalg.norm(direction))
         light += np.float32(strength) * np.maximum(normals @ lamp, 0)
-    return light
+    return light ** np.float32(1 / CAMERA_GAMMA)
 
 
 class View:
@@ -259,11 +260,12 @@ def _room_colours(
 
 
 class Photographer:
-    """Turns casts of one colour view into JPEG images; ``gain`` (3,) RGB of its white balance."""
+    """Turns casts of one colour view into JPEG images; ``gain`` (3,) of linear RGB is its white
+    balance."""
 
     def __init__(self, view: View, gain: np.ndarray, rng: np.random.Generator) -> None:
         self.view = view
-        self.gain = gain.astype(np.float32)
+        self.gain = (gain ** (1 / CAMERA_GAMMA)).astype(np.float32)
         room = np.clip(view.colour * self.gain * 255, 0, 255)
         self._room = np.ascontiguousarray(room[..., ::-1].astype(np.uint8))
         # sensor noise: one tile, taken at another place in each image

@@ -18,6 +18,7 @@ from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.interactions.base import TrueObject
 from intercap_core.studio.layouts import camera_names
+from intercap_core.studio.looks import object_colours
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
@@ -28,6 +29,7 @@ from intercap_core.studio.tissue import press_out
 
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
 OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
+LOOKS = ("mesh", "plain", "printed")  # of the object, as likely as each other
 SMALL_M = 0.35  # a smaller object may be hidden from most cameras
 
 
@@ -65,8 +67,15 @@ class Stage:
         self.subject = Subject.load(capture.subject)
         self.puppet = Puppet(self.subject)
         vertices, faces, colours = true_mesh(entry, capture.seed)
+        rng = self.noise.rng("look")
+        by_chance = LOOKS[rng.integers(len(LOOKS))]
+        self.look = by_chance if capture.look == "random" else capture.look
         self.thing = TrueObject(
-            entry.name, vertices, faces, colours / 255.0, DistanceField(vertices, faces, threads=1)
+            entry.name,
+            vertices,
+            faces,
+            object_colours(self.look, vertices, colours / 255.0, rng),
+            DistanceField(vertices, faces, threads=1),
         )
         self.bounds = np.stack([vertices.min(0), vertices.max(0)])
         kind = interaction_named(capture.interaction)
@@ -92,8 +101,8 @@ class Stage:
             depth=capture.depth,
         )
         furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
-        by_chance = bool(rng.random() < BARE_ROOM_SHARE)
-        bare = by_chance if capture.room == "random" else capture.room == "bare"
+        is_bare = bool(rng.random() < BARE_ROOM_SHARE)
+        bare = is_bare if capture.room == "random" else capture.room == "bare"
         eyes = invert(self.rig.master_from_stage) @ self.rig.true.master_from_colour
         self.room = build_room(
             rng,

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from intercap_core.camera.transforms import apply, invert, rigid
-from intercap_core.studio.render import BODY, OBJECT, Surface, View, scene_of, shade
+from intercap_core.studio.render import BODY, CAMERA_GAMMA, OBJECT, Surface, View, scene_of, shade
 from intercap_core.studio.rig import build_rig
 from intercap_core.studio.room import build_room
 from intercap_core.studio.skeleton import turn
@@ -74,5 +74,5 @@ def test_moving_things_are_drawn_where_rays_hit_them(
 
 
 def test_the_room_is_lit_from_above() -> None:
-    up, down = shade(np.array([[0, 0, 1.0], [0, 0, -1.0]], np.float32))
+    up, down = shade(np.array([[0, 0, 1.0], [0, 0, -1.0]], np.float32)) ** CAMERA_GAMMA
     assert up > 0.8 > 0.5 > down
