@@ -111,8 +111,8 @@ NEAREST_QUANTILE = 0.1
 
 # The object is compared at about this many pixels across: more cost time and carry no more
 # information, since neighbouring pixels of a mask or a depth image err together.
-REDUCED_SILHOUETTE_PX = 110
-REDUCED_DEPTH_PX = 80
+REDUCED_SILHOUETTE_PX = 80
+REDUCED_DEPTH_PX = 60
 MAX_REDUCTION = 4  # every n-th pixel at most
 # Faces of the mesh that is rendered; kept within 0.5 mm of the full one (rigid.constants).
 TRACKING_FACES = 600
@@ -162,10 +162,13 @@ FACING_AWAY_MIN_M = 0.01
 ICP_MAX_RESIDUAL_M = 0.05  # residuals beyond count as this much
 OUTLINE_ALIGNED_VIEWS = 2  # up to so many views silhouettes also align where depth measures
 # Poses rendered after the alignment and fitted after that: with all rotations, and with few.
-FULL_SEARCH, NEAR_SEARCH = (16, 5), (6, 2)
+FULL_SEARCH, NEAR_SEARCH = (16, 3), (6, 2)
 NEAR_TURN_SEARCH_RAD = np.radians(35)  # by which the rotations of a near search are apart
+# Nats by which a start may be worse than a fit and still lead to a rival of it: an aligned pose
+# gains up to 15 by its fit, or ends where the better one is (bottle to chair of the studio).
+HOPELESS_LOG_RATIO = 15.0
 OWN_TURN_STEPS = 12  # angles of a full turn about each axis of the best pose, compared with it
-TURNS_FITTED = 4  # of them
+TURNS_FITTED = 3  # of them
 MAX_GROUPS = 3  # groups of candidates that are searched
 # Nats of a pose in a trusted place, above which less likely groups are not searched, and the prior
 # of such a place. Tuned on the studio.
@@ -177,19 +180,21 @@ SEED_SEARCHES = 3  # frames searched for the seed, more while nothing is found
 SEED_SEARCHES_MAX = 10
 ROUNDS = 15  # of deciding and of looking for more
 SEARCHES_MIN, SEARCH_EVERY_S = 6, 0.5  # frames searched with all rotations, and one in this time
-LOOK_NEAR_S = 0.3  # a frame in doubt is searched by the poses of frames no farther away, seconds
+# A frame in doubt is searched by the poses of frames no farther away, seconds, and within what a
+# hand may have moved meanwhile, metres.
+LOOK_NEAR_S, LOOK_NEAR_M = 0.3, 0.75
 BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
 UNSEEN_S = 0.8  # seconds that an object is followed without being seen
 MAX_HYPOTHESES = 6  # of a frame
 TURNS_FOLLOWED = 2  # of a key frame
 ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
-SURVEYED_FRAMES = 12  # looked at before tracking, spread over the recording
+SURVEYED_FRAMES = 8  # looked at before tracking, spread over the recording
 SURVEYED_GROUPS = 6  # groups of candidates in each of them
 KEY_FRAME_S = 0.2  # seconds between the frames in which turns are compared
 NEAR_TURN_STEPS = 12  # angles of a full turn that are tried for a near symmetry
 NEAR_TURN_FINE_RAD = np.pi / NEAR_TURN_STEPS  # beside no turn, where a slow slide is caught first
-NEAR_TURN_POINTS = 500  # of the surface
-NEAR_TURN_ICP_STEPS = 8
+NEAR_TURN_POINTS = 200  # of the surface
+NEAR_TURN_ICP_STEPS = 5
 NEAR_TURN_ICP_START = 6.0  # robust scale that placing starts from, over the last
 NEAR_TURN_POINT_WEIGHT = 0.05  # of point-to-point beside point-to-plane residuals
 REST_FRAMES_SEEN_AGAIN = 12  # frames of a rest that are looked at again
@@ -252,13 +257,15 @@ APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite diffe
 # Probabilities: of no hypothesis, from which a frame is lost; of quite different ones, from which
 # it is ambiguous; of the chosen one, below which more is looked for.
 LOST_PROBABILITY, AMBIGUOUS_PROBABILITY, DOUBTFUL_PROBABILITY = 0.5, 0.35, 0.9
-DOUBTFUL_SHARE = 0.5  # of the usual nats, below which more is looked for
+# Of the usual nats, below which more is looked for near a pose, and elsewhere too.
+DOUBTFUL_SHARE, HIDDEN_SHARE = 0.5, 0.25
 
 # --- decision: which candidates may be the object ------------------------------------------------
 
 # Extents, of the object's diameter, of a candidate that may be it, partly hidden or with something
 # that it touches; a slack in metres. Tuned on the studio.
 CANDIDATE_MIN_EXTENT, CANDIDATE_MAX_EXTENT, CANDIDATE_SLACK_M = 0.25, 1.4, 0.05
+CLOUD_STRIDE = 2  # of the pixels of the reduced depth image that are looked at
 SIGHTING_MIN_POINTS = 15  # of a candidate's cloud, or pixels of its mask
 CLOUD_MAX_SPREAD = 0.75  # of the diameter, from a candidate's centre to its points
 CLOUD_PERCENTILE = 90  # of its points' distances from the centre, compared with that
@@ -301,7 +308,8 @@ LABELS_TOLD = 8  # labels named in a warning
 
 # After tracking: the surest frames are fitted with meshes of other sizes, one of which must be
 # better by so many nats a frame to be told. Of the studio a tenth costs a cup 6 and others 20.
-CHECK_FRAMES, CHECK_SCALES, CHECK_GAIN = 6, (0.9, 1.1), 5.0
+# Those that are so much worse at the track's own poses are not fitted.
+CHECK_FRAMES, CHECK_SCALES, CHECK_GAIN, CHECK_HOPELESS = 6, (0.9, 1.1), 5.0, 10.0
 # Nats of half of the frames, below which the mesh is hardly that object: wrong meshes of like size
 # have 5 to 19, right ones 40 to 100, a cup at twice the noise 14. Tuned on the studio.
 LIKENESS_LOG_RATIO = 10.0

@@ -19,6 +19,7 @@ from intercap_core.detections.instance import PERSON_LABEL
 from intercap_core.object_track.constants import (
     CLOUD_MAX_SPREAD,
     CLOUD_PERCENTILE,
+    CLOUD_STRIDE,
     GROUP_SLACK_M,
     MAX_GROUPS,
     NO_LABEL_PRIOR,
@@ -90,7 +91,7 @@ def find_groups(
     """The first ``limit`` groups of candidates that may be the object, the most likely first.
 
     ``labels`` are the classes that the object may be given; ``place_prior`` says of a place (3,)
-    how likely what is there is the object.
+    how likely what is there is the object; where it cannot be there is no group.
     """
     measured = _measured(views, mesh.diameter, labels)
     outlined = _outlined(views, labels)
@@ -109,7 +110,8 @@ def find_groups(
         value = sum(s.label_prior for s in group)
         if place_prior is not None:
             value *= place_prior(centre_of(group))
-        groups.append((value, group))
+        if value > 0:
+            groups.append((value, group))
     groups.sort(key=lambda item: -item[0])
     return _different([group for _, group in groups], limit)
 
@@ -200,9 +202,8 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
         candidates = _could_be(view)
         if not candidates:
             continue
-        stride = max(1, 2 // geometry.depth_step)
-        depth = view.depth[::stride, ::stride]
-        rays = geometry.depth_lens.rays[::stride, ::stride]
+        depth = view.depth[::CLOUD_STRIDE, ::CLOUD_STRIDE]
+        rays = geometry.depth_lens.rays[::CLOUD_STRIDE, ::CLOUD_STRIDE]
         valid = (depth > 0) & np.isfinite(rays[..., 0])
         depth, rays = depth[valid], rays[valid]
         local = np.column_stack([rays * depth[:, None], depth])

@@ -9,6 +9,7 @@ import numpy as np
 from intercap_core.object_track.constants import (
     CHECK_FRAMES,
     CHECK_GAIN,
+    CHECK_HOPELESS,
     CHECK_SCALES,
     LIKENESS_LOG_RATIO,
     NEAR_TURN_CHANGED_SHARE,
@@ -56,11 +57,17 @@ def _scale_doubt(observer: Observer, frames: list[FrameResult], believed: list[i
         fits = [observer.fit(t, frames[t].fit.pose, None, mesh=mesh) for t in surest]
         return float(np.mean([fit.log_ratio for fit in fits]))
 
-    own = ratio(observer.mesh)
-    gains = {scale: ratio(scaled(observer.mesh, scale)) - own for scale in CHECK_SCALES}
-    scale = max(gains, key=lambda scale: gains[scale])
-    if gains[scale] < CHECK_GAIN:
+    believed_ratio = float(np.mean([frames[t].fit.log_ratio for t in surest]))
+    gains = {}
+    for scale in CHECK_SCALES:
+        other = scaled(observer.mesh, scale)
+        # of the right size it is far worse before it is fitted, and need not be
+        as_it_is = [observer.assess(t, frames[t].fit.pose, other).log_ratio for t in surest]
+        if np.mean(as_it_is) > believed_ratio - CHECK_HOPELESS:
+            gains[scale] = ratio(other) - ratio(observer.mesh)
+    if max(gains.values(), default=0.0) < CHECK_GAIN:
         return []
+    scale = max(gains, key=lambda scale: gains[scale])
     word = "larger" if scale > 1 else "smaller"
     return [
         f"the images fit a mesh {abs(scale - 1):.0%} {word} better (by {gains[scale]:.0f} nats a "

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.object_track.constants import ASSESS_MIN_OVERLAP, PASS_ROUNDS, PASS_SCALE
+from intercap_core.object_track.constants import (
+    ASSESS_MIN_OVERLAP,
+    LOOK_NEAR_M,
+    PASS_ROUNDS,
+    PASS_SCALE,
+)
 from intercap_core.object_track.evidence import PoseEvidence, evidence_at
 from intercap_core.object_track.fit import (
     Fit,
@@ -84,9 +89,17 @@ class Observer:
         mesh = self.mesh
         return DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight, threads=1)
 
-    def search(self, t: int, rotations: np.ndarray | None = None) -> list[Fit]:
+    def search(
+        self, t: int, rotations: np.ndarray | None = None, places: np.ndarray | None = None
+    ) -> list[Fit]:
         """Fitted hypotheses of frame t, the likeliest first; ``rotations`` (N, 3, 3) are tried, or
-        all there are."""
+        all there are, near ``places`` (M, 3), or anywhere."""
+
+        def place_prior(place: np.ndarray) -> float:
+            if places is not None and np.linalg.norm(places - place, axis=1).min() > LOOK_NEAR_M:
+                return 0.0
+            return self.places.prior(t, place)
+
         return search(
             self.mesh,
             self.field,
@@ -95,7 +108,7 @@ class Observer:
             up=self.up,
             min_overlap=self.settings.min_overlap,
             background_term=self.settings.background_term,
-            place_prior=partial(self.places.prior, t),
+            place_prior=place_prior,
             rotations=rotations,
             renderer=self.renderer,
         )
@@ -144,14 +157,14 @@ class Observer:
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
         return carried(self.joints[[t, u]], pose, centre, radius)
 
-    def assess(self, t: int, pose: np.ndarray) -> Fit:
-        """How well a pose (4, 4) agrees with frame t as it is."""
-        return self.assess_all(t, pose[None])[0]
+    def assess(self, t: int, pose: np.ndarray, mesh: ObjectMesh | None = None) -> Fit:
+        """How well a pose (4, 4) agrees with frame t as it is; ``mesh`` instead of the object's."""
+        return self.assess_all(t, pose[None], mesh)[0]
 
-    def assess_all(self, t: int, poses: np.ndarray) -> list[Fit]:
+    def assess_all(self, t: int, poses: np.ndarray, mesh: ObjectMesh | None = None) -> list[Fit]:
         """:meth:`assess` of many poses (N, 4, 4) at once."""
         return assess_all(
-            self.mesh,
+            mesh or self.mesh,
             self.views(t),
             poses,
             min_overlap=ASSESS_MIN_OVERLAP,

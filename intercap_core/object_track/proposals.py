@@ -11,6 +11,7 @@ from intercap_core.object_track.constants import (
     DOUBTFUL_PROBABILITY,
     DOUBTFUL_SHARE,
     FIT_ROUNDS,
+    HIDDEN_SHARE,
     KEY_FRAME_S,
     LOOK_NEAR_S,
     NEAR_TURN_SEARCH_RAD,
@@ -138,6 +139,9 @@ class Proposals:
             return True
         most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
         apart = max(1, round(SEARCH_EVERY_S / self._step_s)) // 2
+        # a pose that motion is sure of is hidden, rather than elsewhere
+        open_ = (sure < DOUBTFUL_PROBABILITY) | (ratio < HIDDEN_SHARE * usual)
+        waiting = [t for t in waiting if open_[t]]
         while len(self._searched) < most and not new:
             waiting = [
                 t
@@ -164,7 +168,8 @@ class Proposals:
         if found[0].log_ratio < SEARCH_GOOD_LOG_RATIO:
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
-            found += self._observer.search(t, around.reshape(-1, 3, 3))
+            places = [self._observer.mesh.centre_at(start) for start in starts]
+            found += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places))
         return self._follow(t, found)
 
     def _expected(self, t: int, known: dict[int, np.ndarray]) -> np.ndarray:

@@ -19,6 +19,7 @@ from intercap_core.object_track.constants import (
     FULL_SEARCH,
     GRID_ROTATIONS,
     GRID_SPACING_DEG,
+    HOPELESS_LOG_RATIO,
     NEAR_SEARCH,
     OWN_TURN_STEPS,
     SAME_AXIS_COSINE,
@@ -26,6 +27,7 @@ from intercap_core.object_track.constants import (
     SAME_POSE_M,
     SEARCH_GOOD_LOG_RATIO,
     SEARCH_MIN_OVERLAP,
+    SEEN_LOG_RATIO,
     TRUSTED_PLACE,
     TURNS_FITTED,
     UPRIGHT_TURNS,
@@ -61,20 +63,26 @@ def search(
     ``renderer`` draws, None = the CPU.
     """
 
-    def fitted(starts: list[Fit]) -> list[Fit]:
-        return [
-            fit_pose(
-                mesh,
-                views,
-                start.pose,
-                prior=None,
-                min_overlap=min(min_overlap, SEARCH_MIN_OVERLAP),
-                background_term=background_term,
-                labels=labels,
-                renderer=renderer,
-            )
-            for start in starts
-        ]
+    def fitted(starts: list[Fit], best: float = SEEN_LOG_RATIO) -> list[Fit]:
+        """Fits from the starts, the likeliest first, those left out that are hopeless beside the
+        ``best`` known."""
+        fits: list[Fit] = []
+        for start in starts:
+            best = max([best, *(fit.log_ratio for fit in fits)])
+            if start.log_ratio > best - HOPELESS_LOG_RATIO:
+                fits.append(
+                    fit_pose(
+                        mesh,
+                        views,
+                        start.pose,
+                        prior=None,
+                        min_overlap=min(min_overlap, SEARCH_MIN_OVERLAP),
+                        background_term=background_term,
+                        labels=labels,
+                        renderer=renderer,
+                    )
+                )
+        return fits
 
     def compared(poses: np.ndarray) -> list[Fit]:
         found = assess_all(
@@ -92,12 +100,13 @@ def search(
         here = fitted(compared(_distinct(mesh, poses, number_compared))[:number_fitted])
         found += here
         trusted = place_prior is None or place_prior(centre_of(group)) > TRUSTED_PLACE
-        if trusted and max(fit.log_ratio for fit in here) > SEARCH_GOOD_LOG_RATIO:
+        if trusted and any(fit.log_ratio > SEARCH_GOOD_LOG_RATIO for fit in here):
             break
     found.sort(key=lambda fit: -fit.log_ratio)
     if found and not known and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
-        found += fitted(compared(found[0].pose @ own_turns(mesh, OWN_TURN_STEPS))[:TURNS_FITTED])
+        turned = compared(found[0].pose @ own_turns(mesh, OWN_TURN_STEPS))[:TURNS_FITTED]
+        found += fitted(turned, found[0].log_ratio)
         found.sort(key=lambda fit: -fit.log_ratio)
     kept: list[Fit] = []
     for fit in found:

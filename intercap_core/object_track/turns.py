@@ -1,11 +1,7 @@
-"""Orientation of a nearly symmetric object among its near symmetries, decided over all frames.
+"""Near symmetries: turns of an object that are hard to tell apart, found on its mesh.
 
-A mug looks much the same with its handle elsewhere, a box from its back. One frame may not show the
-difference, a hand may occlude it for a second, and the tracker then drifts to another rotation
-unnoticed. Which turns are hard to tell apart follows from the mesh: those that bring its surface
-nearly back onto itself. Every few frames all of them are compared with the images, and dynamic
-programming (Viterbi 1967) finds the sequence of turns that explains all frames best while the
-object turns no faster than objects do; it may change freely only where the track was lost.
+A mug looks much the same with its handle elsewhere, a box from its back. Such turns bring the
+surface nearly back onto itself; the tracker follows them as hypotheses (:mod:`.proposals`).
 """
 
 from __future__ import annotations
@@ -13,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.camera.transforms import rigid
 from intercap_core.object_track.constants import (
     NEAR_TURN_CHANGED_SHARE,
     NEAR_TURN_DISTINCT_DEG,
@@ -40,28 +37,27 @@ def near_turns(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
     found = [np.eye(4)]
     if mesh.symmetry.sphere:
         return found[0][None]
-    points = _surface(mesh)
-    far = max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
-    angles = 2 * np.pi * np.arange(NEAR_TURN_STEPS) / NEAR_TURN_STEPS
+    half = NEAR_TURN_STEPS // 2
+    angles = np.array([NEAR_TURN_FINE_RAD, *(2 * np.pi * np.arange(1, half + 1) / NEAR_TURN_STEPS)])
+    axes = own_axes(mesh)
+    rotations = Rotation.from_rotvec((axes[:, None] * angles[:, None]).reshape(-1, 3)).as_matrix()
+    placed, shares = _placed(mesh, field, rotations)
     flips = []
-    for axis in own_axes(mesh):
-        half = [
-            _placed(field, points, _about(axis, a), far) for a in angles[: NEAR_TURN_STEPS // 2 + 1]
-        ]
+    for about, (_, *share) in zip(
+        placed.reshape(len(axes), -1, 4, 4), shares.reshape(len(axes), -1), strict=True
+    ):
         # the inverse rotation moves the surface as far
-        placed = half + [(np.linalg.inv(turn), share) for turn, share in half[-2:0:-1]]
-        moved = np.array([share for _, share in placed])
-        if moved.max() < NEAR_TURN_CHANGED_SHARE and mesh.symmetry.axis is None:
-            fine, _ = _placed(field, points, _about(axis, NEAR_TURN_FINE_RAD), far)
-            found += [fine, np.linalg.inv(fine)]
-            found += [turn for turn, _ in placed[1:]]
+        turns = [*about[1:], *(np.linalg.inv(turn) for turn in about[-2:0:-1])]
+        changed = np.array([0.0, *share, *share[-2::-1]])
+        if changed.max() < NEAR_TURN_CHANGED_SHARE and mesh.symmetry.axis is None:
+            found += [about[0], np.linalg.inv(about[0]), *turns]
             continue
         least = (
-            (moved <= np.roll(moved, 1))
-            & (moved <= np.roll(moved, -1))
-            & (moved < NEAR_TURN_CHANGED_SHARE)
+            (changed <= np.roll(changed, 1))
+            & (changed <= np.roll(changed, -1))
+            & (changed < NEAR_TURN_CHANGED_SHARE)
         )
-        flips += [placed[i][0] for i in range(1, NEAR_TURN_STEPS) if least[i]]
+        flips += [turn for turn, is_least in zip(turns, least[1:], strict=True) if is_least]
     kept = found
     for turn in flips:
         known = np.array(kept)[:, :3, :3]
@@ -73,34 +69,36 @@ def near_turns(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
 def changed_share(mesh: ObjectMesh, field: DistanceField, motion: np.ndarray) -> float:
     """Share of the surface that a motion (4, 4) of the object brings clearly off the surface."""
     moved = _surface(mesh) @ motion[:3, :3].T + motion[:3, 3]
-    far = max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
-    return float((field.distance(moved) > far).mean())
-
-
-def _about(axis: np.ndarray, angle: float) -> np.ndarray:
-    return Rotation.from_rotvec(angle * axis).as_matrix()
+    return float((field.distance(moved) > _far(mesh)).mean())
 
 
 def _placed(
-    field: DistanceField, points: np.ndarray, rotation: np.ndarray, far: float
-) -> tuple[np.ndarray, float]:
-    """The turn (4, 4) by ``rotation`` shifted so that most of the surface falls onto itself, and
-    the share of ``points`` (N, 3) that stay farther than ``far``."""
-    turned = points @ rotation.T
-    shift = points.mean(0) - turned.mean(0)
+    mesh: ObjectMesh, field: DistanceField, rotations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The turns (N, 4, 4) by ``rotations`` (N, 3, 3), shifted so that most of the surface falls
+    onto itself, and the share (N,) of it that stays far."""
+    points, far = _surface(mesh), _far(mesh)
+    turned = points @ rotations.transpose(0, 2, 1)
+    shift = (points - turned).mean(1)
     for scale in far * np.geomspace(NEAR_TURN_ICP_START, 1, NEAR_TURN_ICP_STEPS):
-        at = turned + shift
-        closest = field.closest(at)
-        gap = closest.points - at
-        weight = geman_mcclure_weight((gap**2).sum(1), scale)
-        weighted = closest.normals * weight[:, None]
+        at = turned + shift[:, None]
+        closest = field.closest(at.reshape(-1, 3))
+        gap = closest.points.reshape(at.shape) - at
+        normals = closest.normals.reshape(at.shape)
+        weight = geman_mcclure_weight((gap**2).sum(-1), scale)[..., None]
         # point to plane, a little to the point where no plane holds it
-        matrix = weighted.T @ closest.normals + NEAR_TURN_POINT_WEIGHT * weight.sum() * np.eye(3)
-        pull = weighted.T @ (closest.normals * gap).sum(1) + NEAR_TURN_POINT_WEIGHT * weight @ gap
-        shift = shift + np.linalg.solve(matrix, pull)
-    turn = np.eye(4)
-    turn[:3, :3], turn[:3, 3] = rotation, shift
-    return turn, float((field.distance(turned + shift) > far).mean())
+        little = NEAR_TURN_POINT_WEIGHT * weight.sum(1)
+        matrix = (normals * weight).transpose(0, 2, 1) @ normals + little[:, None] * np.eye(3)
+        pull = (weight * (normals * (normals * gap).sum(-1, keepdims=True))).sum(1)
+        pull += NEAR_TURN_POINT_WEIGHT * (weight * gap).sum(1)
+        shift = shift + np.linalg.solve(matrix, pull[..., None])[..., 0]
+    distance = field.distance((turned + shift[:, None]).reshape(-1, 3)).reshape(len(rotations), -1)
+    return rigid(rotations, shift), (distance > far).mean(1)
+
+
+def _far(mesh: ObjectMesh) -> float:
+    """Distance from the surface from which a point is noticed, metres."""
+    return max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
 
 
 def _surface(mesh: ObjectMesh) -> np.ndarray:
