@@ -56,7 +56,15 @@ CAPTURE_SETTINGS = [
 ]
 OBJECT_SETTINGS = [
     Path(f"config/object/{name}.yaml")
-    for name in ("config", "no_detector", "noise_05", "noise_2", "family_b")
+    for name in (
+        "config",
+        "no_detector",
+        "noise_05",
+        "noise_2",
+        "family_b",
+        "redrawn_1",
+        "redrawn_2",
+    )
 ]
 BODY_SETTINGS = [
     *(Path(f"config/object/{name}.yaml") for name in ("config", "noise_05", "noise_2", "family_b")),

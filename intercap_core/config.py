@@ -227,6 +227,8 @@ class StudioCapture(Model):
     """Studio subject that plays it (see subjects.tsv)."""
     seed: int
     """Seed of the motion and of every error."""
+    redrawn_detections: Annotated[int, Field(ge=0)] = 0
+    """Other numbers give the same recording, of which detectors err in another way."""
     frames: Annotated[int, Field(ge=2, le=3000)] = 45
     """Number of frame sets."""
     annotate: bool = False

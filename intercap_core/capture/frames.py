@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,6 +15,12 @@ from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
+
+_DECODED = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+}
 
 
 class Frames:
@@ -138,17 +145,19 @@ class Frames:
         start, end = self._offsets[c][index : index + 2]
         return self._artefact.rows(f"{group}/colour", slice(int(start), int(end))).tobytes()
 
-    def colour(self, t: int, c: int) -> np.ndarray | None:
+    def colour(self, t: int, c: int, reduction: Literal[1, 2, 4] = 1) -> np.ndarray | None:
         """Return the colour image (H, W, 3) uint8, BGR; None if there is none.
 
-        Raises UserError where the recorded image cannot be decoded.
+        With a ``reduction`` each pixel is the mean of so many by as many, in a fraction of the
+        time. Raises UserError where the recorded image cannot be decoded.
         """
         jpeg = self.colour_jpeg(t, c)
         if jpeg is None:
             return None
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _DECODED[reduction])
         lens = self.rig[c].colour
-        if image is None or image.shape != (lens.height, lens.width, 3):
+        size = (-(-lens.height // reduction), -(-lens.width // reduction), 3)
+        if image is None or image.shape != size:
             raise UserError(
                 f"{self._artefact.path}: sequence {self.sequence}, camera {self.rig.names[c]}, "
                 f"frame {t}: the recorded image does not decode to {lens.width}x{lens.height}; add "

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
+import numpy as np
 from rich.table import Table
 
 from intercap_core.evaluation.part import (
@@ -24,6 +26,8 @@ from intercap_core.rigid.mesh import ObjectMesh
 
 Objects = Measured[ObjectErrors]
 AREA = "object"
+# The recordings of one dataset and those in which the detectors err in another way.
+REDRAWN = re.compile(rf"{AREA}(_redrawn\d+)?")
 _WIDTH = 120
 _COLUMNS = {
     "mm": ("translation_median_mm", 1), "p95": ("translation_p95_mm", 1),
@@ -64,7 +68,28 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
             found |= keyed(f"{AREA}.{group}{'.' if group else ''}{start}", figures)
         for views, figures in object_errors.by_views(tracked.errors).items():
             found |= keyed(f"{AREA}.{start}views_{views.replace('-', '_to_')}.", figures)
+    drawn = lost_by_draw(evaluations)
+    spreads = {name: max(shares) - min(shares) for name, shares in drawn.items()}
+    found |= {f"{AREA}.{name}.lost_spread": spread for name, spread in spreads.items()}
+    if spreads:
+        found[f"{AREA}.lost_spread"] = float(np.mean(list(spreads.values())))
     return found
+
+
+def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
+    """Share of lost frames by object, one for each draw of the detectors' errors; nothing where
+    there is only one."""
+    draws = [one for one in evaluations if REDRAWN.fullmatch(one.dataset)]
+    if len(draws) < 2:
+        return {}
+    return {
+        name: [
+            float(np.mean(np.concatenate([e.lost for e in by_object(one.errors).get(name, [])])))
+            for one in draws
+            if name in by_object(one.errors)
+        ]
+        for name in by_object(draws[0].errors)
+    }
 
 
 def print_objects(evaluations: Sequence[Objects]) -> None:
@@ -86,6 +111,13 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
             table.add_row(
                 name, *(number(v, d) for v, d in zip(figures.values(), digits, strict=True))
             )
+        console.print(table)
+    drawn = lost_by_draw(evaluations)
+    if drawn:
+        table = Table("object", "lost, detections drawn anew", "spread", box=None)
+        for name, shares in drawn.items():
+            each = "  ".join(number(share, 3) for share in shares)
+            table.add_row(name, each, number(max(shares) - min(shares), 3))
         console.print(table)
 
 

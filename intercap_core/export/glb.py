@@ -18,6 +18,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_NAMES, PARENTS
+from intercap_core.camera.light import linear
 from intercap_core.export.motion import Motion
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.normals import vertex_normals
@@ -243,10 +244,9 @@ def _continuous(quaternions: np.ndarray) -> np.ndarray:
 
 def _linear(colours: np.ndarray) -> np.ndarray:
     """sRGB bytes (V, 4) to the linear values that glTF's vertex colours are."""
-    value = colours / 255.0
-    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    linear[:, 3] = value[:, 3]
-    return linear
+    found = linear(colours)
+    found[:, 3] = colours[:, 3] / 255.0
+    return found
 
 
 def _listed(values: np.ndarray) -> list[float]:

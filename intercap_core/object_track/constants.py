@@ -237,6 +237,31 @@ MASK_AGREES, OUTLINE_COST_MAX = 2.0, 4.5
 VIEW_SAMPLES, OUTLINE_HALF_SAMPLES_PX = 4.0, 60
 LABEL_LOG_RATIO = 1.0  # of a candidate with the right label over one with another
 
+# --- decision: colours of the surface ------------------------------------------------------------
+
+PATCHES_ACROSS = 12  # of the object's diameter: a centimetre of a cup, two pixels at 3 m
+STEEP_COSINE = 0.3  # of a surface to the ray, below which a pixel mixes patches
+# What a view's colours count as at most, in independent samples; half of that at so many pixels.
+COLOUR_SAMPLES, COLOUR_HALF_SAMPLES_PX = 2.0, 60
+# Standard deviations in logarithms of light: of a view's exposure and white balance from frame to
+# frame, of a camera's gain, and of the light's difference between one side and the other.
+EXPOSURE_SIGMA, GAIN_SIGMA, SHADING_SIGMA = 0.1, 0.15, 0.4
+# The same of measured colours at least: shadows and lamps that are no one side's light change the
+# brightness more than the two ratios.
+COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])
+COLOUR_RANGE = 2.0  # in logarithms of light: white to black paint
+COLOURED_SHARE = 0.5  # of the noise's variance, which that of the surface's colours must exceed
+COLOUR_COST_MAX = 4.5  # three standard deviations: what hides the object, a highlight
+LEARNING_STEPS = 4  # of colours and gains in turns
+LEARNING_FRAMES = 12  # from which colours are learnt, at most, and at least
+LEARNING_FRAMES_MIN = 3
+PAINT_EXPLAINS = 0.5  # share of the colours' variance that the mesh's own must explain to count
+PAINT_LOOKS = 3  # independent ones at the mesh's own colours, however many frames there are
+RIVAL_PROBABILITY = 0.01  # of a pose that colours are asked about
+GAUGES = 3  # poses of one frame to which others may be relative: learnt from each
+SURE_PROBABILITY = 0.8  # of a pose, given that of one frame, from which to learn
+COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
+
 # --- decision: which hypothesis is true (tuned on the studio) -------------------------------------
 
 # Of the motion between frames, standard deviations: a hand that carries something.

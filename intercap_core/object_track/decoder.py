@@ -23,15 +23,18 @@ from intercap_core.object_track.constants import (
 from intercap_core.rigid.mesh import ObjectMesh
 
 NOT_SEEN = -1
+_CERTAIN = 1e4  # nats: far more than all frames say
 
 
 @dataclass(frozen=True)
 class Decoded:
     """``path`` (T,) the index of the most likely hypothesis, :data:`NOT_SEEN` where none is true;
-    ``probability`` [T] of each hypothesis and, last, of none, given all frames."""
+    ``probability`` [T] of each hypothesis and, last, of none, given all frames; ``evidence``, the
+    log-likelihood of all frames, against that the object is in none."""
 
     path: np.ndarray
     probability: list[np.ndarray]
+    evidence: float
 
 
 def decode(emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray]) -> Decoded:
@@ -56,7 +59,29 @@ def decode(emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray]) -> Deco
     path = np.array(chosen[::-1])
     path[path == [len(own) for own in emissions]] = NOT_SEEN
     log = [a + b for a, b in zip(ahead, reversed(behind), strict=True)]
-    return Decoded(path, [np.exp(one - logsumexp(one)) for one in log])
+    return Decoded(path, [np.exp(one - logsumexp(one)) for one in log], float(logsumexp(ahead[-1])))
+
+
+def given(
+    emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], frame: int, state: int
+) -> Decoded:
+    """:func:`decode`, given the state of one frame: one of its hypotheses."""
+    known = list(emissions)
+    known[frame] = np.full(len(known[frame]), -_CERTAIN)
+    known[frame][state] = emissions[frame][state] + _CERTAIN
+    found = decode(known, steps)
+    return Decoded(found.path, found.probability, found.evidence - _CERTAIN)
+
+
+def mixed(found: Sequence[Decoded]) -> Decoded:
+    """What follows from several that exclude each other, by their evidence."""
+    evidence = np.array([one.evidence for one in found])
+    share = np.exp(evidence - logsumexp(evidence))
+    probability = [
+        np.einsum("n,nk->k", share, np.array(every))
+        for every in zip(*(one.probability for one in found), strict=True)
+    ]
+    return Decoded(found[int(share.argmax())].path, probability, float(logsumexp(evidence)))
 
 
 def step_costs(

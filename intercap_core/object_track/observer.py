@@ -29,7 +29,11 @@ from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.paint import Paint
 from intercap_core.rigid.render import Renderer, open_renderer
+
+Pictures = Callable[[int], list[np.ndarray | None]]
+"""Of frame t the views' images (h, w, 3) uint8 BGR, reduced; None where there is none."""
 
 
 @dataclass(eq=False)
@@ -39,7 +43,8 @@ class Observer:
     ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
     labels alone; ``labels`` the classes the object may be given; ``up`` (3,) the vertical;
     ``joints`` (T, K, 3) of the person, NaN unknown, master frame; ``surveyed`` frames in which
-    something was seen that may be the object, the most promising first.
+    something was seen that may be the object, the most promising first; ``pictures`` the colour
+    images, ``paint`` the mesh's own colours, where there are any.
     """
 
     mesh: ObjectMesh
@@ -49,6 +54,8 @@ class Observer:
     labels: tuple[str, ...] = ()
     up: np.ndarray | None = None
     joints: np.ndarray | None = None
+    pictures: Pictures | None = None
+    paint: Paint | None = None
     views: Callable[[int], list[View]] = field(init=False)
     renderer: Renderer = field(init=False)
 

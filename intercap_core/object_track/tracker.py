@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import (
     AMBIGUOUS_PROBABILITY,
     APART_M,
@@ -29,13 +30,14 @@ from intercap_core.object_track.frame_result import FrameResult, flagged
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.mesh_check import mesh_doubts
 from intercap_core.object_track.motion import FOREARMS
-from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.observer import Observer, Pictures
 from intercap_core.object_track.prior import Prior, things
 from intercap_core.object_track.proposals import NotFound, Proposals
 from intercap_core.object_track.search import same_pose
 from intercap_core.object_track.view import View
 from intercap_core.object_track.whole import WholeTrack
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.paint import Paint
 from intercap_core.rigid.twist import step_between
 
 _WRISTS = [wrist for _, wrist in FOREARMS]
@@ -59,7 +61,8 @@ class Tracker:
 
     ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
     labels alone; ``times`` (T,) of the frames, seconds; ``labels`` the classes the object may be
-    given; ``up`` (3,) the vertical; ``joints`` (T, 135, 3) of the person, who handles the object.
+    given; ``up`` (3,) the vertical; ``joints`` (T, 135, 3) of the person, who handles the object;
+    ``pictures`` the views' colour images; ``paint`` the mesh's own colours.
     """
 
     def __init__(
@@ -73,8 +76,12 @@ class Tracker:
         labels: tuple[str, ...],
         up: np.ndarray | None,
         joints: np.ndarray | None = None,
+        pictures: Pictures | None = None,
+        paint: Paint | None = None,
     ) -> None:
-        self._observer = Observer(mesh, load, labels_by_view, settings, labels, up, joints)
+        self._observer = Observer(
+            mesh, load, labels_by_view, settings, labels, up, joints, pictures, paint
+        )
         self._mesh = mesh
         self._times = times
         self._joints = joints
@@ -83,6 +90,9 @@ class Tracker:
         self._prior = Prior(self._observer, self._share)
         self._hypotheses = Hypotheses(self._observer, self._prior, self._share, step)
         self._proposals = Proposals(self._observer, self._hypotheses, self._prior, times, step)
+        self._colours = ColourDecision(self._observer, self._hypotheses, self._share, step)
+        self._emissions: list[np.ndarray] = []
+        self._steps: list[np.ndarray] = []
 
     def run(self, initial: tuple[int, np.ndarray] | None = None) -> Track:
         """Track from an annotated (frame, pose (4, 4)), or from what is searched for.
@@ -99,6 +109,7 @@ class Tracker:
             decoded = self._decode()
         if self._proposals.turn(decoded):
             decoded = self._decode()
+        decoded = self._colours.decide(self._emissions, self._steps, decoded)
         if (decoded.path == NOT_SEEN).all():
             raise NotFound
         frames = self._results(decoded)
@@ -120,7 +131,8 @@ class Tracker:
             step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._carried(t))
             for t, gap in enumerate(np.diff(self._times))
         ]
-        decoded = decode([self._share * weight for weight in weights], steps)
+        self._emissions, self._steps = [self._share * weight for weight in weights], steps
+        decoded = decode(self._emissions, steps)
         for t, k in enumerate(decoded.path):
             if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
                 thing, here = things(fits[t]), self._mesh.centre_at(fits[t][k].pose)

@@ -38,3 +38,4 @@ KEPT_ON_DEVICE = 4  # sets of lenses, and meshes, that stay on the GPU
 
 MAX_DISCRETE = 128  # elements of a symmetry group; the icosahedron's rotation group has 60
 SAME_TRANSFORM = 1e-3  # transforms nearer than this, per entry, are one: tables carry 4 digits
+PAINT_POINTS = 20000  # of a coloured surface: a few in each patch that a camera can tell apart

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,9 +28,13 @@ from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.view import View, ViewGeometry, distances
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.paint import Paint
 from intercap_core.schemas import OBJECT_TRACK, PERSON, SCENE
 
 log = logging.getLogger(__name__)
+
+# By the step of the reduced grid, how many pixels a decoder may join.
+_DECODED_BY: dict[int, Literal[1, 2, 4]] = {2: 2, 4: 4}
 
 
 class ObjectRecording:
@@ -77,6 +82,21 @@ class ObjectRecording:
             depth = self._frames.depth(t, c)
             detected = bool(self._detections.candidates_found[t, c])
             found.append(View.build(geometry, depth, self._masks[t][c], candidates, detected))
+        return found
+
+    def pictures(self, t: int) -> list[np.ndarray | None]:
+        """The colour image (h, w, 3) uint8 BGR of each usable camera at moment t, on its reduced
+        grid; None where there is none that can be read."""
+        found: list[np.ndarray | None] = []
+        for c, geometry in zip(self.cameras, self.geometry, strict=True):
+            reduction = _DECODED_BY.get(geometry.step, 1)
+            try:
+                image = self._frames.colour(t, c, reduction)
+            except UserError as error:
+                log.warning("%s", error)
+                image = None
+            step = geometry.step // reduction
+            found.append(None if image is None else image[::step, ::step])
         return found
 
     def _candidates(self, t: int, c: int) -> list[Candidate]:
@@ -138,6 +158,8 @@ def run(
             labels=object_.labels,
             up=source.up if np.isfinite(source.up).all() else None,
             joints=source.joints,
+            pictures=source.pictures,
+            paint=Paint.load(Path(object_.mesh)),
         )
         try:
             track = tracker.run(_start(initial, recording.num_sets, sequence))

@@ -51,7 +51,7 @@ class Detector:
     @classmethod
     def build(cls, noise: NoiseSource, frames: int) -> Detector:
         """Draw the fixed biases; they are the same in all cameras."""
-        rng = noise.rng("keypoint bias")
+        rng = noise.detector_rng("keypoint bias")
         size = np.empty(135)
         size[BODY] = rng.uniform(*BODY_BIAS_M, 25)
         size[25:67] = rng.uniform(*HAND_BIAS_M, 42)
@@ -74,7 +74,7 @@ class Detector:
         the master frame; ``hidden`` (T, 135) bool: something is in the way.
         """
         noise, scale = self.noise, self.noise.scale
-        rng = noise.rng("keypoints", camera.name)
+        rng = noise.detector_rng("keypoints", camera.name)
         per_metre = self._pixels_per_metre(camera, points)
         biased = points + np.einsum("tij,kj->tki", axes, self.body_bias)
         pose = camera.colour_from_master
@@ -153,9 +153,9 @@ class Detector:
         """People (135, 3) in each frame's file: the subject mostly, sometimes nobody, sometimes a
         bystander who is not there, before or after the subject."""
         noise = self.noise
-        rng = noise.rng("people", camera.name)
+        rng = noise.detector_rng("people", camera.name)
         one = np.ones((self.frames, 1))
-        shared = noise.rng("people")
+        shared = noise.detector_rng("people")
         common = noise.process(shared, self.frames, 1, MISS_S)[:, 0]
         missed = noise.episodes(rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.3)[:, 0]
         common = noise.process(shared, self.frames, 1, BYSTANDER_S)[:, 0]

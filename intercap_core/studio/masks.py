@@ -70,7 +70,7 @@ class Segmenter:
     def __init__(self, noise: NoiseSource, frames: int, object_name: str) -> None:
         self.noise, self.frames = noise, frames
         self.label = LABELS.get(object_name, object_name)
-        shared = noise.rng("masks")
+        shared = noise.detector_rng("masks")
         self._shared = {
             name: noise.process(shared, frames, 1, shared.uniform(*EPISODE_S))[:, 0]
             for name in ("label", "miss", "merge", "split", "person")
@@ -94,7 +94,7 @@ class CameraMasks:
     ) -> None:
         noise, frames = network.noise, network.frames
         self.network, self.noise, self.size = network, noise, size
-        self._rng = rng = noise.rng("masks", name)
+        self._rng = rng = noise.detector_rng("masks", name)
         one = np.ones((frames, 1))
 
         def episodes(kind: str, probability: float) -> np.ndarray:
@@ -159,7 +159,7 @@ class CameraMasks:
         for k, (label, rle) in enumerate(self._standing(truth)):
             if self._clutter_on[t, k] and coco.area(rle):
                 found.append((label, rle, score[4 + k] - 0.08))
-        order = self.noise.rng("mask order", t, truth.x0, truth.y0).permutation(len(found))
+        order = self.noise.detector_rng("mask order", t, truth.x0, truth.y0).permutation(len(found))
         return [self._result(*found[i]) for i in order]
 
     def _standing(self, truth: Labels) -> list[tuple[str, dict[str, Any]]]:

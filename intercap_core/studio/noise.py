@@ -30,10 +30,15 @@ class NoiseSource:
     scale: float
     family: str
     fps: float
+    redrawn: int = 0
 
     def rng(self, *name: object) -> np.random.Generator:
         """A generator of its own for what ``name`` says."""
         return np.random.default_rng([self.seed, zlib.crc32(repr(name).encode())])
+
+    def detector_rng(self, *name: object) -> np.random.Generator:
+        """The same for the errors of detectors, which ``redrawn`` draws anew."""
+        return self.rng(*name, self.redrawn) if self.redrawn else self.rng(*name)
 
     def process(
         self,

@@ -63,7 +63,13 @@ class Stage:
         self.depth_mode, self.has_depth = settings.depth_mode, capture.depth
         self.frames, self.fps = capture.frames, settings.fps
         self.duration = capture.frames / settings.fps
-        self.noise = NoiseSource(capture.seed, settings.noise, settings.noise_family, settings.fps)
+        self.noise = NoiseSource(
+            capture.seed,
+            settings.noise,
+            settings.noise_family,
+            settings.fps,
+            capture.redrawn_detections,
+        )
         self.subject = Subject.load(capture.subject)
         self.puppet = Puppet(self.subject)
         vertices, faces, colours = true_mesh(entry, capture.seed)

@@ -1,0 +1,63 @@
+"""Colours that a mesh file brings."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from intercap_core.rigid.paint import Paint
+
+
+def test_colours_of_vertices(tmp_path):
+    box = trimesh.creation.box((0.2, 0.2, 0.2)).subdivide().subdivide()
+    red = box.vertices[:, 0] > 0
+    colours = np.where(red[:, None], (200, 20, 20, 255), (20, 20, 200, 255)).astype(np.uint8)
+    box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=colours)
+    box.export(tmp_path / "box.ply")
+    paint = Paint.load(tmp_path / "box.ply")
+    assert paint is not None and np.linalg.norm(paint.normals, axis=1) == pytest.approx(1)
+    right, left = paint.points[:, 0] > 0.06, paint.points[:, 0] < -0.06
+    assert (paint.colours[right] == (200, 20, 20)).all()
+    assert (paint.colours[left] == (20, 20, 200)).all()
+    again = Paint.load(tmp_path / "box.ply")
+    assert np.array_equal(paint.colours, again.colours) and np.array_equal(
+        paint.points, again.points
+    )
+
+
+def test_a_texture_is_finer_than_its_mesh(tmp_path):
+    """Two triangles, of which a texture of four fields shows more than their corners do."""
+    fields = np.zeros((64, 64, 3), np.uint8)
+    fields[:32, :32], fields[:32, 32:] = (250, 0, 0), (0, 250, 0)
+    fields[32:, :32], fields[32:, 32:] = (0, 0, 250), (250, 250, 0)
+    Image.fromarray(fields).save(tmp_path / "fields.png")
+    (tmp_path / "sheet.mtl").write_text("newmtl a\nmap_Kd fields.png\n")
+    (tmp_path / "sheet.obj").write_text(
+        "mtllib sheet.mtl\nusemtl a\n"
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+        "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+    )
+    paint = Paint.load(tmp_path / "sheet.obj")
+    assert paint is not None
+    x, y = paint.points[:, 0], paint.points[:, 1]
+    corner = (x < 0.45) & (y > 0.55)  # the first rows of an image are at the top
+    assert (paint.colours[corner] == (250, 0, 0)).all()
+    assert (paint.colours[(x > 0.55) & (y < 0.45)] == (250, 250, 0)).all()
+
+
+def test_no_colours_and_one_colour_are_none(tmp_path):
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    box.export(tmp_path / "bare.obj", include_normals=False)
+    assert Paint.load(tmp_path / "bare.obj") is None
+    box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=[90, 90, 90, 255])
+    box.export(tmp_path / "grey.ply")
+    assert Paint.load(tmp_path / "grey.ply") is None
+
+
+def test_a_texture_that_is_not_there_is_none(tmp_path):
+    (tmp_path / "sheet.mtl").write_text("newmtl a\nmap_Kd missing.png\n")
+    (tmp_path / "sheet.obj").write_text(
+        "mtllib sheet.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
+        "f 1/1 2/2 3/3\n"
+    )
+    assert Paint.load(tmp_path / "sheet.obj") is None
