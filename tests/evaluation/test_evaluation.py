@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from intercap_core.evaluation import objects as object_evaluation
 from intercap_core.evaluation.captures import flat as capture_figures
 from intercap_core.evaluation.captures import print_captures
 from intercap_core.evaluation.evaluate import QUICK_SETTINGS
-from intercap_core.evaluation.objects import print_objects
+from intercap_core.evaluation.objects import lost_by_draw, print_objects
 from intercap_core.evaluation.part import Measured, require_truth
 from intercap_core.metrics.body_clouds import CLOUD_KEYS
 from intercap_core.metrics.body_errors import BodyErrors
@@ -34,7 +36,8 @@ def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
         rooms = [entry.room for entry in studio.captures.values()]
         assert {"furnished", "bare"} == set(rooms)
         seeds += [entry.seed for entry in studio.captures.values()]
-    objects = [path for path in OBJECT_SETTINGS if path.stem != "no_detector"]
+    of_config = ("no_detector", "redrawn_1", "redrawn_2")
+    objects = [path for path in OBJECT_SETTINGS if path.stem not in of_config]
     others = [
         Path(f"config/{other}/config.yaml") for other in ("demo", "test", "bench", "evaluation")
     ]
@@ -55,6 +58,36 @@ def test_all_objects_are_evaluated_with_and_without_a_detector() -> None:
     assert [row.recordings for row in without.sequences.values()] == [
         row.recordings for row in project.sequences.values()
     ]
+
+
+def test_detections_are_drawn_anew_of_the_same_recordings() -> None:
+    one, *others = (
+        load_project(Path(f"config/object/{name}.yaml"))
+        for name in ("config", "redrawn_1", "redrawn_2")
+    )
+    for number, other in enumerate(others, 1):
+        for name, capture in other.config.studio.captures.items():
+            first = one.config.studio.captures[name]
+            assert capture == first.model_copy(update={"redrawn_detections": number})
+        assert list(other.sequences) == list(one.sequences)
+
+
+def test_the_spread_of_what_is_lost_is_by_object() -> None:
+    def measured(dataset: str, shares: dict[str, float]) -> Any:
+        errors = [
+            SimpleNamespace(object_=name, lost=np.arange(100) < 100 * share)
+            for name, share in shares.items()
+        ]
+        return SimpleNamespace(dataset=dataset, errors=errors)
+
+    draws = [
+        measured("object", {"cup": 0.3, "chair": 0.0}),
+        measured("object_noise2", {"cup": 0.9}),
+        measured("object_redrawn1", {"cup": 0.04, "chair": 0.0}),
+        measured("object_redrawn2", {"cup": 0.1, "chair": 0.02}),
+    ]
+    assert lost_by_draw(draws) == {"cup": [0.3, 0.04, 0.1], "chair": [0.0, 0.0, 0.02]}
+    assert lost_by_draw(draws[:2]) == {}
 
 
 def test_captures_without_truth_cannot_be_evaluated() -> None:

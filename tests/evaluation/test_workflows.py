@@ -38,7 +38,7 @@ def test_projects_wait_for_those_that_make_their_recordings(
 ) -> None:
     orders = orders_of(wanted, _frames(wanted))
     by_name = {order.project.config.dataset: order for order in orders}
-    assert len(orders) == len(by_name) == 1 + 3 + 5 + 7
+    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7
     assert orders[0] is by_name["object"]  # what most wait for comes first
     assert by_name["object"].stages == [objects.PART.stage, bodies.PART.stage]
     for name in ("object_no_detector", "body_two_view"):
@@ -53,7 +53,8 @@ def test_each_part_is_expected_to_keep_to_its_budget(
     minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
     for part in PARTS:
         assert minutes[f"{part}_minutes_expected"] <= minutes[f"{part}_minutes_budget"]
-    assert sum(budget.BUDGET_MINUTES[part] for part in PARTS) <= 75
+    added_later = 11  # detections drawn anew
+    assert sum(budget.BUDGET_MINUTES[part] for part in PARTS) <= 75 + added_later < 120
 
 
 def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:

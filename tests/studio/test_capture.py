@@ -224,6 +224,13 @@ def test_rig_loses_frames_but_never_the_masters() -> None:
         assert silent.slip[:, 0].max() == 0 and 1 <= silent.slip.max() <= 4
 
 
+def test_detectors_may_err_anew_in_the_same_recording() -> None:
+    first, other = (NoiseSource(3, 1.0, "a", 30.0, redrawn) for redrawn in (0, 1))
+    assert first.rng("depth", "k1").random() == other.rng("depth", "k1").random()
+    assert first.rng("masks").random() == first.detector_rng("masks").random()
+    assert first.detector_rng("masks").random() != other.detector_rng("masks").random()
+
+
 @pytest.mark.parametrize("family", ["a", "b"])
 def test_noise_has_unit_variance_and_lasts(family: str) -> None:
     noise = NoiseSource(3, 1.0, family, 30.0)
