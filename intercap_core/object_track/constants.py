@@ -360,11 +360,11 @@ TOLD_SHARE = 0.5  # of the frames, from which a track's faults are told
 # --- decision: rests and outliers of the track ---------------------------------------------------
 
 # Costs, as minus log-likelihoods: of one observation's own pose (six numbers, each to be told from
-# noise), of a frame without evidence, and of one more rest (its pose and where it begins and ends).
-# Tuned on the studio.
+# noise), of a frame without evidence, and of one more rest (its pose and where it begins and ends);
+# of one that the recording's begin or end cuts, of which one end is known. Tuned on the studio.
 MOVING_COST = 9.0
 UNSEEN_MOVING_COST = 1.0
-REST_COST = 8.0
+REST_COST, CUT_REST_COST = 8.0, 5.0
 REST_MAX_DISTANCE = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away no rest is tested
 # Bounds of the measured variance of resting estimates, times the stated one. Tuned on the studio.
 REST_VARIANCE_BOUNDS = (0.5, 2.0)

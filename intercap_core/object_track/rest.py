@@ -15,6 +15,7 @@ from intercap_core.object_track.constants import (
     BLIP_APART_SQUARED,
     BLIP_FRAMES,
     BLIP_SAME_SQUARED,
+    CUT_REST_COST,
     ERROR_LASTING_S,
     MAX_REST_FRAMES,
     MIN_REST_S,
@@ -83,8 +84,10 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        cost = best_move[a] + REST_COST + 0.5 * weight * spread
-        better = (cost < best_rest[ends]) & (ends - a >= shortest)
+        cut = (a == 0) | (ends == count)  # the recording shows a part of this rest
+        cost = best_move[a] + np.where(cut, CUT_REST_COST, REST_COST) + 0.5 * weight * spread
+        least = np.where(cut, (shortest + 1) // 2, shortest)
+        better = (cost < best_rest[ends]) & (ends - a >= least)
         best_rest[ends[better]] = cost[better]
         began[ends[better]] = a
         residual[ends[better]] = spread[better]
