@@ -19,7 +19,9 @@ Files in the order of a run:
 7. From frame to frame: ``hypotheses`` follows fits through time, each from where ``motion`` expects
    it; ``proposals`` says where else to look (a search, an annotation, ``turns`` of a nearly
    symmetric object); ``decoder`` decides over all frames; ``tracker`` (Tracker) runs all of it.
-8. All frames together: ``whole`` asks ``rest`` for when the object is at rest and ``smooth`` for
+8. Turns that stay open: ``appearance`` learns the colours of the surface's patches
+   (``surface_kernel``), ``colour_decision`` asks them.
+9. All frames together: ``whole`` asks ``rest`` for when the object is at rest and ``smooth`` for
    the most probable track and its covariance. ``frame_result`` has the flags.
 
 ``constants`` has the numbers of all of them. Poses are master_from_object, metres. How good a pose
