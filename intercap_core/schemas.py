@@ -184,6 +184,7 @@ OBJECT_TRACK = Schema(
         "covariance": Field(("T", "6", "6"), "float64", "of (rotation vector, translation), rotation applied on the left", "rad, m", "master"),
         "spread": Field(("T", "6", "6"), "float64", "the part of covariance that other possible poses add: without it, what the images say near this one", "rad, m", "master"),
         "lost": Field(("T",), "bool", "the tracker does not believe its pose"),
+        "gone": Field(("T",), "bool", "lost, and for so long that the object seems to have left the room"),
         "recovered": Field(("T",), "bool", "first frame that is not lost after lost ones"),
         "probability": Field(("T",), "float32", "of the pose, among all that were found, given all frames"),
         "ambiguous": Field(("T",), "bool", "a quite different pose may be the true one, by images and motion of all frames"),

@@ -9,12 +9,14 @@ what follows from each counts by its evidence. Colours that the mesh brings have
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from intercap_core.object_track.appearance import LIGHT, Appearance, Sighting
 from intercap_core.object_track.candidates import choose
 from intercap_core.object_track.constants import (
+    ABSENT_LOG_RATIO,
     ASSESS_MIN_OVERLAP,
     COLOUR_EVERY_S,
     ERROR_LASTING_S,
@@ -64,8 +66,9 @@ class ColourDecision:
         if self._observer.pictures is None or not sure[first]:
             return decoded
         own = decoded.probability[first][:-1]
+        absent = self._share * ABSENT_LOG_RATIO
         gauges = [k for k in np.argsort(-own)[:GAUGES] if own[k] > RIVAL_PROBABILITY]
-        relative = {int(k): given(emissions, steps, first, int(k)) for k in gauges}
+        relative = {int(k): given(emissions, steps, first, int(k), absent) for k in gauges}
         is_open = any(self._open(one) for one in relative.values())
         if not is_open and (self._observer.paint is None or len(gauges) == 1):
             return decoded
@@ -76,8 +79,8 @@ class ColourDecision:
                 return decoded
             evidence = self._painted(learnt)
             values = self._added(emissions, learnt, one)
-            again = given(values, steps, first, k)
-            found.append(Decoded(again.path, again.probability, again.evidence + evidence))
+            again = given(values, steps, first, k, absent)
+            found.append(replace(again, evidence=again.evidence + evidence))
         return mixed(found)
 
     def _open(self, decoded: Decoded) -> dict[int, np.ndarray]:

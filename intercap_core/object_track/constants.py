@@ -267,8 +267,11 @@ COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
 # Of the motion between frames, standard deviations: a hand that carries something.
 MOVING_M_S, MOVING_TURN_RAD_S = 2.5, 7.0
 # Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
-# its coming back.
-JUMP_COST, VANISH_COST, APPEAR_COST = 10.0, 4.0, 4.0
+# its coming back; of its leaving the room, or coming back to it, in addition.
+JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 4.0, 4.0, 4.0
+# Nats of one independent observation by which it is less likely to be hidden from all cameras than
+# to be gone: it is gone if it is not seen for 2.4 s.
+ABSENT_LOG_RATIO = 1.0
 # Nats that the images of one frame say for a pose: from which it is seen; from which it is good
 # enough to start from or to stop a search; below which it is no hypothesis.
 SEEN_LOG_RATIO, SEED_SURE_LOG_RATIO, CONTRADICTED_LOG_RATIO = 3.0, 40.0, -6.0
@@ -282,6 +285,7 @@ APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite diffe
 # Probabilities: of no hypothesis, from which a frame is lost; of quite different ones, from which
 # it is ambiguous; of the chosen one, below which more is looked for.
 LOST_PROBABILITY, AMBIGUOUS_PROBABILITY, DOUBTFUL_PROBABILITY = 0.5, 0.35, 0.9
+GONE_PROBABILITY = 0.5  # of having left, from which a lost frame is told as such
 # Of the usual nats, below which more is looked for near a pose, and elsewhere too.
 DOUBTFUL_SHARE, HIDDEN_SHARE = 0.5, 0.25
 

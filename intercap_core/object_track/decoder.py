@@ -1,14 +1,14 @@
 """Which hypothesis is true in every frame: a hidden Markov model over all frames.
 
-The states of a frame are its hypotheses and, last, that none of them is true: the object is not
-seen. Probabilities come from the forward-backward algorithm, the most likely sequence from that of
-Viterbi (Rabiner, Proceedings of the IEEE 77(2), 1989).
+The states of a frame are its hypotheses and, last, that none of them is true: the object is hidden,
+or it has left. Probabilities come from the forward-backward algorithm, the most likely sequence
+from that of Viterbi (Rabiner, Proceedings of the IEEE 77(2), 1989).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -16,6 +16,7 @@ from scipy.special import logsumexp
 from intercap_core.object_track.constants import (
     APPEAR_COST,
     JUMP_COST,
+    LEAVE_COST,
     MOVING_M_S,
     MOVING_TURN_RAD_S,
     VANISH_COST,
@@ -29,48 +30,77 @@ _CERTAIN = 1e4  # nats: far more than all frames say
 @dataclass(frozen=True)
 class Decoded:
     """``path`` (T,) the index of the most likely hypothesis, :data:`NOT_SEEN` where none is true;
-    ``probability`` [T] of each hypothesis and, last, of none, given all frames; ``evidence``, the
-    log-likelihood of all frames, against that the object is in none."""
+    ``probability`` [T] of each hypothesis and, last, of none, given all frames; ``gone`` (T,), of
+    the object having left; ``evidence``, the log-likelihood of all frames, against that it is in
+    none."""
 
     path: np.ndarray
     probability: list[np.ndarray]
+    gone: np.ndarray
     evidence: float
 
 
-def decode(emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray]) -> Decoded:
+def decode(
+    emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], absent: float = 0.0
+) -> Decoded:
     """The model's states of T frames.
 
     ``emissions`` [T] (K_t,) log-likelihoods of the hypotheses, against that none is true; ``steps``
-    [T - 1] (K_t + 1, K_t+1 + 1) log-probabilities of going from one state to the next.
+    [T - 1] (K_t + 1, K_t+1 + 1) log-probabilities of going from one state to the next. Where none
+    is true the object is hidden, or it has left, which costs more at either end and ``absent`` nats
+    a frame less: what is in the room is seldom hidden from all cameras for long.
     """
-    values = [np.append(own, 0.0) for own in emissions]
+    values = [np.append(own, [0.0, absent]) for own in emissions]
+    values[0][-1] -= LEAVE_COST
+    ways = [_with_leaving(step) for step in steps]
     best, ahead, came = [values[0]], [values[0]], []
-    for step, value in zip(steps, values[1:], strict=True):
+    for step, value in zip(ways, values[1:], strict=True):
         reach = best[-1][:, None] + step
         came.append(reach.argmax(0))
         best.append(reach.max(0) + value)
         ahead.append(logsumexp(ahead[-1][:, None] + step, axis=0) + value)
     behind = [np.zeros(len(values[-1]))]
-    for step, value in zip(reversed(steps), reversed(values[1:]), strict=True):
+    for step, value in zip(reversed(ways), reversed(values[1:]), strict=True):
         behind.append(logsumexp(step + (behind[-1] + value), axis=1))
     chosen = [int(best[-1].argmax())]
     for back in reversed(came):
         chosen.append(int(back[chosen[-1]]))
     path = np.array(chosen[::-1])
-    path[path == [len(own) for own in emissions]] = NOT_SEEN
+    path[path >= [len(own) for own in emissions]] = NOT_SEEN
     log = [a + b for a, b in zip(ahead, reversed(behind), strict=True)]
-    return Decoded(path, [np.exp(one - logsumexp(one)) for one in log], float(logsumexp(ahead[-1])))
+    shares = [np.exp(one - logsumexp(one)) for one in log]
+    return Decoded(
+        path,
+        [np.append(own[:-2], own[-2] + own[-1]) for own in shares],
+        np.array([own[-1] for own in shares]),
+        float(logsumexp(ahead[-1])),
+    )
+
+
+def _with_leaving(step: np.ndarray) -> np.ndarray:
+    """Log-probabilities (K + 2, L + 2) with "gone" as one more state, from those without it."""
+    count, following = step.shape
+    ways = np.empty((count + 1, following + 1))
+    ways[:-1, :-1] = step
+    ways[:-1, -1] = step[:, -1] - LEAVE_COST
+    ways[-1, :-1] = step[-1] - LEAVE_COST
+    ways[-1, -1] = 0.0
+    return ways
 
 
 def given(
-    emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], frame: int, state: int
+    emissions: Sequence[np.ndarray],
+    steps: Sequence[np.ndarray],
+    frame: int,
+    state: int,
+    absent: float = 0.0,
 ) -> Decoded:
     """:func:`decode`, given the state of one frame: one of its hypotheses."""
     known = list(emissions)
     known[frame] = np.full(len(known[frame]), -_CERTAIN)
     known[frame][state] = emissions[frame][state] + _CERTAIN
-    found = decode(known, steps)
-    return Decoded(found.path, found.probability, found.evidence - _CERTAIN)
+    found = decode(known, steps, absent)
+    return replace(found, evidence=found.evidence - _CERTAIN)
 
 
 def mixed(found: Sequence[Decoded]) -> Decoded:
@@ -81,7 +111,9 @@ def mixed(found: Sequence[Decoded]) -> Decoded:
         np.einsum("n,nk->k", share, np.array(every))
         for every in zip(*(one.probability for one in found), strict=True)
     ]
-    return Decoded(found[int(share.argmax())].path, probability, float(logsumexp(evidence)))
+    gone = share @ np.array([one.gone for one in found])
+    path = found[int(share.argmax())].path
+    return Decoded(path, probability, gone, float(logsumexp(evidence)))
 
 
 def step_costs(

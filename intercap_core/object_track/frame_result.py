@@ -15,7 +15,8 @@ from intercap_core.rigid.mesh import ObjectMesh
 class FrameResult:
     """One frame of the track.
 
-    ``lost``: none of the hypotheses is believed; ``ambiguous``: a quite different pose may be the
+    ``lost``: none of the hypotheses is believed; ``gone``: it has left the room, by all frames;
+    ``ambiguous``: a quite different pose may be the
     true one; ``probability`` of the pose's hypothesis given all frames; ``spread`` (6, 6), the
     covariance of (turn on the left, shift) that the other hypotheses add to the fit's;
     ``recovered``: the first frame that is not lost after lost ones; ``free_axis`` (3,), master
@@ -25,6 +26,7 @@ class FrameResult:
 
     fit: Fit
     lost: bool
+    gone: bool = False
     ambiguous: bool = False
     probability: float = 1.0
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))

@@ -84,7 +84,8 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        cut = (a == 0) | (ends == count)  # the recording shows a part of this rest
+        # too short for a rest, but the recording may show a part of one alone
+        cut = (ends - a < shortest) & ((a == 0) | (ends == count))
         cost = best_move[a] + np.where(cut, CUT_REST_COST, REST_COST) + 0.5 * weight * spread
         least = np.where(cut, (shortest + 1) // 2, shortest)
         better = (cost < best_rest[ends]) & (ends - a >= least)

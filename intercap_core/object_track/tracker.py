@@ -15,11 +15,13 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import (
+    ABSENT_LOG_RATIO,
     AMBIGUOUS_PROBABILITY,
     APART_M,
     APART_RAD,
     DOUBTFUL_PROBABILITY,
     ERROR_LASTING_S,
+    GONE_PROBABILITY,
     LOST_PROBABILITY,
     ROUNDS,
     SEARCH_GOOD_LOG_RATIO,
@@ -132,7 +134,7 @@ class Tracker:
             for t, gap in enumerate(np.diff(self._times))
         ]
         self._emissions, self._steps = [self._share * weight for weight in weights], steps
-        decoded = decode(self._emissions, steps)
+        decoded = decode(self._emissions, steps, self._share * ABSENT_LOG_RATIO)
         for t, k in enumerate(decoded.path):
             if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
                 thing, here = things(fits[t]), self._mesh.centre_at(fits[t][k].pose)
@@ -158,7 +160,8 @@ class Tracker:
         for t, (own, k) in enumerate(zip(self._hypotheses.fits, decoded.path, strict=True)):
             probability = decoded.probability[t]
             if k == NOT_SEEN:
-                result.append(FrameResult(self._guess(t), True, probability=0.0))
+                gone = bool(decoded.gone[t] > GONE_PROBABILITY)
+                result.append(FrameResult(self._guess(t), True, gone=gone, probability=0.0))
                 continue
             symmetry, pose = self._mesh.symmetry, own[k].pose
             poses = np.array([symmetry.nearest_equivalent_pose(fit.pose, pose) for fit in own])

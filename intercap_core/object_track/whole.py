@@ -53,6 +53,7 @@ class WholeTrack:
                 frame,
                 fit=fit,
                 lost=bool(guess) and fit.log_ratio < SEEN_LOG_RATIO,
+                gone=frame.gone and fit.log_ratio < SEEN_LOG_RATIO,
                 resting=bool(number >= 0),
                 free_axis=axis,
             )

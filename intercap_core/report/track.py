@@ -39,6 +39,7 @@ TRACK_STATES = {
     "resting": "at rest",
     "doubtful": "another pose may be the true one",
     "lost": "lost",
+    "gone": "not seen for so long that it seems to have left",
 }
 
 
@@ -92,7 +93,7 @@ def read_track(
             overlap=track["overlap"],
             depth=track["depth_residual"],
             contour=track["silhouette_residual"],
-            state=_states(track["lost"], track["ambiguous"], track["resting"]),
+            state=_states(track["gone"], track["lost"], track["ambiguous"], track["resting"]),
             sigma_mm=1e3 * _largest(covariance[:, 3:, 3:]),
             sigma_deg=np.degrees(_largest(covariance[:, :3, :3])),
             recovered=np.flatnonzero(track["recovered"]).tolist(),
@@ -155,10 +156,12 @@ def context(facts: TrackFacts) -> dict[str, Any]:
     }
 
 
-def _states(lost: np.ndarray, doubtful: np.ndarray, resting: np.ndarray) -> list[str]:
+def _states(
+    gone: np.ndarray, lost: np.ndarray, doubtful: np.ndarray, resting: np.ndarray
+) -> list[str]:
     return [
-        "lost" if a else "doubtful" if b else "resting" if c else "moving"
-        for a, b, c in zip(lost, doubtful, resting, strict=True)
+        "gone" if g else "lost" if a else "doubtful" if b else "resting" if c else "moving"
+        for g, a, b, c in zip(gone, lost, doubtful, resting, strict=True)
     ]
 
 
@@ -168,7 +171,9 @@ def _grade(overlap: float) -> str:
 
 def _counted(facts: TrackFacts) -> str:
     parts = [
-        f"{n} {word}" for word in ("lost", "doubtful", "resting") if (n := facts.state.count(word))
+        f"{n} {word}"
+        for word in ("gone", "lost", "doubtful", "resting")
+        if (n := facts.state.count(word))
     ]
     return " · ".join(parts) or "no frame in doubt"
 

@@ -214,6 +214,7 @@ def _tell(track: Track, sequence: str) -> None:
     """What whoever runs the stage should know of a track that is not sound."""
     count = len(track.frames)
     lost = sum(frame.lost for frame in track.frames)
+    gone = sum(frame.gone for frame in track.frames)
     doubtful = sum(frame.ambiguous for frame in track.frames)
     if not track.borne_out:
         log.warning(
@@ -221,6 +222,14 @@ def _tell(track: Track, sequence: str) -> None:
             "at); check its frame and pose",
             sequence,
             track.seed_frame,
+        )
+    if gone:
+        log.warning(
+            "sequence %s: in %d of %d frames no camera shows the object for so long that it seems "
+            "to have left; if it was there, check the candidates, or annotate 'object_pose'",
+            sequence,
+            gone,
+            count,
         )
     if lost > TOLD_SHARE * count:
         log.warning(
@@ -264,6 +273,7 @@ def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndar
         "covariance": np.array([frame.fit.covariance + frame.spread for frame in track.frames]),
         "spread": np.array([frame.spread for frame in track.frames]),
         "lost": np.array([frame.lost for frame in track.frames]),
+        "gone": np.array([frame.gone for frame in track.frames]),
         "recovered": np.array([frame.recovered for frame in track.frames]),
         "probability": np.array([frame.probability for frame in track.frames], np.float32),
         "ambiguous": np.array([frame.ambiguous for frame in track.frames]),

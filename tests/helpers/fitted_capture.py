@@ -329,7 +329,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("covariance", np.repeat(np.eye(6)[None] * 0.004**2, total, 0))
         writer.put("lost", lost)
         writer.put("recovered", np.zeros(total, bool))
-        for key in ("ambiguous", "resting"):
+        for key in ("ambiguous", "resting", "gone"):
             writer.put(key, np.zeros(total, bool))
         writer.put("probability", np.ones(total))
         writer.put("spread", np.zeros((total, 6, 6)))

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.object_track.constants import JUMP_COST
+from intercap_core.object_track.constants import (
+    ABSENT_LOG_RATIO,
+    ERROR_LASTING_S,
+    JUMP_COST,
+    LEAVE_COST,
+)
 from intercap_core.object_track.decoder import NOT_SEEN, decode, step_costs
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.rigid.conftest import catalogue
@@ -34,28 +39,40 @@ def test_it_is_the_sum_over_all_sequences() -> None:
     counts = [2, 0, 3, 1]
     emissions = [rng.normal(size=n) for n in counts]
     steps = [rng.normal(size=(a + 1, b + 1)) for a, b in pairwise(counts)]
-    found = decode(emissions, steps)
-    values = [np.append(own, 0.0) for own in emissions]
-    likely, shares = {}, [np.zeros(n + 1) for n in counts]
-    for states in product(*(range(n + 1) for n in counts)):
+    found = decode(emissions, steps, 0.3)
+    values = [np.append(own, [0.0, 0.3]) for own in emissions]  # hypotheses, hidden, gone
+    likely, shares = {}, [np.zeros(n + 2) for n in counts]
+    for states in product(*(range(n + 2) for n in counts)):
         log = sum(values[t][s] for t, s in enumerate(states))
-        log += sum(steps[t][states[t], states[t + 1]] for t in range(len(steps)))
+        log -= LEAVE_COST * (states[0] == counts[0] + 1)
+        for t, step in enumerate(steps):
+            gone = [states[u] == counts[u] + 1 for u in (t, t + 1)]
+            if not all(gone):
+                log += step[min(states[t], counts[t]), min(states[t + 1], counts[t + 1])]
+                log -= LEAVE_COST * any(gone)
         likely[states] = log
         for t, s in enumerate(states):
             shares[t][s] += np.exp(log)
     best = max(likely, key=lambda states: likely[states])
-    expected = [NOT_SEEN if s == n else s for s, n in zip(best, counts, strict=True)]
+    expected = [NOT_SEEN if s >= n else s for s, n in zip(best, counts, strict=True)]
     assert found.path.tolist() == expected
-    for own, share in zip(found.probability, shares, strict=True):
-        np.testing.assert_allclose(own, share / share.sum(), rtol=1e-10)
+    for t, share in enumerate(shares):
+        own = share / share.sum()
+        np.testing.assert_allclose(found.probability[t][:-1], own[:-2], rtol=1e-10)
+        np.testing.assert_allclose(found.probability[t][-1], own[-2:].sum(), rtol=1e-10)
+        np.testing.assert_allclose(found.gone[t], own[-1], rtol=1e-10)
+    total = sum(np.exp(log) for log in likely.values())
+    assert found.evidence == pytest.approx(np.log(total))
 
 
 def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
     found = decode([np.array([2.0, 1.0])], [])
     assert found.path.tolist() == [0]
-    assert found.probability[0] == pytest.approx(np.exp([2, 1, 0]) / np.exp([2, 1, 0]).sum())
+    weights = np.array([np.exp(2), np.exp(1), 1 + np.exp(-LEAVE_COST)])
+    assert found.probability[0] == pytest.approx(weights / weights.sum())
     nothing = decode([np.zeros(0)] * 3, [np.zeros((1, 1))] * 2)
-    assert (nothing.path == NOT_SEEN).all() and all(p == [1.0] for p in nothing.probability)
+    assert (nothing.path == NOT_SEEN).all()
+    assert all(p == pytest.approx([1.0], abs=1e-12) for p in nothing.probability)
 
 
 def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: ObjectMesh) -> None:
@@ -77,6 +94,22 @@ def test_a_hand_carries_it_and_nothing_else_moves_so_far(cup: ObjectMesh) -> Non
     assert costs[0] == 0 and -0.1 < costs[1] < 0 and costs[2] == -JUMP_COST
     carried = step_costs(cup, here, there, 1 / 15, np.array([[1.0, 0.0, 0.0]]))[0]
     assert carried[0] == 0 and carried[2] == pytest.approx(0)
+
+
+def test_what_is_not_seen_for_a_second_is_hidden_and_for_long_has_left(cup: ObjectMesh) -> None:
+    here = poses_of([0.0])
+
+    def after(seconds: float) -> tuple[list[int], float]:
+        unseen = round(15 * seconds)
+        poses = [here] * 9 + [here[:0]] * unseen + [here] * 9
+        emissions = [np.full(len(own), 4.0) for own in poses]
+        steps = [step_costs(cup, a, b, 1 / 15, NO_HAND) for a, b in pairwise(poses)]
+        found = decode(emissions, steps, ABSENT_LOG_RATIO * 1 / 15 / ERROR_LASTING_S)
+        assert (found.path[9:-9] == NOT_SEEN).all() and (found.path[:9] == 0).all()
+        return found.path.tolist(), float(found.gone[9 + unseen // 2])
+
+    assert after(1.0)[1] < 0.2
+    assert after(5.0)[1] > 0.9
 
 
 def test_what_a_symmetry_hides_is_no_motion() -> None:
