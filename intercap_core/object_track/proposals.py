@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.constants import (
     ANNOTATION_FRAMES,
@@ -206,18 +205,14 @@ class Proposals:
     def turn(self, decoded: Decoded) -> bool:
         """Follow turns of a nearly symmetric object from where they look as likely; whether one is
         new."""
-        turns = near_turns(self._observer.mesh, self._observer.field)[1:]
-        # a spin slides by a little in any frame, and by a lot in few
-        small = turns[Rotation.from_matrix(turns[:, :3, :3]).magnitude() < NEAR_TURN_SEARCH_RAD]
+        turns = near_turns(self._observer.mesh, self._observer.field)
         fits, new = self._hypotheses.fits, False
-        every = max(1, round(KEY_FRAME_S / self._step_s))
-        for t in range(len(fits)):
+        for t in range(0, len(fits), max(1, round(KEY_FRAME_S / self._step_s))):
             k = decoded.path[t]
-            tried = small if t % every else turns
-            if k == NOT_SEEN or not len(tried):
+            if k == NOT_SEEN or len(turns) == 1:
                 continue
             own = fits[t][k]
-            found = self._observer.assess_all(t, own.pose @ tried)
+            found = self._observer.assess_all(t, own.pose @ turns[1:])
             found = [one for one in found if one.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
             found.sort(key=lambda one: -one.log_ratio)
             for other in found[:TURNS_FOLLOWED]:
