@@ -188,7 +188,7 @@ UNSEEN_S = 0.8  # seconds that an object is followed without being seen
 MAX_HYPOTHESES = 6  # of a frame
 TURNS_FOLLOWED = 2  # of a key frame
 ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
-SURVEYED_FRAMES = 8  # looked at before tracking, spread over the recording
+SURVEYED_FRAMES = 12  # looked at before tracking, spread over the recording
 SURVEYED_GROUPS = 6  # groups of candidates in each of them
 KEY_FRAME_S = 0.2  # seconds between the frames in which turns are compared
 NEAR_TURN_STEPS = 12  # angles of a full turn that are tried for a near symmetry
@@ -269,6 +269,10 @@ MOVING_M_S, MOVING_TURN_RAD_S = 2.5, 7.0
 # Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
 # its coming back; of its leaving the room, or coming back to it, in addition.
 JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 4.0, 4.0, 4.0
+# Of going where it cannot be reached between two sure frames, and of coming back: chance clutter is
+# anywhere in a room, of which what can be reached is a hundredth. The reach: an error of either
+# pose, and a thrown object's way.
+EXCURSION_COST, REACH_M, REACH_M_S = 5.0, 0.2, 4.0
 # Nats of one independent observation by which it is less likely to be hidden from all cameras than
 # to be gone: it is gone if it is not seen for 2.4 s.
 ABSENT_LOG_RATIO = 1.0

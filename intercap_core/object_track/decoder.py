@@ -9,16 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import logsumexp
 
 from intercap_core.object_track.constants import (
     APPEAR_COST,
+    EXCURSION_COST,
     JUMP_COST,
     LEAVE_COST,
     MOVING_M_S,
     MOVING_TURN_RAD_S,
+    REACH_M,
+    REACH_M_S,
     VANISH_COST,
 )
 from intercap_core.rigid.mesh import ObjectMesh
@@ -144,3 +148,39 @@ def step_costs(
         size = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift_m / (MOVING_M_S * seconds)) ** 2
         costs[:-1, :-1] = -np.minimum(0.5 * size, JUMP_COST)
     return costs
+
+
+def excursions(
+    centres: Sequence[np.ndarray], path: np.ndarray, sure: np.ndarray, times: np.ndarray
+) -> list[np.ndarray]:
+    """Which hypotheses [T] (K_t,) cannot be true if the sure frames around are.
+
+    ``centres`` [T] (K_t, 3) of the hypotheses, metres; of frames that are ``sure`` (T,) the
+    ``path`` (T,) says where it is; ``times`` (T,) seconds. Out of reach is what is too far from the
+    sure frame before or after, where there are both and one can be reached from the other.
+    """
+
+    def reaches(a: np.ndarray, b: np.ndarray, seconds: float) -> np.ndarray:
+        return np.linalg.norm(a - b, axis=-1) < REACH_M + REACH_M_S * seconds
+
+    known = np.flatnonzero(sure).tolist()
+    places = np.array([centres[t][path[t]] for t in known]).reshape(-1, 3)
+    found = [np.zeros(len(own), bool) for own in centres]
+    for i, (u, v) in enumerate(pairwise(known)):
+        if v > u + 1 and reaches(places[i], places[i + 1], times[v] - times[u]):
+            for t in range(u + 1, v):
+                found[t] = ~(
+                    reaches(centres[t], places[i], times[t] - times[u])
+                    & reaches(centres[t], places[i + 1], times[v] - times[t])
+                )
+    return found
+
+
+def with_excursions(steps: Sequence[np.ndarray], away: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The log-probabilities of steps where going to a hypothesis that is out of reach, and coming
+    back, each cost :data:`EXCURSION_COST` in addition; ``away`` [T] as of :func:`excursions`."""
+    result = []
+    for step, (before, after) in zip(steps, pairwise(away), strict=True):
+        out, back = np.append(before, False), np.append(after, False)
+        result.append(step - EXCURSION_COST * (out[:, None] != back))
+    return result

@@ -26,7 +26,14 @@ from intercap_core.object_track.constants import (
     ROUNDS,
     SEARCH_GOOD_LOG_RATIO,
 )
-from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode, step_costs
+from intercap_core.object_track.decoder import (
+    NOT_SEEN,
+    Decoded,
+    decode,
+    excursions,
+    step_costs,
+    with_excursions,
+)
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult, flagged
 from intercap_core.object_track.hypotheses import Hypotheses
@@ -133,8 +140,17 @@ class Tracker:
             step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._carried(t))
             for t, gap in enumerate(np.diff(self._times))
         ]
-        self._emissions, self._steps = [self._share * weight for weight in weights], steps
-        decoded = decode(self._emissions, steps, self._share * ABSENT_LOG_RATIO)
+        self._emissions = [self._share * weight for weight in weights]
+        absent = self._share * ABSENT_LOG_RATIO
+        decoded = decode(self._emissions, steps, absent)
+        sure = np.array(
+            [k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY
+             for t, k in enumerate(decoded.path)]
+        )  # fmt: skip
+        centres = [np.array([self._mesh.centre_at(p) for p in own]).reshape(-1, 3) for own in poses]
+        away = excursions(centres, decoded.path, sure, self._times)
+        self._steps = with_excursions(steps, away)
+        decoded = decode(self._emissions, self._steps, absent)
         for t, k in enumerate(decoded.path):
             if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
                 thing, here = things(fits[t]), self._mesh.centre_at(fits[t][k].pose)

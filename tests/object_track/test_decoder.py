@@ -11,10 +11,17 @@ from scipy.spatial.transform import Rotation
 from intercap_core.object_track.constants import (
     ABSENT_LOG_RATIO,
     ERROR_LASTING_S,
+    EXCURSION_COST,
     JUMP_COST,
     LEAVE_COST,
 )
-from intercap_core.object_track.decoder import NOT_SEEN, decode, step_costs
+from intercap_core.object_track.decoder import (
+    NOT_SEEN,
+    decode,
+    excursions,
+    step_costs,
+    with_excursions,
+)
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.rigid.conftest import catalogue
 
@@ -125,3 +132,20 @@ def test_equal_evidence_is_even_odds(cup: ObjectMesh) -> None:
     found = decode([np.array([6.0, 6.0])] * 8, steps)
     for own in found.probability:
         assert own[:2] == pytest.approx([0.5, 0.5], abs=1e-2)
+
+
+def test_what_cannot_be_reached_between_sure_frames_costs_twice() -> None:
+    """At rest, hidden for three frames in which clutter two metres away looks a little like it."""
+    there, clutter = np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]])
+    centres = [there, clutter, np.concatenate([there, clutter]), clutter, there]
+    times = np.arange(5) / 15
+    sure = np.array([True, False, False, False, True])
+    away = excursions(centres, np.array([0, 0, 0, 0, 0]), sure, times)
+    assert [own.tolist() for own in away] == [[False], [True], [False, True], [True], [False]]
+    steps = with_excursions(
+        [np.zeros((len(a) + 1, len(b) + 1)) for a, b in pairwise(centres)], away
+    )
+    assert steps[0].tolist() == [[-EXCURSION_COST, 0], [-EXCURSION_COST, 0]]
+    assert steps[1].tolist() == [[-EXCURSION_COST, 0, -EXCURSION_COST], [0, -EXCURSION_COST, 0]]
+    far = [*centres[:4], clutter]  # sure frames that contradict each other say nothing
+    assert not any(own.any() for own in excursions(far, np.zeros(5, int), sure, times))
