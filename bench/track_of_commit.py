@@ -1,0 +1,131 @@
+"""The object's tracker of another commit on the artefacts that are there, beside today's track.
+
+    python -m bench.track_of_commit COMMIT SETTINGS [SETTINGS ...]
+
+Tracks every recording of the settings, such as config/object/noise_2.yaml or those below
+results/seed_<N>/settings, with the code of the commit, checked out for a while beside this one: the
+same frames, detections and person, the same truth, and that commit's own measures. Prints a row of
+both for each, and adds them to ``--output`` with keys ``before.<dataset>.<measure>`` and
+``now.<dataset>.<measure>``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+COLUMNS = {
+    "lost": "lost_share", "not noticed": "lost_unnoticed_share", "first": "first_frame_success",
+    "mm": "translation_median_mm", "p95": "translation_p95_mm", "deg": "rotation_median_deg",
+    "p95 deg": "rotation_p95_deg", "precision": "flag_precision", "rest mm": "rest_jitter_mm",
+    "rest deg": "rest_jitter_deg", "normalised": "normalised_median",
+}  # fmt: skip
+
+
+def errors_of(settings: Path, sequence: str, folder: Path | None) -> Any:
+    """Errors of one recording's track by the code that is imported: of the track that is there, or
+    of one made anew in ``folder``."""
+    from intercap_core.metrics import object_errors
+    from intercap_core.project import load_project
+    from intercap_core.rigid.mesh import ObjectMesh
+    from intercap_core.stages import object_track
+
+    project = load_project(settings)
+    row = project.sequences[sequence]
+    entry = project.objects[row.object]
+    track = project.artefact(sequence, "object_track")
+    if folder is not None:
+        track = folder / f"{project.config.dataset}-{sequence}.h5"
+        inputs = ("frames", "scene", "detections", "person")
+        object_track.run(
+            **{stage: project.artefact(sequence, stage) for stage in inputs},
+            output=track,
+            object_=entry,
+            settings=project.config.object_track,
+        )
+    scene = project.artefact(sequence, "scene")
+    return object_errors.measure(scene, track, row.truth, ObjectMesh.load(entry))
+
+
+def measured(settings: list[Path], folder: Path | None, workers: int) -> dict[str, Any]:
+    """Figures by dataset, as ``intercap evaluate`` has them; see :func:`errors_of`."""
+    from intercap_core.metrics.object_errors import figures
+    from intercap_core.project import load_project
+
+    found = {}
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for path in settings:
+            project = load_project(path)
+            jobs = [pool.submit(errors_of, path, name, folder) for name in project.sequences]
+            found[project.config.dataset] = figures([job.result() for job in jobs])
+    return found
+
+
+def before(commit: str, settings: list[Path], workers: int) -> dict[str, Any]:
+    """:func:`measured` by the code of ``commit``, tracks made anew."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        subprocess.run(["git", "worktree", "add", "--detach", str(tree), commit], check=True)
+        try:
+            output = Path(folder) / "figures.json"
+            subprocess.run(
+                [sys.executable, __file__, commit, *map(str, settings), "--made-in", folder,
+                 "--output", str(output), "--workers", str(workers)],
+                check=True, env=os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"},
+            )  # fmt: skip
+            return dict(json.loads(output.read_text(encoding="utf-8")))
+        finally:
+            subprocess.run(["git", "worktree", "remove", "--force", str(tree)], check=True)
+
+
+def main() -> None:
+    """Read the command line, measure both and print them."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("commit")
+    parser.add_argument("settings", type=Path, nargs="+")
+    parser.add_argument("--output", type=Path, default=Path("results/track_of_commit.json"))
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--made-in", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    settings = [path.resolve() for path in arguments.settings]
+    if arguments.made_in is not None:  # within the other commit's code
+        found = measured(settings, arguments.made_in, arguments.workers)
+        arguments.output.write_text(json.dumps(found), encoding="utf-8")
+        return
+    both = {
+        "before": before(arguments.commit, settings, arguments.workers),
+        "now": measured(settings, None, arguments.workers),
+    }
+    _print(arguments.commit, both)
+    from bench.command import add_figures
+
+    for area, datasets in both.items():
+        flat = {f"{name}.{key}": v for name, own in datasets.items() for key, v in own.items()}
+        add_figures(arguments.output, area, flat)
+    print(arguments.output)
+
+
+def _print(commit: str, both: dict[str, dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("recordings", "track", *COLUMNS, box=None, title=f"before: {commit}")
+    for name in both["now"]:
+        for area, datasets in both.items():
+            values = [datasets[name].get(key) for key in COLUMNS.values()]
+            table.add_row(name, area, *("" if v is None else f"{v:.3f}" for v in values))
+    console = Console()
+    console.width = max(console.width, 140)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()
