@@ -4,7 +4,8 @@
 
 Tracks every recording of the settings, such as config/object/noise_2.yaml or those below
 results/seed_<N>/settings, with the code of the commit, checked out for a while beside this one: the
-same frames, detections and person, the same truth, and that commit's own measures. Prints a row of
+same frames, detections and person, the same truth, and that commit's own measures; so does today's.
+Settings that the commit does not know cannot be read by it. Prints a row of
 both for each, and adds them to ``--output`` with keys ``before.<dataset>.<measure>`` and
 ``now.<dataset>.<measure>``.
 """
@@ -30,9 +31,8 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def errors_of(settings: Path, sequence: str, folder: Path | None) -> Any:
-    """Errors of one recording's track by the code that is imported: of the track that is there, or
-    of one made anew in ``folder``."""
+def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
+    """Errors of one recording's track, made in ``folder`` by the code that is imported."""
     from intercap_core.metrics import object_errors
     from intercap_core.project import load_project
     from intercap_core.rigid.mesh import ObjectMesh
@@ -41,21 +41,20 @@ def errors_of(settings: Path, sequence: str, folder: Path | None) -> Any:
     project = load_project(settings)
     row = project.sequences[sequence]
     entry = project.objects[row.object]
-    track = project.artefact(sequence, "object_track")
-    if folder is not None:
-        track = folder / f"{project.config.dataset}-{sequence}.h5"
-        inputs = ("frames", "scene", "detections", "person")
-        object_track.run(
-            **{stage: project.artefact(sequence, stage) for stage in inputs},
-            output=track,
-            object_=entry,
-            settings=project.config.object_track,
-        )
+    track = folder / f"{project.config.dataset}-{sequence}.h5"
+    inputs = ("frames", "scene", "detections", "person")
+    object_track.run(
+        **{stage: project.artefact(sequence, stage) for stage in inputs},
+        output=track,
+        object_=entry,
+        settings=project.config.object_track,
+        initial=project.annotation(sequence).object_pose,
+    )
     scene = project.artefact(sequence, "scene")
     return object_errors.measure(scene, track, row.truth, ObjectMesh.load(entry))
 
 
-def measured(settings: list[Path], folder: Path | None, workers: int) -> dict[str, Any]:
+def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]:
     """Figures by dataset, as ``intercap evaluate`` has them; see :func:`errors_of`."""
     from intercap_core.metrics.object_errors import figures
     from intercap_core.project import load_project
@@ -100,10 +99,9 @@ def main() -> None:
         found = measured(settings, arguments.made_in, arguments.workers)
         arguments.output.write_text(json.dumps(found), encoding="utf-8")
         return
-    both = {
-        "before": before(arguments.commit, settings, arguments.workers),
-        "now": measured(settings, None, arguments.workers),
-    }
+    both = {"before": before(arguments.commit, settings, arguments.workers)}
+    with tempfile.TemporaryDirectory() as folder:
+        both["now"] = measured(settings, Path(folder), arguments.workers)
     _print(arguments.commit, both)
     from bench.command import add_figures
 

@@ -77,18 +77,14 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
 
 
 def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
-    """Share of lost frames by object, one for each draw of the detectors' errors; nothing where
-    there is only one."""
-    draws = [one for one in evaluations if REDRAWN.fullmatch(one.dataset)]
+    """Share of lost frames of each object that all draws of the detectors' errors have, one for
+    each draw; nothing where there is only one."""
+    draws = [by_object(one.errors) for one in evaluations if REDRAWN.fullmatch(one.dataset)]
     if len(draws) < 2:
         return {}
     return {
-        name: [
-            float(np.mean(np.concatenate([e.lost for e in by_object(one.errors).get(name, [])])))
-            for one in draws
-            if name in by_object(one.errors)
-        ]
-        for name in by_object(draws[0].errors)
+        name: [float(np.mean(np.concatenate([e.lost for e in draw[name]]))) for draw in draws]
+        for name in sorted(set.intersection(*(set(draw) for draw in draws)))
     }
 
 

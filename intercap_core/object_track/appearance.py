@@ -125,7 +125,7 @@ class Appearance:
             for camera in cameras:
                 left_over = residual[views == camera] + self._gain[camera]
                 self._gain[camera] = share * np.median(left_over, axis=0)
-            self._gain -= self._gain[cameras].mean(0)
+            self._gain[cameras] -= self._gain[cameras].mean(0)
             # what the other frames do not foretell is noise: a hand before the object, a shadow
             noise = _mean_square(residual)
             self._noise = np.maximum(noise, COLOUR_MIN_SIGMA**2)
@@ -200,7 +200,9 @@ class Appearance:
         """The mesh's own colours of the patches, where they explain those learnt."""
         number = patches_of(paint.points, paint.normals, size)
         at, is_known = self._find(number)
-        red, green, blue = LIGHT[paint.colours].T
+        # a scan has no noise that would drown its darkest and brightest colours
+        levels = np.clip(paint.colours, LEVELS_USED.start, LEVELS_USED.stop - 1)
+        red, green, blue = LIGHT[levels].T
         colour = np.stack([(red + green + blue) / 3, red - green, blue - green], 1)
         usable = is_known & np.isfinite(colour).all(1)
         count = len(self._patches)
@@ -214,7 +216,9 @@ class Appearance:
         learnt = self._known(np.ones(len(self._frames), bool)).mean
         mean[there] += np.median(learnt[there] - mean[there], axis=0)
         off = _mean_square(learnt[there] - mean[there])
-        if (off > (1 - PAINT_EXPLAINS) * _mean_square(learnt[there] - self._average)).all():
+        square = _mean_square(learnt[there] - self._average)
+        # of all channels together: paint of another copy may be right in one by chance
+        if (off / self._noise).sum() > (1 - PAINT_EXPLAINS) * (square / self._noise).sum():
             return None
         variance = np.where(there[:, None], off, self._spread)
         return _Known(mean, variance)

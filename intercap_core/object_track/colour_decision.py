@@ -8,7 +8,7 @@ what follows from each counts by its evidence. Colours that the mesh brings have
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from intercap_core.object_track.constants import (
     RIVAL_PROBABILITY,
     STEEP_COSINE,
     SURE_PROBABILITY,
+    WEAK_GAUGE,
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded, given, mixed
 from intercap_core.object_track.hypotheses import Hypotheses
@@ -67,30 +68,33 @@ class ColourDecision:
             return decoded
         own = decoded.probability[first][:-1]
         absent = self._share * ABSENT_LOG_RATIO
-        gauges = [k for k in np.argsort(-own)[:GAUGES] if own[k] > RIVAL_PROBABILITY]
-        relative = {int(k): given(emissions, steps, first, int(k), absent) for k in gauges}
-        is_open = any(self._open(one) for one in relative.values())
-        if not is_open and (self._observer.paint is None or len(gauges) == 1):
+        gauges = [int(k) for k in np.argsort(-own)[:GAUGES] if own[k] > RIVAL_PROBABILITY]
+        relative = {k: given(emissions, steps, first, k, absent) for k in gauges}
+        rivals = self._open(list(relative.values()))
+        if not gauges or (not rivals and (self._observer.paint is None or len(gauges) == 1)):
+            return decoded
+        learnt = {k: self._learn(one) for k, one in relative.items()}
+        if any(learnt[k] is None and own[k] > WEAK_GAUGE for k in gauges):
             return decoded
         found = []
-        for k, one in relative.items():
-            learnt = self._learn(one)
-            if learnt is None:
-                return decoded
-            evidence = self._painted(learnt)
-            values = self._added(emissions, learnt, one)
-            again = given(values, steps, first, k, absent)
-            found.append(replace(again, evidence=again.evidence + evidence))
-        return mixed(found)
+        for k, colours in learnt.items():
+            if colours is not None:
+                values = self._added(emissions, colours, rivals)
+                again = given(values, steps, first, k, absent)
+                found.append(replace(again, evidence=again.evidence + self._painted(colours)))
+        return mixed(found) if found else decoded
 
-    def _open(self, decoded: Decoded) -> dict[int, np.ndarray]:
-        """The hypotheses of each frame whose choice is open, some frames left out that are near
-        others."""
+    def _open(self, relative: Sequence[Decoded]) -> dict[int, np.ndarray]:
+        """The hypotheses of each frame whose choice is open in any of these, some frames left out
+        that are near others; all of them are asked about the same."""
         found = {}
-        for t in range(0, len(decoded.path), self._every):
-            rivals = np.flatnonzero(decoded.probability[t][:-1] > RIVAL_PROBABILITY)
-            if len(rivals) > 1 or (len(rivals) and decoded.path[t] == NOT_SEEN):
-                found[t] = rivals
+        for t in range(0, len(relative[0].path) if relative else 0, self._every):
+            likely = np.array([one.probability[t][:-1] > RIVAL_PROBABILITY for one in relative])
+            if any(
+                own.sum() > 1 or (own.any() and one.path[t] == NOT_SEEN)
+                for one, own in zip(relative, likely, strict=True)
+            ):
+                found[t] = np.flatnonzero(likely.any(0))
         return found
 
     def _learn(self, decoded: Decoded) -> Appearance | None:
@@ -115,13 +119,16 @@ class ColourDecision:
         return PAINT_LOOKS * float(np.mean([learnt.paint_log_ratio(s) for s in learnt.sightings]))
 
     def _added(
-        self, emissions: Sequence[np.ndarray], learnt: Appearance, decoded: Decoded
+        self,
+        emissions: Sequence[np.ndarray],
+        learnt: Appearance,
+        rivals: Mapping[int, np.ndarray],
     ) -> list[np.ndarray]:
         """The emissions with what the learnt colours say where the choice is open."""
         values = [own.copy() for own in emissions]
         if learnt.says_something:
-            for t, rivals in self._open(decoded).items():
-                seen = {int(k): self._sighting(t, int(k)) for k in rivals}
+            for t, some in rivals.items():
+                seen = {int(k): self._sighting(t, int(k)) for k in some}
                 ratio = {
                     k: self._share * learnt.log_ratio(one, self._apart)
                     for k, one in seen.items()

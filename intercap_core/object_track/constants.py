@@ -258,6 +258,8 @@ LEARNING_FRAMES_MIN = 3
 PAINT_EXPLAINS = 0.5  # share of the colours' variance that the mesh's own must explain to count
 PAINT_LOOKS = 3  # independent ones at the mesh's own colours, however many frames there are
 RIVAL_PROBABILITY = 0.01  # of a pose that colours are asked about
+# Probability of such a pose, below which it is left out where too few frames are certain with it.
+WEAK_GAUGE = 0.05
 GAUGES = 3  # poses of one frame to which others may be relative: learnt from each
 SURE_PROBABILITY = 0.8  # of a pose, given that of one frame, from which to learn
 COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
@@ -274,7 +276,7 @@ JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 4.0, 4.0, 4.0
 # pose, and a thrown object's way.
 EXCURSION_COST, REACH_M, REACH_M_S = 5.0, 0.2, 4.0
 # Nats of one independent observation by which it is less likely to be hidden from all cameras than
-# to be gone: it is gone if it is not seen for 2.4 s.
+# to be gone: gone is the likelier from about two seconds on.
 ABSENT_LOG_RATIO = 1.0
 # Nats that the images of one frame say for a pose: from which it is seen; from which it is good
 # enough to start from or to stop a search; below which it is no hypothesis.
@@ -373,6 +375,7 @@ TOLD_SHARE = 0.5  # of the frames, from which a track's faults are told
 MOVING_COST = 9.0
 UNSEEN_MOVING_COST = 1.0
 REST_COST, CUT_REST_COST = 8.0, 5.0
+CUT_LONGER = 0.9  # of a frame's own pose, by which a longer one costs more, up to the whole
 REST_MAX_DISTANCE = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away no rest is tested
 # Bounds of the measured variance of resting estimates, times the stated one. Tuned on the studio.
 REST_VARIANCE_BOUNDS = (0.5, 2.0)

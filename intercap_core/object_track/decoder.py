@@ -55,7 +55,8 @@ def decode(
     a frame less: what is in the room is seldom hidden from all cameras for long.
     """
     values = [np.append(own, [0.0, absent]) for own in emissions]
-    values[0][-1] -= LEAVE_COST
+    for end in (0, -1):
+        values[end][-1] -= LEAVE_COST
     ways = [_with_leaving(step) for step in steps]
     best, ahead, came = [values[0]], [values[0]], []
     for step, value in zip(ways, values[1:], strict=True):

@@ -15,6 +15,7 @@ from intercap_core.object_track.constants import (
     BLIP_APART_SQUARED,
     BLIP_FRAMES,
     BLIP_SAME_SQUARED,
+    CUT_LONGER,
     CUT_REST_COST,
     ERROR_LASTING_S,
     MAX_REST_FRAMES,
@@ -84,11 +85,15 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        # too short for a rest, but the recording may show a part of one alone
-        cut = (ends - a < shortest) & ((a == 0) | (ends == count))
-        cost = best_move[a] + np.where(cut, CUT_REST_COST, REST_COST) + 0.5 * weight * spread
+        # of a rest at its begin or end the recording may show a part alone; what is longer costs no
+        # more than to take its last frames for a motion
+        length = ends - a
+        cut = (a == 0) | (ends == count)
+        longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * CUT_LONGER
+        own = np.where(cut, np.minimum(CUT_REST_COST + longer, REST_COST), REST_COST)
+        cost = best_move[a] + own + 0.5 * weight * spread
         least = np.where(cut, (shortest + 1) // 2, shortest)
-        better = (cost < best_rest[ends]) & (ends - a >= least)
+        better = (cost < best_rest[ends]) & (length >= least)
         best_rest[ends[better]] = cost[better]
         began[ends[better]] = a
         residual[ends[better]] = spread[better]

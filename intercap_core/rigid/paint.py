@@ -10,6 +10,8 @@ import numpy as np
 import trimesh
 
 from intercap_core.rigid.constants import PAINT_POINTS
+from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.mesh import ObjectMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,10 +24,11 @@ class Paint:
     colours: np.ndarray
 
     @classmethod
-    def load(cls, path: Path) -> Paint | None:
-        """The colours of a mesh file that was checked before; None where it has none or only one.
+    def load(cls, path: Path, outward: ObjectMesh) -> Paint | None:
+        """The colours of a mesh file; None where it has none or only one.
 
-        A texture that cannot be read counts as none.
+        ``outward`` is the object that was loaded from it and knows which side of a face is out. A
+        texture that cannot be read counts as none.
         """
         mesh: Any = trimesh.load(path, process=False, force="mesh")
         visual = mesh.visual
@@ -35,11 +38,13 @@ class Paint:
         points, face, weights = sampled[0], sampled[1], sampled[2]
         try:
             colours = _colours(mesh, face, weights)
-        except (AttributeError, TypeError, ValueError, IndexError):
+        except (AttributeError, TypeError, ValueError, IndexError, OSError):
             return None
         if not np.ptp(colours, axis=0).any():
             return None
-        return cls(np.asarray(points), mesh.face_normals[face], colours)
+        points = np.asarray(points)
+        surface = DistanceField(outward.vertices, outward.faces, watertight=outward.watertight)
+        return cls(points, surface.closest(points).normals, colours)
 
 
 def _colours(mesh: Any, face: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -57,6 +57,7 @@ class ObjectRecording:
             self.up = artefact["zup_from_master"][2, :3].copy()
         self._detections = moments.with_candidates_of(person)
         self._diameter_m = diameter_m
+        self._unreadable: set[tuple[int, int]] = set()
         with artefacts.read(person, PERSON) as artefact:
             masks = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
             self.joints = np.where(artefact["missing"][:, None, None], np.nan, artefact["joints"])
@@ -89,15 +90,24 @@ class ObjectRecording:
         grid; None where there is none that can be read."""
         found: list[np.ndarray | None] = []
         for c, geometry in zip(self.cameras, self.geometry, strict=True):
-            reduction = _DECODED_BY.get(geometry.step, 1)
-            try:
-                image = self._frames.colour(t, c, reduction)
-            except UserError as error:
-                log.warning("%s", error)
-                image = None
-            step = geometry.step // reduction
-            found.append(None if image is None else image[::step, ::step])
+            image = self._picture(t, c, _DECODED_BY.get(geometry.step, 1))
+            step = geometry.step
+            if image is not None and image.shape[:2] != (geometry.lens.height, geometry.lens.width):
+                image = image[::step, ::step]
+            found.append(image)
         return found
+
+    def _picture(self, t: int, c: int, reduction: Literal[1, 2, 4]) -> np.ndarray | None:
+        """The image as its decoder reduces it, or whole where that is of another size."""
+        try:
+            return self._frames.colour(t, c, reduction)
+        except UserError as error:
+            if reduction > 1:
+                return self._picture(t, c, 1)
+            if (t, c) not in self._unreadable:
+                log.warning("%s", error)
+            self._unreadable.add((t, c))
+            return None
 
     def _candidates(self, t: int, c: int) -> list[Candidate]:
         """What may be the object by its size, where that is known."""
@@ -159,7 +169,7 @@ def run(
             up=source.up if np.isfinite(source.up).all() else None,
             joints=source.joints,
             pictures=source.pictures,
-            paint=Paint.load(Path(object_.mesh)),
+            paint=Paint.load(Path(object_.mesh), mesh),
         )
         try:
             track = tracker.run(_start(initial, recording.num_sets, sequence))

@@ -10,7 +10,7 @@ import pytest
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import PATCHES_ACROSS
-from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode, given, mixed
+from intercap_core.object_track.decoder import Decoded, decode, given, mixed
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
@@ -135,7 +135,12 @@ def test_without_pictures_nothing_changes(capture, views):
     assert found.probability[OPEN][:2] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
-@pytest.mark.parametrize("brought", [None, two_sides, plain])
+def other_sides(points: np.ndarray) -> np.ndarray:
+    """Another copy of the object: white before, green behind."""
+    return np.where(points[:, 1:2] < 0, (0.8, 0.8, 0.75), (0.1, 0.4, 0.12))
+
+
+@pytest.mark.parametrize("brought", [None, two_sides, plain, other_sides])
 def test_what_is_open_in_all_frames_is_open_but_for_the_colours_of_the_mesh(
     capture, views, mesh, brought
 ):
@@ -177,10 +182,11 @@ def test_given_a_state_the_others_follow_and_their_mixture_is_the_whole():
         assert part.path[1] == k and part.probability[1][k] == pytest.approx(1)
         log_share = np.log(whole.probability[1][k])
         assert part.evidence - whole.evidence == pytest.approx(log_share, abs=1e-6)
-    share = whole.probability[1][:3]
     again = mixed(parts)
-    for one, other in zip(again.probability, whole.probability, strict=True):
-        seen = one if len(one) == 4 else other * share.sum()
-        assert seen == pytest.approx(one, abs=1) and one.sum() == pytest.approx(1)
+    share = whole.probability[1][:3]
     assert again.probability[1][:3] == pytest.approx(share / share.sum())
-    assert NOT_SEEN not in again.path[1:2]
+    by_hand = sum(s * part.probability[0] for s, part in zip(share, parts, strict=True))
+    assert again.probability[0] == pytest.approx(by_hand / share.sum())
+    unseen = decode([emissions[0], np.full(3, -1e4), emissions[2]], steps)
+    rest = share.sum() * again.probability[2] + (1 - share.sum()) * unseen.probability[2]
+    assert rest == pytest.approx(whole.probability[2], abs=1e-9)

@@ -51,7 +51,7 @@ def test_it_is_the_sum_over_all_sequences() -> None:
     likely, shares = {}, [np.zeros(n + 2) for n in counts]
     for states in product(*(range(n + 2) for n in counts)):
         log = sum(values[t][s] for t, s in enumerate(states))
-        log -= LEAVE_COST * (states[0] == counts[0] + 1)
+        log -= LEAVE_COST * sum(states[t] == counts[t] + 1 for t in (0, -1))
         for t, step in enumerate(steps):
             gone = [states[u] == counts[u] + 1 for u in (t, t + 1)]
             if not all(gone):
@@ -75,7 +75,7 @@ def test_it_is_the_sum_over_all_sequences() -> None:
 def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
     found = decode([np.array([2.0, 1.0])], [])
     assert found.path.tolist() == [0]
-    weights = np.array([np.exp(2), np.exp(1), 1 + np.exp(-LEAVE_COST)])
+    weights = np.array([np.exp(2), np.exp(1), 1 + np.exp(-2 * LEAVE_COST)])
     assert found.probability[0] == pytest.approx(weights / weights.sum())
     nothing = decode([np.zeros(0)] * 3, [np.zeros((1, 1))] * 2)
     assert (nothing.path == NOT_SEEN).all()

@@ -156,3 +156,20 @@ def test_a_long_rest_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("intercap_core.object_track.rest.MAX_REST_FRAMES", 20)
     true = lifted(60, 58, 59)[:55]
     assert (resting(looks_at(true), np.arange(55) / FPS, CENTRE) == 0).all()
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_rest_that_the_recording_cuts_is_found_from_three_frames_on(at_end: bool) -> None:
+    found = []
+    for still in range(2, 12):
+        true = lifted(still + 20, 0, still)
+        true[still:, 1, 3] = 0.1 + 0.06 * np.arange(1, 21)  # then it is taken away, at 0.9 m/s
+        true[:still] = true[still - 1]
+        true[:still, 1, 3] = 0.1
+        if at_end:
+            true = true[::-1].copy()
+        segment = resting(looks_at(true), np.arange(len(true)) / FPS, CENTRE)
+        rests = segment[::-1][:still] if at_end else segment[:still]
+        found.append(int((rests >= 0).sum()))
+    assert (np.diff(found) >= 0).all(), "what rests longer is found as longer"
+    assert found[-1] >= 10

@@ -5,7 +5,14 @@ import pytest
 import trimesh
 from PIL import Image
 
+from intercap_core.config import ObjectEntry
+from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.paint import Paint
+from tests.rigid.conftest import catalogue
+
+
+def any_mesh() -> ObjectMesh:
+    return ObjectMesh.load(catalogue()["toolbox"])
 
 
 def test_colours_of_vertices(tmp_path):
@@ -14,15 +21,25 @@ def test_colours_of_vertices(tmp_path):
     colours = np.where(red[:, None], (200, 20, 20, 255), (20, 20, 200, 255)).astype(np.uint8)
     box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=colours)
     box.export(tmp_path / "box.ply")
-    paint = Paint.load(tmp_path / "box.ply")
+    mesh = ObjectMesh.load(ObjectEntry(name="box", mesh=tmp_path / "box.ply"))
+    paint = Paint.load(tmp_path / "box.ply", mesh)
     assert paint is not None and np.linalg.norm(paint.normals, axis=1) == pytest.approx(1)
     right, left = paint.points[:, 0] > 0.06, paint.points[:, 0] < -0.06
     assert (paint.colours[right] == (200, 20, 20)).all()
     assert (paint.colours[left] == (20, 20, 200)).all()
-    again = Paint.load(tmp_path / "box.ply")
+    again = Paint.load(tmp_path / "box.ply", mesh)
     assert np.array_equal(paint.colours, again.colours) and np.array_equal(
         paint.points, again.points
     )
+    top = paint.points[:, 2] > 0.099
+    assert (paint.normals[top] @ (0, 0, 1) > 0.9).mean() > 0.95
+    # of a file that is wound inward the loader turns the faces
+    box.invert()
+    box.export(tmp_path / "inward.ply")
+    inward = ObjectMesh.load(ObjectEntry(name="box", mesh=tmp_path / "inward.ply"))
+    paint = Paint.load(tmp_path / "inward.ply", inward)
+    top = paint.points[:, 2] > 0.099
+    assert (paint.normals[top] @ (0, 0, 1) > 0.9).mean() > 0.95
 
 
 def test_a_texture_is_finer_than_its_mesh(tmp_path):
@@ -37,7 +54,7 @@ def test_a_texture_is_finer_than_its_mesh(tmp_path):
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
         "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
     )
-    paint = Paint.load(tmp_path / "sheet.obj")
+    paint = Paint.load(tmp_path / "sheet.obj", any_mesh())
     assert paint is not None
     x, y = paint.points[:, 0], paint.points[:, 1]
     corner = (x < 0.45) & (y > 0.55)  # the first rows of an image are at the top
@@ -48,10 +65,10 @@ def test_a_texture_is_finer_than_its_mesh(tmp_path):
 def test_no_colours_and_one_colour_are_none(tmp_path):
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     box.export(tmp_path / "bare.obj", include_normals=False)
-    assert Paint.load(tmp_path / "bare.obj") is None
+    assert Paint.load(tmp_path / "bare.obj", any_mesh()) is None
     box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=[90, 90, 90, 255])
     box.export(tmp_path / "grey.ply")
-    assert Paint.load(tmp_path / "grey.ply") is None
+    assert Paint.load(tmp_path / "grey.ply", any_mesh()) is None
 
 
 def test_a_texture_that_is_not_there_is_none(tmp_path):
@@ -60,4 +77,4 @@ def test_a_texture_that_is_not_there_is_none(tmp_path):
         "mtllib sheet.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
         "f 1/1 2/2 3/3\n"
     )
-    assert Paint.load(tmp_path / "sheet.obj") is None
+    assert Paint.load(tmp_path / "sheet.obj", any_mesh()) is None
