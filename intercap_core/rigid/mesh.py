@@ -183,9 +183,12 @@ def _read(path: Path) -> trimesh.Trimesh:
 def _colours(mesh: trimesh.Trimesh) -> np.ndarray:
     """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
     visual: Any = mesh.visual
-    if visual is not None and visual.kind == "texture":
-        visual = visual.to_color()
-    colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
+    try:
+        if visual is not None and visual.kind == "texture":
+            visual = visual.to_color()
+        colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
+    except (AttributeError, TypeError, ValueError, IndexError, OSError):
+        colours = np.zeros(0, np.uint8)  # a texture that is not there, or is no image
     if colours.shape != (len(mesh.vertices), 4):
         return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
     return colours

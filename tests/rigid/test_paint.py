@@ -71,10 +71,14 @@ def test_no_colours_and_one_colour_are_none(tmp_path):
     assert Paint.load(tmp_path / "grey.ply", any_mesh()) is None
 
 
-def test_a_texture_that_is_not_there_is_none(tmp_path):
-    (tmp_path / "sheet.mtl").write_text("newmtl a\nmap_Kd missing.png\n")
-    (tmp_path / "sheet.obj").write_text(
-        "mtllib sheet.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
-        "f 1/1 2/2 3/3\n"
-    )
-    assert Paint.load(tmp_path / "sheet.obj", any_mesh()) is None
+@pytest.mark.parametrize("texture", ["missing.png", "notes.txt"])
+def test_a_texture_that_is_not_there_or_no_image_is_none(tmp_path, texture):
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    (tmp_path / "notes.txt").write_text("no image")
+    (tmp_path / "box.mtl").write_text(f"newmtl a\nmap_Kd {texture}\n")
+    rows = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["vt 0 0"]
+    rows += [f"f {a + 1}/1 {b + 1}/1 {c + 1}/1" for a, b, c in box.faces]
+    (tmp_path / "box.obj").write_text("\n".join(["mtllib box.mtl", "usemtl a", *rows]) + "\n")
+    mesh = ObjectMesh.load(ObjectEntry(name="box", mesh=tmp_path / "box.obj"))
+    assert len(mesh.faces) == 12 and not np.ptp(mesh.colours, axis=0).any()
+    assert Paint.load(tmp_path / "box.obj", mesh) is None
