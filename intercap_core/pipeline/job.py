@@ -55,17 +55,27 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
         logger.info("%s %.1f s", FINISHED, time.monotonic() - start)
     except UserError as error:
         logger.error("%s %s", FAILED, error)
-        print(f"{name} failed: {error}", file=sys.stderr)
+        _tell(f"{name} failed: {error}")
         raise SystemExit(1) from None
     except Exception as error:
         logger.exception("unexpected error")
         told = f"unexpected {type(error).__name__}: {str(error).strip() or 'no message'}"
         logger.error("%s %s", FAILED, told.splitlines()[0])
-        print(f"{name} failed: {told}; the traceback is in {log}", file=sys.stderr)
+        _tell(f"{name} failed: {told}; the traceback is in {log}")
         raise SystemExit(1) from None
     finally:
         logger.removeHandler(handler)
         handler.close()
+
+
+def _tell(line: str) -> None:
+    """Write to standard error, on a line of its own.
+
+    Snakemake and other jobs write there too, and Snakemake ends its messages by a second write:
+    one write that begins with a newline is never glued to such a message.
+    """
+    sys.stderr.write(f"\n{line}\n")
+    sys.stderr.flush()
 
 
 def last_failure(folder: Path) -> str | None:

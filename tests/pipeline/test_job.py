@@ -1,0 +1,48 @@
+"""What a job of the workflow tells, beside others that write to the same stream."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+
+from intercap_core.errors import UserError
+from intercap_core.pipeline.job import job, last_failure
+
+
+class Writes(io.StringIO):
+    """A stream that remembers each write by itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.each: list[str] = []
+
+    def write(self, text: str) -> int:
+        self.each.append(text)
+        return super().write(text)
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        (UserError("person.h5: is cut off"), "one: scene failed: person.h5: is cut off"),
+        (ValueError("two\nlines"), "one: scene failed: unexpected ValueError: two\nlines; "),
+    ],
+)
+def test_a_fault_is_told_by_one_write_that_begins_a_line(
+    fault: Exception, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = Writes()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with pytest.raises(SystemExit) as left, job("one: scene", tmp_path / "logs" / "scene.log"):
+        raise fault
+    assert left.value.code == 1
+    (told,) = stream.each
+    # another process may just have written a line without its end
+    assert told.startswith(f"\n{says}")
+    assert told.endswith("\n")
+    failure = last_failure(tmp_path / "logs")
+    assert failure is not None
+    assert says.splitlines()[0].partition("failed: ")[2] in failure
