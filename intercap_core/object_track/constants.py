@@ -88,6 +88,8 @@ ONSET_M_S, ONSET_RAD_S = 0.6, np.radians(150)
 PRIOR_CONTRADICTED, PRIOR_WIDENED = 1.5, 4.0
 # From a wrist to the surface of what the hand may hold, metres: a hand's length.
 HOLDING_REACH_M = 0.20
+# Sine of the angle between a palm's two edges, below which it shows no turn; of hands about 0.3.
+PALM_MIN_SINE = 0.1
 # Share of the last step that may be missing or added in the next. Tuned on the studio.
 ONSET_STEP_SHARE = 0.5
 # Standard deviation added for every second that the object is not seen. Tuned on the studio.
@@ -180,12 +182,14 @@ SEED_SEARCHES = 3  # frames searched for the seed, more while nothing is found
 SEED_SEARCHES_MAX = 10
 ROUNDS = 15  # of deciding and of looking for more
 SEARCHES_MIN, SEARCH_EVERY_S = 6, 0.5  # frames searched with all rotations, and one in this time
+RUN_SEARCHED = 3  # frames in a row in which it is seen, from which one is searched
 # A frame in doubt is searched by the poses of frames no farther away, seconds, and within what a
 # hand may have moved meanwhile, metres.
 LOOK_NEAR_S, LOOK_NEAR_M = 0.3, 0.75
 BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
 UNSEEN_S = 0.8  # seconds that an object is followed without being seen
 MAX_HYPOTHESES = 6  # of a frame
+CROWDED = (0.04, 25.0)  # metres and degrees within which, of too many, the less likely one goes
 TURNS_FOLLOWED = 2  # of a key frame
 ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
 SURVEYED_FRAMES = 12  # looked at before tracking, spread over the recording
@@ -266,8 +270,14 @@ COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
 
 # --- decision: which hypothesis is true (tuned on the studio) -------------------------------------
 
-# Of the motion between frames, standard deviations: a hand that carries something.
-MOVING_M_S, MOVING_TURN_RAD_S = 2.5, 7.0
+# Of the motion between frames, standard deviations: of what moves freely (a swing, a kick), and its
+# cost in addition, nats a second, for hands and rest explain most of what is recorded; of fits of
+# what stands; of what a hand holds against its palm: of fits and joints, and of slipping.
+MOVING_M_S, MOVING_TURN_RAD_S, FREE_COST_S = 2.5, 7.0, 30.0
+STANDING_M, STANDING_RAD = 0.015, np.radians(8)
+HELD_M, HELD_RAD, HELD_M_S, HELD_RAD_S = 0.02, np.radians(10), 0.3, 1.0
+# Minus log-likelihood of going from one of these to another: once a second at 15 frames a second.
+MODE_COST = 2.7
 # Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
 # its coming back; of its leaving the room, or coming back to it, in addition.
 JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 4.0, 4.0, 4.0

@@ -9,6 +9,7 @@ import numpy as np
 from intercap_core.object_track.constants import (
     BASIN,
     CONTRADICTED_LOG_RATIO,
+    CROWDED,
     MAX_HYPOTHESES,
     PRIOR_CONTRADICTED,
     PRIOR_WIDENED,
@@ -56,15 +57,25 @@ class Hypotheses:
 
     def add(self, t: int, fit: Fit) -> None:
         """Add a hypothesis of frame t; of two at one pose the likelier stays, of too many the least
-        likely goes."""
+        likely of those that are close to another: turns that nothing tells apart stay spread."""
         own = self.fits[t]
         k = self.known(t, fit.pose)
         if k is None:
             own.append(fit)
             if len(own) > MAX_HYPOTHESES:
-                del own[int(self._prior.weigh(t, own).argmin())]
+                del own[self._least_missed(t)]
         elif fit.log_ratio > own[k].log_ratio:
             own[k] = fit
+
+    def _least_missed(self, t: int) -> int:
+        """The least likely hypothesis of frame t of those that have a likelier one close by, or of
+        all."""
+        own, mesh = self.fits[t], self._observer.mesh
+        order = np.argsort(self._prior.weigh(t, own))
+        for i, k in enumerate(order):
+            if any(same_pose(mesh, own[k].pose, own[j].pose, CROWDED) for j in order[i + 1 :]):
+                return int(k)
+        return int(order[0])
 
     def follow(self, t: int, fit: Fit) -> None:
         """Add a fit of frame t and where it leads in the frames before and after, until it meets

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.object_track.constants import (
     GROWTH_LOST_M_S,
     GROWTH_LOST_RAD_S,
@@ -12,12 +15,17 @@ from intercap_core.object_track.constants import (
     ONSET_M_S,
     ONSET_RAD_S,
     ONSET_STEP_SHARE,
+    PALM_MIN_SINE,
     STILL_M,
     STILL_RAD,
 )
 from intercap_core.object_track.fit import MotionPrior
 
-FOREARMS = ((3, 4), (6, 7))  # elbow and wrist of BODY_25, right and left
+# Elbow, wrist, and the knuckles of the index and the little finger, right and left.
+_HANDS = [
+    [KEYPOINT_NAMES.index(f"{side}_{name}") for name in ("elbow", "wrist", "index1", "pinky1")]
+    for side in ("right", "left")
+]
 
 
 def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -53,23 +61,67 @@ def expected(
     )
 
 
+@dataclass(frozen=True)
+class HandMotion:
+    """A hand's motion between two frames: by ``turn`` (3, 3) about the wrist, which goes from
+    ``start`` (3,) to ``end`` (3,), metres."""
+
+    turn: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+
+    def carry(self, poses: np.ndarray) -> np.ndarray:
+        """Poses (..., 4, 4) of what is held, after the motion."""
+        found = poses.copy()
+        found[..., :3, :3] = self.turn @ poses[..., :3, :3]
+        found[..., :3, 3] = (poses[..., :3, 3] - self.start) @ self.turn.T + self.end
+        return found
+
+
+def hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
+    """The motions of the right and of the left hand between two frames, None where it is unknown.
+
+    ``joints`` (2, K, 3) of the person in both, NaN unknown. A hand turns as its palm does, or,
+    where that is not seen in both frames, as the forearm.
+    """
+    found: list[HandMotion | None] = []
+    for elbow, wrist, index, pinky in _HANDS:
+        start, end = joints[:, wrist]
+        if not (np.isfinite(start).all() and np.isfinite(end).all()):
+            found.append(None)
+            continue
+        palms = [_palm(own[index] - own[wrist], own[pinky] - own[wrist]) for own in joints]
+        if palms[0] is None or palms[1] is None:
+            turn = _between(start - joints[0, elbow], end - joints[1, elbow])
+        else:
+            turn = palms[1] @ palms[0].T
+        found.append(HandMotion(turn, start, end))
+    return found
+
+
 def carried(joints: np.ndarray, now: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
     """Poses (N, 4, 4) of an object in each hand that may hold it, in the next frame.
 
     ``joints`` (2, K, 3) of the person in the pose's frame and the next, NaN unknown; ``now`` (4, 4)
-    the pose, ``centre`` (3,) of the object there and its ``radius``, metres. What a hand holds
-    moves with the wrist and turns as the forearm does.
+    the pose, ``centre`` (3,) of the object there and its ``radius``, metres.
     """
-    found = []
-    for elbow, wrist in FOREARMS:
-        (e0, e1), (w0, w1) = joints[:, elbow], joints[:, wrist]
-        if np.linalg.norm(centre - w0) < radius + HOLDING_REACH_M and np.isfinite(w1).all():
-            turn = _between(w0 - e0, w1 - e1)
-            pose = now.copy()
-            pose[:3, :3] = turn @ now[:3, :3]
-            pose[:3, 3] = turn @ (now[:3, 3] - w0) + w1
-            found.append(pose)
+    found = [
+        hand.carry(now)
+        for hand in hand_motions(joints)
+        if hand is not None and np.linalg.norm(centre - hand.start) < radius + HOLDING_REACH_M
+    ]
     return np.array(found).reshape(-1, 4, 4)
+
+
+def _palm(index: np.ndarray, pinky: np.ndarray) -> np.ndarray | None:
+    """Axes (3, 3), in columns, of a palm with these directions (3,) from the wrist to the knuckles;
+    None where they are unknown or one line."""
+    normal = np.cross(index, pinky)
+    size = float(np.linalg.norm(normal))
+    if not size > PALM_MIN_SINE * float(np.linalg.norm(index) * np.linalg.norm(pinky)):
+        return None
+    along, normal = index / np.linalg.norm(index), normal / size
+    return np.stack([along, np.cross(normal, along), normal], axis=1)
 
 
 def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

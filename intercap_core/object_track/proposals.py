@@ -16,6 +16,7 @@ from intercap_core.object_track.constants import (
     LOOK_NEAR_S,
     NEAR_TURN_SEARCH_RAD,
     RIVAL_LOG_RATIO,
+    RUN_SEARCHED,
     SEARCH_EVERY_S,
     SEARCH_GOOD_LOG_RATIO,
     SEARCHES_MIN,
@@ -135,6 +136,9 @@ class Proposals:
         for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
             if self._hypotheses.best(t) < poor and t not in self._looked:
                 new |= self._look_near(t, known)
+        for t in self._unsearched(decoded.path, ratio):
+            self._searched.add(t)
+            new |= self._follow(t, self._observer.search(t))
         if new:
             return True
         most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
@@ -155,6 +159,17 @@ class Proposals:
             self._searched.add(t)
             new = self._follow(t, self._observer.search(t))
         return new
+
+    def _unsearched(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
+        """The likeliest frame of every time that the object is seen, in no frame of which it was
+        searched: what reappears may have turned out of sight."""
+        seen = np.flatnonzero(path != NOT_SEEN)
+        runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
+        return [
+            int(run[ratio[run].argmax()])
+            for run in runs
+            if len(run) >= RUN_SEARCHED and not self._searched & set(run.tolist())
+        ]
 
     def _look_near(self, t: int, known: dict[int, np.ndarray]) -> bool:
         """Search frame t with the rotations that the frames around lead to, ``known`` poses (4, 4)

@@ -26,30 +26,22 @@ from intercap_core.object_track.constants import (
     ROUNDS,
     SEARCH_GOOD_LOG_RATIO,
 )
-from intercap_core.object_track.decoder import (
-    NOT_SEEN,
-    Decoded,
-    decode,
-    excursions,
-    step_costs,
-    with_excursions,
-)
+from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult, flagged
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.mesh_check import mesh_doubts
-from intercap_core.object_track.motion import FOREARMS
+from intercap_core.object_track.motion import HandMotion, hand_motions
 from intercap_core.object_track.observer import Observer, Pictures
 from intercap_core.object_track.prior import Prior, things
 from intercap_core.object_track.proposals import NotFound, Proposals
 from intercap_core.object_track.search import same_pose
+from intercap_core.object_track.steps import excursions, step_costs, with_excursions
 from intercap_core.object_track.view import View
 from intercap_core.object_track.whole import WholeTrack
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.paint import Paint
 from intercap_core.rigid.twist import step_between
-
-_WRISTS = [wrist for _, wrist in FOREARMS]
 
 
 @dataclass(frozen=True)
@@ -137,7 +129,7 @@ class Tracker:
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
         steps = [
-            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._carried(t))
+            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._hands(t))
             for t, gap in enumerate(np.diff(self._times))
         ]
         self._emissions = [self._share * weight for weight in weights]
@@ -160,12 +152,11 @@ class Tracker:
                         self._observer.places.seen_beside(t, place, here)
         return decoded
 
-    def _carried(self, t: int) -> np.ndarray:
-        """Motions (H, 3) of the known hands from frame t to the next, metres."""
+    def _hands(self, t: int) -> list[HandMotion | None]:
+        """How the hands move from frame t to the next."""
         if self._joints is None:
-            return np.zeros((0, 3))
-        step = self._joints[t + 1, _WRISTS] - self._joints[t, _WRISTS]
-        return step[np.isfinite(step).all(1)]
+            return [None, None]
+        return hand_motions(self._joints[[t, t + 1]])
 
     # --- the outcome ---------------------------------------------------------------------------
 
