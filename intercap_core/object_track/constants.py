@@ -141,6 +141,8 @@ FIT_CONVERGED_M, FIT_CONVERGED_RAD = 5e-4, np.radians(0.1)  # 0.2 px of 1080p at
 # A pose this near to the one drawn last is a quarter of a pixel off: steps on from the same
 # renderings, whose residuals are linear in so small a motion.
 REDRAWN_M, REDRAWN_RAD = 1.5e-3, np.radians(0.3)
+# What moves less until a view exposes is drawn once for all: a quarter of the same.
+UNMOVED_M, UNMOVED_RAD = 4e-4, np.radians(0.08)
 FIT_DAMPING = 1e-3  # of the diagonal
 
 # --- solver effort: the search of a frame --------------------------------------------------------
@@ -191,6 +193,8 @@ UNSEEN_S = 0.8  # seconds that an object is followed without being seen
 MAX_HYPOTHESES = 6  # of a frame
 CROWDED = (0.04, 25.0)  # metres and degrees within which, of too many, the less likely one goes
 TURNS_FOLLOWED = 2  # of a key frame
+# What moves is fitted again where that changes by so much what a view sees, so many times at most.
+MOTION_CHANGED_M, MOTION_CHANGED_RAD, MOTION_ROUNDS = 3e-3, np.radians(0.5), 3
 ANNOTATION_FRAMES = 5  # by which an annotation's frame may be off
 SURVEYED_FRAMES = 12  # looked at before tracking, spread over the recording
 SURVEYED_GROUPS = 6  # groups of candidates in each of them
@@ -374,6 +378,8 @@ NEAR_TURN_DISTINCT_DEG = 45.0
 
 # Standard deviations that are as good as lost: one frame in six would be off by more.
 UNSURE_M, UNSURE_RAD = 0.035, np.radians(15)
+# Out of sight for less, seconds, between poses that are as good as one: it stayed there.
+BRIDGED_S = 0.3
 FREE_AXIS_SIGMA_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
 TOLD_SHARE = 0.5  # of the frames, from which a track's faults are told
 

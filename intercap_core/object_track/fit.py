@@ -7,7 +7,7 @@ scale that shrinks from the size of the expected error to that of the noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from intercap_core.object_track.constants import (
     SCALE_SHRINKAGE,
     SUPPORTING_AGREEMENT,
     SUPPORTING_PX,
+    UNMOVED_M,
+    UNMOVED_RAD,
 )
 from intercap_core.object_track.view import View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
@@ -52,11 +54,13 @@ class MotionPrior:
 
 @dataclass(frozen=True)
 class Fit:
-    """A pose (4, 4) master_from_object, its covariance (6, 6) and how each view agrees."""
+    """A pose (4, 4) master_from_object, its covariance (6, 6), how each view agrees, and the
+    ``twist`` (6,) in a second by which each saw it (:func:`fit_pose`)."""
 
     pose: np.ndarray
     covariance: np.ndarray
     views: tuple[ViewReport, ...]
+    twist: np.ndarray = field(default_factory=lambda: np.zeros(6))
 
     @property
     def log_ratio(self) -> float:
@@ -136,7 +140,8 @@ def fit_pose(
                 _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
     report_scale = REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1]
     reports = renderer.pool.map(lambda fit: fit.report(report_scale), fits)
-    return Fit(pose, np.linalg.inv(information + 1e-9 * np.eye(6)), tuple(reports))
+    covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
+    return Fit(pose, covariance, tuple(reports), np.zeros(6) if twist is None else twist)
 
 
 def _step(
@@ -203,21 +208,6 @@ def _draw(
     return [[next(drawn) for _ in group] for group in shots]
 
 
-def assess(
-    mesh: ObjectMesh,
-    views: list[View],
-    pose: np.ndarray,
-    *,
-    min_overlap: float,
-    labels: tuple[str, ...] = (),
-    renderer: Renderer | None = None,
-) -> Fit:
-    """How well a pose (4, 4) agrees with all views, without changing it."""
-    return assess_all(
-        mesh, views, pose[None], min_overlap=min_overlap, labels=labels, renderer=renderer
-    )[0]
-
-
 def assess_all(
     mesh: ObjectMesh,
     views: list[View],
@@ -225,25 +215,36 @@ def assess_all(
     *,
     min_overlap: float,
     labels: tuple[str, ...] = (),
+    twists: np.ndarray | None = None,
     renderer: Renderer | None = None,
 ) -> list[Fit]:
-    """:func:`assess` of many poses (N, 4, 4) at once."""
+    """How well poses (N, 4, 4) agree with all views, without changing them; ``twists`` (N, 6) as of
+    :func:`fit_pose`."""
     renderer = renderer or default_renderer()
-    cases = [(view, pose) for pose in poses for view in views]
-    drawn = _draw(renderer, mesh, [view for view, _ in cases], [pose for _, pose in cases])
+    motions = np.zeros((len(poses), 6)) if twists is None else twists
+    seen = [own for pose, twist in zip(poses, motions, strict=True)
+            for own in _seen(pose, views, twist)]  # fmt: skip
+    each = list(views) * len(poses)
+    drawn = _draw(renderer, mesh, each, seen)
 
     def compare(number: int) -> ViewReport:
-        (view, pose), (silhouette, *depth) = cases[number], drawn[number]
+        silhouette, *depth = drawn[number]
         return quick_report(
-            mesh, view, pose, silhouette, depth[0] if depth else None, min_overlap, labels
+            mesh,
+            each[number],
+            seen[number],
+            silhouette,
+            depth[0] if depth else None,
+            min_overlap,
+            labels,
         )
 
-    reports = renderer.pool.map(compare, range(len(cases)))
+    reports = renderer.pool.map(compare, range(len(each)))
     unknown = np.full((6, 6), np.nan)
     count = len(views)
     return [
-        Fit(pose, unknown, tuple(reports[i * count : (i + 1) * count]))
-        for i, pose in enumerate(poses)
+        Fit(pose, unknown, tuple(reports[i * count : (i + 1) * count]), twist)
+        for i, (pose, twist) in enumerate(zip(poses, motions, strict=True))
     ]
 
 
@@ -261,6 +262,12 @@ def _limited(step: np.ndarray) -> np.ndarray:
 
 
 def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
-    """The pose at each view's exposure: the same array where it exposes at the frame set's time."""
-    late = [0.0 if twist is None else view.geometry.time_offset_s for view in views]
-    return [pose if not t or twist is None else moved(pose, t * twist) for t in late]
+    """The pose at each view's exposure: the same array where it hardly moves until then."""
+    if twist is None:
+        return [pose] * len(views)
+    steps = np.array([view.geometry.time_offset_s for view in views])[:, None] * twist
+    moves = (np.abs(steps[:, :3]).max(1) > UNMOVED_RAD) | (np.abs(steps[:, 3:]).max(1) > UNMOVED_M)
+    if not moves.any():
+        return [pose] * len(views)
+    later = moved(np.broadcast_to(pose, (len(views), 4, 4)), steps)
+    return [own if moves[i] else pose for i, own in enumerate(later)]

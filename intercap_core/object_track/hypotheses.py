@@ -10,19 +10,24 @@ from intercap_core.object_track.constants import (
     BASIN,
     CONTRADICTED_LOG_RATIO,
     CROWDED,
+    FIT_ROUNDS,
     MAX_HYPOTHESES,
+    MOTION_CHANGED_M,
+    MOTION_CHANGED_RAD,
     PRIOR_CONTRADICTED,
     PRIOR_WIDENED,
     RIVAL_LOG_RATIO,
+    RIVAL_PROBABILITY,
     SEEN_LOG_RATIO,
     UNSEEN_S,
 )
+from intercap_core.object_track.decoder import NOT_SEEN, Decoded
 from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.motion import expected, extrapolated
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
 from intercap_core.object_track.search import same_pose
-from intercap_core.rigid.twist import step_between
+from intercap_core.rigid.twist import step_between, twists
 
 
 class Hypotheses:
@@ -84,16 +89,46 @@ class Hypotheses:
         for frames in (range(t + 1, self._observer.count), range(t - 1, -1, -1)):
             self._follow(t, fit.pose, frames)
 
+    def see_moving(self, decoded: Decoded, times: np.ndarray) -> set[int]:
+        """Fit again what moves, as each view saw it when it exposed; the frames that changed.
+
+        The motion is that of the frames around, better known than when a frame was fitted; a rival
+        moves as what is believed does. ``times`` (T,) of the frames, seconds.
+        """
+        known = decoded.path != NOT_SEEN
+        poses = np.tile(np.eye(4), (len(known), 1, 1))
+        frames = [t for t, k in enumerate(decoded.path) if k != NOT_SEEN]
+        for t in frames:
+            poses[t] = self.fits[t][decoded.path[t]].pose
+        motion = twists(poses, known, times)
+        changed = set()
+        for t in frames:
+            late = max(abs(view.geometry.time_offset_s) for view in self._observer.views(t))
+            for k, fit in enumerate(self.fits[t]):
+                turn, shift = np.abs(motion[t] - fit.twist).reshape(2, 3).max(1) * late
+                if decoded.probability[t][k] < RIVAL_PROBABILITY or (
+                    turn < MOTION_CHANGED_RAD and shift < MOTION_CHANGED_M
+                ):
+                    continue
+                again = self._observer.fit(
+                    t, fit.pose, MotionPrior(fit.pose), FIT_ROUNDS, twist=motion[t]
+                )
+                if again.log_ratio > fit.log_ratio:
+                    self.fits[t][k] = again
+                    changed.add(t)
+        return changed
+
     def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
         before = now = pose
         unseen, deficit = 0, 0.0
         for t in frames:
             predicted = self._likeliest(t, last, before, now)
+            twist = step_between(now, predicted) / (self._step_s * (t - last))
             last = t
             if self.seen(t, predicted) is not None:
                 return
             prior = expected(before, now, predicted, self._step_s, unseen * self._step_s)
-            fit = self._fit(t, predicted, prior)
+            fit = self._fit(t, predicted, prior, twist)
             if self.seen(t, fit.pose) is not None:
                 return
             weights = self._prior.weigh(t, [fit, *self.fits[t]])
@@ -118,17 +153,18 @@ class Hypotheses:
                 starts.append(pose)
         if len(starts) == 1:
             return extrapolated(before, now)
-        found = self._observer.assess_all(t, np.array(starts))
+        rates = step_between(now, np.array(starts)) / (self._step_s * (t - last))
+        found = self._observer.assess_all(t, np.array(starts), twists=rates)
         return max(found, key=lambda one: one.log_ratio).pose
 
-    def _fit(self, t: int, start: np.ndarray, prior: MotionPrior) -> Fit:
-        """The fit of frame t from ``start`` (4, 4), its prior widened where the images contradict
-        it."""
-        fit = self._observer.fit(t, start, prior)
+    def _fit(self, t: int, start: np.ndarray, prior: MotionPrior, twist: np.ndarray) -> Fit:
+        """The fit of frame t from ``start`` (4, 4), moving by ``twist`` (6,); its prior widened
+        where the images contradict it."""
+        fit = self._observer.fit(t, start, prior, twist=twist)
         step = np.abs(step_between(prior.pose, fit.pose))
         limit = np.repeat([prior.sigma_rad, prior.sigma_m], 3) * PRIOR_CONTRADICTED
         if fit.log_ratio < SEEN_LOG_RATIO or (step < limit).all():
             return fit
         wide = (PRIOR_WIDENED * prior.sigma_m, PRIOR_WIDENED * prior.sigma_rad)
-        again = self._observer.fit(t, fit.pose, MotionPrior(prior.pose, *wide))
+        again = self._observer.fit(t, fit.pose, MotionPrior(prior.pose, *wide), twist=twist)
         return again if again.log_ratio > fit.log_ratio else fit

@@ -128,9 +128,10 @@ class Observer:
         rounds: tuple[int, ...] = PASS_ROUNDS,
         scale: float = PASS_SCALE,
         mesh: ObjectMesh | None = None,
+        twist: np.ndarray | None = None,
     ) -> Fit:
-        """The pose (4, 4) of frame t fitted from one that is nearly right; ``mesh`` instead of the
-        object's own."""
+        """The pose (4, 4) of frame t fitted from one that is nearly right, of an object that moves
+        by ``twist`` (6,); ``mesh`` instead of the object's own."""
         return fit_pose(
             mesh or self.mesh,
             self.views(t),
@@ -141,6 +142,7 @@ class Observer:
             labels=self.labels,
             rounds=rounds,
             start_scale=scale,
+            twist=twist,
             renderer=self.renderer,
         )
 
@@ -164,17 +166,30 @@ class Observer:
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
         return carried(self.joints[[t, u]], pose, centre, radius)
 
-    def assess(self, t: int, pose: np.ndarray, mesh: ObjectMesh | None = None) -> Fit:
+    def assess(
+        self,
+        t: int,
+        pose: np.ndarray,
+        mesh: ObjectMesh | None = None,
+        twist: np.ndarray | None = None,
+    ) -> Fit:
         """How well a pose (4, 4) agrees with frame t as it is; ``mesh`` instead of the object's."""
-        return self.assess_all(t, pose[None], mesh)[0]
+        return self.assess_all(t, pose[None], mesh, None if twist is None else twist[None])[0]
 
-    def assess_all(self, t: int, poses: np.ndarray, mesh: ObjectMesh | None = None) -> list[Fit]:
-        """:meth:`assess` of many poses (N, 4, 4) at once."""
+    def assess_all(
+        self,
+        t: int,
+        poses: np.ndarray,
+        mesh: ObjectMesh | None = None,
+        twists: np.ndarray | None = None,
+    ) -> list[Fit]:
+        """:meth:`assess` of many poses (N, 4, 4) at once, moving by ``twists`` (N, 6)."""
         return assess_all(
             mesh or self.mesh,
             self.views(t),
             poses,
             min_overlap=ASSESS_MIN_OVERLAP,
             labels=self.labels,
+            twists=twists,
             renderer=self.renderer,
         )

@@ -160,6 +160,10 @@ class Proposals:
             new = self._follow(t, self._observer.search(t))
         return new
 
+    def look_again(self, changed: set[int]) -> None:
+        """Let :meth:`look` look once more where what is known around has ``changed``."""
+        self._looked -= {t + step for t in changed for step in (-1, 1)}
+
     def _unsearched(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
         """The likeliest frame of every time that the object is seen, in no frame of which it was
         searched: what reappears may have turned out of sight."""
@@ -174,12 +178,14 @@ class Proposals:
     def _look_near(self, t: int, known: dict[int, np.ndarray]) -> bool:
         """Search frame t with the rotations that the frames around lead to, ``known`` poses (4, 4)
         by frame; whether something new was found."""
-        starts = self._expected(t, known)
+        starts, rates = self._expected(t, known)
         if not len(starts):
             return False
         self._looked.add(t)
-        first = max(self._observer.assess_all(t, starts), key=lambda one: one.log_ratio)
-        found = [self._observer.fit(t, first.pose, MotionPrior(first.pose), FIT_ROUNDS, 1.0)]
+        seen = self._observer.assess_all(t, starts, twists=rates)
+        first = max(seen, key=lambda one: one.log_ratio)
+        prior = MotionPrior(first.pose)
+        found = [self._observer.fit(t, first.pose, prior, FIT_ROUNDS, 1.0, twist=first.twist)]
         if found[0].log_ratio < SEARCH_GOOD_LOG_RATIO:
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
@@ -187,9 +193,9 @@ class Proposals:
             found += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places))
         return self._follow(t, found)
 
-    def _expected(self, t: int, known: dict[int, np.ndarray]) -> np.ndarray:
-        """Poses (N, 4, 4) of frame t by those of the frames around: as they are, at constant
-        velocity from either side, and between."""
+    def _expected(self, t: int, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (N, 4, 4) of frame t by those of the frames around, and their twists (N, 6): as
+        they are, at constant velocity or in a hand from either side, and between."""
         fits, reach = self._hypotheses.fits, max(1, round(LOOK_NEAR_S / self._step_s))
         poses = {}
         for u in range(max(t - reach, 0), min(t + reach + 1, len(fits))):
@@ -199,21 +205,29 @@ class Proposals:
                 poses[u] = fits[u][int(self._prior.weigh(u, fits[u]).argmax())].pose
         before = [u for u in poses if u < t][:-3:-1]
         after = [u for u in poses if u > t][:2]
-        found = []
+        found, rates = [], []
         for near in (before, after):
-            if near:
-                found.append(poses[near[0]])
+            if not near:
+                continue
+            here = poses[near[0]]
+            ahead = self._times[t] - self._times[near[0]]
+            found.append(here)
+            rates.append(np.zeros(6))
             if len(near) > 1:
-                rate = step_between(poses[near[1]], poses[near[0]]) / (
+                rate = step_between(poses[near[1]], here) / (
                     self._times[near[0]] - self._times[near[1]]
                 )
-                ahead = self._times[t] - self._times[near[0]]
-                found.append(moved(poses[near[0]], rate * ahead))
+                found.append(moved(here, rate * ahead))
+                rates.append(rate)
+            for pose in self._observer.carried(near[0], t, here):
+                found.append(pose)
+                rates.append(step_between(here, pose) / ahead)
         if before and after:
             a, b = before[0], after[0]
-            part = (self._times[t] - self._times[a]) / (self._times[b] - self._times[a])
-            found.append(moved(poses[a], part * step_between(poses[a], poses[b])))
-        return np.array(found).reshape(-1, 4, 4)
+            rate = step_between(poses[a], poses[b]) / (self._times[b] - self._times[a])
+            found.append(moved(poses[a], rate * (self._times[t] - self._times[a])))
+            rates.append(rate)
+        return np.array(found).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
 
     # --- near symmetries -----------------------------------------------------------------------
 
@@ -227,12 +241,15 @@ class Proposals:
             if k == NOT_SEEN or len(turns) == 1:
                 continue
             own = fits[t][k]
-            found = self._observer.assess_all(t, own.pose @ turns[1:])
+            moving = np.tile(own.twist, (len(turns) - 1, 1))
+            found = self._observer.assess_all(t, own.pose @ turns[1:], twists=moving)
             found = [one for one in found if one.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
             found.sort(key=lambda one: -one.log_ratio)
             for other in found[:TURNS_FOLLOWED]:
                 if self._hypotheses.known(t, other.pose) is None:
-                    fit = self._observer.fit(t, other.pose, MotionPrior(other.pose))
+                    fit = self._observer.fit(
+                        t, other.pose, MotionPrior(other.pose), twist=own.twist
+                    )
                     new |= self._follow(t, [fit])
         return new
 

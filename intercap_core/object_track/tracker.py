@@ -23,6 +23,7 @@ from intercap_core.object_track.constants import (
     ERROR_LASTING_S,
     GONE_PROBABILITY,
     LOST_PROBABILITY,
+    MOTION_ROUNDS,
     ROUNDS,
     SEARCH_GOOD_LOG_RATIO,
 )
@@ -104,12 +105,15 @@ class Tracker:
         if seed is None:
             seed = self._proposals.start()
         decoded = self._decode()
-        for _ in range(ROUNDS):
-            if not self._proposals.look(decoded):
-                break
-            decoded = self._decode()
+        decoded = self._look(decoded)
         if self._proposals.turn(decoded):
             decoded = self._decode()
+        for _ in range(MOTION_ROUNDS):
+            changed = self._hypotheses.see_moving(decoded, self._times)
+            if not changed:
+                break
+            self._proposals.look_again(changed)
+            decoded = self._look(self._decode())
         decoded = self._colours.decide(self._emissions, self._steps, decoded)
         if (decoded.path == NOT_SEEN).all():
             raise NotFound
@@ -122,6 +126,14 @@ class Tracker:
         final = flagged(self._mesh, refined)
         doubts = mesh_doubts(self._observer, final)
         return Track(final, seed, initial is not None, borne_out, tuple(doubts))
+
+    def _look(self, decoded: Decoded) -> Decoded:
+        """Decide anew until nothing more is found in the frames in doubt."""
+        for _ in range(ROUNDS):
+            if not self._proposals.look(decoded):
+                break
+            decoded = self._decode()
+        return decoded
 
     def _decode(self) -> Decoded:
         """Decide over all frames, and tell the places' prior where the object surely was."""

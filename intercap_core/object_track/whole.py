@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from intercap_core.object_track.constants import (
+    BRIDGED_S,
     COMMON_ERROR_VARIANCE,
     COMMON_TURN_VARIANCE,
     FREE_AXIS_SIGMA_RAD,
@@ -16,6 +18,7 @@ from intercap_core.object_track.constants import (
     SEEN_LOG_RATIO,
     UNKNOWN_SIGMA,
     UNSURE_M,
+    UNSURE_RAD,
 )
 from intercap_core.object_track.evidence import PoseEvidence
 from intercap_core.object_track.fit import Fit
@@ -41,13 +44,13 @@ class WholeTrack:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
         A lost frame is found again where interpolation of its neighbours leads to a pose that the
-        images support. A frame that smoothing moves far from its own fit becomes lost, unless they
-        support the smoothed pose.
+        images support, or where those around for a moment are at like poses. A frame that smoothing
+        moves far from its own fit becomes lost, unless they support the smoothed pose.
         """
         lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
         fits, segment, free_axis, pulled = self._smoothed(fits, lost)
-        guessed = lost | pulled
+        guessed = (lost & ~self._bridged(fits, lost)) | pulled
         return [
             replace(
                 frame,
@@ -61,6 +64,18 @@ class WholeTrack:
                 frames, fits, segment, free_axis, guessed, strict=True
             )
         ]
+
+    def _bridged(self, fits: list[Fit], lost: np.ndarray) -> np.ndarray:
+        """Lost frames (T,) bool that are few, between two at like poses: it went nowhere."""
+        found = np.zeros(len(lost), bool)
+        known = np.flatnonzero(~lost)
+        for a, b in pairwise(known.tolist()):
+            if b - a > 1 and self._times[b] - self._times[a] < BRIDGED_S:
+                one, two = fits[a].pose, fits[b].pose
+                turn = self._mesh.symmetry.rotation_error_deg(one[:3, :3], two[:3, :3])
+                shift = np.linalg.norm(self._mesh.centre_at(one) - self._mesh.centre_at(two))
+                found[a + 1 : b] = shift < UNSURE_M and np.radians(float(turn)) < UNSURE_RAD
+        return found
 
     # --- all frames together -------------------------------------------------------------------
 
