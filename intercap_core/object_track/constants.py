@@ -188,6 +188,7 @@ RUN_SEARCHED = 3  # frames in a row in which it is seen, from which one is searc
 # A frame in doubt is searched by the poses of frames no farther away, seconds, and within what a
 # hand may have moved meanwhile, metres.
 LOOK_NEAR_S, LOOK_NEAR_M = 0.3, 0.75
+NEAR_FITTED = 3  # of these poses, until one is good
 BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
 UNSEEN_S = 0.8  # seconds that an object is followed without being seen
 MAX_HYPOTHESES = 6  # of a frame

@@ -24,6 +24,7 @@ from intercap_core.object_track.constants import (
     OUT_OF_REACH_M,
     SAME_PLACE_M,
     SAME_PLACE_SHARE,
+    SEARCH_GOOD_LOG_RATIO,
     SOMETIMES_PRESENT,
     SUREST_PLACE,
     SURVEYED_FRAMES,
@@ -61,6 +62,7 @@ class Places:
         self._same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
         self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
         self._standing = [(s, self._standing_prior(s)) for s in standing]
+        self._clutter: list[tuple[np.ndarray, dict[int, float]]] = []
 
     @classmethod
     def survey(
@@ -102,6 +104,7 @@ class Places:
         such place moves, and mostly somebody moves it. ``share`` is how many independent
         observations a frame is.
         """
+        ratio -= self._like_the_object(place)
         found = self._nearest(place)
         if found is None or found[0].share < SOMETIMES_PRESENT:
             gaps = self._gaps(place, slice(t, t + 1))
@@ -123,12 +126,36 @@ class Places:
             if np.linalg.norm(s.place - place) >= self._same
         ]
 
-    def seen_beside(self, t: int, place: np.ndarray, object_at: np.ndarray) -> None:
-        """Record that something looks like the object at ``place`` (3,) in frame t, in which the
-        object itself is at ``object_at`` (3,)."""
+    def seen_beside(self, t: int, place: np.ndarray, object_at: np.ndarray, ratio: float) -> None:
+        """Record that something looks like the object at ``place`` (3,) in frame t, by ``ratio``
+        nats, in which the object itself is at ``object_at`` (3,)."""
         found = self._nearest(place)
-        if found is not None and np.linalg.norm(found[0].place - object_at) >= self._same:
+        if np.linalg.norm(place - object_at) < self._same:
+            return
+        if found is not None and ratio > SEARCH_GOOD_LOG_RATIO:
             found[0].beside.add(t)
+        likeness = self._likeness(place)
+        if likeness is None:
+            likeness = (place, {})
+            self._clutter.append(likeness)
+        likeness[1][t] = max(ratio, likeness[1].get(t, 0.0))
+
+    def forget_clutter(self) -> None:
+        """Forget what was seen beside the object, before it is told anew."""
+        self._clutter.clear()
+
+    def _likeness(self, place: np.ndarray) -> tuple[np.ndarray, dict[int, float]] | None:
+        """The clutter at ``place`` (3,), if any."""
+        near = (one for one in self._clutter if np.linalg.norm(one[0] - place) < self._same)
+        return next(near, None)
+
+    def _like_the_object(self, place: np.ndarray) -> float:
+        """Nats for the object of what stays at ``place`` (3,) while the object is elsewhere: no
+        evidence that it is there now."""
+        found = self._likeness(place)
+        if found is None or len(found[1]) < BESIDE_FRAMES:
+            return 0.0
+        return float(np.mean(list(found[1].values())))
 
     def _standing_prior(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))

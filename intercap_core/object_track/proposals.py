@@ -14,6 +14,7 @@ from intercap_core.object_track.constants import (
     HIDDEN_SHARE,
     KEY_FRAME_S,
     LOOK_NEAR_S,
+    NEAR_FITTED,
     NEAR_TURN_SEARCH_RAD,
     RIVAL_LOG_RATIO,
     RUN_SEARCHED,
@@ -183,14 +184,22 @@ class Proposals:
             return False
         self._looked.add(t)
         seen = self._observer.assess_all(t, starts, twists=rates)
-        first = max(seen, key=lambda one: one.log_ratio)
-        prior = MotionPrior(first.pose)
-        found = [self._observer.fit(t, first.pose, prior, FIT_ROUNDS, 1.0, twist=first.twist)]
-        if found[0].log_ratio < SEARCH_GOOD_LOG_RATIO:
+        found: list[Fit] = []
+        for start in sorted(seen, key=lambda one: -one.log_ratio)[:NEAR_FITTED]:
+            prior = MotionPrior(start.pose)
+            found.append(
+                self._observer.fit(t, start.pose, prior, FIT_ROUNDS, 1.0, twist=start.twist)
+            )
+            if found[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
+                break
+        best = max(found, key=lambda one: one.log_ratio)
+        if best.log_ratio < SEARCH_GOOD_LOG_RATIO:
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
             places = [self._observer.mesh.centre_at(start) for start in starts]
-            found += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places))
+            found += self._observer.search(
+                t, around.reshape(-1, 3, 3), np.array(places), best.twist
+            )
         return self._follow(t, found)
 
     def _expected(self, t: int, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -52,6 +52,7 @@ def search(
     background_term: bool,
     place_prior: Callable[[np.ndarray], float] | None = None,
     rotations: np.ndarray | None = None,
+    twist: np.ndarray | None = None,
     renderer: Renderer | None = None,
 ) -> list[Fit]:
     """Fitted hypotheses of the pose, the likeliest first; none where nothing is detected.
@@ -60,7 +61,8 @@ def search(
     be given (empty: any but a person); ``up`` (3,) is the vertical in the master frame, to try the
     standing poses more finely; ``place_prior`` says of a place (3,) how likely what is there is the
     object, 0 to 1; ``rotations`` (N, 3, 3) are tried alone where they are known roughly;
-    ``renderer`` draws, None = the CPU.
+    ``twist`` (6,) is the object's motion, see :func:`.fit.fit_pose`; ``renderer`` draws, None = the
+    CPU.
     """
 
     def fitted(starts: list[Fit], best: float = SEEN_LOG_RATIO) -> list[Fit]:
@@ -79,6 +81,7 @@ def search(
                         min_overlap=min(min_overlap, SEARCH_MIN_OVERLAP),
                         background_term=background_term,
                         labels=labels,
+                        twist=twist,
                         renderer=renderer,
                     )
                 )
@@ -86,7 +89,13 @@ def search(
 
     def compared(poses: np.ndarray) -> list[Fit]:
         found = assess_all(
-            mesh, views, poses, min_overlap=ASSESS_MIN_OVERLAP, labels=labels, renderer=renderer
+            mesh,
+            views,
+            poses,
+            min_overlap=ASSESS_MIN_OVERLAP,
+            labels=labels,
+            twists=None if twist is None else np.tile(twist, (len(poses), 1)),
+            renderer=renderer,
         )
         return sorted(found, key=lambda fit: -fit.log_ratio)
 

@@ -25,7 +25,7 @@ from intercap_core.object_track.constants import (
     LOST_PROBABILITY,
     MOTION_ROUNDS,
     ROUNDS,
-    SEARCH_GOOD_LOG_RATIO,
+    SEEN_LOG_RATIO,
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode
 from intercap_core.object_track.fit import Fit
@@ -155,13 +155,14 @@ class Tracker:
         away = excursions(centres, decoded.path, sure, self._times)
         self._steps = with_excursions(steps, away)
         decoded = decode(self._emissions, self._steps, absent)
+        places = self._observer.places
+        places.forget_clutter()
         for t, k in enumerate(decoded.path):
             if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
-                thing, here = things(fits[t]), self._mesh.centre_at(fits[t][k].pose)
+                thing = things(fits[t])
                 for other, fit in enumerate(fits[t]):
-                    if thing[other] != thing[k] and fit.log_ratio > SEARCH_GOOD_LOG_RATIO:
-                        place = self._mesh.centre_at(fit.pose)
-                        self._observer.places.seen_beside(t, place, here)
+                    if thing[other] != thing[k] and fit.log_ratio > SEEN_LOG_RATIO:
+                        places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
         return decoded
 
     def _hands(self, t: int) -> list[HandMotion | None]:

@@ -11,6 +11,7 @@ from intercap_core.object_track.constants import (
     BRIDGED_S,
     COMMON_ERROR_VARIANCE,
     COMMON_TURN_VARIANCE,
+    CONTRADICTED_LOG_RATIO,
     FREE_AXIS_SIGMA_RAD,
     MIN_NOISE_VARIANCE,
     RELOOK_LOG_RATIO,
@@ -45,23 +46,28 @@ class WholeTrack:
 
         A lost frame is found again where interpolation of its neighbours leads to a pose that the
         images support, or where those around for a moment are at like poses. A frame that smoothing
-        moves far from its own fit becomes lost, unless they support the smoothed pose.
+        moves far from its own fit becomes lost, unless they support the smoothed pose, and so does
+        one whose final pose they contradict.
         """
         lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
         fits, segment, free_axis, pulled = self._smoothed(fits, lost)
-        guessed = (lost & ~self._bridged(fits, lost)) | pulled
+        ratio = np.array([fit.log_ratio for fit in fits])
+        bridged = self._bridged(fits, lost)
+        lost = ((lost & ~bridged) | pulled) & (ratio < SEEN_LOG_RATIO)
+        # what was decided may have fitted one moment and not the motion through it
+        lost |= ~bridged & (ratio < CONTRADICTED_LOG_RATIO)
         return [
             replace(
                 frame,
                 fit=fit,
-                lost=bool(guess) and fit.log_ratio < SEEN_LOG_RATIO,
+                lost=bool(unseen),
                 gone=frame.gone and fit.log_ratio < SEEN_LOG_RATIO,
                 resting=bool(number >= 0),
                 free_axis=axis,
             )
-            for frame, fit, number, axis, guess in zip(
-                frames, fits, segment, free_axis, guessed, strict=True
+            for frame, fit, number, axis, unseen in zip(
+                frames, fits, segment, free_axis, lost, strict=True
             )
         ]
 
