@@ -82,7 +82,7 @@ PRIOR_SIGMA_M, PRIOR_SIGMA_RAD = 0.06, float(np.radians(15))
 STILL_M, STILL_RAD = 0.004, np.radians(1.5)
 # Standard deviation of how the velocity changes from one frame to the next, m/s and rad/s. Tuned on
 # the studio.
-ONSET_M_S, ONSET_RAD_S = 0.6, np.radians(150)
+ONSET_M_S, ONSET_RAD_S = 0.6, np.radians(60)
 # A fit that ends so many of the prior's standard deviations away is fitted again with a prior this
 # many times as wide: something set out or stopped.
 PRIOR_CONTRADICTED, PRIOR_WIDENED = 1.5, 4.0
@@ -191,7 +191,7 @@ LOOK_NEAR_S, LOOK_NEAR_M = 0.3, 0.75
 NEAR_FITTED = 3  # of these poses, until one is good
 BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
 UNSEEN_S = 0.8  # seconds that an object is followed without being seen
-MAX_HYPOTHESES = 6  # of a frame
+MAX_HYPOTHESES = 12  # of a frame: turns of a mug whose handle is hidden, 30 degrees apart
 CROWDED = (0.04, 25.0)  # metres and degrees within which, of too many, the less likely one goes
 TURNS_FOLLOWED = 2  # of a key frame
 # What moves is fitted again where that changes by so much what a view sees, so many times at most.
@@ -285,7 +285,7 @@ HELD_M, HELD_RAD, HELD_M_S, HELD_RAD_S = 0.02, np.radians(10), 0.3, 1.0
 MODE_COST = 2.7
 # Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
 # its coming back; of its leaving the room, or coming back to it, in addition.
-JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 4.0, 4.0, 4.0
+JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 7.0, 7.0, 4.0
 # Of going where it cannot be reached between two sure frames, and of coming back: chance clutter is
 # anywhere in a room, of which what can be reached is a hundredth. The reach: an error of either
 # pose, and a thrown object's way.
@@ -305,7 +305,7 @@ RELOOK_LOG_RATIO = 2.0  # nats by which a smoothed pose may be less likely and i
 APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite different: lost
 # Probabilities: of no hypothesis, from which a frame is lost; of quite different ones, from which
 # it is ambiguous; of the chosen one, below which more is looked for.
-LOST_PROBABILITY, AMBIGUOUS_PROBABILITY, DOUBTFUL_PROBABILITY = 0.5, 0.35, 0.9
+LOST_PROBABILITY, AMBIGUOUS_PROBABILITY, DOUBTFUL_PROBABILITY = 0.5, 0.2, 0.9
 GONE_PROBABILITY = 0.5  # of having left, from which a lost frame is told as such
 # Of the usual nats, below which more is looked for near a pose, and elsewhere too.
 DOUBTFUL_SHARE, HIDDEN_SHARE = 0.5, 0.25

@@ -12,20 +12,23 @@ from intercap_core.object_track.constants import (
     ABSENT_LOG_RATIO,
     ERROR_LASTING_S,
     EXCURSION_COST,
+    FREE_COST_S,
+    HELD_M,
+    HELD_M_S,
+    HELD_RAD,
+    HELD_RAD_S,
     JUMP_COST,
     LEAVE_COST,
+    MODE_COST,
+    STANDING_M,
 )
-from intercap_core.object_track.decoder import (
-    NOT_SEEN,
-    decode,
-    excursions,
-    step_costs,
-    with_excursions,
-)
+from intercap_core.object_track.decoder import NOT_SEEN, decode
+from intercap_core.object_track.motion import HandMotion
+from intercap_core.object_track.steps import excursions, step_costs, with_excursions
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.rigid.conftest import catalogue
 
-NO_HAND = np.zeros((0, 3))
+NO_HAND = [None, None]
 
 
 @pytest.fixture(scope="module")
@@ -41,35 +44,50 @@ def poses_of(places: list[float], degrees: float = 0.0) -> np.ndarray:
     return found
 
 
-def test_it_is_the_sum_over_all_sequences() -> None:
+@pytest.mark.parametrize("modes", [1, 2])
+def test_it_is_the_sum_over_all_sequences(modes: int) -> None:
+    """States of a frame: each hypothesis in each mode, hidden, gone."""
     rng = np.random.default_rng(4)
     counts = [2, 0, 3, 1]
     emissions = [rng.normal(size=n) for n in counts]
-    steps = [rng.normal(size=(a + 1, b + 1)) for a, b in pairwise(counts)]
+    steps = [rng.normal(size=(modes, a + 1, b + 1)) for a, b in pairwise(counts)]
+    for step in steps:  # to and from none of them, whatever the mode
+        step[:, :, -1], step[:, -1, :] = step[0, :, -1], step[0, -1, :]
     found = decode(emissions, steps, 0.3)
-    values = [np.append(own, [0.0, 0.3]) for own in emissions]  # hypotheses, hidden, gone
-    likely, shares = {}, [np.zeros(n + 2) for n in counts]
-    for states in product(*(range(n + 2) for n in counts)):
-        log = sum(values[t][s] for t, s in enumerate(states))
-        log -= LEAVE_COST * sum(states[t] == counts[t] + 1 for t in (0, -1))
-        for t, step in enumerate(steps):
-            gone = [states[u] == counts[u] + 1 for u in (t, t + 1)]
-            if not all(gone):
-                log += step[min(states[t], counts[t]), min(states[t + 1], counts[t + 1])]
-                log -= LEAVE_COST * any(gone)
-        likely[states] = log
-        for t, s in enumerate(states):
-            shares[t][s] += np.exp(log)
-    best = max(likely, key=lambda states: likely[states])
-    expected = [NOT_SEEN if s >= n else s for s, n in zip(best, counts, strict=True)]
-    assert found.path.tolist() == expected
-    for t, share in enumerate(shares):
-        own = share / share.sum()
-        np.testing.assert_allclose(found.probability[t][:-1], own[:-2], rtol=1e-10)
-        np.testing.assert_allclose(found.probability[t][-1], own[-2:].sum(), rtol=1e-10)
-        np.testing.assert_allclose(found.gone[t], own[-1], rtol=1e-10)
-    total = sum(np.exp(log) for log in likely.values())
-    assert found.evidence == pytest.approx(np.log(total))
+    states = [[*product(range(n), range(modes)), ("hidden", 0), ("gone", 0)] for n in counts]
+
+    def emission(t: int, what: int | str) -> float:
+        return (
+            {"hidden": 0.0, "gone": 0.3}.get(what) if isinstance(what, str) else emissions[t][what]
+        )
+
+    def step_of(t: int, one: tuple, two: tuple) -> float:
+        if one[0] == two[0] == "gone":
+            return 0.0
+        at = [-1 if isinstance(what, str) else what for what, _ in (one, two)]
+        log = steps[t][two[1], at[0], at[1]] - LEAVE_COST * ("gone" in (one[0], two[0]))
+        if at[1] >= 0 and at[0] < 0:
+            return log - np.log(modes)
+        return log - MODE_COST * (at[0] >= 0 and at[1] >= 0 and one[1] != two[1])
+
+    likely = {}
+    for sequence in product(*states):
+        log = sum(emission(t, what) for t, (what, _) in enumerate(sequence))
+        log -= LEAVE_COST * sum(sequence[t][0] == "gone" for t in (0, -1))
+        log -= np.log(modes) * (not isinstance(sequence[0][0], str))
+        log += sum(step_of(t, *pair) for t, pair in enumerate(pairwise(sequence)))
+        likely[sequence] = log
+    total = np.logaddexp.reduce(list(likely.values()))
+    assert found.evidence == pytest.approx(total)
+    best = max(likely, key=lambda one: likely[one])
+    assert found.path.tolist() == [NOT_SEEN if isinstance(what, str) else what for what, _ in best]
+    for t, n in enumerate(counts):
+        share = {what: 0.0 for what in (*range(n), "hidden", "gone")}
+        for sequence, log in likely.items():
+            share[sequence[t][0]] += np.exp(log - total)
+        expected = [*(share[k] for k in range(n)), share["hidden"] + share["gone"]]
+        assert found.probability[t] == pytest.approx(expected, rel=1e-9)
+        assert found.gone[t] == pytest.approx(share["gone"], rel=1e-9)
 
 
 def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
@@ -77,7 +95,7 @@ def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
     assert found.path.tolist() == [0]
     weights = np.array([np.exp(2), np.exp(1), 1 + np.exp(-2 * LEAVE_COST)])
     assert found.probability[0] == pytest.approx(weights / weights.sum())
-    nothing = decode([np.zeros(0)] * 3, [np.zeros((1, 1))] * 2)
+    nothing = decode([np.zeros(0)] * 3, [np.zeros((1, 1, 1))] * 2)
     assert (nothing.path == NOT_SEEN).all()
     assert all(p == pytest.approx([1.0], abs=1e-12) for p in nothing.probability)
 
@@ -92,15 +110,39 @@ def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: O
         return decode(emissions, steps).path.tolist()
 
     assert path(1.0) == [0] * 10
-    assert path(3.0) == [0] * 5 + [1] * 5
+    assert path(5.0) == [0] * 5 + [1] * 5
 
 
-def test_a_hand_carries_it_and_nothing_else_moves_so_far(cup: ObjectMesh) -> None:
+def test_at_rest_freely_or_in_a_hand_each_has_its_cost(cup: ObjectMesh) -> None:
     here, there = poses_of([0.0]), poses_of([0.0, 0.02, 1.0])
-    costs = step_costs(cup, here, there, 1 / 15, NO_HAND)[0]
-    assert costs[0] == 0 and -0.1 < costs[1] < 0 and costs[2] == -JUMP_COST
-    carried = step_costs(cup, here, there, 1 / 15, np.array([[1.0, 0.0, 0.0]]))[0]
-    assert carried[0] == 0 and carried[2] == pytest.approx(0)
+    rest, free, right, left = step_costs(cup, here, there, 1 / 15, NO_HAND)[:, 0, :-1]
+    assert rest[:2] == pytest.approx([0, -0.5 * (0.02 / STANDING_M) ** 2]) and rest[2] < -1000
+    assert free[0] == pytest.approx(-FREE_COST_S / 15)
+    assert free[2] == pytest.approx(-JUMP_COST - FREE_COST_S / 15)  # any step, at some cost
+    assert (right == -np.inf).all() and (left == -np.inf).all()
+    hand = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([1.1, 0, 0]))
+    carried = step_costs(cup, here, there, 1 / 15, [None, hand])[:, 0, :-1]
+    assert (carried[2] == -np.inf).all()
+    assert carried[3, 2] == pytest.approx(0) and carried[3, 0] < -10
+    away = HandMotion(np.eye(3), np.array([0.6, 0, 0]), np.array([1.6, 0, 0]))
+    assert (step_costs(cup, here, there, 1 / 15, [None, away])[3, :-1, :-1] == -np.inf).all()
+
+
+def test_it_turns_with_the_palm_about_the_wrist(cup: ObjectMesh) -> None:
+    turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    wrist, end = np.array([0.1, 0.0, 0.0]), np.array([0.15, 0.02, 0.0])
+    before = poses_of([0.0])
+    with_it = np.eye(4)[None].copy()
+    with_it[0, :3, :3], with_it[0, :3, 3] = turn, turn @ (-wrist) + end
+    after = np.concatenate([with_it, before])
+    held = step_costs(cup, before, after, 1 / 15, [HandMotion(turn, wrist, end), None])[2, 0, :-1]
+    assert held[0] == pytest.approx(0, abs=1e-9)
+    # what stays behind is off by the turn, and by the shift as far as the turn is known
+    sigma = np.hypot(HELD_RAD, HELD_RAD_S / 15)
+    arm = np.linalg.norm(cup.centre_at(before[0]) - wrist)
+    moved = np.linalg.norm(cup.centre_at(after[0]) - cup.centre_at(before[0]))
+    shift = moved / np.sqrt(HELD_M**2 + (HELD_M_S / 15) ** 2 + (arm * sigma) ** 2)
+    assert held[1] == pytest.approx(-0.5 * ((np.radians(40) / sigma) ** 2 + shift**2))
 
 
 def test_what_is_not_seen_for_a_second_is_hidden_and_for_long_has_left(cup: ObjectMesh) -> None:
@@ -122,7 +164,7 @@ def test_what_is_not_seen_for_a_second_is_hidden_and_for_long_has_left(cup: Obje
 def test_what_a_symmetry_hides_is_no_motion() -> None:
     bottle = ObjectMesh.load(catalogue()["bottle"])
     spun = step_costs(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
-    assert spun[0, 0] == pytest.approx(0, abs=1e-9)
+    assert spun[0, 0, 0] == pytest.approx(0, abs=1e-9)
 
 
 def test_equal_evidence_is_even_odds(cup: ObjectMesh) -> None:
@@ -143,9 +185,9 @@ def test_what_cannot_be_reached_between_sure_frames_costs_twice() -> None:
     away = excursions(centres, np.array([0, 0, 0, 0, 0]), sure, times)
     assert [own.tolist() for own in away] == [[False], [True], [False, True], [True], [False]]
     steps = with_excursions(
-        [np.zeros((len(a) + 1, len(b) + 1)) for a, b in pairwise(centres)], away
+        [np.zeros((1, len(a) + 1, len(b) + 1)) for a, b in pairwise(centres)], away
     )
-    assert steps[0].tolist() == [[-EXCURSION_COST, 0], [-EXCURSION_COST, 0]]
-    assert steps[1].tolist() == [[-EXCURSION_COST, 0, -EXCURSION_COST], [0, -EXCURSION_COST, 0]]
+    assert steps[0][0].tolist() == [[-EXCURSION_COST, 0], [-EXCURSION_COST, 0]]
+    assert steps[1][0].tolist() == [[-EXCURSION_COST, 0, -EXCURSION_COST], [0, -EXCURSION_COST, 0]]
     far = [*centres[:4], clutter]  # sure frames that contradict each other say nothing
     assert not any(own.any() for own in excursions(far, np.zeros(5, int), sure, times))

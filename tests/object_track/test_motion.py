@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.object_track.motion import carried, expected
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.object_track.motion import carried, expected, hand_motions
 
 ELBOW, WRIST = 3, 4
 
@@ -30,6 +31,27 @@ def test_it_moves_with_the_wrist_and_turns_with_the_forearm() -> None:
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = turn, shift
     np.testing.assert_allclose(found[0], rigid @ pose, atol=1e-12)
+
+
+def test_it_turns_with_the_palm_where_that_is_seen() -> None:
+    """The forearm stays, the palm turns by 50 degrees about it: a turn that no forearm shows."""
+    turn = Rotation.from_rotvec(np.radians(50) * np.array([1.0, 0.0, 0.0])).as_matrix()
+    elbow, wrist = np.array([0.0, 0.0, 0.0]), np.array([0.25, 0.0, 0.0])
+    knuckles = np.array([[0.34, 0.03, 0.01], [0.33, -0.04, 0.0]])
+    joints = joints_of(np.stack([elbow, elbow]), np.stack([wrist, wrist]))
+    seen = [KEYPOINT_NAMES.index(f"right_{finger}1") for finger in ("index", "pinky")]
+    joints[0, seen], joints[1, seen] = knuckles, (knuckles - wrist) @ turn.T + wrist
+    right, left = hand_motions(joints)
+    assert left is None and right is not None
+    np.testing.assert_allclose(right.turn, turn, atol=1e-12)
+    joints[1, seen[1]] = np.nan  # then it is the forearm's turn
+    (right, _) = hand_motions(joints)
+    assert right is not None
+    np.testing.assert_allclose(right.turn, np.eye(3), atol=1e-12)
+    joints[1, seen] = joints[1, WRIST] + [[0.08, 0, 0], [0.09, 0, 0]]  # and where a palm is a line
+    (right, _) = hand_motions(joints)
+    assert right is not None
+    np.testing.assert_allclose(right.turn, np.eye(3), atol=1e-12)
 
 
 def test_what_no_hand_reaches_is_not_carried() -> None:

@@ -48,12 +48,29 @@ def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
     twin = Standing(APART, 0.8)
     places = Places(bottle, [twin], _joints(APART, 20))  # the person walks past it
     assert places.prior(3, APART) == 1.0
-    places.seen_beside(8, APART, HANDLED)
-    places.seen_beside(8, APART, HANDLED)  # one frame counts once
-    places.seen_beside(12, APART, APART + 0.01)  # the object itself
+    places.seen_beside(8, APART, HANDLED, 40.0)
+    places.seen_beside(8, APART, HANDLED, 40.0)  # one frame counts once
+    places.seen_beside(12, APART, APART + 0.01, 40.0)  # the object itself
+    places.seen_beside(14, APART, HANDLED, 5.0)  # it hardly looks like it
     assert places.prior(3, APART) == 1.0
-    places.seen_beside(16, APART, HANDLED)
+    places.seen_beside(16, APART, HANDLED, 40.0)
     assert places.prior(3, APART) == 0.1
+
+
+def test_what_clutter_looks_like_is_no_evidence_for_the_object_there(bottle):
+    """By 6 and 10 nats a thing looks like the bottle while that is elsewhere; then 7 nats there are
+    none, and 40 are the bottle, which was put there."""
+    places = Places(bottle, [], _joints(APART, 20))
+    assert places.weigh(3, APART, 7.0, 0.2) == 7.0
+    for t, nats in ((8, 10.0), (8, 9.0), (12, 6.0)):
+        places.seen_beside(t, APART, HANDLED, nats)
+    assert places.weigh(3, APART + 0.01, 7.0, 0.2) == pytest.approx(7.0 - 8.0)
+    assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - 8.0)
+    assert places.weigh(3, HANDLED, 7.0, 0.2) == pytest.approx(
+        Places(bottle, [], _joints(APART, 20)).weigh(3, HANDLED, 7.0, 0.2)
+    )
+    places.forget_clutter()
+    assert places.weigh(3, APART, 7.0, 0.2) == 7.0
 
 
 @pytest.mark.parametrize("name", ["tennis_racquet"])

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.config import InitialObjectPose, ObjectTrackSettings
 from intercap_core.errors import UserError
-from intercap_core.object_track.fit import MotionPrior, assess, assess_all, fit_pose
+from intercap_core.object_track.fit import MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.search import rank_frames, rotation_grid, search
 from intercap_core.object_track.tracker import Tracker
@@ -89,7 +89,7 @@ def test_fit_recovers_from_six_centimetres_and_twenty_degrees(
     millimetres, degrees = _error(mesh, fit.pose, capture.poses[0])
     assert millimetres < 1.5 and degrees < 0.4
     assert fit.mean_overlap > 0.9 and fit.support == len(views)
-    truth = assess(mesh, views, capture.poses[0], min_overlap=0.3, labels=LABELS)
+    (truth,) = assess_all(mesh, views, capture.poses[:1], min_overlap=0.3, labels=LABELS)
     assert fit.log_ratio > truth.log_ratio - 2
 
 
@@ -119,7 +119,7 @@ def test_poses_assessed_together_are_those_assessed_alone(mesh, capture, views):
     poses = np.array([_disturbed(capture.poses[0], 0.05, 15, seed) for seed in range(3)])
     together = assess_all(mesh, views, poses, min_overlap=0.1, labels=LABELS)
     for pose, fit in zip(poses, together, strict=True):
-        alone = assess(mesh, views, pose, min_overlap=0.1, labels=LABELS)
+        (alone,) = assess_all(mesh, views, pose[None], min_overlap=0.1, labels=LABELS)
         assert fit.log_ratio == alone.log_ratio and len(fit.views) == len(views)
 
 
@@ -172,7 +172,7 @@ def test_search_finds_the_pose_with_nothing_to_start_from(mesh, capture, views):
     found = _search(mesh, views, LABELS, up)
     millimetres, degrees = _error(mesh, found[0].pose, capture.poses[0])
     assert millimetres < 3 and degrees < 1
-    truth = assess(mesh, views, capture.poses[0], min_overlap=0.3, labels=LABELS)
+    (truth,) = assess_all(mesh, views, capture.poses[:1], min_overlap=0.3, labels=LABELS)
     assert truth.log_ratio == pytest.approx(found[0].log_ratio, abs=3)
     assert all(one.log_ratio < found[0].log_ratio for one in found[1:])
 
