@@ -32,6 +32,7 @@ from intercap_core.object_track.constants import (
     WEAK_GAUGE,
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded, given, mixed
+from intercap_core.object_track.fit import Fit, seen_by
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.surface_kernel import seen_patches
@@ -145,16 +146,20 @@ class ColourDecision:
     def _sighting(self, t: int, k: int) -> Sighting | None:
         """What frame t shows at its hypothesis k; None where it shows nothing of it."""
         if (t, k) not in self._seen:
-            self._seen[t, k] = self._look(t, self._hypotheses.fits[t][k].pose)
+            self._seen[t, k] = self._look(t, self._hypotheses.fits[t][k])
         return self._seen[t, k]
 
-    def _look(self, t: int, pose: np.ndarray) -> Sighting | None:
+    def _look(self, t: int, fit: Fit) -> Sighting | None:
         observer, mesh = self._observer, self._observer.mesh
         assert observer.pictures is not None
         if self._pictures is None or self._pictures[0] != t:
             self._pictures = (t, observer.pictures(t))
         views, pictures = observer.views(t), self._pictures[1]
-        shots = [Shot(v.geometry.lens, v.geometry.colour_from_master @ pose) for v in views]
+        poses = seen_by(fit.pose, views, fit.twist)
+        shots = [
+            Shot(view.geometry.lens, view.geometry.colour_from_master @ pose)
+            for view, pose in zip(views, poses, strict=True)
+        ]
         parts = []
         for number, (view, shot, drawn) in enumerate(
             zip(views, shots, observer.renderer.draw(Surface.of(mesh), shots), strict=True)
@@ -170,7 +175,7 @@ class ColourDecision:
                 mesh.face_normals, self._size, STEEP_COSINE,
             )  # fmt: skip
             if len(patch):
-                normals = mesh.face_normals[face] @ pose[:3, :3].T
+                normals = mesh.face_normals[face] @ poses[number][:3, :3].T
                 parts.append((number, *_by_patch(patch, colour, normals)))
         if not parts:
             return None

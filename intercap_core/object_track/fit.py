@@ -137,7 +137,7 @@ def fit_pose(
                 last = step
             else:
                 last, drawn_pose = np.zeros(6), pose
-                _look(renderer, mesh, views, fits, _seen(drawn_pose, views, twist))
+                _look(renderer, mesh, views, fits, seen_by(drawn_pose, views, twist))
     report_scale = REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1]
     reports = renderer.pool.map(lambda fit: fit.report(report_scale), fits)
     covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
@@ -180,7 +180,7 @@ def view_fits(
     twist: np.ndarray | None,
 ) -> list[ViewFit]:
     """Every view's fit, looking at ``pose`` (4, 4) as its camera sees it; see :func:`fit_pose`."""
-    seen = _seen(pose, views, twist)
+    seen = seen_by(pose, views, twist)
     return [
         ViewFit(mesh, view, min_overlap, labels, own, drawn)
         for view, own, drawn in zip(views, seen, _draw(renderer, mesh, views, seen), strict=True)
@@ -223,7 +223,7 @@ def assess_all(
     renderer = renderer or default_renderer()
     motions = np.zeros((len(poses), 6)) if twists is None else twists
     seen = [own for pose, twist in zip(poses, motions, strict=True)
-            for own in _seen(pose, views, twist)]  # fmt: skip
+            for own in seen_by(pose, views, twist)]  # fmt: skip
     each = list(views) * len(poses)
     drawn = _draw(renderer, mesh, each, seen)
 
@@ -261,8 +261,9 @@ def _limited(step: np.ndarray) -> np.ndarray:
     return step / max(1.0, turn / FIT_MAX_STEP_RAD, shift / FIT_MAX_STEP_M)
 
 
-def _seen(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
-    """The pose at each view's exposure: the same array where it hardly moves until then."""
+def seen_by(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
+    """The pose (4, 4) at each view's exposure, of what moves by ``twist`` (6,): the same array
+    where it hardly moves until then."""
     if twist is None:
         return [pose] * len(views)
     steps = np.array([view.geometry.time_offset_s for view in views])[:, None] * twist

@@ -54,15 +54,21 @@ def _scale_doubt(observer: Observer, frames: list[FrameResult], believed: list[i
         return []
 
     def ratio(mesh: ObjectMesh) -> float:
-        fits = [observer.fit(t, frames[t].fit.pose, None, mesh=mesh) for t in surest]
-        return float(np.mean([fit.log_ratio for fit in fits]))
+        found = []
+        for t in surest:
+            fit = frames[t].fit
+            found.append(observer.fit(t, fit.pose, None, mesh=mesh, twist=fit.twist).log_ratio)
+        return float(np.mean(found))
 
     believed_ratio = float(np.mean([frames[t].fit.log_ratio for t in surest]))
     gains = {}
     for scale in CHECK_SCALES:
         other = scaled(observer.mesh, scale)
         # of the right size it is far worse before it is fitted, and need not be
-        as_it_is = [observer.assess(t, frames[t].fit.pose, other).log_ratio for t in surest]
+        as_it_is = [
+            observer.assess(t, frames[t].fit.pose, other, frames[t].fit.twist).log_ratio
+            for t in surest
+        ]
         if np.mean(as_it_is) > believed_ratio - CHECK_HOPELESS:
             gains[scale] = ratio(other) - ratio(observer.mesh)
     if max(gains.values(), default=0.0) < CHECK_GAIN:

@@ -111,6 +111,7 @@ class Proposals:
             return None
         t, fit = found
         self._prior.annotated = (t, fit.pose)
+        self._searched.add(t)
         self._observer.places.claim(self._observer.mesh.centre_at(fit.pose))
         self._hypotheses.follow(t, fit)
         return t

@@ -113,12 +113,15 @@ class WholeTrack:
         covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
         free = self._free_axes(track, covariance)
         result = [
-            replace(fit, pose=pose, covariance=own, views=seen.reports if seen else fit.views)
-            for fit, pose, own, seen in zip(fits, track, covariance, found, strict=True)
+            Fit(pose, own, seen.reports if seen else fit.views, twist)
+            for fit, pose, own, seen, twist in zip(
+                fits, track, covariance, found, motion, strict=True
+            )
         ]
         pulled = self._apart(looked, track) & np.array([seen is not None for seen in found])
         for t in map(int, np.flatnonzero(pulled | lost)):
-            result[t] = replace(result[t], views=self._observer.assess(t, track[t]).views)
+            seen = self._observer.assess(t, track[t], twist=motion[t])
+            result[t] = replace(result[t], views=seen.views)
         return result, segment, free, pulled
 
     def _apart(self, one: np.ndarray, two: np.ndarray) -> np.ndarray:

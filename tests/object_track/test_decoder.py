@@ -101,16 +101,16 @@ def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
 
 
 def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: ObjectMesh) -> None:
-    """Two poses half a turn apart; the images prefer the second from frame 5 on."""
+    """Two poses half a turn apart; the images prefer the second from frame 6 on."""
     both = np.concatenate([poses_of([0.0]), poses_of([0.0], 180)])
     steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 9
 
     def path(gain: float) -> list[int]:
-        emissions = [np.array([5.0, 2.0])] * 5 + [np.array([5.0, 5.0 + gain])] * 5
+        emissions = [np.array([5.0, 5.0 - gain])] * 6 + [np.array([5.0, 5.0 + gain])] * 4
         return decode(emissions, steps).path.tolist()
 
     assert path(1.0) == [0] * 10
-    assert path(5.0) == [0] * 5 + [1] * 5
+    assert path(5.0) == [0] * 6 + [1] * 4
 
 
 def test_at_rest_freely_or_in_a_hand_each_has_its_cost(cup: ObjectMesh) -> None:
