@@ -1,6 +1,6 @@
 """What a stage computes with half and with double the value of one of its constants.
 
-    python -m bench.sensitivity [SETTINGS] [--constants object_track.SCORE_SIGMA ...]
+    python -m bench.sensitivity [SETTINGS] [--constants object_track.JUMP_COST ...]
         [--sequences ...] [--output docs/sensitivity.md]
 
 Each constant's stage is replayed from the project's stored artefacts into a folder that is thrown
@@ -62,6 +62,11 @@ RISKIEST = (
     Probe("object_track.RIVAL_LOG_RATIO", "hypotheses that are followed"),
     Probe("object_track.AMBIGUOUS_PROBABILITY", "when a rival pose makes a frame ambiguous"),
     Probe("object_track.JUMP_COST", "what a step that no motion explains costs"),
+    Probe("object_track.MODE_COST", "what going from rest to a hand or to free motion costs"),
+    Probe("object_track.FREE_COST_S", "what free motion costs"),
+    Probe("object_track.HELD_RAD", "how far a hold turns in the palm"),
+    Probe("object_track.ONSET_RAD_S", "how far a hypothesis may turn from frame to frame"),
+    Probe("object_track.VANISH_COST", "what going out of sight costs"),
     Probe("object_track.UNHANDLED_LOG_RATIO", "against what moves with nobody near"),
     Probe("object_track.COMMON_ERROR_VARIANCE", "what views err together, in the covariance"),
     Probe("object_track.COMMON_TURN_VARIANCE", "the same of turns"),
