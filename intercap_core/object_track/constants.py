@@ -230,6 +230,8 @@ SEARCH_MIN_OVERLAP = 0.2  # of a candidate that a searched pose is fitted to, at
 # Deviation of measured depth from the object's surface: systematic error, calibration, and the
 # mesh's own error, metres. Tuned on the studio.
 DEPTH_LIKELY_SIGMA_M = 0.008
+# Measured this near to the room's own surface, metres, a pixel shows that: three such deviations.
+BACKGROUND_M = 0.025
 # Where the object is not, depth is measured anywhere within this range of where it would be.
 CLUTTER_RANGE_M = 0.3
 # Log of the share of a surface's pixels that the sensor looks past (flying pixels, edges), and of

@@ -8,7 +8,8 @@ nats, as the sum of
 - mask: a candidate is the object's, with the distances of its outline from the render's and its
   label, or the detector missed it, which it does the less the more of it is visible.
 
-What a person hides is no evidence. Pixels of one view err together: however many there are, they
+What a person hides is no evidence, and depth that is the room's own none for the object, where no
+candidate holds it. Pixels of one view err together: however many there are, they
 count as the samples stated in :mod:`.constants`, as in the fit (:mod:`.view_fit`).
 """
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.object_track.constants import (
+    BACKGROUND_M,
     CLUTTER_RANGE_M,
     CONTOUR_SIGMA_PX,
     DEPTH_HALF_SAMPLES_PX,
@@ -74,11 +76,12 @@ def _depth(
     person = view.person
     mask = candidate.mask if candidate is not None else EMPTY
     total, count = depth_log_ratio(
-        drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth, geometry.depth_lens.rays,
-        mesh.face_normals, geometry.depth_from_master[:3, :3] @ pose[:3, :3],
+        drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth, view.background,
+        geometry.depth_lens.rays, mesh.face_normals,
+        geometry.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
         person.mask, person.x0, person.y0, mask.mask, mask.x0, mask.y0,
-        DEPTH_LIKELY_SIGMA_M, CLUTTER_RANGE_M, LOG_SEEN_PAST, LOG_HIDDEN,
+        DEPTH_LIKELY_SIGMA_M, BACKGROUND_M, CLUTTER_RANGE_M, LOG_SEEN_PAST, LOG_HIDDEN,
     )  # fmt: skip
     return VIEW_SAMPLES * total / (count + DEPTH_HALF_SAMPLES_PX)
 

@@ -16,6 +16,7 @@ def depth_log_ratio(
     x0,
     y0,
     measured,
+    background,
     rays,
     face_normals,
     rotation,
@@ -28,6 +29,7 @@ def depth_log_ratio(
     mx,
     my,
     sigma,
+    background_m,
     clutter_m,
     log_past,
     log_hidden,
@@ -35,12 +37,14 @@ def depth_log_ratio(
     """Sum over a rendering's pixels of log p(depth | object there) - log p(depth | it is not), and
     how many were measured.
 
-    The rendering's pixel (u, v) is pixel (u + x0, v + y0) of ``measured`` (H, W), 0 where none;
-    ``rays`` (H, W, 2) of its lens; ``rotation`` (3, 3) camera_from_object; ``person`` and the
-    candidate's ``mask`` (h, w) with their first pixels in the colour image, whose lens has the
-    parameters ``colour`` (13,). The surface is measured with deviation ``sigma``, anything else
-    anywhere within ``clutter_m``; it is seen past with ``log_past``, hidden by what is no person
-    with ``log_hidden``. What a person explains is no evidence, outside the mask.
+    The rendering's pixel (u, v) is pixel (u + x0, v + y0) of ``measured`` (H, W), 0 where none, and
+    of the empty room's ``background`` (H, W), 0 where unknown, or (0, 0); ``rays`` (H, W, 2) of its
+    lens; ``rotation`` (3, 3) camera_from_object; ``person`` and the candidate's ``mask`` (h, w)
+    with their first pixels in the colour image, whose lens has the parameters ``colour`` (13,). The
+    surface is measured with deviation ``sigma``, anything else anywhere within ``clutter_m``; it is
+    seen past with ``log_past``, hidden by what is no person with ``log_hidden``. Outside the mask,
+    what a person explains is no evidence, and what the background explains within ``background_m``
+    is none for the object: something flat fits into any floor.
     """
     total, count = 0.0, 0
     agrees = np.log(clutter_m / (sigma * np.sqrt(2 * np.pi)))
@@ -76,8 +80,12 @@ def depth_log_ratio(
             i, j = x - mx, y - my
             own = 0 <= i < mask.shape[1] and 0 <= j < mask.shape[0] and mask[j, i]
             i, j = x - px, y - py
-            if own or not (0 <= i < person.shape[1] and 0 <= j < person.shape[0] and person[j, i]):
+            if own:
                 total += max(found, log_hidden)
+            elif not (0 <= i < person.shape[1] and 0 <= j < person.shape[0] and person[j, i]):
+                known = background[y0 + v, x0 + u] if background.size else np.float32(0.0)
+                if found < 0 or known <= 0 or abs(known - z) > background_m:
+                    total += max(found, log_hidden)
     return total, count
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,13 @@ class ViewGeometry:
             depth_bias_m,
             time_offset_s,
         )
+
+    def reduced_depth(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Depth (H, W) uint16 mm on the reduced grid: float32 metres, bias removed, 0 invalid."""
+        raw = depth_mm[:: self.depth_step, :: self.depth_step]
+        depth = raw * np.float32(1e-3) - np.float32(self.depth_bias_m)
+        depth[raw == 0] = 0
+        return depth
 
     # Computed once: a fit asks for them thousands of times.
 
@@ -118,7 +125,8 @@ class View:
     """One image of a frame set: what the tracker uses of it.
 
     ``depth`` (h, w) float32 metres on the reduced depth grid, bias removed, 0 where invalid; None
-    where there is no depth image. ``detected``: whether candidates are known for this image.
+    where there is no depth image. ``background`` the same of the empty room, (0, 0) where that is
+    not known. ``detected``: whether candidates are known for this image.
     """
 
     geometry: ViewGeometry
@@ -126,6 +134,7 @@ class View:
     person: ReducedMask
     candidates: tuple[Candidate, ...]
     detected: bool = True
+    background: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     @property
     def nbytes(self) -> int:
@@ -142,19 +151,15 @@ class View:
         person_rle: bytes,
         candidates: list[tuple[int, str, float, bytes]],
         detected: bool = True,
+        background: np.ndarray | None = None,
     ) -> View:
         """Reduce one image's depth (H, W) uint16 mm, person mask and candidates.
 
         A candidate is (index, label, score, RLE); one that holds the person beside something else
-        is there a second time without the person. Raises ValueError where a mask does not fit the
-        image.
+        is there a second time without the person. ``background`` (h, w) is reduced already
+        (:meth:`ViewGeometry.reduced_depth`). Raises ValueError where a mask does not fit the image.
         """
-        depth = None
-        if depth_mm is not None:
-            step = geometry.depth_step
-            raw = depth_mm[::step, ::step]
-            depth = raw * np.float32(1e-3) - np.float32(geometry.depth_bias_m)
-            depth[raw == 0] = 0
+        depth = None if depth_mm is None else geometry.reduced_depth(depth_mm)
         colour, step = geometry.camera.colour, geometry.step
         found = tuple(
             Candidate(index, label, score, decode(rle, colour, step))
@@ -166,4 +171,5 @@ class View:
             for candidate in found
             if (part := without_person(candidate.mask, person, step)) is not None
         )
-        return cls(geometry, depth, person, found + parts, detected)
+        room = np.zeros((0, 0), np.float32) if background is None else background
+        return cls(geometry, depth, person, found + parts, detected, room)

@@ -55,6 +55,11 @@ class ObjectRecording:
             self._frames = frames.showing(artefact["image_of"])
             moments = detections.showing(artefact["image_of"])
             self.up = artefact["zup_from_master"][2, :3].copy()
+            rooms = {
+                c: artefact[f"cameras/{camera.name}/background"]
+                for c, camera in enumerate(rig)
+                if f"cameras/{camera.name}/background" in artefact
+            }
         self._detections = moments.with_candidates_of(person)
         self._diameter_m = diameter_m
         self._unreadable: set[tuple[int, int]] = set()
@@ -72,17 +77,22 @@ class ObjectRecording:
             for c, distance in zip(self.cameras, away, strict=True)
         ]
 
+        self._rooms = [
+            geometry.reduced_depth(rooms[c]) if c in rooms else None
+            for c, geometry in zip(self.cameras, self.geometry, strict=True)
+        ]
+
     def views(self, t: int) -> list[View]:
         """What each usable camera shows of moment t."""
         found = []
-        for c, geometry in zip(self.cameras, self.geometry, strict=True):
+        for c, geometry, room in zip(self.cameras, self.geometry, self._rooms, strict=True):
             candidates = [
                 (candidate.index, candidate.label, candidate.score, candidate.rle)
                 for candidate in self._candidates(t, c)
             ]
             depth = self._frames.depth(t, c)
             detected = bool(self._detections.candidates_found[t, c])
-            found.append(View.build(geometry, depth, self._masks[t][c], candidates, detected))
+            found.append(View.build(geometry, depth, self._masks[t][c], candidates, detected, room))
         return found
 
     def pictures(self, t: int) -> list[np.ndarray | None]:
