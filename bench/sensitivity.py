@@ -62,7 +62,7 @@ RISKIEST = (
     Probe("object_track.RIVAL_LOG_RATIO", "hypotheses that are followed"),
     Probe("object_track.AMBIGUOUS_PROBABILITY", "when a rival pose makes a frame ambiguous"),
     Probe("object_track.JUMP_COST", "what a step that no motion explains costs"),
-    Probe("object_track.MODE_COST", "what going from rest to a hand or to free motion costs"),
+    Probe("object_track.MODE_CHANGES_S", "how often rest, a hand and free motion change"),
     Probe("object_track.FREE_COST_S", "what free motion costs"),
     Probe("object_track.HELD_RAD", "how far a hold turns in the palm"),
     Probe("object_track.ONSET_RAD_S", "how far a hypothesis may turn from frame to frame"),

@@ -184,7 +184,7 @@ SEED_SEARCHES = 3  # frames searched for the seed, more while nothing is found
 SEED_SEARCHES_MAX = 10
 ROUNDS = 15  # of deciding and of looking for more
 SEARCHES_MIN, SEARCH_EVERY_S = 6, 0.5  # frames searched with all rotations, and one in this time
-RUN_SEARCHED = 3  # frames in a row in which it is seen, from which one is searched
+RUN_SEARCHED_S = 0.2  # that it is seen for, from which one of the frames is searched
 # A frame in doubt is searched by the poses of frames no farther away, seconds, and within what a
 # hand may have moved meanwhile, metres.
 LOOK_NEAR_S, LOOK_NEAR_M = 0.3, 0.75
@@ -192,7 +192,7 @@ NEAR_FITTED = 3  # of these poses, until one is good
 BASIN = (0.04, 15.0)  # metres and degrees from which a fit surely leads to one pose
 UNSEEN_S = 0.8  # seconds that an object is followed without being seen
 MAX_HYPOTHESES = 12  # of a frame: turns of a mug whose handle is hidden, 30 degrees apart
-CROWDED = (0.04, 25.0)  # metres and degrees within which, of too many, the less likely one goes
+CROWDED = (0.04, 20.0)  # metres and degrees within which, of too many, the less likely one goes
 TURNS_FOLLOWED = 2  # of a key frame
 # What moves is fitted again where that changes by so much what a view sees, so many times at most.
 MOTION_CHANGED_M, MOTION_CHANGED_RAD, MOTION_ROUNDS = 3e-3, np.radians(0.5), 3
@@ -268,7 +268,7 @@ LEARNING_FRAMES = 12  # from which colours are learnt, at most, and at least
 LEARNING_FRAMES_MIN = 3
 PAINT_EXPLAINS = 0.5  # share of the colours' variance that the mesh's own must explain to count
 PAINT_LOOKS = 3  # independent ones at the mesh's own colours, however many frames there are
-RIVAL_PROBABILITY = 0.01  # of a pose that colours are asked about
+RIVAL_PROBABILITY = 0.01  # of a pose that colours are asked about, and that is seen in motion
 # Probability of such a pose, below which it is left out where too few frames are certain with it.
 WEAK_GAUGE = 0.05
 GAUGES = 3  # poses of one frame to which others may be relative: learnt from each
@@ -281,10 +281,10 @@ COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
 # cost in addition, nats a second, for hands and rest explain most of what is recorded; of fits of
 # what stands; of what a hand holds against its palm: of fits and joints, and of slipping.
 MOVING_M_S, MOVING_TURN_RAD_S, FREE_COST_S = 2.5, 7.0, 30.0
+FREE_LASTING_S = 0.1  # over a longer step that costs no more: it may have rested meanwhile
 STANDING_M, STANDING_RAD = 0.015, np.radians(8)
 HELD_M, HELD_RAD, HELD_M_S, HELD_RAD_S = 0.02, np.radians(10), 0.3, 1.0
-# Minus log-likelihood of going from one of these to another: once a second at 15 frames a second.
-MODE_COST = 2.7
+MODE_CHANGES_S = 1.0  # from each of these to another, in a second
 # Minus log-likelihoods of a step that no motion explains, of the object going out of sight and of
 # its coming back; of its leaving the room, or coming back to it, in addition.
 JUMP_COST, VANISH_COST, APPEAR_COST, LEAVE_COST = 10.0, 7.0, 7.0, 4.0
@@ -296,7 +296,7 @@ EXCURSION_COST, REACH_M, REACH_M_S = 5.0, 0.2, 4.0
 # to be gone: gone is the likelier from about two seconds on.
 ABSENT_LOG_RATIO = 1.0
 # Nats that the images of one frame say for a pose: from which it is seen; from which it is good
-# enough to start from or to stop a search; below which it is no hypothesis.
+# enough to start from or to stop a search; below which it is no hypothesis, and lost.
 SEEN_LOG_RATIO, SEED_SURE_LOG_RATIO, CONTRADICTED_LOG_RATIO = 3.0, 40.0, -6.0
 RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow
 UPRIGHT_LOG_RATIO = (
@@ -344,6 +344,9 @@ UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against what moves with nobody nea
 SUREST_PLACE = 1 - 1e-6  # prior of a place, at most: its log-odds have to end somewhere
 MIN_PLACE_PRIOR = 0.1  # of what stands apart all the time
 BESIDE_FRAMES = 2  # in which something stands there while the object is elsewhere: another thing
+# Nats that a thing which is seen there too takes off what looks like the object in its place, at
+# most: a part of furniture, not a twin that the track may have mistaken.
+CLUTTER_LOG_RATIO = 10.0
 
 # --- decision: the mesh's size -------------------------------------------------------------------
 

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from intercap_core.object_track.constants import LEAVE_COST, MODE_COST
+from intercap_core.object_track.constants import LEAVE_COST
 
 NOT_SEEN = -1
 _CERTAIN = 1e4  # nats: far more than all frames say
+_NEVER = -600.0  # nats: the least that a frame says, of which the exponential is still a number
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,11 @@ def decode(
     """The model's states of T frames.
 
     ``emissions`` [T] (K_t,) log-likelihoods of the hypotheses, against that none is true; ``steps``
-    [T - 1] (M, K_t + 1, K_t+1 + 1) log-probabilities of going from one of them, or none, to the
-    next, in each of M modes of motion. Where none is true the object is hidden, or it has left,
-    which costs more at either end and ``absent`` nats a frame less: what is in the room is seldom
-    hidden from all cameras for long.
+    [T - 1] (M, M, K_t + 1, K_t+1 + 1) log-probabilities of going in one mode of motion, and another
+    from then on, from one of them, or none, to the next; none is in no mode, and those of the first
+    count for it. Where none is true the object is hidden, or it has left, which costs more at
+    either end and ``absent`` nats a frame less: what is in the room is seldom hidden from all
+    cameras for long.
     """
     modes = len(steps[0]) if steps else 1
     values = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
@@ -63,16 +65,14 @@ def decode(
 
 def _ways(step: np.ndarray) -> np.ndarray:
     """Log-probabilities (K * M + 2, L * M + 2) of going from each state to the next, hypothesis by
-    hypothesis and in it mode by mode; then hidden and gone. The mode of arrival is that of the
-    step."""
-    modes, count, following = len(step), step.shape[1] - 1, step.shape[2] - 1
-    change = -MODE_COST * (1 - np.eye(modes))
+    hypothesis and in it mode by mode; then hidden and gone."""
+    modes, count, following = len(step), step.shape[2] - 1, step.shape[3] - 1
     ways = np.empty((count * modes + 2, following * modes + 2))
-    between = step[:, :-1, :-1].transpose(1, 2, 0)[:, None] + change[:, None]
+    between = step[:, :, :-1, :-1].transpose(2, 0, 3, 1)
     ways[:-2, :-2] = between.reshape(count * modes, following * modes)
-    ways[:-2, -2] = np.repeat(step[0, :-1, -1], modes)
-    ways[-2, :-2] = np.repeat(step[0, -1, :-1], modes) - np.log(modes)
-    ways[-2, -2] = step[0, -1, -1]
+    ways[:-2, -2] = np.repeat(step[0, 0, :-1, -1], modes)
+    ways[-2, :-2] = np.repeat(step[0, 0, -1, :-1], modes) - np.log(modes)
+    ways[-2, -2] = step[0, 0, -1, -1]
     ways[:-1, -1] = ways[:-1, -2] - LEAVE_COST
     ways[-1, :-1] = ways[-2, :-1] - LEAVE_COST
     ways[-1, -1] = 0.0
@@ -97,7 +97,7 @@ def _shares(
 ) -> tuple[list[np.ndarray], float]:
     """The probability of each state [T], and the log-likelihood of all frames."""
     moves = [np.exp(way) for way in ways]
-    seen = [np.exp(value - value.max()) for value in values]
+    seen = [np.exp(np.maximum(value - value.max(), _NEVER)) for value in values]
     evidence = float(sum(value.max() for value in values))
     ahead: list[np.ndarray] = []
     for t, own in enumerate(seen):

@@ -23,7 +23,7 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded
 from intercap_core.object_track.fit import Fit, MotionPrior
-from intercap_core.object_track.motion import expected, extrapolated
+from intercap_core.object_track.motion import about, expected, extrapolated, unwrapped
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
 from intercap_core.object_track.search import same_pose
@@ -33,15 +33,16 @@ from intercap_core.rigid.twist import step_between, twists
 class Hypotheses:
     """The fits [T] that may be true, each frame's in the order in which they were found.
 
-    ``share`` is how many independent observations a frame is; ``step_s`` the seconds between two.
+    ``share`` is how many independent observations a frame is; ``times`` (T,) seconds.
     """
 
-    def __init__(self, observer: Observer, prior: Prior, share: float, step_s: float) -> None:
+    def __init__(self, observer: Observer, prior: Prior, share: float, times: np.ndarray) -> None:
         self._observer = observer
         self._prior = prior
         self._share = share
-        self._step_s = step_s
-        self._patience = max(1, round(UNSEEN_S / step_s))
+        self._times = times
+        self._step_s = float(np.median(np.diff(times))) if len(times) > 1 else UNSEEN_S
+        self._patience = max(1, round(UNSEEN_S / self._step_s))
         self.fits: list[list[Fit]] = [[] for _ in range(observer.count)]
 
     def known(self, t: int, pose: np.ndarray) -> int | None:
@@ -61,8 +62,8 @@ class Hypotheses:
         return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
 
     def add(self, t: int, fit: Fit) -> None:
-        """Add a hypothesis of frame t; of two at one pose the likelier stays, of too many the least
-        likely of those that are close to another: turns that nothing tells apart stay spread."""
+        """Add a hypothesis of frame t; of two at one pose the likelier stays. Of too many one goes,
+        so that turns that nothing tells apart stay spread."""
         own = self.fits[t]
         k = self.known(t, fit.pose)
         if k is None:
@@ -73,14 +74,16 @@ class Hypotheses:
             own[k] = fit
 
     def _least_missed(self, t: int) -> int:
-        """The least likely hypothesis of frame t of those that have a likelier one close by, or of
-        all."""
+        """The least likely hypothesis of frame t: of those that the images do not support, or of
+        those that have a likelier one close by, or of all."""
         own, mesh = self.fits[t], self._observer.mesh
-        order = np.argsort(self._prior.weigh(t, own))
+        order = [int(k) for k in np.argsort(self._prior.weigh(t, own))]
+        if own[order[0]].log_ratio < SEEN_LOG_RATIO < own[order[-1]].log_ratio:
+            return order[0]
         for i, k in enumerate(order):
             if any(same_pose(mesh, own[k].pose, own[j].pose, CROWDED) for j in order[i + 1 :]):
-                return int(k)
-        return int(order[0])
+                return k
+        return order[0]
 
     def follow(self, t: int, fit: Fit) -> None:
         """Add a fit of frame t and where it leads in the frames before and after, until it meets
@@ -89,41 +92,50 @@ class Hypotheses:
         for frames in (range(t + 1, self._observer.count), range(t - 1, -1, -1)):
             self._follow(t, fit.pose, frames)
 
-    def see_moving(self, decoded: Decoded, times: np.ndarray) -> set[int]:
+    def see_moving(self, decoded: Decoded) -> set[int]:
         """Fit again what moves, as each view saw it when it exposed; the frames that changed.
 
-        The motion is that of the frames around, better known than when a frame was fitted; a rival
-        moves as what is believed does. ``times`` (T,) of the frames, seconds.
+        The motion is that of the frames around, better known than when a frame was fitted; rivals
+        move as what is believed does.
         """
         known = decoded.path != NOT_SEEN
         poses = np.tile(np.eye(4), (len(known), 1, 1))
         frames = [t for t, k in enumerate(decoded.path) if k != NOT_SEEN]
         for t in frames:
             poses[t] = self.fits[t][decoded.path[t]].pose
-        motion = twists(poses, known, times)
+        motion = twists(unwrapped(self._observer.mesh.symmetry, poses, known), known, self._times)
         changed = set()
         for t in frames:
             late = max(abs(view.geometry.time_offset_s) for view in self._observer.views(t))
             for k, fit in enumerate(self.fits[t]):
-                turn, shift = np.abs(motion[t] - fit.twist).reshape(2, 3).max(1) * late
+                twist = about(motion[t], poses[t, :3, 3], fit.pose[:3, 3])
+                turn, shift = np.abs(twist - fit.twist).reshape(2, 3).max(1) * late
                 if decoded.probability[t][k] < RIVAL_PROBABILITY or (
                     turn < MOTION_CHANGED_RAD and shift < MOTION_CHANGED_M
                 ):
                     continue
-                again = self._observer.fit(
-                    t, fit.pose, MotionPrior(fit.pose), FIT_ROUNDS, twist=motion[t]
-                )
+                prior = MotionPrior(fit.pose)
+                again = self._observer.fit(t, fit.pose, prior, FIT_ROUNDS, twist=twist)
                 if again.log_ratio > fit.log_ratio:
                     self.fits[t][k] = again
                     changed.add(t)
+            if t in changed:
+                self._join(t)
         return changed
+
+    def _join(self, t: int) -> None:
+        """Leave one of several hypotheses of frame t that have become one pose, the likeliest."""
+        left, self.fits[t] = sorted(self.fits[t], key=lambda fit: -fit.log_ratio), []
+        for fit in left:
+            if self.known(t, fit.pose) is None:
+                self.fits[t].append(fit)
 
     def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
         before = now = pose
         unseen, deficit = 0, 0.0
         for t in frames:
             predicted = self._likeliest(t, last, before, now)
-            twist = step_between(now, predicted) / (self._step_s * (t - last))
+            twist = step_between(now, predicted) / (self._times[t] - self._times[last])
             last = t
             if self.seen(t, predicted) is not None:
                 return
@@ -145,15 +157,15 @@ class Hypotheses:
                 unseen += 1
 
     def _likeliest(self, t: int, last: int, before: np.ndarray, now: np.ndarray) -> np.ndarray:
-        """The pose (4, 4) expected in frame t that its images support best: as in frame ``last``,
-        at constant velocity, or carried by a hand."""
-        starts = [now]
-        for pose in (extrapolated(before, now), *self._observer.carried(last, t, now)):
+        """The pose (4, 4) expected in frame t that its images support best: at constant velocity,
+        as in frame ``last``, or carried by a hand."""
+        starts = [extrapolated(before, now)]
+        for pose in (now, *self._observer.carried(last, t, now)):
             if not any(same_pose(self._observer.mesh, pose, other, BASIN) for other in starts):
                 starts.append(pose)
         if len(starts) == 1:
-            return extrapolated(before, now)
-        rates = step_between(now, np.array(starts)) / (self._step_s * (t - last))
+            return starts[0]
+        rates = step_between(now, np.array(starts)) / (self._times[t] - self._times[last])
         found = self._observer.assess_all(t, np.array(starts), twists=rates)
         return max(found, key=lambda one: one.log_ratio).pose
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +21,7 @@ from intercap_core.object_track.constants import (
     STILL_RAD,
 )
 from intercap_core.object_track.fit import MotionPrior
+from intercap_core.rigid.symmetry import SymmetryGroup
 
 # Elbow, wrist, and the knuckles of the index and the little finger, right and left.
 _HANDS = [
@@ -70,6 +72,11 @@ class HandMotion:
     start: np.ndarray
     end: np.ndarray
 
+    def reaches(self, centres: np.ndarray, radius: float) -> np.ndarray:
+        """Whether the hand may hold, before the motion, what is at ``centres`` (..., 3) and as
+        large as ``radius``, metres."""
+        return np.linalg.norm(centres - self.start, axis=-1) < radius + HOLDING_REACH_M
+
     def carry(self, poses: np.ndarray) -> np.ndarray:
         """Poses (..., 4, 4) of what is held, after the motion."""
         found = poses.copy()
@@ -99,6 +106,22 @@ def hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
     return found
 
 
+def unwrapped(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Equivalent poses (T, 4, 4) of which the ``known`` (T,) follow each other as closely as the
+    symmetry allows."""
+    result = poses.copy()
+    if not symmetry.trivial:
+        for s, t in pairwise(np.flatnonzero(known)):
+            result[t] = symmetry.nearest_equivalent_pose(poses[t], result[s])
+    return result
+
+
+def about(twist: np.ndarray, point: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The same motion (6,), of which ``twist`` states the shift of ``point`` (3,), with that of
+    ``other`` (3,)."""
+    return np.append(twist[:3], twist[3:] + np.cross(twist[:3], other - point))
+
+
 def carried(joints: np.ndarray, now: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
     """Poses (N, 4, 4) of an object in each hand that may hold it, in the next frame.
 
@@ -108,7 +131,7 @@ def carried(joints: np.ndarray, now: np.ndarray, centre: np.ndarray, radius: flo
     found = [
         hand.carry(now)
         for hand in hand_motions(joints)
-        if hand is not None and np.linalg.norm(centre - hand.start) < radius + HOLDING_REACH_M
+        if hand is not None and hand.reaches(centre, radius)
     ]
     return np.array(found).reshape(-1, 4, 4)
 

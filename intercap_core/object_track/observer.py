@@ -101,10 +101,11 @@ class Observer:
         t: int,
         rotations: np.ndarray | None = None,
         places: np.ndarray | None = None,
-        twist: np.ndarray | None = None,
+        motion: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> list[Fit]:
         """Fitted hypotheses of frame t, the likeliest first; ``rotations`` (N, 3, 3) are tried, or
-        all there are, near ``places`` (M, 3), or anywhere, of what moves by ``twist`` (6,)."""
+        all there are, near ``places`` (M, 3), or anywhere, in ``motion`` (:func:`.search.search`).
+        """
 
         def place_prior(place: np.ndarray) -> float:
             if places is not None and np.linalg.norm(places - place, axis=1).min() > LOOK_NEAR_M:
@@ -121,7 +122,7 @@ class Observer:
             background_term=self.settings.background_term,
             place_prior=place_prior,
             rotations=rotations,
-            twist=twist,
+            motion=motion,
             renderer=self.renderer,
         )
 

@@ -18,6 +18,7 @@ from intercap_core.object_track.constants import (
     ALWAYS_PRESENT,
     AT_HAND_M,
     BESIDE_FRAMES,
+    CLUTTER_LOG_RATIO,
     MIN_PLACE_PRIOR,
     MOVED_PRIOR,
     NEAREST_QUANTILE,
@@ -130,24 +131,26 @@ class Places:
         """Record that something looks like the object at ``place`` (3,) in frame t, by ``ratio``
         nats, in which the object itself is at ``object_at`` (3,)."""
         found = self._nearest(place)
-        if np.linalg.norm(place - object_at) < self._same:
-            return
-        if found is not None and ratio > SEARCH_GOOD_LOG_RATIO:
+        apart = found is not None and np.linalg.norm(found[0].place - object_at) >= self._same
+        if found is not None and apart and ratio > SEARCH_GOOD_LOG_RATIO:
             found[0].beside.add(t)
         likeness = self._likeness(place)
+        if np.linalg.norm((place if likeness is None else likeness[0]) - object_at) < self._same:
+            return
         if likeness is None:
             likeness = (place, {})
             self._clutter.append(likeness)
         likeness[1][t] = max(ratio, likeness[1].get(t, 0.0))
 
     def forget_clutter(self) -> None:
-        """Forget what was seen beside the object, before it is told anew."""
+        """Forget how much the things beside the object look like it, before it is told anew."""
         self._clutter.clear()
 
     def _likeness(self, place: np.ndarray) -> tuple[np.ndarray, dict[int, float]] | None:
         """The clutter at ``place`` (3,), if any."""
-        near = (one for one in self._clutter if np.linalg.norm(one[0] - place) < self._same)
-        return next(near, None)
+        away = [float(np.linalg.norm(seen_at - place)) for seen_at, _ in self._clutter]
+        nearest = int(np.argmin(away)) if away else 0
+        return self._clutter[nearest] if away and away[nearest] < self._same else None
 
     def _like_the_object(self, place: np.ndarray) -> float:
         """Nats for the object of what stays at ``place`` (3,) while the object is elsewhere: no
@@ -155,7 +158,7 @@ class Places:
         found = self._likeness(place)
         if found is None or len(found[1]) < BESIDE_FRAMES:
             return 0.0
-        return float(np.mean(list(found[1].values())))
+        return min(float(np.mean(list(found[1].values()))), CLUTTER_LOG_RATIO)
 
     def _standing_prior(self, standing: Standing) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))

@@ -8,6 +8,7 @@ import numpy as np
 
 from intercap_core.object_track.constants import (
     ANNOTATION_FRAMES,
+    BASIN,
     DOUBTFUL_PROBABILITY,
     DOUBTFUL_SHARE,
     FIT_ROUNDS,
@@ -17,7 +18,7 @@ from intercap_core.object_track.constants import (
     NEAR_FITTED,
     NEAR_TURN_SEARCH_RAD,
     RIVAL_LOG_RATIO,
-    RUN_SEARCHED,
+    RUN_SEARCHED_S,
     SEARCH_EVERY_S,
     SEARCH_GOOD_LOG_RATIO,
     SEARCHES_MIN,
@@ -30,8 +31,10 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded
 from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.hypotheses import Hypotheses
+from intercap_core.object_track.motion import about
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
+from intercap_core.object_track.search import same_pose
 from intercap_core.object_track.turns import near_turns
 from intercap_core.rigid.pose import rotation_exp
 from intercap_core.rigid.twist import moved, step_between
@@ -59,6 +62,7 @@ class Proposals:
         self._prior = prior
         self._times = times
         self._step_s = step_s
+        self._reach = max(1, round(LOOK_NEAR_S / step_s))
         self._searched: set[int] = set()
         self._looked: set[int] = set()
 
@@ -121,8 +125,8 @@ class Proposals:
     def look(self, decoded: Decoded) -> bool:
         """Look for the object in the frames in doubt; whether something new was found.
 
-        First with the rotations that the frames around lead to, outwards from where it is sure;
-        then, in some, with all.
+        First with the rotations that the frames around lead to, outwards from where it is sure, and
+        with all once in each time that the object is seen; then, in some frames, with all.
         """
         fits = self._hypotheses.fits
         ratio, sure = np.zeros(len(fits)), np.zeros(len(fits))
@@ -138,12 +142,12 @@ class Proposals:
         for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
             if self._hypotheses.best(t) < poor and t not in self._looked:
                 new |= self._look_near(t, known)
-        for t in self._unsearched(decoded.path, ratio):
+        most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
+        for t in self._unsearched(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
             self._searched.add(t)
             new |= self._follow(t, self._observer.search(t))
         if new:
             return True
-        most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
         apart = max(1, round(SEARCH_EVERY_S / self._step_s)) // 2
         # a pose that motion is sure of is hidden, rather than elsewhere
         open_ = (sure < DOUBTFUL_PROBABILITY) | (ratio < HIDDEN_SHARE * usual)
@@ -164,17 +168,18 @@ class Proposals:
 
     def look_again(self, changed: set[int]) -> None:
         """Let :meth:`look` look once more where what is known around has ``changed``."""
-        self._looked -= {t + step for t in changed for step in (-1, 1)}
+        near = range(-self._reach, self._reach + 1)
+        self._looked -= {t + step for t in changed for step in near}
 
     def _unsearched(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
-        """The likeliest frame of every time that the object is seen, in no frame of which it was
-        searched: what reappears may have turned out of sight."""
+        """The likeliest frame of every time that the object is seen for longer, in no frame of
+        which it was searched: what reappears may have turned out of sight."""
         seen = np.flatnonzero(path != NOT_SEEN)
         runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
         return [
             int(run[ratio[run].argmax()])
             for run in runs
-            if len(run) >= RUN_SEARCHED and not self._searched & set(run.tolist())
+            if len(run) * self._step_s >= RUN_SEARCHED_S and not self._searched & set(run.tolist())
         ]
 
     def _look_near(self, t: int, known: dict[int, np.ndarray]) -> bool:
@@ -186,7 +191,13 @@ class Proposals:
         self._looked.add(t)
         seen = self._observer.assess_all(t, starts, twists=rates)
         found: list[Fit] = []
-        for start in sorted(seen, key=lambda one: -one.log_ratio)[:NEAR_FITTED]:
+        tried: list[np.ndarray] = []
+        for start in sorted(seen, key=lambda one: -one.log_ratio):
+            if len(tried) == NEAR_FITTED or any(
+                same_pose(self._observer.mesh, start.pose, other, BASIN) for other in tried
+            ):
+                continue
+            tried.append(start.pose)
             prior = MotionPrior(start.pose)
             found.append(
                 self._observer.fit(t, start.pose, prior, FIT_ROUNDS, 1.0, twist=start.twist)
@@ -198,15 +209,15 @@ class Proposals:
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
             places = [self._observer.mesh.centre_at(start) for start in starts]
-            found += self._observer.search(
-                t, around.reshape(-1, 3, 3), np.array(places), best.twist
-            )
+            motion = best.twist, best.pose[:3, 3]
+            found += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places), motion)
         return self._follow(t, found)
 
     def _expected(self, t: int, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Poses (N, 4, 4) of frame t by those of the frames around, and their twists (N, 6): as
         they are, at constant velocity or in a hand from either side, and between."""
-        fits, reach = self._hypotheses.fits, max(1, round(LOOK_NEAR_S / self._step_s))
+        fits, reach = self._hypotheses.fits, self._reach
+        same = self._observer.mesh.symmetry.nearest_equivalent_pose
         poses = {}
         for u in range(max(t - reach, 0), min(t + reach + 1, len(fits))):
             if u in known:
@@ -224,7 +235,7 @@ class Proposals:
             found.append(here)
             rates.append(np.zeros(6))
             if len(near) > 1:
-                rate = step_between(poses[near[1]], here) / (
+                rate = step_between(same(poses[near[1]], here), here) / (
                     self._times[near[0]] - self._times[near[1]]
                 )
                 found.append(moved(here, rate * ahead))
@@ -234,7 +245,8 @@ class Proposals:
                 rates.append(step_between(here, pose) / ahead)
         if before and after:
             a, b = before[0], after[0]
-            rate = step_between(poses[a], poses[b]) / (self._times[b] - self._times[a])
+            gap = self._times[b] - self._times[a]
+            rate = step_between(poses[a], same(poses[b], poses[a])) / gap
             found.append(moved(poses[a], rate * (self._times[t] - self._times[a])))
             rates.append(rate)
         return np.array(found).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
@@ -245,21 +257,24 @@ class Proposals:
         """Follow turns of a nearly symmetric object from where they look as likely; whether one is
         new."""
         turns = near_turns(self._observer.mesh, self._observer.field)
-        fits, new = self._hypotheses.fits, False
-        for t in range(0, len(fits), max(1, round(KEY_FRAME_S / self._step_s))):
-            k = decoded.path[t]
-            if k == NOT_SEEN or len(turns) == 1:
-                continue
-            own = fits[t][k]
-            moving = np.tile(own.twist, (len(turns) - 1, 1))
-            found = self._observer.assess_all(t, own.pose @ turns[1:], twists=moving)
+        every = max(1, round(KEY_FRAME_S / self._step_s))
+        # what is followed from one of them may change the order in others
+        keys = {
+            t: self._hypotheses.fits[t][decoded.path[t]]
+            for t in range(0, len(decoded.path), every)
+            if decoded.path[t] != NOT_SEEN and len(turns) > 1
+        }
+        new = False
+        for t, own in keys.items():
+            poses = own.pose @ turns[1:]
+            moving = np.array([about(own.twist, own.pose[:3, 3], pose[:3, 3]) for pose in poses])
+            found = self._observer.assess_all(t, poses, twists=moving)
             found = [one for one in found if one.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
             found.sort(key=lambda one: -one.log_ratio)
             for other in found[:TURNS_FOLLOWED]:
                 if self._hypotheses.known(t, other.pose) is None:
-                    fit = self._observer.fit(
-                        t, other.pose, MotionPrior(other.pose), twist=own.twist
-                    )
+                    prior = MotionPrior(other.pose)
+                    fit = self._observer.fit(t, other.pose, prior, twist=other.twist)
                     new |= self._follow(t, [fit])
         return new
 

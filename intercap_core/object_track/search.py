@@ -34,6 +34,7 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.fit import Fit, assess_all, fit_pose
 from intercap_core.object_track.groups import centre_of, find_groups
+from intercap_core.object_track.motion import about
 from intercap_core.object_track.view import View
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
@@ -52,7 +53,7 @@ def search(
     background_term: bool,
     place_prior: Callable[[np.ndarray], float] | None = None,
     rotations: np.ndarray | None = None,
-    twist: np.ndarray | None = None,
+    motion: tuple[np.ndarray, np.ndarray] | None = None,
     renderer: Renderer | None = None,
 ) -> list[Fit]:
     """Fitted hypotheses of the pose, the likeliest first; none where nothing is detected.
@@ -61,8 +62,8 @@ def search(
     be given (empty: any but a person); ``up`` (3,) is the vertical in the master frame, to try the
     standing poses more finely; ``place_prior`` says of a place (3,) how likely what is there is the
     object, 0 to 1; ``rotations`` (N, 3, 3) are tried alone where they are known roughly;
-    ``twist`` (6,) is the object's motion, see :func:`.fit.fit_pose`; ``renderer`` draws, None = the
-    CPU.
+    ``motion`` is a twist (6,) of the object in a second, see :func:`.fit.fit_pose`, and the point
+    (3,) that moves by it; ``renderer`` draws, None = the CPU.
     """
 
     def fitted(starts: list[Fit], best: float = SEEN_LOG_RATIO) -> list[Fit]:
@@ -81,7 +82,7 @@ def search(
                         min_overlap=min(min_overlap, SEARCH_MIN_OVERLAP),
                         background_term=background_term,
                         labels=labels,
-                        twist=twist,
+                        twist=start.twist,
                         renderer=renderer,
                     )
                 )
@@ -94,7 +95,9 @@ def search(
             poses,
             min_overlap=ASSESS_MIN_OVERLAP,
             labels=labels,
-            twists=None if twist is None else np.tile(twist, (len(poses), 1)),
+            twists=None
+            if motion is None
+            else np.array([about(*motion, pose[:3, 3]) for pose in poses]),
             renderer=renderer,
         )
         return sorted(found, key=lambda fit: -fit.log_ratio)

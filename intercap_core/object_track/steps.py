@@ -1,8 +1,8 @@
 """How the object goes from one frame to the next: at rest, in a hand, or freely.
 
-Each is a mode of motion, in which it stays for a while; the decoder goes from one to another at a
-cost (:mod:`.decoder`). All log-probabilities are up to the same constant, which is that of no
-motion at all.
+Each is a mode of motion, in which it stays for a while, and changes it seldom. Of a mode's own
+log-probability the most likely step has 0, whatever the mode's width: poses are a few hypotheses,
+no densities.
 """
 
 from __future__ import annotations
@@ -11,17 +11,19 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from scipy.special import logsumexp
 
 from intercap_core.object_track.constants import (
     APPEAR_COST,
     EXCURSION_COST,
     FREE_COST_S,
+    FREE_LASTING_S,
     HELD_M,
     HELD_M_S,
     HELD_RAD,
     HELD_RAD_S,
-    HOLDING_REACH_M,
     JUMP_COST,
+    MODE_CHANGES_S,
     MOVING_M_S,
     MOVING_TURN_RAD_S,
     REACH_M,
@@ -41,38 +43,50 @@ def step_costs(
     seconds: float,
     hands: Sequence[HandMotion | None],
 ) -> np.ndarray:
-    """Log-probabilities (2 + H, K + 1, L + 1) of the steps from poses ``before`` (K, 4, 4) to
-    ``after`` (L, 4, 4), ``seconds`` later, and to and from none of them, by mode.
+    """Log-probabilities (M, M, K + 1, L + 1), M = 2 + H, of the steps from poses ``before`` (K, 4,
+    4) to ``after`` (L, 4, 4), ``seconds`` later, and to and from none of them, by the mode of the
+    step before and by the step's own.
 
-    First at rest; then freely, of which any step is one, at some cost; then with each of the H
-    ``hands``, where its motion is known and it is near enough to hold the object.
+    The first mode is rest; in the second the object moves freely, of which any step is one, at some
+    cost; then it moves with each of the H ``hands``, where the hand's motion is known and it is
+    near enough to hold the object.
     """
-    found = np.zeros((2 + len(hands), len(before) + 1, len(after) + 1))
-    found[:, :-1, -1], found[:, -1, :-1] = -VANISH_COST, -APPEAR_COST
+    modes = 2 + len(hands)
+    found = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
+    found[..., :-1, -1], found[..., -1, :-1] = -VANISH_COST, -APPEAR_COST
     if not (len(before) and len(after)):
         return found
     turn, shift = _apart(mesh, before, after)
-    found[0, :-1, :-1] = -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2)
     moved = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift / (MOVING_M_S * seconds)) ** 2
-    found[1, :-1, :-1] = -np.minimum(0.5 * moved, JUMP_COST) - FREE_COST_S * seconds
-    for mode, hand in enumerate(hands, 2):
-        found[mode, :-1, :-1] = -np.inf
-        if hand is not None:
-            found[mode, :-1, :-1] = _held(mesh, before, after, seconds, hand)
+    ways = [
+        -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
+        -np.minimum(0.5 * moved, JUMP_COST) - FREE_COST_S * min(seconds, FREE_LASTING_S),
+        *(_held(mesh, before, after, seconds, hand) for hand in hands),
+    ]
+    own = np.array(ways)
+    changes = np.full((modes, modes), np.log(-np.expm1(-MODE_CHANGES_S * seconds)))
+    np.fill_diagonal(changes, 0.0)
+    # of the modes that are possible from a pose, one is true
+    possible = np.where(np.isfinite(own).any(2), 0.0, -np.inf)
+    share = changes[:, :, None] - logsumexp(changes[:, :, None] + possible, axis=1, keepdims=True)
+    found[..., :-1, :-1] = share[..., None] + own
     return found
 
 
 def _held(
-    mesh: ObjectMesh, before: np.ndarray, after: np.ndarray, seconds: float, hand: HandMotion
+    mesh: ObjectMesh, before: np.ndarray, after: np.ndarray, seconds: float, hand: HandMotion | None
 ) -> np.ndarray:
     """Log-probabilities (K, L) of steps with this hand."""
+    if hand is None:
+        return np.full((len(before), len(after)), -np.inf)
     turn, shift = _apart(mesh, hand.carry(before), after)
-    arm = np.array([np.linalg.norm(mesh.centre_at(pose) - hand.start) for pose in before])
+    centres = np.array([mesh.centre_at(pose) for pose in before])
     turn_sigma = np.hypot(HELD_RAD, HELD_RAD_S * seconds)
     # an error of the hand's turn moves what is far from it
+    arm = np.linalg.norm(centres - hand.start, axis=1)
     shift_sigma = np.sqrt(HELD_M**2 + (HELD_M_S * seconds) ** 2 + (arm * turn_sigma) ** 2)
     found = -0.5 * ((turn / turn_sigma) ** 2 + (shift / shift_sigma[:, None]) ** 2)
-    found[arm > mesh.diameter / 2 + HOLDING_REACH_M] = -np.inf
+    found[~hand.reaches(centres, mesh.diameter / 2)] = -np.inf
     return found
 
 

@@ -86,11 +86,11 @@ class Tracker:
         )
         self._mesh = mesh
         self._times = times
-        self._joints = joints
+        self._hands = _hands(joints, len(times))
         step = float(np.median(np.diff(times))) if len(times) > 1 else ERROR_LASTING_S
         self._share = min(1.0, step / ERROR_LASTING_S)
         self._prior = Prior(self._observer, self._share)
-        self._hypotheses = Hypotheses(self._observer, self._prior, self._share, step)
+        self._hypotheses = Hypotheses(self._observer, self._prior, self._share, times)
         self._proposals = Proposals(self._observer, self._hypotheses, self._prior, times, step)
         self._colours = ColourDecision(self._observer, self._hypotheses, self._share, step)
         self._emissions: list[np.ndarray] = []
@@ -109,7 +109,7 @@ class Tracker:
         if self._proposals.turn(decoded):
             decoded = self._decode()
         for _ in range(MOTION_ROUNDS):
-            changed = self._hypotheses.see_moving(decoded, self._times)
+            changed = self._hypotheses.see_moving(decoded)
             if not changed:
                 break
             self._proposals.look_again(changed)
@@ -141,7 +141,7 @@ class Tracker:
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
         steps = [
-            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._hands(t))
+            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t])
             for t, gap in enumerate(np.diff(self._times))
         ]
         self._emissions = [self._share * weight for weight in weights]
@@ -164,12 +164,6 @@ class Tracker:
                     if thing[other] != thing[k] and fit.log_ratio > SEEN_LOG_RATIO:
                         places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
         return decoded
-
-    def _hands(self, t: int) -> list[HandMotion | None]:
-        """How the hands move from frame t to the next."""
-        if self._joints is None:
-            return [None, None]
-        return hand_motions(self._joints[[t, t + 1]])
 
     # --- the outcome ---------------------------------------------------------------------------
 
@@ -214,3 +208,8 @@ class Tracker:
         weights = self._prior.weigh(u, fits[u])
         found = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
         return Fit(found.pose, np.eye(6), found.views)
+
+
+def _hands(joints: np.ndarray | None, count: int) -> list[list[HandMotion | None]]:
+    """How the hands move from each of the frames (T) to the next."""
+    return [[] if joints is None else hand_motions(joints[[t, t + 1]]) for t in range(count - 1)]

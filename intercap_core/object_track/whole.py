@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from intercap_core.object_track.constants import (
+    BASIN,
     BRIDGED_S,
     COMMON_ERROR_VARIANCE,
     COMMON_TURN_VARIANCE,
@@ -24,6 +25,7 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.evidence import PoseEvidence
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult
+from intercap_core.object_track.motion import unwrapped
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
@@ -53,16 +55,16 @@ class WholeTrack:
         fits = [frame.fit for frame in frames]
         fits, segment, free_axis, pulled = self._smoothed(fits, lost)
         ratio = np.array([fit.log_ratio for fit in fits])
-        bridged = self._bridged(fits, lost)
-        lost = ((lost & ~bridged) | pulled) & (ratio < SEEN_LOG_RATIO)
         # what was decided may have fitted one moment and not the motion through it
-        lost |= ~bridged & (ratio < CONTRADICTED_LOG_RATIO)
+        contradicted = ratio < CONTRADICTED_LOG_RATIO
+        lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
+        lost &= contradicted | ~self._bridged(fits, lost)
         return [
             replace(
                 frame,
                 fit=fit,
                 lost=bool(unseen),
-                gone=frame.gone and fit.log_ratio < SEEN_LOG_RATIO,
+                gone=frame.gone and bool(unseen),
                 resting=bool(number >= 0),
                 free_axis=axis,
             )
@@ -77,10 +79,8 @@ class WholeTrack:
         known = np.flatnonzero(~lost)
         for a, b in pairwise(known.tolist()):
             if b - a > 1 and self._times[b] - self._times[a] < BRIDGED_S:
-                one, two = fits[a].pose, fits[b].pose
-                turn = self._mesh.symmetry.rotation_error_deg(one[:3, :3], two[:3, :3])
-                shift = np.linalg.norm(self._mesh.centre_at(one) - self._mesh.centre_at(two))
-                found[a + 1 : b] = shift < UNSURE_M and np.radians(float(turn)) < UNSURE_RAD
+                shift, turn = self._between(fits[a].pose[None], fits[b].pose[None])
+                found[a + 1 : b] = shift[0] < UNSURE_M and turn[0] < UNSURE_RAD
         return found
 
     # --- all frames together -------------------------------------------------------------------
@@ -90,7 +90,8 @@ class WholeTrack:
     ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray]:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
         (T, 3) about which nothing was seen, and which frames (T,) end far from what they show."""
-        poses = self._unwrapped(np.array([fit.pose for fit in fits]))
+        poses = np.array([fit.pose for fit in fits])
+        poses = unwrapped(self._mesh.symmetry, poses, np.ones(len(fits), bool))
         poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
         motion = twists(poses, ~lost, self._times)
         found = [
@@ -118,17 +119,22 @@ class WholeTrack:
                 fits, track, covariance, found, motion, strict=True
             )
         ]
-        pulled = self._apart(looked, track) & np.array([seen is not None for seen in found])
-        for t in map(int, np.flatnonzero(pulled | lost)):
+        shift, turn = self._between(looked, track)
+        known = np.array([seen is not None for seen in found])
+        pulled = (shift > UNSURE_M) & known
+        differs = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1])))
+        for t in map(int, np.flatnonzero(differs | lost)):
             seen = self._observer.assess(t, track[t], twist=motion[t])
             result[t] = replace(result[t], views=seen.views)
         return result, segment, free, pulled
 
-    def _apart(self, one: np.ndarray, two: np.ndarray) -> np.ndarray:
-        """Frames (T,) bool in which two tracks' poses (T, 4, 4) differ."""
-        centre = self._mesh.centre_at
+    def _between(self, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far (T,) apart the centres of two tracks' poses (T, 4, 4) are, metres, and how far
+        turned, radians."""
+        centre, symmetry = self._mesh.centre_at, self._mesh.symmetry
         offset = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
-        return np.linalg.norm(offset, axis=-1) > UNSURE_M
+        turn = symmetry.rotation_error_deg(one[:, :3, :3], two[:, :3, :3])
+        return np.linalg.norm(offset, axis=-1), np.radians(turn)
 
     def _solved(
         self, looked: np.ndarray, found: list[PoseEvidence | None], start: np.ndarray
@@ -162,16 +168,6 @@ class WholeTrack:
             )
             frames += list(rest[some])
         return sorted(map(int, frames))
-
-    def _unwrapped(self, poses: np.ndarray) -> np.ndarray:
-        """Equivalent poses (T, 4, 4) that follow each other as closely as the symmetry allows."""
-        symmetry = self._mesh.symmetry
-        if symmetry.trivial:
-            return poses
-        result = poses.copy()
-        for t in range(1, len(poses)):
-            result[t] = symmetry.nearest_equivalent_pose(poses[t], result[t - 1])
-        return result
 
     def _axes(self, pose: np.ndarray) -> np.ndarray:
         """Steps (N, 6) of a pose that leave all images as they are: turns about the symmetry's

@@ -100,7 +100,9 @@ def observer_of(
 def decided(observer: Observer, capture: ObjectCapture, open_frames: set[int]) -> Decoded:
     """What colours add where the images of some frames leave open whether the object is turned,
     and nothing says that it does not turn there and back."""
-    hypotheses = Hypotheses(observer, Prior(observer, 0.1), 0.1, 0.1)
+    hypotheses = Hypotheses(
+        observer, Prior(observer, 0.1), 0.1, 0.1 * np.arange(len(capture.poses))
+    )
     emissions, steps = [], []
     for t, pose in enumerate(capture.poses):
         hypotheses.fits[t] = observer.assess_all(t, np.array([pose, pose @ HALF_TURN]))
@@ -109,7 +111,7 @@ def decided(observer: Observer, capture: ObjectCapture, open_frames: set[int]) -
     for _ in capture.poses[1:]:
         step = np.full((3, 3), -20.0 if together else 0.0)
         np.fill_diagonal(step, 0.0)
-        steps.append(step[None])
+        steps.append(step[None, None])
     before = decode(emissions, steps)
     assert all(
         before.probability[t][:2] == pytest.approx([0.5, 0.5], abs=0.01) for t in open_frames
@@ -175,7 +177,7 @@ def test_patches_are_cells_of_the_surface_and_know_their_side(mesh):
 def test_given_a_state_the_others_follow_and_their_mixture_is_the_whole():
     rng = np.random.default_rng(1)
     emissions = [rng.normal(size=n) for n in (2, 3, 2)]
-    steps = [rng.normal(size=(1, 3, 4)), rng.normal(size=(1, 4, 3))]
+    steps = [rng.normal(size=(2, 2, 3, 4)), rng.normal(size=(2, 2, 4, 3))]
     whole = decode(emissions, steps)
     parts = [given(emissions, steps, 1, k) for k in range(3)]
     for k, part in enumerate(parts):

@@ -68,6 +68,22 @@ def test_what_nothing_shows_says_nothing(capture, views) -> None:
     assert ratios(capture, blind, capture.poses[:1]) == pytest.approx(0, abs=1e-9)
 
 
+def test_what_the_empty_room_explains_is_no_evidence_outside_a_mask(capture, views) -> None:
+    """The depth is the room's own: without candidates nothing speaks for the object there, with
+    them the masks do; where something else is measured, the room takes nothing away."""
+    pose = capture.poses[:1]
+    unseen = [replace(view, candidates=()) for view in views]
+    fits = ratios(capture, unseen, pose)[0]
+    room = [replace(view, background=view.depth) for view in unseen]
+    assert fits > 10 and ratios(capture, room, pose)[0] <= 0
+    in_mask = [replace(view, background=view.depth) for view in views]
+    assert ratios(capture, in_mask, pose)[0] > 0.9 * ratios(capture, views, pose)[0]
+    before_wall = [replace(view, background=view.depth + np.float32(0.5)) for view in unseen]
+    assert ratios(capture, before_wall, pose)[0] == pytest.approx(fits)
+    seen_past = ratios(capture, unseen, moved(pose[0], 0.6)[None])[0]
+    assert ratios(capture, room, moved(pose[0], 0.6)[None])[0] <= seen_past + 1e-9
+
+
 def test_a_missed_object_costs_as_much_as_a_detector_misses(capture, views) -> None:
     unnamed = [replace(view, depth=None, candidates=()) for view in views]
     found = assess_all(capture.mesh, unnamed, capture.poses[:1], min_overlap=0.1)[0]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.object_track.constants import CLUTTER_LOG_RATIO
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.places import Places, Standing
 from intercap_core.object_track.tracker import Tracker
@@ -57,6 +58,17 @@ def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
     assert places.prior(3, APART) == 0.1
 
 
+def test_what_is_beside_the_object_in_its_own_place_marks_nothing(bottle):
+    """Object and rival on either side of one standing place, which is the object's."""
+    standing = Standing(APART, 0.8)
+    places = Places(bottle, [standing], _joints(APART, 20))
+    aside = np.array([0.07, 0.0, 0.0])
+    one, two = APART - aside, APART + aside
+    for t in (3, 9, 12):
+        places.seen_beside(t, two, one, 40.0)
+    assert places.prior(3, APART) == 1.0
+
+
 def test_what_clutter_looks_like_is_no_evidence_for_the_object_there(bottle):
     """By 6 and 10 nats a thing looks like the bottle while that is elsewhere; then 7 nats there are
     none, and 40 are the bottle, which was put there."""
@@ -66,6 +78,9 @@ def test_what_clutter_looks_like_is_no_evidence_for_the_object_there(bottle):
         places.seen_beside(t, APART, HANDLED, nats)
     assert places.weigh(3, APART + 0.01, 7.0, 0.2) == pytest.approx(7.0 - 8.0)
     assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - 8.0)
+    for t in (14, 15, 16):
+        places.seen_beside(t, APART, HANDLED, 50.0)  # a twin, perhaps: it keeps most of its nats
+    assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - CLUTTER_LOG_RATIO)
     assert places.weigh(3, HANDLED, 7.0, 0.2) == pytest.approx(
         Places(bottle, [], _joints(APART, 20)).weigh(3, HANDLED, 7.0, 0.2)
     )
