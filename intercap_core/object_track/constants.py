@@ -303,6 +303,7 @@ UPRIGHT_LOG_RATIO = (
     2.0  # times the cosine of the angle to its standing pose: few mugs are upside down
 )
 ANNOTATION_LOG_RATIO = 10.0  # of the pose that a person gave, of one frame on its own
+UNDONE_LOG_RATIO = 10.0  # nats that a pose loses by the motion through it, and is hardly seen then
 RELOOK_LOG_RATIO = 2.0  # nats by which a smoothed pose may be less likely and is looked at again
 APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite different: lost
 # Probabilities: of no hypothesis, from which a frame is lost; of quite different ones, from which
@@ -362,9 +363,11 @@ SIZE_LARGEST_PERCENTILE, SIZE_SMALLEST_PERCENTILE = 90, 25
 LABELS_TOLD = 8  # labels named in a warning
 
 # After tracking: the surest frames are fitted with meshes of other sizes, one of which must be
-# better by so many nats a frame to be told. Of the studio a tenth costs a cup 6 and others 20.
-# Those that are so much worse at the track's own poses are not fitted.
-CHECK_FRAMES, CHECK_SCALES, CHECK_GAIN, CHECK_HOPELESS = 6, (0.9, 1.1), 5.0, 10.0
+# better by so many nats a frame to be told. Of the studio a tenth costs most objects 20. Masks that
+# are too small for all views make a bottle look a tenth smaller by 6, and a cup that is so costs no
+# more: of so small an object it is not told. Those that are so much worse at the track's own poses
+# are not fitted.
+CHECK_FRAMES, CHECK_SCALES, CHECK_GAIN, CHECK_HOPELESS = 6, (0.9, 1.1), 8.0, 10.0
 # Nats of half of the frames, below which the mesh is hardly that object: wrong meshes of like size
 # have 5 to 19, right ones 40 to 100, a cup at twice the noise 14. Tuned on the studio.
 LIKENESS_LOG_RATIO = 10.0

@@ -18,6 +18,7 @@ from intercap_core.object_track.constants import (
     RELOOK_LOG_RATIO,
     REST_FRAMES_SEEN_AGAIN,
     SEEN_LOG_RATIO,
+    UNDONE_LOG_RATIO,
     UNKNOWN_SIGMA,
     UNSURE_M,
     UNSURE_RAD,
@@ -53,10 +54,12 @@ class WholeTrack:
         """
         lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
+        decided = np.array([fit.log_ratio for fit in fits])
         fits, segment, free_axis, pulled = self._smoothed(fits, lost)
         ratio = np.array([fit.log_ratio for fit in fits])
         # what was decided may have fitted one moment and not the motion through it
-        contradicted = ratio < CONTRADICTED_LOG_RATIO
+        undone = (ratio < SEEN_LOG_RATIO) & (ratio < decided - UNDONE_LOG_RATIO)
+        contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
         lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
         lost &= contradicted | ~self._bridged(fits, lost)
         return [
