@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
-    parser.add_argument("--constants", nargs="+", metavar="ROOM.NAME", help="default: the thirty")
+    parser.add_argument("--constants", nargs="+", metavar="ROOM.NAME", help="default: the riskiest")
     parser.add_argument("--sequences", nargs="+", help=f"default: {', '.join(SEQUENCES)}")
     parser.add_argument("--output", type=Path, help="Markdown file for the tables")
     parser.add_argument("--known", type=Path, default=KNOWN, help="JSON of what is known already")

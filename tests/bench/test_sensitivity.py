@@ -16,9 +16,9 @@ from bench.stage_figures import STAGES_WITH_FIGURES
 from intercap_core.errors import UserError
 
 
-def test_the_thirty_are_constants_of_rooms_that_can_be_replayed() -> None:
+def test_the_riskiest_are_constants_of_rooms_that_can_be_replayed() -> None:
     found = [find_constant(entry.name) for entry in RISKIEST]
-    assert len({(c.module, c.name) for c in found}) == len(RISKIEST) == 30
+    assert len({(c.module, c.name) for c in found}) == len(RISKIEST) >= 30
     assert {c.room for c in found} <= set(STAGES)
 
 
