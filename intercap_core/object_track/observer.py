@@ -179,7 +179,8 @@ class Observer:
         mesh: ObjectMesh | None = None,
         twist: np.ndarray | None = None,
     ) -> Fit:
-        """How well a pose (4, 4) agrees with frame t as it is; ``mesh`` instead of the object's."""
+        """How well a pose (4, 4) agrees with frame t as it is, of an object that moves by ``twist``
+        (6,); ``mesh`` instead of the object's."""
         return self.assess_all(t, pose[None], mesh, None if twist is None else twist[None])[0]
 
     def assess_all(
