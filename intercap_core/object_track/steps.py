@@ -131,9 +131,9 @@ def excursions(
 
 
 def with_excursions(steps: Sequence[np.ndarray], away: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The log-probabilities of steps [T - 1] (M, M, K_t + 1, K_t+1 + 1), where going to a hypothesis
-    that is out of reach, and coming back, each cost :data:`EXCURSION_COST` in addition; ``away``
-    [T] (K_t,) as of :func:`excursions`."""
+    """The log-probabilities of steps [T - 1] (M, M, K_t + 1, K_t+1 + 1), where going to a
+    hypothesis that is out of reach, and coming back, each cost :data:`EXCURSION_COST` in addition;
+    ``away`` [T] (K_t,) as of :func:`excursions`."""
     result = []
     for step, (before, after) in zip(steps, pairwise(away), strict=True):
         out, back = np.append(before, False), np.append(after, False)
