@@ -12,7 +12,6 @@ from intercap_core.joint.constants import UNTRACKED_SIGMA
 from intercap_core.joint.problem import Trust
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.object_data import TrackedPoses
-from intercap_core.rigid.pose_interpolation import bridge_poses
 
 # In the order of `BodyParameters`.
 _POSE = (
@@ -45,8 +44,8 @@ class Flags:
 class SequentialFits:
     """One state of body and object, and how far it is to be trusted.
 
-    ``state`` has the mean shape and, where the object is lost, interpolated poses. ``joint_sigma``
-    (T, 55) and ``object_sigma`` (T,) are stated standard deviations of positions, metres.
+    ``state`` has the mean shape. ``joint_sigma`` (T, 55) and ``object_sigma`` (T,) are stated
+    standard deviations of positions, metres.
     """
 
     state: State
@@ -91,11 +90,11 @@ class SequentialFits:
 
 
 def _state(body: Artefact, track: Artefact) -> State:
-    """The sequential fits as one state: the mean shape, lost object poses interpolated."""
+    """The sequential fits as one state, with the mean shape."""
     vector = np.concatenate([body[name] for name in _POSE], axis=1).astype(float)
     assert vector.shape[1] == TRANSL.stop
     betas = body["betas"].astype(float)
     fitted = ~body["failed"]
     shape = betas[fitted].mean(axis=0) if fitted.any() else betas.mean(axis=0)
-    rotation, translation = bridge_poses(track["rotation"], track["translation"], ~track["lost"])
+    rotation, translation = (track[name].astype(float) for name in ("rotation", "translation"))
     return State(vector, shape, body["expression"].astype(float), rotation, translation)

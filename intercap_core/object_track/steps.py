@@ -35,6 +35,8 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.motion import HandMotion
 from intercap_core.rigid.mesh import ObjectMesh
 
+FIRST_HAND = 2  # the modes before: rest, free
+
 
 def step_costs(
     mesh: ObjectMesh,
@@ -51,19 +53,12 @@ def step_costs(
     cost; then it moves with each of the H ``hands``, where the hand's motion is known and it is
     near enough to hold the object.
     """
-    modes = 2 + len(hands)
+    modes = FIRST_HAND + len(hands)
     found = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
     found[..., :-1, -1], found[..., -1, :-1] = -VANISH_COST, -APPEAR_COST
     if not (len(before) and len(after)):
         return found
-    turn, shift = _apart(mesh, before, after)
-    moved = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift / (MOVING_M_S * seconds)) ** 2
-    ways = [
-        -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
-        -np.minimum(0.5 * moved, JUMP_COST) - FREE_COST_S * min(seconds, FREE_LASTING_S),
-        *(_held(mesh, before, after, seconds, hand) for hand in hands),
-    ]
-    own = np.array(ways)
+    own = mode_log_ratios(mesh, before, after, seconds, hands)
     changes = np.full((modes, modes), np.log(-np.expm1(-MODE_CHANGES_S * seconds)))
     np.fill_diagonal(changes, 0.0)
     # of the modes that are possible from a pose, one is true
@@ -73,13 +68,31 @@ def step_costs(
     return found
 
 
+def mode_log_ratios(
+    mesh: ObjectMesh,
+    before: np.ndarray,
+    after: np.ndarray,
+    seconds: float,
+    hands: Sequence[HandMotion | None],
+) -> np.ndarray:
+    """Log-probabilities (M, K, L) of the same steps in each mode, of those between poses alone."""
+    turn, shift = apart(mesh, before, after)
+    moved = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift / (MOVING_M_S * seconds)) ** 2
+    ways = [
+        -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
+        -np.minimum(0.5 * moved, JUMP_COST) - FREE_COST_S * min(seconds, FREE_LASTING_S),
+        *(_held(mesh, before, after, seconds, hand) for hand in hands),
+    ]
+    return np.array(ways)
+
+
 def _held(
     mesh: ObjectMesh, before: np.ndarray, after: np.ndarray, seconds: float, hand: HandMotion | None
 ) -> np.ndarray:
     """Log-probabilities (K, L) of steps with this hand."""
     if hand is None:
         return np.full((len(before), len(after)), -np.inf)
-    turn, shift = _apart(mesh, hand.carry(before), after)
+    turn, shift = apart(mesh, hand.carry(before), after)
     centres = np.array([mesh.centre_at(pose) for pose in before])
     turn_sigma = np.hypot(HELD_RAD, HELD_RAD_S * seconds)
     # an error of the hand's turn moves what is far from it
@@ -90,9 +103,7 @@ def _held(
     return found
 
 
-def _apart(
-    mesh: ObjectMesh, before: np.ndarray, after: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def apart(mesh: ObjectMesh, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Turns (K, L), radians, and shifts (K, L) of the centre, metres, between all pairs of poses
     (K, 4, 4) and (L, 4, 4)."""
     turn = np.radians(

@@ -122,7 +122,7 @@ class Tracker:
         borne_out = initial is None or (
             given is not None and same_pose(self._mesh, frames[seed].fit.pose, given[1])
         )
-        refined = WholeTrack(self._observer, self._times).refine(frames)
+        refined = WholeTrack(self._observer, self._times, self._share).refine(frames)
         final = flagged(self._mesh, refined)
         doubts = mesh_doubts(self._observer, final)
         return Track(final, seed, initial is not None, borne_out, tuple(doubts))

@@ -24,25 +24,28 @@ from intercap_core.object_track.constants import (
     UNSURE_RAD,
 )
 from intercap_core.object_track.evidence import PoseEvidence
+from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.motion import unwrapped
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
-from intercap_core.rigid.pose_interpolation import bridge_poses
+from intercap_core.object_track.steps import apart
 from intercap_core.rigid.twist import twists
 
 _TURNS_LESS = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
 
 
 class WholeTrack:
-    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds."""
+    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds, ``share`` of
+    an independent observation that a frame is."""
 
-    def __init__(self, observer: Observer, times: np.ndarray) -> None:
+    def __init__(self, observer: Observer, times: np.ndarray, share: float) -> None:
         self._observer = observer
         self._mesh = observer.mesh
         self._times = times
+        self._share = share
 
     def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
         """The frames with the poses, covariances, rests and free axes that all together show.
@@ -55,13 +58,14 @@ class WholeTrack:
         lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
         decided = np.array([fit.log_ratio for fit in fits])
-        fits, segment, free_axis, pulled = self._smoothed(fits, lost)
+        fits, segment, free_axis, pulled, carried = self._smoothed(fits, lost)
         ratio = np.array([fit.log_ratio for fit in fits])
         # what was decided may have fitted one moment and not the motion through it
         undone = (ratio < SEEN_LOG_RATIO) & (ratio < decided - UNDONE_LOG_RATIO)
         contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
         lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
-        lost &= contradicted | ~self._bridged(fits, lost)
+        poses = np.array([fit.pose for fit in fits])
+        lost &= contradicted | ~(carried | self._nowhere(poses, lost))
         return [
             replace(
                 frame,
@@ -76,35 +80,36 @@ class WholeTrack:
             )
         ]
 
-    def _bridged(self, fits: list[Fit], lost: np.ndarray) -> np.ndarray:
+    def _nowhere(self, poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Lost frames (T,) bool that are few, between two at like poses: it went nowhere."""
         found = np.zeros(len(lost), bool)
-        known = np.flatnonzero(~lost)
-        for a, b in pairwise(known.tolist()):
+        for a, b in pairwise(np.flatnonzero(~lost).tolist()):
             if b - a > 1 and self._times[b] - self._times[a] < BRIDGED_S:
-                shift, turn = self._between(fits[a].pose[None], fits[b].pose[None])
-                found[a + 1 : b] = shift[0] < UNSURE_M and turn[0] < UNSURE_RAD
+                turn, shift = apart(self._mesh, poses[[a]], poses[[b]])
+                found[a + 1 : b] = shift[0, 0] < UNSURE_M and turn[0, 0] < UNSURE_RAD
         return found
 
     # --- all frames together -------------------------------------------------------------------
 
     def _smoothed(
         self, fits: list[Fit], lost: np.ndarray
-    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
-        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show."""
+        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show and
+        in which lost ones a hand surely carries it."""
         poses = np.array([fit.pose for fit in fits])
         poses = unwrapped(self._mesh.symmetry, poses, np.ones(len(fits), bool))
-        poses[:, :3, :3], poses[:, :3, 3] = bridge_poses(poses[:, :3, :3], poses[:, :3, 3], ~lost)
+        filled = fill(self._observer, poses, lost, self._times, self._share)
+        poses = filled.poses
         motion = twists(poses, ~lost, self._times)
         found = [
             None if lost[t] else self._observer.evidence(t, poses[t], motion[t])
             for t in range(len(fits))
         ]
-        track, covariance, segment = self._solved(poses, found, poses)
+        looked = poses.copy()
+        track, covariance, segment = self._solved(looked, found, filled, poses)
         motion = twists(track, np.ones(len(fits), bool), self._times)
         motion[segment >= 0] = 0
-        looked = poses.copy()
         for t in reversed(
             self._worth_a_look(segment)
         ):  # the images read last are still in the cache
@@ -113,7 +118,7 @@ class WholeTrack:
             least = SEEN_LOG_RATIO if before is None else _ratio(before) - RELOOK_LOG_RATIO
             if _ratio(again) > least:
                 found[t], looked[t] = again, track[t]
-        track, covariance, segment = self._solved(looked, found, track)
+        track, covariance, segment = self._solved(looked, found, filled, track)
         covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
         free = self._free_axes(track, covariance)
         result = [
@@ -122,28 +127,31 @@ class WholeTrack:
                 fits, track, covariance, found, motion, strict=True
             )
         ]
-        shift, turn = self._between(looked, track)
+        turn, shift = self._between(looked, track)
         known = np.array([seen is not None for seen in found])
         pulled = (shift > UNSURE_M) & known
         differs = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1])))
         for t in map(int, np.flatnonzero(differs | lost)):
             seen = self._observer.assess(t, track[t], twist=motion[t])
             result[t] = replace(result[t], views=seen.views)
-        return result, segment, free, pulled
+        return result, segment, free, pulled, filled.sure
 
     def _between(self, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (T,) apart the centres of two tracks' poses (T, 4, 4) are, metres, and how far
-        turned, radians."""
-        centre, symmetry = self._mesh.centre_at, self._mesh.symmetry
-        offset = [centre(a) - centre(b) for a, b in zip(one, two, strict=True)]
-        turn = symmetry.rotation_error_deg(one[:, :3, :3], two[:, :3, :3])
-        return np.linalg.norm(offset, axis=-1), np.radians(turn)
+        """How far (T,) two tracks' poses (T, 4, 4) are turned, radians, and their centres apart,
+        metres."""
+        pairs = [apart(self._mesh, one[[t]], two[[t]]) for t in range(len(one))]
+        turn, shift = np.array(pairs).reshape(-1, 2).T
+        return turn, shift
 
     def _solved(
-        self, looked: np.ndarray, found: list[PoseEvidence | None], start: np.ndarray
+        self,
+        looked: np.ndarray,
+        found: list[PoseEvidence | None],
+        filled: Filled,
+        start: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
-        rests."""
+        rests, for which what is ``filled`` in does not count."""
         count = len(looked)
         noise = _noise([e for e in found if e is not None])
         information, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
@@ -156,6 +164,12 @@ class WholeTrack:
         segment = resting(combined, self._times, centre)
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])
+        unseen = [evidence is None for evidence in found]
+        # what a hand tells of frames that follow each other is as good as one observation
+        hand = self._share * filled.hand
+        information[unseen] = (hand + filled.images / noise)[unseen]
+        gradient[unseen] = filled.pull[unseen] * (self._share - 1 / noise)
+        combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
         poses, covariance = smooth(combined, start, node, self._times, centre)
         return poses, covariance, segment
 

@@ -19,7 +19,6 @@ from intercap_core.joint.terms.object_data import ObjectData, TrackedPoses
 from intercap_core.joint.terms.term import Term
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.pose_interpolation import bridge_poses
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -260,14 +259,6 @@ def test_a_term_that_is_left_out_leaves_the_others_as_they_are(model, box):
     rest = Problem(kept).equations(state)
     assert whole.energy.pop("penetration") > 0
     assert rest.energy == whole.energy
-
-
-def test_bridging_takes_the_straight_way():
-    rotation = np.tile(np.eye(3), (5, 1, 1))
-    translation = np.array([[0.0, 0, 0], [9, 9, 9], [9, 9, 9], [0.3, 0, 0], [9, 9, 9]])
-    known = np.array([True, False, False, True, False])
-    _, moved = bridge_poses(rotation, translation, known)
-    np.testing.assert_allclose(moved[:, 0], [0, 0.1, 0.2, 0.3, 0.3])
 
 
 def test_a_brief_contact_does_not_shake_a_steady_track(model, box):

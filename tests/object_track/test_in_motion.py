@@ -192,7 +192,7 @@ def test_out_of_sight_for_a_moment_it_stays_unless_the_images_contradict(
     observer = observer_of(capture, images)
     fits = [observer.fit(t, capture.poses[t], None) for t in range(FRAMES)]
     frames = [FrameResult(fit, lost=t == 2) for t, fit in enumerate(fits)]
-    found = WholeTrack(observer, capture.times).refine(frames)
+    found = WholeTrack(observer, capture.times, 0.2).refine(frames)
     assert [frame.lost for frame in found] == [t == 2 and contradicted for t in range(FRAMES)]
 
 
