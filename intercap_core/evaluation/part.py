@@ -28,7 +28,9 @@ Figures = dict[str, float]
 Columns = Mapping[str, tuple[str, int]]  # of a table: heading to a figure's key and its digits
 
 SPREAD = "_spread"
-COUNTS = ("frames", "captures", "slips_true", "slips_missed", "slips_false")
+COUNTS = (
+    "frames", "captures", "slips_true", "slips_missed", "slips_false", "object_worse_count",
+)  # fmt: skip
 EXTREME = "worst"
 
 

@@ -9,12 +9,23 @@ from rich.console import Console
 from rich.table import Table
 
 from intercap_core.evaluation.part import SPREAD, Figures, Measured, Part, keyed, number, spread
-from intercap_core.metrics import figures
+from intercap_core.metrics import figures, hold_figures
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
 
 PLAIN, ANNOTATED = "no annotations", "annotated"
+# Figures of the sequential fits that stand beside the joint stage's, and their names there.
+SEQUENTIAL = {
+    "body_pve_mm": "body_pve_sequential_mm",
+    "hand_grasp_mpjpe_mm": "hand_grasp_sequential_mm",
+    "fingertip_touching_mm": "fingertip_touching_sequential_mm",
+    "slip_mm_s": "slip_sequential_mm_s",
+    "planted_mm_s": "planted_sequential_mm_s",
+    "floor_mm": "floor_sequential_mm",
+    "foot_swing_mm": "foot_swing_sequential_mm",
+    "acceleration_feet_mm": "acceleration_feet_sequential_mm",
+}
 Areas = dict[str, Figures]
 
 
@@ -47,10 +58,15 @@ def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]
 
 def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
     """Every figure of a group of sequences by area: the stages, and what is not one stage's."""
-    found = {stage: figures.truth_figures(sequences, stage) for stage in ESTIMATES}
+    known = [s for s in sequences if s.has_truth]
+    found = {
+        stage: figures.truth_figures(sequences, stage) | hold_figures.hold_figures(known, stage)
+        for stage in ESTIMATES
+    }
     for stage in ESTIMATES:
         sweep = figures.contact_sweep(sequences, stage)
         found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
+    found["joint"] |= hold_figures.stated_contact_figures(known) | _beside_sequential(known, found)
     return {
         **found,
         "penetration": figures.penetration_figures(sequences),
@@ -59,6 +75,19 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
         "extrinsics": figures.extrinsics_figures(sequences),
         "flags": figures.flag_figures(sequences),
     }
+
+
+def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
+    """What the joint stage is held to: the sequential fits' figures, and objects that got worse."""
+    first = found["body_fit"]
+    beside = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
+    if sequences:
+        worse = hold_figures.worse_objects(sequences)
+        beside |= {"object_worse_count": float(len(worse))}
+    for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
+        slips = hold_figures.slip_by_object(sequences, stage)
+        beside |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
+    return beside
 
 
 def with_spread(sequences: Sequence[SequenceMetrics]) -> Areas:

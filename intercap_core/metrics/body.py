@@ -8,6 +8,7 @@ from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 
 BODY_JOINTS = slice(0, 22)
 WRISTS = (20, 21)
+FOOT_JOINTS = (7, 8, 10, 11)  # ankles and balls
 FINGER_JOINTS = (slice(25, 40), slice(40, 55))  # left, right
 BOTH_HANDS = slice(25, 55)
 # A three-dimensional normal error is longer than this many standard deviations half of the time

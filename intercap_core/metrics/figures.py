@@ -114,7 +114,7 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
         "hand_mpjpe_mm": over("hand_mpjpe"),
         "hand_mpjpe_wrist_mm": over("hand_mpjpe_wrist"),
         "hand_grasp_mpjpe_mm": _hand_in_grasp(known, stage),
-        **_object_figures(known, stage),
+        **object_figures(known, stage),
         **_contact_figures(known, stage),
         "acceleration_body_mm": over("acceleration_body"),
         "acceleration_hands_mm": over("acceleration_hands"),
@@ -220,7 +220,7 @@ def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:
     )
 
 
-def _object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
+def object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
     """The figures of :func:`object_errors.figures` by the names of this module's tables."""
     have = [s for s in sequences if f"truth/{stage}/object_translation" in s.values]
     found = object_errors.figures([_object_errors(s, stage) for s in have])

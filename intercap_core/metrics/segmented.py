@@ -18,7 +18,6 @@ from intercap_core.schemas import PERSON
 # Only depth pixels within this distance of the projected meshes are used: larger errors of a fit
 # need no exact figure.
 MARGIN_M = 0.25
-_POINTS_PER_VIEW = 12000  # beyond it every second, third, ... pixel of a regular grid is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +62,7 @@ def segmented_points(
 
 
 def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarray:
-    """Flat depth pixels in the box of ``near`` (M, 3) and in its range of depths, thinned."""
+    """Flat depth pixels in the box of ``near`` (M, 3) and in its range of depths."""
     lens = camera.depth
     assert lens is not None
     local = apply(camera.depth_from_master, near)
@@ -77,9 +76,8 @@ def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarr
     x1, y1 = (int(np.ceil(v + margin)) + 1 for v in pixels.max(0))
     window = depth[y0:y1, x0:x1]
     wanted = (window > 1e3 * max(nearest, 0.0)) & (window < 1e3 * farthest)
-    step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(wanted) / _POINTS_PER_VIEW))))
-    rows, columns = np.nonzero(wanted[::step, ::step])
-    return (rows * step + y0) * lens.width + columns * step + x0
+    rows, columns = np.nonzero(wanted)
+    return (rows + y0) * lens.width + columns + x0
 
 
 def read_person_masks(person: Path) -> list[list[bytes]]:

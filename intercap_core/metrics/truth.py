@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from intercap_core import artefacts
 from intercap_core.metrics import body, contact, motion, object_pose
 from intercap_core.metrics.clouds import SurfaceSamples
+from intercap_core.metrics.planted import Floor
 from intercap_core.metrics.times import match_times
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
 from intercap_core.rigid.mesh import ObjectMesh
@@ -25,8 +26,8 @@ class Truth:
     fitted body has another topology than the one the truth was matched to; ``visible`` (T, V) of
     them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
     (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
-    ``translation`` (T, 3); ``contact_region`` (T, 12) in the order of METRIC_REGIONS;
-    ``master_from_colour`` (C, 4, 4) and ``camera_names``.
+    ``translation`` (T, 3); ``contact_region`` (T, 12) in the order of METRIC_REGIONS; the
+    ``floor``; ``master_from_colour`` (C, 4, 4) and ``camera_names``.
     """
 
     vertices: np.ndarray | None
@@ -40,6 +41,7 @@ class Truth:
     translation: np.ndarray
     object_views: np.ndarray
     contact_region: np.ndarray
+    floor: Floor
     camera_names: tuple[str, ...]
     master_from_colour: np.ndarray
 
@@ -74,6 +76,7 @@ class Truth:
                 translation=file["translation"][at],
                 object_views=file["object_views"][at],
                 contact_region=file["region_contact"][at][:, columns],
+                floor=Floor(file["ground_normal"], float(file.attributes["ground_offset"])),
                 camera_names=tuple(file.text("camera_names")),
                 master_from_colour=file["master_from_colour"],
             )
@@ -105,6 +108,11 @@ def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndar
             joints[:, body.BODY_JOINTS], true[:, body.BODY_JOINTS], fps
         ),
         "acceleration_hands": motion.acceleration_error(joints[:, hands], true[:, hands], fps),
+        "acceleration_feet": motion.acceleration_error(
+            joints[:, body.FOOT_JOINTS], true[:, body.FOOT_JOINTS], fps
+        ),
+        "joint_offset": (joints - true)[:, body.BODY_JOINTS],
+        "fingertips": np.linalg.norm(tips - truth.tips, axis=-1).reshape(-1, 2, 5).mean(-1),
     }
     if track.sigma is not None:
         result["joint_normalised"] = body.normalised_joint_error(joints, true, track.sigma)

@@ -13,19 +13,18 @@ from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, MetricsSettings, ObjectEntry, SubjectEntry, digest
 from intercap_core.detections.read import Detections
-from intercap_core.metrics import body, contact, motion, object_pose
+from intercap_core.metrics import body, motion, object_pose
 from intercap_core.metrics import truth as truths
 from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.flags import merge_reasons
 from intercap_core.metrics.measurement import Measurement, Values
-from intercap_core.metrics.proximity import PosedObject
 from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
+from intercap_core.metrics.stage_errors import StageErrors
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack, read_body, read_object
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import (
     BODY_FIT,
     JOINT,
-    METRIC_REGIONS,
     METRICS,
     OBJECT_TRACK,
     PERSON,
@@ -81,16 +80,18 @@ def run(
         true_distance = values.pop("true_distance", None)
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, fitted_object, mesh, images.fps)
-        values |= _flags(images, person, object_track, body_fit, joint)
+        values |= _stated(images, person, object_track, body_fit, joint)
         if known is not None:
             tracked = read_object(object_track, "object_track")
             first_body = read_body(body_fit, "body_fit", body_models, subject.gender)
-            errors = _Errors(known, true_distance, mesh, measured.threshold, images.fps)
+            errors = StageErrors(known, true_distance, mesh, measured.threshold, images.fps)
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
             values |= errors.of_object("joint", fitted_object)
             values |= errors.of_body("joint", fitted_body, fitted_object)
-            values |= errors.about_truth() | _extrinsics_errors(setting, known)
+            values |= errors.about_truth(fitted_body.model.regions) | _extrinsics_errors(
+                setting, known
+            )
         attributes = {
             "sequence": images.sequence,
             "subject": subject.subject,
@@ -131,8 +132,10 @@ def _motion(body_track: BodyTrack, track: ObjectTrack, mesh: ObjectMesh, fps: fl
     }
 
 
-def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joint: Path) -> Values:
-    """Frames that some stage does not trust, with every reason."""
+def _stated(
+    images: Frames, person: Path, object_track: Path, body_fit: Path, joint: Path
+) -> Values:
+    """Frames that some stage does not trust, with every reason, and contact as joint states it."""
     with artefacts.read(person, PERSON) as artefact:
         missing = artefact["missing"]
     with artefacts.read(object_track, OBJECT_TRACK) as artefact:
@@ -142,6 +145,7 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
         uncertain = artefact["uncertain"]
     with artefacts.read(joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
+        probability = artefact["contact_probability"]
     unseen = np.asarray(~images.available.any(1))
     alone = ~joint_flags  # the joint stage repeats, in its words, what it was told of a frame
     reasons = merge_reasons(
@@ -158,7 +162,11 @@ def _flags(images: Frames, person: Path, object_track: Path, body_fit: Path, joi
     for t in np.flatnonzero(joint_flags):
         said = joint_reasons[t] or "joint fit not trusted"
         reasons[t] = f"{reasons[t]}; {said}" if reasons[t] else said
-    return {"flagged": np.array([bool(r) for r in reasons]), "flag_reason": reasons}
+    return {
+        "flagged": np.array([bool(r) for r in reasons]),
+        "flag_reason": reasons,
+        "contact_probability": probability,
+    }
 
 
 def _extrinsics_errors(scene: artefacts.Artefact, truth: truths.Truth) -> Values:
@@ -193,66 +201,3 @@ def _warn_of_foreign_truth(path: Path | None, values: Values) -> None:
             path,
             1e3 * min(apart),
         )
-
-
-class _Errors:
-    """Errors of each stage by dataset name; what a stage does not estimate is left out."""
-
-    def __init__(
-        self,
-        truth: truths.Truth,
-        true_distance: np.ndarray | None,
-        mesh: ObjectMesh,
-        threshold_m: float,
-        fps: float,
-    ) -> None:
-        self._truth = truth
-        self._true_distance = true_distance
-        self._mesh = mesh
-        self._threshold = threshold_m
-        self._fps = fps
-        self._surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-
-    def of_object(self, stage: str, track: ObjectTrack) -> Values:
-        errors = truths.object_errors(self._truth, track, self._mesh, self._fps)
-        return {f"truth/{stage}/{key}": value for key, value in errors.items()}
-
-    def of_body(self, stage: str, body_track: BodyTrack, track: ObjectTrack) -> Values:
-        """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets."""
-        errors = truths.body_errors(self._truth, body_track, self._fps)
-        if self._truth.vertices is not None and self._true_distance is not None:
-            errors |= self._vertices(body_track, track)
-        return {f"truth/{stage}/{key}": value for key, value in errors.items()}
-
-    def _vertices(self, body_track: BodyTrack, track: ObjectTrack) -> Values:
-        """Vertex errors and contact, frame by frame."""
-        pve, counts, touching = [], [], []
-        assert self._truth.vertices is not None and self._true_distance is not None
-        for t, vertices in enumerate(body_track.vertices()):
-            pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
-            distance = self._surface.signed_distance(
-                vertices.astype(np.float64), track.rotation[t], track.translation[t]
-            )
-            counts.append(truths.contact_counts(distance, self._true_distance[t]))
-            touching.append(contact.vertex_contact(distance, self._threshold))
-        touched = np.stack(touching)
-        regions = body_track.model.regions
-        return {
-            "body_pve": pve,
-            "vertex_contact_counts": np.stack(counts),
-            "contact_frame": touched.any(1),
-            "region_contact": contact.region_contact(touched, regions, METRIC_REGIONS),
-        }
-
-    def about_truth(self) -> Values:
-        truth = self._truth
-        centre = object_pose.posed_point(
-            truth.rotation, truth.translation, self._mesh.centre_of_mass
-        )
-        return {
-            "truth/sweep": contact.SWEEP_M,
-            "truth/contact_region": truth.contact_region,
-            "truth/object_views": truth.object_views,
-            "truth/object_moving": motion.moving(truth.rotation, centre, self._fps),
-            "truth/object_centre": centre,
-        }
