@@ -161,6 +161,10 @@ class JointSettings(Model):
 
     contact_weight: Annotated[float, Field(ge=0)] = 1.0
     """Weight of contact (lambda_Q)."""
+    stick_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of held skin not sliding over the object (without a symbol in equation 6)."""
+    plant_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of standing feet not moving (without a symbol in equation 6)."""
     ground_weight: Annotated[float, Field(ge=0)] = 1.0
     """Weight of not sinking into the floor (lambda_G)."""
     penetration_weight: Annotated[float, Field(ge=0)] = 1.0

@@ -16,6 +16,11 @@ EVIDENCE_CORRELATION_S = 0.2
 # millimetres more must not rule contact out. Tuned on the studio.
 OUTLIER_PROBABILITY = 0.01
 
+# Of a part of a sole that stands, after errors of the fits: speed, m/s, and height above the floor,
+# metres; and of one that swings. Tuned on the studio.
+STANDING_SPEED, SWING_SPEED = 0.06, 0.6
+STANDING_HEIGHT, SWING_HEIGHT = 0.02, 0.15
+
 # --- human motion
 
 # Changes between free and touching, per second and region: an interaction of a few seconds has a

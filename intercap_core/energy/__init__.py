@@ -43,6 +43,10 @@ differences from the paper are in ``docs/equations.md``.
 | 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
 | 6 | Q_t, annotated | contact/detect.py | annotation_evidence | - |
 | beyond | Q_t, detected | contact/detect.py | contact_probability | joint.detect_contact |
+| beyond | stick: points on the object | energy/stick.py | local_points | joint.stick_weight |
+| beyond | stick | joint/terms/stick.py | Stick | joint.stick_weight |
+| beyond | plant | joint/terms/plant.py | Plant | joint.plant_weight |
+| beyond | what stands, detected | contact/standing.py | standing_probability | - |
 | beyond | body in object: residuals | energy/penetration.py | weights | joint.penetration_weight |
 | beyond | body in object | joint/terms/penetration.py | Penetration | joint.penetration_weight |
 | 6, A.5 | E_G: residuals | energy/ground.py | residuals | joint.ground_weight |

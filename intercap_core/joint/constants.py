@@ -49,6 +49,14 @@ OBJECT_ACCELERATION = 6.0
 # the studio.
 ACCELERATION_OUTLIER = 2.0
 
+# How far a grip and a sole creep: a random walk, metres in one second. Tuned on the studio.
+STICK_WALK, PLANT_WALK = 0.003, 0.003
+# Speeds of what truly slides, m/s: beyond the jitter of the fits. Tuned on the studio.
+STICK_OUTLIER, PLANT_OUTLIER = 0.15, 0.15
+# Share of a region's contact below which a vertex is left out, and vertices of each part of a sole:
+# a part moves as one.
+STICK_LEAST, SOLE_VERTICES = 0.005, 6
+
 # --- lasting errors of the sequential fits
 
 # How fast they change: a random walk, metres in one second. Tuned on the studio.

@@ -84,6 +84,17 @@ class PosedGeometry:
         )
         return lin.along(along[:, :, None])[:, :, 0, BODY].double().cpu().numpy()
 
+    def skin_along(self, axes: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Derivative (T, A, R, 168) by the body, of the skin vertices ``index`` (A,) along the
+        ``axes`` (T, R, 3) of each frame."""
+        g = self._geometry
+        lin = g.model.linearise(self._parameters, vertex_ids=g.skin.vertices[index])
+        along = np.broadcast_to(axes[:, None], (len(axes), len(index), *axes.shape[1:]))
+        directions = torch.as_tensor(
+            np.ascontiguousarray(along), dtype=lin.points.dtype, device=lin.points.device
+        )
+        return lin.along(directions)[..., BODY].double().cpu().numpy()
+
     @cached_property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
         """The body's joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body."""

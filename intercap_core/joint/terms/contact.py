@@ -31,6 +31,15 @@ class Contact(Term):
         """Use this probability (T, R) that each region touches from now on."""
         self._probability = probability
 
+    def holding(self) -> np.ndarray:
+        """How surely each of the patches' vertices holds the object (T, M), times its share of its
+        patch's area, as of the last :meth:`refresh`."""
+        assert self._shares is not None, "refresh comes first"
+        assert self._probability is not None, "take_probability comes first"
+        patches = self._geometry.patches
+        gate = self._probability[:, patches.region_of_patch] * self._shares.gate
+        return self._shares.area * gate[:, patches.patch]
+
     def refresh(self, state: State) -> None:
         """Take anew which vertices carry the contact."""
         patches = self._geometry.patches

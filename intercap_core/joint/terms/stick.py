@@ -1,0 +1,71 @@
+"""Stick (beyond the paper): skin that holds the object does not slide over it.
+
+    E = sum over steps t, vertices i of Q_i a_i rho(|q_i(t+1) - q_i(t)|^2) / 2 sigma^2
+
+q is the vertex in the object's frame (:mod:`intercap_core.energy.stick`), Q the probability that
+its region touches in both frames and its patch takes part, a its share of its patch's area. sigma
+is that of a random walk: real grips creep. Robust, so that what truly slides, turns in the fingers
+or is taken anew does so. Weighed by the setting ``stick_weight``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.energy import stick
+from intercap_core.energy.smoothness import RATE
+from intercap_core.joint.constants import STICK_LEAST, STICK_OUTLIER, STICK_WALK
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.state import ALL, State
+from intercap_core.joint.terms.contact import Contact
+from intercap_core.joint.terms.term import Term
+from intercap_core.schemas import CONTACT_REGIONS
+
+# Hands grip and soles stand; what sits or leans glides as it settles.
+_GRIPPING = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith(("_hand", "_foot"))]
+
+
+class Stick(Term):
+    """Relative motion of touching skin and object, with the ``contact`` term's probabilities."""
+
+    name = "stick"
+
+    def __init__(self, geometry: Geometry, contact: Contact, fps: float, weight: float) -> None:
+        self._geometry, self._contact, self._fps = geometry, contact, fps
+        self._scale = weight * fps / STICK_WALK**2
+        self._grips = np.isin(geometry.patches.region, _GRIPPING)
+        self._index = np.zeros(0, int)  # of the skin's vertices
+        self._weight = np.zeros((0, 0))
+
+    def refresh(self, state: State) -> None:
+        """Take anew which vertices hold the object over each step."""
+        holds = self._contact.holding()
+        both = np.minimum(holds[1:], holds[:-1]) * self._grips
+        some = np.flatnonzero(both.max(axis=0, initial=0.0) > STICK_LEAST)
+        self._index = self._geometry.skin.patch[some]
+        self._weight = both[:, some] * self._scale
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add the slips at ``state``."""
+        frames, count = len(state), len(self._index)
+        if frames < 2 or not count:
+            return
+        posed = self._geometry.at(state)
+        points = posed.skin[:, self._index]
+        local = stick.local_points(points, state.rotation, state.translation)
+        step = np.diff(local, axis=0)
+        weight, energy = stick.robust(step, self._weight, STICK_OUTLIER / self._fps)
+        by_object = stick.local_by_object(points, state.rotation, state.translation)
+        by_body = posed.skin_along(state.rotation.transpose(0, 2, 1), self._index)
+        rows = np.concatenate([by_body, by_object], axis=3)
+        equations.add_differences(
+            self.name,
+            ALL,
+            RATE,
+            rows.reshape(frames, 3 * count, -1),
+            np.repeat(weight, 3, axis=1),
+            step.reshape(frames - 1, -1),
+            energy,
+            tie=True,
+        )
