@@ -278,7 +278,7 @@ BODY_FIT = Schema(
 
 JOINT = Schema(
     name="joint",
-    version=2,
+    version=3,
     stage="joint",
     attributes={
         "sequence": "sequence name",
@@ -287,6 +287,8 @@ JOINT = Schema(
         "gender": "which body file was used",
         "body_model": "digest of the body file",
         "iterations": "Gauss-Newton steps taken",
+        "refused": "steps that would not have lowered the energy",
+        "converged": "the last steps changed little, contact and time offsets too",
     },
     fields={
         **_body(one_shape=True),

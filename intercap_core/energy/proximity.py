@@ -43,8 +43,7 @@ def proximity(
     frames, count = points.shape[:2]
     local = np.einsum("tji,tnj->tni", rotation, points - translation[:, None])
     flat = local.reshape(-1, 3)
-    closest = field.closest(flat)
-    inside = field.inside(flat)
+    inside, closest = field.boundary(flat)
     offset = flat - closest.points
     length = np.linalg.norm(offset, axis=1)
     sign = np.where(inside, -1.0, 1.0)

@@ -44,7 +44,8 @@ class ContactEstimate:
 @dataclass(frozen=True)
 class JointFit:
     """The refined state, with contact, time offsets and residuals there, the energy by term before
-    and after, the number of ``steps``, and the reasons (T,) not to trust a frame, "" = none."""
+    and after, the numbers of ``steps`` and of ``refused`` ones, whether it ``converged``, and the
+    reasons (T,) not to trust a frame, "" = none."""
 
     state: State
     contact: ContactEstimate
@@ -53,6 +54,8 @@ class JointFit:
     energy_before: dict[str, float]
     energy_after: dict[str, float]
     steps: int
+    refused: int
+    converged: bool
     flag_reasons: list[str]
 
 
@@ -90,7 +93,7 @@ def fit(
     def estimate_contact(at: State) -> ContactEstimate:
         return _estimate_contact(geometry, at, sequential, fps, settings, intervals)
 
-    steps, energy_before = 0, None
+    steps, refused, energy_before = 0, 0, None
     estimate = estimate_contact(state)
     for max_steps in ROUND_STEPS:
         contact.take_probability(estimate.probability)
@@ -98,17 +101,26 @@ def fit(
         offset_change = body_data.take_offsets(body_data.estimate_offsets(prior).offset)
         object_data.take_offsets(body_data.time_offset)
         minimum = minimise(problem.equations, state, max_steps=max_steps)
-        state, steps = minimum.state, steps + minimum.steps
+        state, steps, refused = minimum.state, steps + minimum.steps, refused + minimum.refused
         energy_before = energy_before or minimum.energy_before
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
         previous, estimate = estimate, estimate_contact(state)
         contact_change = np.abs(estimate.probability - previous.probability).max()
-        if (
+        settled = (
             minimum.converged
             and contact_change < CONTACT_CONVERGED
             and offset_change < OFFSET_CHANGED_S
-        ):
+        )
+        if settled:
             break
+    stuck = steps == 0 and refused > 0
+    log.log(
+        logging.WARNING if stuck else logging.INFO,
+        "%d steps taken, %d refused, %s",
+        steps,
+        refused,
+        "settled" if settled else "ended before it settled",
+    )
     residuals = body_data.residuals(state)
     return JointFit(
         state=state,
@@ -118,7 +130,9 @@ def fit(
         energy_before=energy_before or {},
         energy_after=minimum.equations.energy,
         steps=steps,
-        flag_reasons=_flag_reasons(geometry, state, sequential.flags),
+        refused=refused,
+        converged=settled,
+        flag_reasons=_flag_reasons(geometry, state, sequential.flags, stuck),
     )
 
 
@@ -151,7 +165,7 @@ def _estimate_contact(
     return ContactEstimate(contact_probability(motion, fps, given=given), labels)
 
 
-def _flag_reasons(geometry: Geometry, state: State, flags: Flags) -> list[str]:
+def _flag_reasons(geometry: Geometry, state: State, flags: Flags, stuck: bool) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be."""
     deep = geometry.at(state).proximity.distance.min(axis=1) < -FLAGGED_DEPTH
     causes = (
@@ -160,5 +174,6 @@ def _flag_reasons(geometry: Geometry, state: State, flags: Flags) -> list[str]:
         (flags.lost, "object lost, filled in"),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
+        (np.full(len(state), stuck), "no step of the joint fit lowered its energy"),
     )
     return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]

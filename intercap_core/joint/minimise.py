@@ -31,13 +31,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Minimum:
-    """The final state, the equations there, the energy of each term at the start, the number of
-    accepted steps, and whether the last one gained little."""
+    """The final state, the equations there, the energy of each term at the start, the numbers of
+    accepted ``steps`` and of ``refused`` ones, and whether the last one gained little."""
 
     state: State
     equations: NormalEquations
     energy_before: dict[str, float]
     steps: int
+    refused: int
     converged: bool
 
 
@@ -52,19 +53,19 @@ def minimise(
     Progress is measured against the round's own, since most of the energy is noise that no state
     explains.
     """
-    damping, accepted, gained, converged = INITIAL_DAMPING, 0, 0.0, False
+    damping, accepted, refused, gained, converged = INITIAL_DAMPING, 0, 0, 0.0, False
     here = linearise(state)
     before = here.energy
     for _ in range(max_steps):
         step = here.step(damping)
         if step is None:
-            damping *= DAMPING_UP
+            damping, refused = damping * DAMPING_UP, refused + 1
             continue
         trial = state.moved(_limited(step))
         there = linearise(trial)
         log.info("energy %.4g -> %.4g (damping %.0e)", here.total, there.total, damping)
         if not there.total < here.total:
-            damping *= DAMPING_UP
+            damping, refused = damping * DAMPING_UP, refused + 1
             continue
         gain = here.total - there.total
         gained += gain
@@ -73,7 +74,7 @@ def minimise(
         if gain < MIN_GAIN_SHARE * gained:
             converged = True
             break
-    return Minimum(state, here, before, accepted, converged)
+    return Minimum(state, here, before, accepted, refused, converged)
 
 
 def _limited(step: np.ndarray) -> np.ndarray:

@@ -292,8 +292,8 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
                 "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
             )
         log.warning(
-            "%s: not watertight, %.1f %% of its edges are open; what lies inside is decided by a "
-            "vote of five rays, so penetration near the holes is uncertain",
+            "%s: not watertight, %.1f %% of its edges are open; inside is what its surface winds "
+            "around, so that penetration near the holes is uncertain",
             path, 100 * open_share,
         )  # fmt: skip
     return mesh, new_id.reshape(-1)

@@ -111,6 +111,8 @@ def run(
         subject=subject.subject,
         object=object_.name,
         iterations=fitted.steps,
+        refused=fitted.refused,
+        converged=fitted.converged,
         **attributes,
     ) as writer:
         _put_body(writer, model, fitted.state)

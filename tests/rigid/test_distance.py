@@ -50,3 +50,52 @@ def test_inside_survives_missing_faces():
     truth = np.linalg.norm(points, axis=1) < 0.11
     field = DistanceField(ball.vertices, ball.faces[kept], watertight=False)
     assert (field.inside(points) != truth).mean() < 0.005
+
+
+def box_without_its_lid() -> tuple[trimesh.Trimesh, DistanceField]:
+    box = trimesh.creation.box((0.4, 0.3, 0.2)).subdivide().subdivide().subdivide()
+    kept = box.triangles_center[:, 2] < 0.0999
+    return box, DistanceField(box.vertices, box.faces[kept], watertight=False)
+
+
+def test_what_is_outside_a_holed_mesh_is_never_inside():
+    """Rays that leave through the hole used to vote points a decimetre above it inside."""
+    box, field = box_without_its_lid()
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-0.5, 0.5, size=(20000, 3))
+    outside = ~trimesh.bounds.contains(box.bounds, points)
+    assert not field.inside(points[outside]).any()
+    away = field.signed_distance(points[outside])
+    solid = DistanceField(box.vertices, box.faces)
+    np.testing.assert_array_less(solid.signed_distance(points[outside]) - 1e-6, away)
+
+
+def test_nothing_is_deeper_in_a_holed_mesh_than_in_the_closed_one():
+    """Below the missing lid the nearest face is a side, the way out is up."""
+    box, field = box_without_its_lid()
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-0.5, 0.5, size=(4000, 3)) * box.extents
+    solid = DistanceField(box.vertices, box.faces)
+    depth, true = field.signed_distance(points), solid.signed_distance(points)
+    inside = depth < 0
+    assert (depth >= true - 1e-6).all()
+    np.testing.assert_allclose(depth[inside], true[inside], atol=1e-6)
+    assert inside.mean() > 0.8  # near the hole half of the surface is not around a point
+    below = np.array([[0.0, 0.0, 0.02], [0.03, 0.02, 0.03]])
+    found, closest = field.boundary(below)
+    assert found.all()
+    np.testing.assert_allclose(closest.points, [[0, 0, 0.1], [0.03, 0.02, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(closest.normals, [[0, 0, 1.0]] * 2, atol=1e-6)
+
+
+def test_a_tenth_of_the_faces_may_be_missing():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.11)
+    rng = np.random.default_rng(7)
+    kept = rng.permutation(len(ball.faces))[: int(0.9 * len(ball.faces))]
+    points = rng.normal(size=(4000, 3)) * 0.07
+    points = points[np.abs(np.linalg.norm(points, axis=1) - 0.11) > 0.005]
+    true = 0.11 - np.linalg.norm(points, axis=1)
+    field = DistanceField(ball.vertices, ball.faces[kept], watertight=False)
+    found = -field.signed_distance(points)
+    assert (np.sign(found) != np.sign(true)).mean() < 0.002
+    np.testing.assert_allclose(found, true, atol=0.006)
