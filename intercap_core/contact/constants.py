@@ -54,9 +54,8 @@ ANNOTATED_LOGIT = 6.0
 
 # --- solver effort: how densely the skin is sampled
 
-# Vertices kept of each region: fingers are thin and wrap around things, the rest is smooth. Tuned
-# on the studio.
-HAND_VERTICES = 240
-OTHER_VERTICES = 60
+# Vertices kept of each region: fingers are thin and wrap around things, and what sits on an edge
+# touches it with little of a large region. Tuned on the studio.
+REGION_VERTICES = 240
 # Vertices nearest to the object whose mean is a region's distance and slip. Tuned on the studio.
 NEAREST_VERTICES = 6

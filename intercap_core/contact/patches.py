@@ -8,7 +8,7 @@ import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.contact.constants import HAND_VERTICES, OTHER_VERTICES
+from intercap_core.contact.constants import REGION_VERTICES
 from intercap_core.schemas import CONTACT_REGIONS
 
 # Joints from here on are the fingers', three a finger, first of the left hand.
@@ -38,10 +38,9 @@ def contact_patches(model: BodyModel) -> Patches:
     vertices, region, patch, share = [], [], [], []
     for r, name in enumerate(CONTACT_REGIONS):
         ids = np.asarray(model.regions[name])
-        hand = name.endswith("_hand")
-        kept = ids[farthest_points(template[ids], HAND_VERTICES if hand else OTHER_VERTICES)]
+        kept = ids[farthest_points(template[ids], REGION_VERTICES)]
         part = np.full(len(kept), _PALM)
-        if hand:
+        if name.endswith("_hand"):
             finger = joint_of[kept] >= _FIRST_FINGER_JOINT
             part[finger] = (joint_of[kept][finger] - _FIRST_FINGER_JOINT) // 3
         for value in np.unique(part):
