@@ -28,7 +28,8 @@ def sole_parts(patches: Patches, count: int) -> list[np.ndarray]:
     for joint in _SOLES:
         members = np.flatnonzero(np.isin(patches.region, feet) & (patches.joint == joint))
         if len(members):
-            found.append(members[:: max(1, len(members) // count)][:count])
+            chosen = np.linspace(0, len(members) - 1, min(len(members), count)).round().astype(int)
+            found.append(members[chosen])
     return found
 
 

@@ -53,9 +53,11 @@ ACCELERATION_OUTLIER = 2.0
 STICK_WALK, PLANT_WALK = 0.003, 0.003
 # Speeds of what truly slides, m/s: beyond the jitter of the fits. Tuned on the studio.
 STICK_OUTLIER, PLANT_OUTLIER = 0.15, 0.15
-# Share of a region's contact below which a vertex is left out, and vertices of each part of a sole:
-# a part moves as one.
-STICK_LEAST, SOLE_VERTICES = 0.005, 6
+# Probability of a hold below which a patch is left out, and share of the most that a vertex of it
+# holds below which others are; vertices of a patch, and of each half of a sole, at most: they move
+# nearly as one.
+STICK_LEAST, STICK_NEAR = 0.02, 0.1
+STICK_VERTICES, SOLE_VERTICES = 24, 6
 
 # --- lasting errors of the sequential fits
 
@@ -115,6 +117,9 @@ MAX_STEP_TURN = 0.5
 MAX_STEP_SHIFT = 0.1
 # A step that gains less than this share of what the round has gained ends it. Tuned on the studio.
 MIN_GAIN_SHARE = 0.03
+# A refused step that would have gained less than this share of the energy, by its slope: the fit is
+# at a minimum. Tuned on the studio.
+NEGLIGIBLE_SHARE = 1e-3
 # Largest change of a contact probability after which another round has nothing new to work with.
 # Tuned on the studio.
 CONTACT_CONVERGED = 0.1

@@ -93,7 +93,7 @@ def fit(
     def estimate_contact(at: State) -> ContactEstimate:
         return _estimate_contact(geometry, at, sequential, fps, settings, intervals)
 
-    steps, refused, energy_before = 0, 0, None
+    steps, refused, energy_before, settled = 0, 0, None, False
     estimate = estimate_contact(state)
     for max_steps in ROUND_STEPS:
         contact.take_probability(estimate.probability)
@@ -113,7 +113,7 @@ def fit(
         )
         if settled:
             break
-    stuck = steps == 0 and refused > 0
+    stuck = steps == 0 and refused > 0 and not settled
     log.log(
         logging.WARNING if stuck else logging.INFO,
         "%d steps taken, %d refused, %s",

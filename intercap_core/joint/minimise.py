@@ -16,6 +16,7 @@ from intercap_core.joint.constants import (
     MAX_STEP_TURN,
     MIN_DAMPING,
     MIN_GAIN_SHARE,
+    NEGLIGIBLE_SHARE,
 )
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.state import (
@@ -32,7 +33,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Minimum:
     """The final state, the equations there, the energy of each term at the start, the numbers of
-    accepted ``steps`` and of ``refused`` ones, and whether the last one gained little."""
+    accepted ``steps`` and of ``refused`` ones, and whether the last one gained little or would
+    have."""
 
     state: State
     equations: NormalEquations
@@ -66,6 +68,10 @@ def minimise(
         log.info("energy %.4g -> %.4g (damping %.0e)", here.total, there.total, damping)
         if not there.total < here.total:
             damping, refused = damping * DAMPING_UP, refused + 1
+            # of a quadratic energy, half of what its slope promises
+            if -0.5 * float((here.gradient * step).sum()) < NEGLIGIBLE_SHARE * here.total:
+                converged = True
+                break
             continue
         gain = here.total - there.total
         gained += gain

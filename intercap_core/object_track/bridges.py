@@ -26,12 +26,14 @@ from intercap_core.rigid.twist import moved, step_between
 @dataclass(frozen=True)
 class Bridge:
     """One way that the object may have gone in lost frames: its ``poses`` (N, 4, 4) in the
-    ``frames`` (N,), what speaks for it, nats, as a motion from the known frame before to the one
-    after, and what the hand's motion tells of the poses, the ``information`` (N, 6, 6) of (turn on
-    the left, shift), zero where no hand carries it."""
+    ``frames`` (N,), the equivalent pose ``end`` (4, 4) of the known frame after that it leads to,
+    what speaks for it, nats, as a motion from the known frame before to that one, and what the
+    hand's motion tells of the poses, the ``information`` (N, 6, 6) of (turn on the left, shift),
+    zero where no hand carries it."""
 
     frames: np.ndarray
     poses: np.ndarray
+    end: np.ndarray
     log_ratio: float
     information: np.ndarray
 
@@ -54,38 +56,51 @@ class Gap:
         return float(self.times[self.after] - self.times[self.before])
 
     def bridges(self) -> list[Bridge]:
-        """The straight way, at rest or free, and with each hand that may have held the object."""
+        """The straight way, at rest or free, and with each hand that may have held the object and
+        is known in some of the frames."""
         a, b = self.before, self.after
+        same = self.mesh.symmetry.nearest_equivalent_pose
         frames = np.arange(a + 1, b)
         hands = [] if self.joints is None else hand_motions(self.joints[[a, b]])
         ways = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], self.seconds, hands)
         ratio = ways[:, 0, 0]
-        direct = straight(self.poses, np.isin(np.arange(len(self.poses)), (a, b)))[frames]
+        end = same(self.poses[b], self.poses[a])
+        direct = self._straight(end)
         nothing = np.zeros((len(frames), 6, 6))
-        found = [Bridge(frames, direct, float(ratio[:FIRST_HAND].max()), nothing)]
-        for hand, own in enumerate(ratio[FIRST_HAND:]):
-            if np.isfinite(own):
-                poses, information = direct.copy(), nothing.copy()
-                for i, t in enumerate(frames):
-                    pose = self._in_hand(hand, int(t))
-                    if pose is not None:
-                        poses[i], information[i] = pose, self._hold(int(t))
-                found.append(Bridge(frames, poses, float(own), information))
+        found = [Bridge(frames, direct, end, float(ratio[:FIRST_HAND].max()), nothing)]
+        for number, (hand, own) in enumerate(zip(hands, ratio[FIRST_HAND:], strict=True)):
+            if hand is None or not np.isfinite(own):
+                continue
+            end = same(self.poses[b], hand.carry(self.poses[a]))
+            poses, information = direct.copy(), nothing.copy()
+            for i, t in enumerate(frames):
+                pose = self._in_hand(number, int(t), end)
+                if pose is not None:
+                    poses[i], information[i] = pose, self._hold(int(t))
+            if information.any():
+                found.append(Bridge(frames, poses, end, float(own), information))
         return found
 
-    def _in_hand(self, hand: int, t: int) -> np.ndarray | None:
-        """The pose (4, 4) of frame ``t`` as the hand carries it from both sides; None where the
-        hand is unknown."""
-        ends = []
-        for u in (self.before, self.after):
-            assert self.joints is not None
+    def _straight(self, end: np.ndarray) -> np.ndarray:
+        """Poses (N, 4, 4) on the straight way to ``end`` (4, 4)."""
+        poses = self.poses[self.before : self.after + 1].copy()
+        poses[-1] = end
+        known = np.zeros(len(poses), bool)
+        known[[0, -1]] = True
+        return straight(poses, known)[1:-1]
+
+    def _in_hand(self, hand: int, t: int, end: np.ndarray) -> np.ndarray | None:
+        """The pose (4, 4) of frame ``t`` as the hand carries it from both sides, to ``end`` (4, 4);
+        None where the hand is unknown."""
+        assert self.joints is not None
+        carried = []
+        for u, pose in ((self.before, self.poses[self.before]), (self.after, end)):
             motion = hand_motions(self.joints[[u, t]])[hand]
             if motion is None:
                 return None
-            ends.append(motion.carry(self.poses[u]))
-        end = self.mesh.symmetry.nearest_equivalent_pose(ends[1], ends[0])
+            carried.append(motion.carry(pose))
         share = (self.times[t] - self.times[self.before]) / self.seconds
-        return moved(ends[0], share * step_between(ends[0], end))
+        return moved(carried[0], share * step_between(*carried))
 
     def _hold(self, t: int) -> np.ndarray:
         """What a hold tells of frame ``t`` (6, 6): the less, the longer before and after it."""

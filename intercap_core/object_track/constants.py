@@ -389,6 +389,9 @@ NEAR_TURN_DISTINCT_DEG = 45.0
 UNSURE_M, UNSURE_RAD = 0.035, np.radians(15)
 # Out of sight for less, seconds, between poses that are as good as one: it stayed there.
 BRIDGED_S = 0.3
+# Nats by which a hand is likelier than any other way of what is lost, from which it surely has it:
+# odds of seven to one. Free motion for longer than a moment costs 3 more, nobody seeing anything.
+CARRIED_LOG_RATIO = 2.0
 FREE_AXIS_SIGMA_RAD = np.radians(25)  # standard deviation of a turn of which nothing was seen
 TOLD_SHARE = 0.5  # of the frames, from which a track's faults are told
 

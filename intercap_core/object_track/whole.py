@@ -27,7 +27,6 @@ from intercap_core.object_track.evidence import PoseEvidence
 from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult
-from intercap_core.object_track.motion import unwrapped
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
@@ -50,8 +49,9 @@ class WholeTrack:
     def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
         """The frames with the poses, covariances, rests and free axes that all together show.
 
-        A lost frame is found again where interpolation of its neighbours leads to a pose that the
-        images support, or where those around for a moment are at like poses. A frame that smoothing
+        A lost frame is found again where the likeliest way from the frames before to those after
+        leads to a pose that the images support, where a hand surely carried it and they do not
+        contradict, or where those around for a moment are at like poses. A frame that smoothing
         moves far from its own fit becomes lost, unless they support the smoothed pose, and so does
         one whose final pose they contradict.
         """
@@ -98,7 +98,6 @@ class WholeTrack:
         (T, 3) about which nothing was seen, and which frames (T,) end far from what they show and
         in which lost ones a hand surely carries it."""
         poses = np.array([fit.pose for fit in fits])
-        poses = unwrapped(self._mesh.symmetry, poses, np.ones(len(fits), bool))
         filled = fill(self._observer, poses, lost, self._times, self._share)
         poses = filled.poses
         motion = twists(poses, ~lost, self._times)

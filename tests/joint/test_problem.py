@@ -24,6 +24,7 @@ from intercap_core.schemas import CONTACT_REGIONS
 
 FRAMES = 5
 LEFT_HAND = CONTACT_REGIONS.index("left_hand")
+PLANT = 6  # of the problem's terms
 
 
 @pytest.fixture(scope="module")
@@ -227,12 +228,16 @@ def test_gradient_is_the_derivative_of_the_energy(model, box):
 
 @pytest.mark.parametrize("index", range(2, 12))
 def test_each_term_s_gradient_is_the_derivative_of_its_energy(model, box, index):
-    """Hand and box overlap, and both reach below the floor."""
+    """Hand and box overlap, and both reach below the floor; or feet stand, for what plants them."""
     state = _state(model, -0.01)
     floor = Ground(state.translation[0], np.array([0, 1.0, 0]))
+    if index == PLANT:
+        lowest = model(state.parameters(model)).vertices[0][:, 1].min().item()
+        floor = Ground(np.array([0, lowest, 0]), np.array([0, 1.0, 0]))
     data = (_Hold(state, 0.1), ObjectData(_tracked(state, 0.1, np.zeros(FRAMES, bool))))
     scene = _Scene(model, box, state, data=data, floor=floor, touching=[LEFT_HAND])
     term = scene.problem.terms[index]
+    assert (index == PLANT) == (term.name == "plant")
     rng = np.random.default_rng(index)
     here = state.moved(rng.normal(scale=0.002, size=(FRAMES, ALL.stop)))
     direction = rng.normal(size=(FRAMES, ALL.stop))
@@ -245,6 +250,7 @@ def test_each_term_s_gradient_is_the_derivative_of_its_energy(model, box, index)
         return found
 
     step = 1e-3
+    assert equations(here).total > 0
     up, down = (equations(here.moved(s * direction)).total for s in (step, -step))
     slope = float((equations(here).gradient * direction).sum())
     assert (up - down) / (2 * step) == pytest.approx(slope, rel=0.02)

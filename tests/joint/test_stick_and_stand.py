@@ -8,11 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.contact.standing import sole_parts, standing_probability
 from intercap_core.energy import stick
+from intercap_core.joint.constants import STICK_VERTICES
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.minimise import minimise
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
+from intercap_core.joint.terms.stick import _representatives
 from intercap_core.schemas import CONTACT_REGIONS
 from tests.joint.test_problem import _Hold, _Scene, _state, _tracked, box  # noqa: F401
 
@@ -146,3 +148,23 @@ def test_one_frame_has_nothing_to_slide(model, box) -> None:  # noqa: F811
     equations: NormalEquations = scene.equations(one)
     assert "stick" not in equations.energy and "plant" not in equations.energy
     assert minimise(scene.equations, one, max_steps=4).equations.total <= equations.total
+
+
+def test_a_sole_that_holds_a_board_has_all_of_its_weight(model, box) -> None:  # noqa: F811
+    """A patch of many vertices that share alike is thinned, at any probability."""
+    for probability in (1.0, 0.3):
+        holds = np.full((4, 240), probability / 240)
+        some, weight = _representatives(holds)
+        assert len(some) == STICK_VERTICES and len(np.unique(some)) == len(some)
+        np.testing.assert_allclose(weight.sum(1), probability)
+    holds[2] = 0.0
+    assert _representatives(holds)[1][2].sum() == 0
+
+
+def test_at_a_minimum_a_refused_step_is_the_end(model, box) -> None:  # noqa: F811
+    state = _state(model, 0.001)
+    data = (_Hold(state, 0.01), ObjectData(_tracked(state, 0.01, np.zeros(len(state), bool))))
+    scene = _Scene(model, box, state, data=data, touching=[LEFT_HAND])
+    there = minimise(scene.equations, state, max_steps=40).state
+    again = minimise(scene.equations, there, max_steps=40)
+    assert again.converged and again.steps <= 2

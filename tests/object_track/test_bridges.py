@@ -80,6 +80,8 @@ def test_a_frame_without_the_hand_lies_between(suitcase: ObjectMesh) -> None:
     direct, held = ways_of(suitcase, poses, joints)
     assert not held.information[2].any() and held.information[[0, 1, 3, 4], 0, 0].all()
     np.testing.assert_array_equal(held.poses[2], direct.poses[2])
+    joints[2:-2] = np.nan  # unknown in all lost frames
+    assert len(ways_of(suitcase, poses, joints)) == 1
     joints[-2] = np.nan  # of what a hand does from one end to the other nothing is known
     assert len(ways_of(suitcase, poses, joints)) == 1
 
@@ -176,3 +178,41 @@ def test_what_a_hand_carries_out_of_sight_is_not_lost(suitcase: ObjectMesh) -> N
         for frame, true in zip(final, capture.poses, strict=True)
     ]
     assert max(off) < 0.03
+
+
+def test_of_two_hands_that_part_neither_surely_has_it(suitcase: ObjectMesh) -> None:
+    capture = Still.make(suitcase, 7)
+    away = hand_of(away_and_back(capture.poses), suitcase.centre_of_mass)
+    there = hand_of(capture.poses, suitcase.centre_of_mass)
+    joints = there.copy()
+    left = [KEYPOINT_NAMES.index(f"left_{name}") for name in ("wrist", "index1", "pinky1")]
+    joints[:, left] = away[:, [WRIST, INDEX, PINKY]]
+    lost = np.array([False, True, True, True, True, True, False])
+    found, _ = filled_of(capture, joints, lost, set(range(1, 6)))
+    assert not found.sure.any()
+
+
+def test_what_is_taken_up_elsewhere_much_later_is_not_surely_carried(suitcase: ObjectMesh) -> None:
+    """The images are blind for over a second; the hand is at the object at both ends."""
+    capture = ObjectCapture.make(suitcase, 20, speed=0.03, turn_deg=2.0)
+    joints = hand_of(capture.poses, suitcase.centre_of_mass)
+    lost = np.ones(20, bool)
+    lost[[0, -1]] = False
+    assert not filled_of(capture, joints, lost, set(range(1, 19)))[0].sure.any()
+
+
+def test_a_symmetric_object_turns_on_in_the_hand() -> None:
+    """Two-fold; turned by 126 degrees unseen, the frame after is found the other way round."""
+    board = ObjectMesh.load(catalogue()["skateboard"]).simplified(600)
+    assert not board.symmetry.trivial
+    capture = ObjectCapture.make(board, 12, speed=0.02, turn_deg=14.0, label="skateboard")
+    joints = hand_of(capture.poses, board.centre_of_mass)
+    lost = np.zeros(12, bool)
+    lost[2:10] = True
+    poses = capture.poses.copy()
+    poses[10:] = poses[10:] @ board.symmetry.discrete[1]
+    observer = observer_of(capture, joints, set(range(2, 10)))
+    found = fill(observer, poses, lost, capture.times, 0.2)
+    steps = Rotation.from_matrix(found.poses[1:, :3, :3] @ found.poses[:-1, :3, :3].swapaxes(1, 2))
+    np.testing.assert_allclose(np.degrees(steps.magnitude()), 14, atol=2)
+    np.testing.assert_allclose(found.poses, capture.poses, atol=0.02)

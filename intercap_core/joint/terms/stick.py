@@ -14,7 +14,13 @@ import numpy as np
 
 from intercap_core.energy import stick
 from intercap_core.energy.smoothness import RATE
-from intercap_core.joint.constants import STICK_LEAST, STICK_OUTLIER, STICK_WALK
+from intercap_core.joint.constants import (
+    STICK_LEAST,
+    STICK_NEAR,
+    STICK_OUTLIER,
+    STICK_VERTICES,
+    STICK_WALK,
+)
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import ALL, State
@@ -39,12 +45,21 @@ class Stick(Term):
         self._weight = np.zeros((0, 0))
 
     def refresh(self, state: State) -> None:
-        """Take anew which vertices hold the object over each step."""
+        """Take anew which vertices hold the object over each step: of each patch those that do so
+        most, with the weight of all of it."""
         holds = self._contact.holding()
-        both = np.minimum(holds[1:], holds[:-1]) * self._grips
-        some = np.flatnonzero(both.max(axis=0, initial=0.0) > STICK_LEAST)
-        self._index = self._geometry.skin.patch[some]
-        self._weight = both[:, some] * self._scale
+        both = np.minimum(holds[1:], holds[:-1])
+        patch = self._geometry.patches.patch
+        kept, weights = [np.zeros(0, int)], [np.zeros((len(both), 0))]
+        for number in np.unique(patch[self._grips]):
+            members = np.flatnonzero(patch == number)
+            own = both[:, members]
+            if own.sum(axis=1).max(initial=0.0) > STICK_LEAST:
+                some, weight = _representatives(own)
+                kept.append(members[some])
+                weights.append(weight)
+        self._index = self._geometry.skin.patch[np.concatenate(kept)]
+        self._weight = np.concatenate(weights, axis=1) * self._scale
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the slips at ``state``."""
@@ -69,3 +84,15 @@ class Stick(Term):
             energy,
             tie=True,
         )
+
+
+def _representatives(holds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Some (K,) of a patch's vertices that hold the most, ``holds`` (T - 1, M), and their weights
+    (T - 1, K), which are those of the whole patch."""
+    most = holds.max(axis=0)
+    near = np.flatnonzero(most > STICK_NEAR * most.max())
+    some = near[np.linspace(0, len(near) - 1, min(len(near), STICK_VERTICES)).round().astype(int)]
+    weight = holds[:, some]
+    part = np.maximum(weight.sum(axis=1), STICK_NEAR * holds.sum(axis=1))
+    share = np.divide(holds.sum(axis=1), part, out=np.zeros(len(holds)), where=part > 0)
+    return some, weight * share[:, None]
