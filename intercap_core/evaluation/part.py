@@ -115,6 +115,11 @@ def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors
     """
     truth = project.sequences[sequence].truth
     assert truth is not None
+    if not truth.is_file():
+        raise UserError(
+            f"{truth}: the truth of {sequence!r} is missing, though its {part.stage} is there; "
+            f"remove {project.results / sequence} and start again: both are made anew"
+        )
     if part.kept is None:
         return part.measure(project, sequence)
     state = hashlib.sha256(code_digest(part.code).encode())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from intercap_core.config import Config, ObjectEntry, SubjectEntry
+from intercap_core.errors import UserError
 from intercap_core.evaluation.captures import PART
 from intercap_core.evaluation.part import measured_once, spread
 from intercap_core.metrics.capture import CaptureErrors, SlipCounts
@@ -47,6 +48,9 @@ def test_errors_are_kept_by_content(tmp_path: Path) -> None:
     measured_once(part, project, "one")
     assert calls == ["one", "one"]
     assert len(list((files[1].parent / "evaluation").iterdir())) == 1  # the older errors are gone
+    (tmp_path / "truth.h5").unlink()  # a recording that was interrupted, whose results remain
+    with pytest.raises(UserError, match=r"truth.h5: the truth of 'one' is missing.*remove .*one"):
+        measured_once(part, project, "one")
 
 
 def test_the_spread_is_the_standard_error_over_recordings() -> None:
