@@ -14,13 +14,15 @@ from intercap_core.evaluation.part import SPREAD
 REFERENCE = Path("bench/reference-quick.json")
 TIMES_SPREAD = 2.0  # standard errors
 SAME = 0.02  # of the figure: the same for all who read it
+NEGLIGIBLE = 5e-4  # of any unit: no digit of a table shows it
 # Words of keys that say which way is better; others are printed but not judged
 _MORE_IS_BETTER = ("recall", "precision", "_f1", "success", "improved")
 _LESS_IS_BETTER = ("_mm", "_deg", "lost_", "bad_frames", "acceleration", "missing")
 _MAIN = (
     "translation_median_mm", "translation_p95_mm", "rotation_median_deg", "rotation_p95_deg",
     "lost_share", "body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "contact_region_f1",
-    "object_translation_mm", "object_rotation_deg",
+    "object_translation_mm", "object_rotation_deg", "slip_mm_s", "planted_mm_s",
+    "contact_detected_f1", "hand_grasp_mpjpe_mm",
 )  # fmt: skip
 
 
@@ -31,7 +33,7 @@ def worse(key: str, value: float, before: float, error: float) -> bool:
         gain = -gain
     elif not any(word in key for word in _LESS_IS_BETTER):
         return False
-    return gain > max(TIMES_SPREAD * error, SAME * abs(before))
+    return gain > max(TIMES_SPREAD * error, SAME * abs(before), NEGLIGIBLE)
 
 
 def compare(figures: Mapping[str, float], reference: Path = REFERENCE) -> list[str]:

@@ -85,3 +85,4 @@ def test_worse_goes_beyond_the_spread_in_the_bad_direction() -> None:
     assert worse("joint.contact_region_f1", 0.8, 0.95, 0.02)
     assert worse("object.cup.lost_share", 0.3, 0.0, 0.0)
     assert not worse("object.recordings", 3, 5, 0.0)
+    assert not worse("joint.rest_jitter_mm", 3e-4, 2e-4, 0.0)  # nothing rests more still
