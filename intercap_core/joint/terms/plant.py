@@ -11,12 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.contact.standing import sole_parts, standing_probability
-from intercap_core.energy import stick
-from intercap_core.energy.smoothness import RATE
 from intercap_core.joint.constants import PLANT_OUTLIER, PLANT_WALK, SOLE_VERTICES
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import BODY, State
+from intercap_core.joint.terms.coupled import add_steps
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.term import Term
 
@@ -52,17 +51,8 @@ class Plant(Term):
         if frames < 2 or not count:
             return
         posed = self._geometry.at(state)
-        step = np.diff(posed.skin[:, self._index], axis=0)
-        weight, energy = stick.robust(step, self._weight, PLANT_OUTLIER / self._fps)
+        points = posed.skin[:, self._index]
         axes = np.tile(np.eye(3), (frames, 1, 1))
         rows = posed.skin_along(axes, self._index)
-        equations.add_differences(
-            self.name,
-            BODY,
-            RATE,
-            rows.reshape(frames, 3 * count, -1),
-            np.repeat(weight, 3, axis=1),
-            step.reshape(frames - 1, -1),
-            energy,
-            tie=True,
-        )
+        outlier = PLANT_OUTLIER / self._fps
+        add_steps(self.name, BODY, points, rows, self._weight, outlier, equations)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.energy import stick
-from intercap_core.energy.smoothness import RATE
 from intercap_core.joint.constants import (
     STICK_LEAST,
     STICK_NEAR,
@@ -25,6 +24,7 @@ from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.contact import Contact
+from intercap_core.joint.terms.coupled import add_steps
 from intercap_core.joint.terms.term import Term
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -69,21 +69,11 @@ class Stick(Term):
         posed = self._geometry.at(state)
         points = posed.skin[:, self._index]
         local = stick.local_points(points, state.rotation, state.translation)
-        step = np.diff(local, axis=0)
-        weight, energy = stick.robust(step, self._weight, STICK_OUTLIER / self._fps)
         by_object = stick.local_by_object(points, state.rotation, state.translation)
         by_body = posed.skin_along(state.rotation.transpose(0, 2, 1), self._index)
         rows = np.concatenate([by_body, by_object], axis=3)
-        equations.add_differences(
-            self.name,
-            ALL,
-            RATE,
-            rows.reshape(frames, 3 * count, -1),
-            np.repeat(weight, 3, axis=1),
-            step.reshape(frames - 1, -1),
-            energy,
-            tie=True,
-        )
+        outlier = STICK_OUTLIER / self._fps
+        add_steps(self.name, ALL, local, rows, self._weight, outlier, equations)
 
 
 def _representatives(holds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
