@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import torch
 
 from intercap_core.joint.state import ALL
 from intercap_core.solve.banded import BandedSystem
+
+# Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in the F frames of a slice.
+Rows = Callable[[slice, np.ndarray], np.ndarray]
+
+# Rows are made for so many frames at a time: few enough that they stay in the cache.
+_FRAMES_TOGETHER = 16
 
 
 class NormalEquations:
@@ -14,22 +22,21 @@ class NormalEquations:
 
     ``bands`` (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or fewer for short recordings,
     ``gradient`` (T, n) and ``energy`` of each term, one half of the weighted sum of squares.
-    ``ties`` are stiff parts of the matrix, each over some columns, that are not damped: damping by
-    their large diagonal would freeze an object that has to move as one over many frames.
+    ``damped`` (T, n) is the diagonal without its stiff parts: damping by their large values would
+    freeze an object that has to move as one over many frames.
     """
 
     def __init__(self, frames: int) -> None:
         self.bands = np.zeros((min(3, frames), frames, ALL.stop, ALL.stop))
-        self.ties: list[tuple[slice, np.ndarray]] = []
+        self.damped = np.zeros((frames, ALL.stop))
         self.gradient = np.zeros((frames, ALL.stop))
         self.energy: dict[str, float] = {}
 
     def step(self, damping: float) -> np.ndarray | None:
         """The damped Gauss-Newton step (T, n), or None where the matrix is not definite."""
-        damped = BandedSystem(torch.from_numpy(self.bands)).damped(damping).bands
-        for columns, tie in self.ties:
-            damped[:, :, columns, columns] += torch.from_numpy(tie)
-        factor = BandedSystem(damped).factorise()
+        matrix = torch.tensor(self.bands)
+        matrix[0].diagonal(dim1=1, dim2=2).add_(torch.from_numpy(damping * self.damped))
+        factor = BandedSystem(matrix).factorise(in_place=True)
         if factor is None:
             return None
         return factor.solve(-torch.from_numpy(self.gradient)).numpy()
@@ -49,6 +56,7 @@ class NormalEquations:
     ) -> None:
         """Add ready J^T W J (T, m, m) and J^T W r (T, m) over ``columns`` of every frame."""
         self.bands[0][:, columns, columns] += hessian
+        self.damped[:, columns] += hessian.diagonal(axis1=1, axis2=2)
         self.gradient[:, columns] += gradient
         self.energy[term] = self.energy.get(term, 0.0) + energy
 
@@ -56,51 +64,56 @@ class NormalEquations:
         self,
         term: str,
         columns: slice,
-        jacobian: np.ndarray,
+        rows: Rows,
         weights: np.ndarray,
         residuals: np.ndarray,
         energy: float | None = None,
-    ) -> None:
-        """Add rows: ``jacobian`` (T, N, m) over ``columns``, ``weights`` and ``residuals``
-        (T, N). ``energy`` is that of a robust term, None for plain least squares."""
-        weighted = (jacobian * weights[..., None]).transpose(0, 2, 1)
-        self.add_blocks(
-            term,
-            columns,
-            weighted @ jacobian,
-            (weighted @ residuals[..., None])[..., 0],
-            0.5 * float((weights * residuals**2).sum()) if energy is None else energy,
-        )
-
-    def add_differences(
-        self,
-        term: str,
-        columns: slice,
-        stencil: tuple[float, ...],
-        jacobian: np.ndarray,
-        weights: np.ndarray,
-        residuals: np.ndarray,
-        energy: float,
         *,
-        tie: bool = False,
+        stencil: tuple[float, ...] = (1.0,),
+        stiff: bool = False,
     ) -> None:
-        """Add differences of rows over neighbouring frames; ``tie``: to the stiff parts.
+        """Add values, or their differences over neighbouring frames; ``stiff``: not damped.
 
-        ``stencil`` (w+1,) factors of frames t .. t+w; ``jacobian`` (T, N, m) of the rows' values;
-        ``weights`` and ``residuals`` (T-w, N) and ``energy`` of their differences.
+        ``rows`` derive the values by ``columns``, ``stencil`` (w+1,) are the factors of frames
+        t .. t+w; ``weights`` (T-w, N) and ``residuals`` (T-w, N, R) are those of the differences.
+        ``energy`` is that of a robust term, None for plain least squares.
         """
-        count = len(jacobian) + 1 - len(stencil)
+        if energy is None:
+            energy = 0.5 * float((weights[..., None] * residuals**2).sum())
         self.energy[term] = self.energy.get(term, 0.0) + energy
-        if count < 1:
+        frames, ahead = len(self.gradient), len(stencil) - 1
+        if frames <= ahead:
             return
-        parts = [jacobian[k : k + count] * factor for k, factor in enumerate(stencil)]
-        weighted = [(part * weights[..., None]).transpose(0, 2, 1) for part in parts]
-        bands = self.bands[:, :, columns, columns]
-        if tie:
-            bands = np.zeros_like(bands)
-            self.ties.append((columns, bands))
-        for k, rows in enumerate(weighted):
-            self.gradient[k : k + count, columns] += (rows @ residuals[..., None])[..., 0]
-            for j in range(k + 1):
-                # frame t + k against frame t + j, stored with the earlier one
-                bands[k - j, j : j + count] += rows @ parts[j]
+        forces = _over_stencil(stencil, weights[..., None] * residuals)
+        # of the values of frame t with those of frames t, t + 1, ..
+        couplings = [
+            _over_stencil([f * g for f, g in zip(stencil, stencil[d:], strict=False)], weights)
+            for d in range(ahead + 1)
+        ]
+        for start in range(0, frames, _FRAMES_TOGETHER):
+            stop = min(start + _FRAMES_TOGETHER, frames)
+            last = min(stop + ahead, frames)
+            used = np.flatnonzero(couplings[0][start:last].any(axis=0))
+            if not len(used):
+                continue
+            jacobian = rows(slice(start, last), used)
+            size = jacobian.shape[2]
+            jacobian = jacobian.reshape(last - start, -1, jacobian.shape[3])
+            force = forces[start:stop, used].reshape(stop - start, 1, -1)
+            self.gradient[start:stop, columns] += (force @ jacobian[: stop - start])[:, 0]
+            for d, coupling in enumerate(couplings):
+                here = slice(start, min(stop, frames - d))
+                count = max(here.stop - here.start, 0)
+                weighted = np.repeat(coupling[here, used], size, axis=1)[..., None]
+                block = (jacobian[d : d + count] * weighted).transpose(0, 2, 1) @ jacobian[:count]
+                self.bands[d, here, columns, columns] += block
+                if d == 0 and not stiff:
+                    self.damped[here, columns] += block.diagonal(axis1=1, axis2=2)
+
+
+def _over_stencil(factors: Sequence[float], values: np.ndarray) -> np.ndarray:
+    """Sum over k of ``factors`` (k,) times ``values`` (T - w, ...) of k frames before."""
+    out = np.zeros((len(values) + len(factors) - 1, *values.shape[1:]))
+    for k, factor in enumerate(factors):
+        out[k : k + len(values)] += factor * values
+    return out

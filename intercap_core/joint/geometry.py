@@ -70,30 +70,16 @@ class PosedGeometry:
         state = self.state
         return proximity(self._geometry.field, self.skin, state.rotation, state.translation)
 
-    def skin_by_body(self, directions: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Derivative (T, A, 168) by the body, of the skin vertices ``index`` (A,) along
-        ``directions`` (T, N, 3) of all."""
-        if not len(index):
-            return np.zeros((len(self.state), 0, BODY.stop))
+    def skin_by_body(self, frames: slice, index: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Derivative (F, K, R, 168) by the body in ``frames``, of the skin vertices ``index`` (K,)
+        along ``axes`` (F, K, R, 3)."""
         g = self._geometry
-        lin = g.model.linearise(self._parameters, vertex_ids=g.skin.vertices[index])
+        parameters = g.model.parameters(self._parameters.vector()[frames])
+        lin = g.model.linearise(parameters, vertex_ids=g.skin.vertices[index])
         along = torch.as_tensor(
-            np.ascontiguousarray(directions[:, index]),
-            dtype=lin.points.dtype,
-            device=lin.points.device,
+            np.ascontiguousarray(axes), dtype=lin.points.dtype, device=lin.points.device
         )
-        return lin.along(along[:, :, None])[:, :, 0, BODY].double().cpu().numpy()
-
-    def skin_along(self, axes: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Derivative (T, A, R, 168) by the body, of the skin vertices ``index`` (A,) along the
-        ``axes`` (T, R, 3) of each frame."""
-        g = self._geometry
-        lin = g.model.linearise(self._parameters, vertex_ids=g.skin.vertices[index])
-        along = np.broadcast_to(axes[:, None], (len(axes), len(index), *axes.shape[1:]))
-        directions = torch.as_tensor(
-            np.ascontiguousarray(along), dtype=lin.points.dtype, device=lin.points.device
-        )
-        return lin.along(directions)[..., BODY].double().cpu().numpy()
+        return lin.along(along)[..., BODY].double().cpu().numpy()
 
     @cached_property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:

@@ -28,32 +28,26 @@ class BandedSystem:
         if n != n2 or w1 > t:
             raise ValueError(f"bands have shape {tuple(self.bands.shape)}, expected (w+1, T, n, n)")
 
-    def damped(self, damping: float) -> BandedSystem:
-        """The matrix with its diagonal times 1 + damping (Marquardt 1963)."""
-        bands = self.bands.clone()
-        bands[0].diagonal(dim1=1, dim2=2).mul_(1 + damping)
-        return BandedSystem(bands)
-
-    def factorise(self) -> BandedFactor | None:
-        """The Cholesky factor, or None where the matrix is not positive definite."""
-        bands = self.bands
-        w1, count = bands.shape[:2]
-        lower = torch.zeros_like(bands)
+    def factorise(self, *, in_place: bool = False) -> BandedFactor | None:
+        """The Cholesky factor, or None where the matrix is not positive definite. ``in_place``: in
+        the memory of ``bands``, which then no longer hold the matrix."""
+        lower = self.bands if in_place else self.bands.clone()
+        w1, count = lower.shape[:2]
         if w1 == 1:
-            lower[0], info = torch.linalg.cholesky_ex(bands[0])
+            lower[0], info = torch.linalg.cholesky_ex(lower[0])
             return None if bool(info.any()) else BandedFactor(lower)
         for t in range(count):
             # lower[k, t - k] is block (t, t - k); finish row t from its farthest column on
             for k in range(min(w1 - 1, t), 0, -1):
-                block = bands[k, t - k]
+                block = lower[k, t - k]
                 for j in range(k + 1, min(w1 - 1, t) + 1):
-                    block = block - lower[j, t - j] @ lower[j - k, t - j].T
+                    block -= lower[j, t - j] @ lower[j - k, t - j].T
                 lower[k, t - k] = torch.linalg.solve_triangular(
                     lower[0, t - k].T, block, upper=True, left=False
                 )
-            block = bands[0, t]
+            block = lower[0, t]
             for k in range(1, min(w1 - 1, t) + 1):
-                block = block - lower[k, t - k] @ lower[k, t - k].T
+                block -= lower[k, t - k] @ lower[k, t - k].T
             lower[0, t], info = torch.linalg.cholesky_ex(block)
             if bool(info):
                 return None

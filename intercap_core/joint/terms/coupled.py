@@ -6,7 +6,7 @@ import numpy as np
 
 from intercap_core.energy import stick
 from intercap_core.energy.smoothness import RATE
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.equations import NormalEquations, Rows
 from intercap_core.joint.geometry import PosedGeometry
 from intercap_core.joint.state import ALL
 
@@ -24,38 +24,30 @@ def add_distances(
     ``residual`` (T, N) metres, whose derivative is that of the distance wherever ``weight`` (T, N),
     1/m^2, is not 0; ``energy`` that of a robust term, None for plain least squares.
     """
-    index = np.flatnonzero(weight.any(axis=0))
     near = posed.proximity
-    rows = np.concatenate(
-        [posed.skin_by_body(near.normals, index), near.by_object[:, index]], axis=2
-    )
-    equations.add_rows(name, ALL, rows, weight[:, index], residual[:, index], energy)
+
+    def rows(frames: slice, index: np.ndarray) -> np.ndarray:
+        normals = near.normals[frames, index, None]
+        by_object = near.by_object[frames, index, None]
+        return np.concatenate([posed.skin_by_body(frames, index, normals), by_object], axis=3)
+
+    equations.add_rows(name, ALL, rows, weight, residual[..., None], energy)
 
 
 def add_steps(
     name: str,
     columns: slice,
     points: np.ndarray,
-    rows: np.ndarray,
+    rows: Rows,
     weight: np.ndarray,
     outlier: float,
     equations: NormalEquations,
 ) -> None:
     """Add the steps of points (T, N, 3), metres, from frame to frame, as stiff parts.
 
-    ``rows`` (T, N, 3, m) their derivatives over ``columns``; ``weight`` (T - 1, N), 1/m^2, of each
-    step, which counts less towards and beyond ``outlier``, metres.
+    ``rows`` are their derivatives over ``columns``; ``weight`` (T - 1, N), 1/m^2, of each step,
+    which counts less towards and beyond ``outlier``, metres.
     """
-    frames, count = points.shape[:2]
     step = np.diff(points, axis=0)
     weights, energy = stick.robust(step, weight, outlier)
-    equations.add_differences(
-        name,
-        columns,
-        RATE,
-        rows.reshape(frames, 3 * count, -1),
-        np.repeat(weights, 3, axis=1),
-        step.reshape(frames - 1, -1),
-        energy,
-        tie=True,
-    )
+    equations.add_rows(name, columns, rows, weights, step, energy, stencil=RATE, stiff=True)

@@ -89,7 +89,7 @@ class ObjectDrift(Term):
             self._still,
             RESTING_SIGMA,
             equations,
-            tie=True,
+            stiff=True,
         )
 
 
@@ -108,21 +108,18 @@ def _add_pairs(
     sigma: float,
     equations: NormalEquations,
     *,
-    tie: bool = False,
+    stiff: bool = False,
 ) -> None:
     """Add the changes of ``correction`` (T, N, 3) over the steps ``pairs`` (T-1,), with the points'
     ``jacobian`` (T, N, 3, m) over ``columns`` and standard deviation ``sigma``, metres."""
-    frames, count = correction.shape[:2]
-    change = np.diff(correction, axis=0).reshape(frames - 1, -1)
-    weight = np.repeat(pairs[:, None] / sigma**2, 3 * count, axis=1)
-    weight /= DRIFT_POINTS_PER_MEASUREMENT
-    equations.add_differences(
+    change = np.diff(correction, axis=0)
+    weight = np.repeat(pairs[:, None] / sigma**2, change.shape[1], axis=1)
+    equations.add_rows(
         name,
         columns,
-        smoothness.RATE,
-        jacobian.reshape(frames, 3 * count, -1),
-        weight,
+        lambda at, some: jacobian[at, some],
+        weight / DRIFT_POINTS_PER_MEASUREMENT,
         change,
-        0.5 * float((weight * change**2).sum()),
-        tie=tie,
+        stencil=smoothness.RATE,
+        stiff=stiff,
     )

@@ -43,10 +43,12 @@ class BodyGround(Term):
         posed = self._geometry.at(state)
         height = ground.residuals(posed.skin, self._floor.point, self._floor.normal)
         weight = np.where(height < 0, self._geometry.skin.share, 0.0) * self._scale
-        index = np.flatnonzero(weight.any(axis=0))
-        normals = np.broadcast_to(self._floor.normal, posed.skin.shape)
-        rows = posed.skin_by_body(normals, index)
-        equations.add_rows(self.name, BODY, rows, weight[:, index], height[:, index])
+
+        def rows(frames: slice, index: np.ndarray) -> np.ndarray:
+            shape = (*height[frames, index].shape, 1, 3)
+            return posed.skin_by_body(frames, index, np.broadcast_to(self._floor.normal, shape))
+
+        equations.add_rows(self.name, BODY, rows, weight, height[..., None])
 
 
 class ObjectGround(Term):
@@ -73,8 +75,12 @@ class ObjectGround(Term):
         weight = (height < 0) / self._standing
         weight = weight * self._weight / GROUND_SIGMA**2
         vertices = self._geometry.at(state).object_vertices
-        rows = ground.by_object(vertices, state.translation, self._floor.normal)
-        equations.add_rows(self.name, OBJECT, rows, weight, height)
+
+        def rows(frames: slice, index: np.ndarray) -> np.ndarray:
+            points, origin = vertices[frames, index], state.translation[frames]
+            return ground.by_object(points, origin, self._floor.normal)[:, :, None]
+
+        equations.add_rows(self.name, OBJECT, rows, weight, height[..., None])
 
     def _height(self, state: State) -> np.ndarray:
         vertices = self._geometry.at(state).object_vertices

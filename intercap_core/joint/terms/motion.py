@@ -37,21 +37,20 @@ class BodyMotion(Term):
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_S at ``state``."""
-        frames = len(state)
-        if frames < 3:
+        if len(state) < 3:
             return
         joints, jacobian = self._geometry.at(state).joints
         acceleration = smoothness.accelerations(joints, self._fps) / self._sigma[:, None]
         weight, energy = smoothness.robust(acceleration, ACCELERATION_OUTLIER)
-        rows = jacobian * (self._fps**2 / self._sigma[:, None, None])
-        equations.add_differences(
+        unit = self._fps**2 / self._sigma
+        equations.add_rows(
             self.name,
             BODY,
-            smoothness.ACCELERATION,
-            rows.reshape(frames, -1, BODY.stop),
-            np.repeat(weight * self._weight, 3, axis=1),
-            acceleration.reshape(frames - 2, -1),
+            lambda at, some: jacobian[at, some] * unit[some, None, None],
+            weight * self._weight,
+            acceleration,
             energy * self._weight,
+            stencil=smoothness.ACCELERATION,
         )
 
 
@@ -65,18 +64,18 @@ class ObjectMotion(Term):
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_A at ``state``."""
-        frames = len(state)
-        if frames < 3:
+        if len(state) < 3:
             return
         points, jacobian = self._geometry.at(state).moments
         acceleration = smoothness.accelerations(points, self._fps) / OBJECT_ACCELERATION
         weight, energy = smoothness.robust(acceleration, ACCELERATION_OUTLIER)
-        equations.add_differences(
+        unit = self._fps**2 / OBJECT_ACCELERATION
+        equations.add_rows(
             self.name,
             OBJECT,
-            smoothness.ACCELERATION,
-            jacobian.reshape(frames, -1, 6) * (self._fps**2 / OBJECT_ACCELERATION),
-            np.repeat(weight * self._weight, 3, axis=1),
-            acceleration.reshape(frames - 2, -1),
+            lambda at, some: jacobian[at, some] * unit,
+            weight * self._weight,
+            acceleration,
             energy * self._weight,
+            stencil=smoothness.ACCELERATION,
         )

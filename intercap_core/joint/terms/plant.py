@@ -52,7 +52,10 @@ class Plant(Term):
             return
         posed = self._geometry.at(state)
         points = posed.skin[:, self._index]
-        axes = np.tile(np.eye(3), (frames, 1, 1))
-        rows = posed.skin_along(axes, self._index)
+
+        def rows(at: slice, index: np.ndarray) -> np.ndarray:
+            axes = np.broadcast_to(np.eye(3), (*points[at, index].shape, 3))
+            return posed.skin_by_body(at, self._index[index], axes)
+
         outlier = PLANT_OUTLIER / self._fps
         add_steps(self.name, BODY, points, rows, self._weight, outlier, equations)

@@ -69,9 +69,14 @@ class Stick(Term):
         posed = self._geometry.at(state)
         points = posed.skin[:, self._index]
         local = stick.local_points(points, state.rotation, state.translation)
-        by_object = stick.local_by_object(points, state.rotation, state.translation)
-        by_body = posed.skin_along(state.rotation.transpose(0, 2, 1), self._index)
-        rows = np.concatenate([by_body, by_object], axis=3)
+
+        def rows(at: slice, index: np.ndarray) -> np.ndarray:
+            rotation, some = state.rotation[at], points[at, index]
+            axes = np.broadcast_to(rotation.transpose(0, 2, 1)[:, None], (*some.shape, 3))
+            by_body = posed.skin_by_body(at, self._index[index], axes)
+            by_object = stick.local_by_object(some, rotation, state.translation[at])
+            return np.concatenate([by_body, by_object], axis=3)
+
         outlier = STICK_OUTLIER / self._fps
         add_steps(self.name, ALL, local, rows, self._weight, outlier, equations)
 
