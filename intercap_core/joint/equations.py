@@ -14,7 +14,10 @@ from intercap_core.solve.banded import BandedSystem
 Rows = Callable[[slice, np.ndarray], np.ndarray]
 
 # Rows are made for so many frames at a time: few enough that they stay in the cache.
-_FRAMES_TOGETHER = 16
+_FRAMES_TOGETHER = 8
+# Values of less weight than this share of their term's largest change nothing: the tail of a
+# Gaussian over a contact patch would have a row of each of its vertices.
+_NEGLIGIBLE = 1e-12
 
 
 class NormalEquations:
@@ -90,10 +93,11 @@ class NormalEquations:
             _over_stencil([f * g for f, g in zip(stencil, stencil[d:], strict=False)], weights)
             for d in range(ahead + 1)
         ]
+        counts = couplings[0] > _NEGLIGIBLE * couplings[0].max(initial=0.0)
         for start in range(0, frames, _FRAMES_TOGETHER):
             stop = min(start + _FRAMES_TOGETHER, frames)
             last = min(stop + ahead, frames)
-            used = np.flatnonzero(couplings[0][start:last].any(axis=0))
+            used = np.flatnonzero(counts[start:last].any(axis=0))
             if not len(used):
                 continue
             jacobian = rows(slice(start, last), used)

@@ -90,3 +90,17 @@ def test_equations_take_the_memory_of_their_bands() -> None:
         tracemalloc.stop()
     per_frame = (used[100] - used[50]) / 50
     assert per_frame < 1.1 * 3 * ALL.stop**2 * 8
+
+
+def test_rows_are_made_for_what_has_weight_alone() -> None:
+    asked: list[tuple[slice, list[int]]] = []
+
+    def rows(at: slice, some: np.ndarray) -> np.ndarray:
+        asked.append((at, some.tolist()))
+        return np.ones((at.stop - at.start, len(some), 1, 6))
+
+    weights = np.full((40, POINTS), 1e-15)
+    weights[20, 2] = 1.0
+    NormalEquations(40).add_rows("term", OBJECT, rows, weights, np.ones((40, POINTS, 1)))
+    assert len(asked) == 1 and asked[0][1] == [2]
+    assert asked[0][0].start <= 20 < asked[0][0].stop
