@@ -52,7 +52,7 @@ def _speed_over_object(
     fps: float,
 ) -> np.ndarray:
     """Speed (T, N) of points (T, N, 3) in the object's frame, m/s."""
-    local = np.einsum("tji,tnj->tni", rotation, points - translation[:, None])
+    local = (points - translation[:, None]) @ rotation
     return np.linalg.norm(_derivative(local, fps), axis=2)
 
 
@@ -63,9 +63,9 @@ def _rigid_speed(
     fps: float,
 ) -> np.ndarray:
     """Speed (T, N) of the object's surface points (T, N, 3), moving rigidly with it, m/s."""
-    local = np.einsum("tji,tnj->tni", rotation, surface - translation[:, None])
+    local = (surface - translation[:, None]) @ rotation
     turn, shift = _derivative(rotation, fps), _derivative(translation, fps)
-    velocity = np.einsum("tij,tnj->tni", turn, local) + shift[:, None]
+    velocity = local @ turn.transpose(0, 2, 1) + shift[:, None]
     return np.linalg.norm(velocity, axis=2)
 
 

@@ -14,6 +14,8 @@ import numpy as np
 from intercap_core.energy.constants import ON_SURFACE
 from intercap_core.rigid.distance import DistanceField
 
+_FRAMES_TOGETHER = 32  # what is between the points and the result is kept of so many at a time
+
 
 @dataclass(frozen=True)
 class Proximity:
@@ -40,8 +42,25 @@ def proximity(
 ) -> Proximity:
     """Distances of ``points`` (T, N, 3) to the object at ``rotation`` (T, 3, 3) and
     ``translation`` (T, 3), all in the master frame, with exact first derivatives."""
+    shape = points.shape[:2]
+    found = Proximity(np.empty(shape), np.empty((*shape, 3)), np.empty((*shape, 6)))
+    for start in range(0, len(points), _FRAMES_TOGETHER):
+        at = slice(start, start + _FRAMES_TOGETHER)
+        found.distance[at], found.normals[at], found.by_object[at] = _proximity(
+            field, points[at], rotation[at], translation[at]
+        )
+    return found
+
+
+def _proximity(
+    field: DistanceField,
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, normals and derivative by the object, of a few frames."""
     frames, count = points.shape[:2]
-    local = np.einsum("tji,tnj->tni", rotation, points - translation[:, None])
+    local = (points - translation[:, None]) @ rotation
     flat = local.reshape(-1, 3)
     inside, closest = field.boundary(flat)
     offset = flat - closest.points
@@ -49,9 +68,10 @@ def proximity(
     sign = np.where(inside, -1.0, 1.0)
     direction = sign[:, None] * offset / np.maximum(length, ON_SURFACE)[:, None]
     direction = np.where((length < ON_SURFACE)[:, None], closest.normals, direction)
-    normals = np.einsum("tij,tnj->tni", rotation, direction.reshape(frames, count, 3))
+    to_master = rotation.transpose(0, 2, 1)  # of rows
+    normals = direction.reshape(frames, count, 3) @ to_master
     # d/dw of -n . (exp(w) (q - t)) = -((q - t) x n); turning n itself changes nothing to first
     # order since x - q is parallel to it.
-    arm = np.einsum("tij,tnj->tni", rotation, closest.points.reshape(frames, count, 3))
+    arm = closest.points.reshape(frames, count, 3) @ to_master
     by_object = np.concatenate([-np.cross(arm, normals), -normals], axis=2)
-    return Proximity((sign * length).reshape(frames, count), normals, by_object)
+    return (sign * length).reshape(frames, count), normals, by_object

@@ -101,5 +101,5 @@ class PosedGeometry:
     @cached_property
     def object_vertices(self) -> np.ndarray:
         """(T, V, 3) the object's vertices."""
-        turned = np.einsum("tij,nj->tni", self.state.rotation, self._geometry.mesh.vertices)
+        turned = self._geometry.mesh.vertices @ self.state.rotation.transpose(0, 2, 1)
         return turned + self.state.translation[:, None]

@@ -104,8 +104,8 @@ class BodyData(Term):
         frames = self._fitter.frames[self._trusted]
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
-        hessian[frames] = normal.hessian.double().cpu().numpy()[self._trusted]
-        gradient[frames] = normal.gradient.double().cpu().numpy()[self._trusted]
+        hessian[frames] = normal.hessian.cpu().numpy()[self._trusted]
+        gradient[frames] = normal.gradient.cpu().numpy()[self._trusted]
         energy = float(normal.cost.double().cpu().numpy()[self._trusted].sum())
         bridged = np.setdiff1d(np.arange(len(state)), frames)
         precision = np.full(BODY.stop, BRIDGED_BODY_TURN**-2)
