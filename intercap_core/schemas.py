@@ -91,7 +91,7 @@ DETECTIONS = Schema(
 
 SCENE = Schema(
     name="scene",
-    version=2,
+    version=3,
     stage="scene",
     attributes={
         "sequence": "sequence name",
@@ -112,6 +112,7 @@ SCENE = Schema(
         "master_from_colour": Field(("C", "4", "4"), "float64", "refined extrinsics", "m", "master"),
         "master_from_colour_start": Field(("C", "4", "4"), "float64", "extrinsics as given", "m", "master"),
         "depth_bias": Field(("C",), "float64", "to subtract from each camera's depth", "m"),
+        "camera_covariance": Field(("C", "7", "C", "7"), "float64", "of each camera's rotation about its centre, translation and depth bias, beside the master's pose (0)", "rad, m", "master"),
         "note": Field(("C",), "str", "what is degraded about this camera's pose or time, in words"),
         "pairs": Field(("P", "2"), "int32", "camera indices of each overlapping pair"),
         "pair_points": Field(("P",), "int64", "held-out correspondences of the pair's backgrounds"),
@@ -278,7 +279,7 @@ BODY_FIT = Schema(
 
 JOINT = Schema(
     name="joint",
-    version=3,
+    version=4,
     stage="joint",
     attributes={
         "sequence": "sequence name",
@@ -301,6 +302,24 @@ JOINT = Schema(
         "contact_annotated": Field(("T", "R"), "int8", "1 touching, 0 not, -1 not annotated"),
         "time_offset": Field(("C",), "float64", "refined exposure offset of each camera", "s"),
         "time_offset_sigma": Field(("C",), "float64", "stated standard deviation of it", "s"),
+        "camera_names": Field(("C",), "str", "one name a camera"),
+        "master_from_colour": Field(
+            ("C", "4", "4"),
+            "float64",
+            "the cameras as body and object have settled them",
+            "m",
+            "master",
+        ),
+        "depth_bias": Field(
+            ("C",), "float64", "to subtract from each camera's depth, settled alike", "m"
+        ),
+        "camera_covariance": Field(
+            ("C", "7", "C", "7"),
+            "float64",
+            "of each camera's rotation about its centre, translation and depth bias, beside the master's pose (0)",
+            "rad, m",
+            "master",
+        ),
         "energy_names": Field(("E",), "str", "terms of the energy"),
         "energy_before": Field(("E",), "float64", "weighted energy of each term at the start"),
         "energy_after": Field(("E",), "float64", "weighted energy of each term at the end"),
@@ -436,6 +455,7 @@ METRICS = Schema(
         "truth/object_centre": Field(("T", "3"), "float64", "true centre of mass", "m", "master", optional=True),
         "truth/extrinsics_before": Field(("C",), "float32", "RMS displacement over a 2 m cube by each camera's error as given; NaN = the master, or no images", "m", optional=True),
         "truth/extrinsics_after": Field(("C",), "float32", "the same after refinement", "m", optional=True),
+        "truth/extrinsics_joint": Field(("C",), "float32", "the same after the joint fit", "m", optional=True),
     },
 )  # fmt: skip
 

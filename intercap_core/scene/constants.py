@@ -36,6 +36,9 @@ GRAVITY_CONE_DEG = 10.0  # of an accelerometer and its mounting, on a tripod; a 
 PRIOR_TRANSLATION_M = 0.01
 PRIOR_ROTATION_RAD = np.radians(0.5)
 PRIOR_BIAS_M = 0.003  # systematic depth error is at most 11 mm + 0.1 % (Azure Kinect DK data sheet)
+# Variance of refined poses and biases over that of the normal equations: the points of a surface
+# share errors of its lens and its material. Tuned on the studio.
+COVARIANCE_INFLATION = 3.0
 PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of a period of 1/30 s
 # Of the poses as they are given, beside the offsets in the keypoints' equations: rotation, rad, and
 # translation, m. Tuned on the studio.

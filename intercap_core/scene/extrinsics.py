@@ -11,10 +11,13 @@ from intercap_core.camera.rig import Rig
 from intercap_core.scene.body_constraints import BodyConstraint, body_views
 from intercap_core.scene.constants import (
     CONVERGED_M,
+    COVARIANCE_INFLATION,
     KNOWN_OFFSET_SIGMA_S,
     MAY_WORSEN,
     MIN_BODY_POINTS,
     MUST_IMPROVE,
+    PRIOR_ROTATION_RAD,
+    PRIOR_TRANSLATION_M,
     TIMING_INFLATION,
     WEAK_POINTS,
     WEAK_RESIDUAL,
@@ -54,10 +57,12 @@ class Refinement:
     """``poses`` (C, 4, 4) master_from_colour, ``bias`` (C,) metres to subtract from depth,
     ``offset`` and ``offset_sigma`` (C,) seconds, NaN sigma = not known; ``improved``: the poses are
     better than the start's on held-out points; the pairs, the verdict and each camera's note, in
-    words."""
+    words. ``covariance`` (C, 7, C, 7) of each camera's rotation about its centre, rad, translation
+    and depth bias, m, given the master's pose."""
 
     poses: np.ndarray
     bias: np.ndarray
+    covariance: np.ndarray
     offset: np.ndarray
     offset_sigma: np.ndarray
     improved: bool
@@ -115,6 +120,7 @@ def refine(
     return Refinement(
         found.estimate.poses,
         found.estimate.bias,
+        _stated_covariance(found.covariance, master),
         np.where(unknown, 0.0, found.estimate.offset),
         sigma,
         improved,
@@ -123,6 +129,18 @@ def refine(
         _verdict(rig, pairs, ratios, improved, converged, free_poses),
         _notes(rig, master, pairs, views.weights, improved),
     )
+
+
+def _stated_covariance(found: np.ndarray, master: int) -> np.ndarray:
+    """Covariance (C, 7, C, 7) of poses and depth bias from that ``found`` (C, 8, C, 8): residuals
+    of many points say little of errors that they share. Poses that were held are as uncertain as
+    given ones."""
+    stated = COVARIANCE_INFLATION * found[:, :OFFSET, :, :OFFSET]
+    given = np.repeat([PRIOR_ROTATION_RAD, PRIOR_TRANSLATION_M], 3) ** 2
+    for c in range(len(stated)):
+        if c != master and not stated[c, :6, c, :6].any():
+            stated[c, :6, c, :6] = np.diag(given)
+    return stated
 
 
 def _ratios(

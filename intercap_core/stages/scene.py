@@ -170,6 +170,7 @@ def _write(
         writer.put("master_from_colour", rig.master_from_colour)
         writer.put("master_from_colour_start", source.rig.master_from_colour)
         writer.put("depth_bias", refined.bias)
+        writer.put("camera_covariance", refined.covariance)
         writer.put("note", notes)
         writer.put("pairs", pairs.pairs)
         for k, kind in enumerate(("pair", "pair_moving")):

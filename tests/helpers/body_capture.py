@@ -177,6 +177,7 @@ def _write_scene(path: Path, rig: Rig, times: np.ndarray, time_offset: np.ndarra
         writer.put("present", np.ones(cameras, bool))
         writer.put("times", times)
         writer.put("depth_bias", np.zeros(cameras))
+        writer.put("camera_covariance", np.zeros((cameras, 7, cameras, 7)))
         writer.put("pairs", np.zeros((0, 2), np.int32))
         writer.put("note", [""] * cameras)
         for key in SCENE.fields:

@@ -165,6 +165,7 @@ class Carrying:
                 writer.put(key, self.rig.master_from_colour)
             for key in ("depth_bias", "time_offset"):
                 writer.put(key, np.zeros(count))
+            writer.put("camera_covariance", np.zeros((count, 7, count, 7)))
             writer.put("time_offset_sigma", np.full(count, np.nan))
             writer.put("slip", slip)
             writer.put("image_of", images_of_moments(slip, np.ones(slip.shape, bool)))

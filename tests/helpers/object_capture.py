@@ -186,6 +186,7 @@ class ObjectCapture:
             w.put("present", np.ones(cameras, bool))
             w.put("times", times)
             w.put("depth_bias", np.zeros(cameras))
+            w.put("camera_covariance", np.zeros((cameras, 7, cameras, 7)))
             w.put("pairs", np.zeros((0, 2), np.int32))
             w.put("note", [""] * cameras)
             for key in SCENE.fields:

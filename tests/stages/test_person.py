@@ -42,6 +42,7 @@ def write_scene(path: Path, rig: Rig, sets: int, slip: np.ndarray | None = None)
             writer.put(key, rig.master_from_colour)
         for key in ("depth_bias", "time_offset"):
             writer.put(key, np.zeros(count))
+        writer.put("camera_covariance", np.zeros((count, 7, count, 7)))
         writer.put("time_offset_sigma", np.full(count, np.nan))
         slip = np.zeros((sets, count), int) if slip is None else slip
         writer.put("slip", slip)
