@@ -19,12 +19,12 @@ from intercap_core.metrics import object_pose
 from intercap_core.metrics.truth import Truth
 from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View
 from intercap_core.project import Project
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.twist import moved
-from intercap_core.stages.object_track import ObjectRecording
 
 # Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
 ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)

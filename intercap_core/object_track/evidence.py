@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from intercap_core.object_track.constants import (
+    COMMON_ERROR_VARIANCE,
     CONTOUR_SCALES_PX,
     DEPTH_SCALES_M,
+    MIN_NOISE_VARIANCE,
     REPORT_CONTOUR_SCALE,
+    UNKNOWN_SIGMA,
 )
 from intercap_core.object_track.fit import view_fits
 from intercap_core.object_track.view import View
@@ -23,11 +27,14 @@ from intercap_core.rigid.render import Renderer, default_renderer
 class PoseEvidence:
     """What each view of a frame set says about small motions of a pose: the weighted J'J
     ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
-    one standard deviation; zero from a view that says nothing. No prior is in them. ``reports`` is
+    one standard deviation; zero from a view that says nothing. No prior is in them. ``of_depth``
+    (V, 6, 6) and ``depth_gradient`` (V, 6) are the part of them that depth gives. ``reports`` is
     how each view agrees with the pose."""
 
     information: np.ndarray
     gradient: np.ndarray
+    of_depth: np.ndarray
+    depth_gradient: np.ndarray
     reports: tuple[ViewReport, ...]
 
 
@@ -46,14 +53,38 @@ def evidence_at(
     renderer = renderer or default_renderer()
     fits = view_fits(renderer, mesh, views, pose, min_overlap, labels, twist)
 
-    def terms(fit: ViewFit) -> tuple[NormalEquations, ViewReport]:
+    def terms(fit: ViewFit) -> tuple[NormalEquations, NormalEquations, ViewReport]:
         fit.choose()
-        found = fit.normal_equations(DEPTH_SCALES_M[1], CONTOUR_SCALES_PX[1], background_term)
-        return found, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
+        depth = fit.depth_terms(DEPTH_SCALES_M[1])
+        contour = fit.contour_terms(CONTOUR_SCALES_PX[1], background_term)
+        return depth, contour, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
 
     found = renderer.pool.map(terms, fits)
+    depth = [np.array(part) for part in zip(*(one[0] for one in found), strict=True)]
+    contour = [np.array(part) for part in zip(*(one[1] for one in found), strict=True)]
     return PoseEvidence(
-        np.array([h for (h, _), _ in found]),
-        np.array([g for (_, g), _ in found]),
-        tuple(report for _, report in found),
+        depth[0] + contour[0],
+        depth[1] + contour[1],
+        depth[0],
+        depth[1],
+        tuple(report for *_, report in found),
     )
+
+
+def views_noise(found: Sequence[PoseEvidence]) -> float:
+    """Factor of the evidence's stated variance, from how far the views' gradients disagree.
+
+    At the minimum each view v of a frame still has a gradient g_v; if its errors are independent,
+    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What
+    all views have in common (calibration, masks that are too large) does not show and comes on top.
+    """
+    squares = freedom = 0.0
+    for evidence in found:
+        total = evidence.information.sum(0) + np.diag(UNKNOWN_SIGMA**-2)
+        inverse = np.linalg.inv(total)
+        share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
+        gradient = evidence.gradient
+        squares += float(np.einsum("vi,ij,vj->", gradient, inverse, gradient))
+        freedom += float((6 * share * (1 - share)).sum())
+    apart = squares / freedom if freedom > 1 else 1.0
+    return float(np.clip(apart, MIN_NOISE_VARIANCE / COMMON_ERROR_VARIANCE, 1.0))

@@ -61,6 +61,10 @@ class ViewGeometry:
             time_offset_s,
         )
 
+    def corrected(self, camera: Camera, depth_bias_m: float, time_offset_s: float) -> ViewGeometry:
+        """The same lenses at the pose of ``camera``, with another depth bias and exposure."""
+        return replace(self, camera=camera, depth_bias_m=depth_bias_m, time_offset_s=time_offset_s)
+
     def reduced_depth(self, depth_mm: np.ndarray) -> np.ndarray:
         """Depth (H, W) uint16 mm on the reduced grid: float32 metres, bias removed, 0 invalid."""
         raw = depth_mm[:: self.depth_step, :: self.depth_step]
@@ -135,6 +139,20 @@ class View:
     candidates: tuple[Candidate, ...]
     detected: bool = True
     background: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+
+    def through(self, geometry: ViewGeometry) -> View:
+        """The same image through :meth:`ViewGeometry.corrected` geometry."""
+
+        def nearer(depth: np.ndarray) -> np.ndarray:
+            by = np.float32(geometry.depth_bias_m - self.geometry.depth_bias_m)
+            return np.where(depth > 0, depth - by, 0) if by else depth
+
+        return replace(
+            self,
+            geometry=geometry,
+            depth=None if self.depth is None else nearer(self.depth),
+            background=nearer(self.background),
+        )
 
     @property
     def nbytes(self) -> int:

@@ -121,11 +121,17 @@ class ViewFit:
         self, depth_scale_m: float, contour_scale_px: float, background: bool
     ) -> NormalEquations:
         """Both terms of equation 1, weighed; ``contour_scale_px`` is at full resolution."""
-        h_depth, g_depth = self._depth_terms(depth_scale_m)
-        h_contour, g_contour, _ = self._contour_terms(contour_scale_px, background)
+        h_depth, g_depth = self.depth_terms(depth_scale_m)
+        h_contour, g_contour = self.contour_terms(contour_scale_px, background)
         return h_depth + h_contour, g_depth + g_contour
 
-    def _depth_terms(self, scale_m: float) -> NormalEquations:
+    def contour_terms(self, scale_px: float, background: bool) -> NormalEquations:
+        """The silhouette's term, weighed; ``scale_px`` is at full resolution."""
+        hessian, gradient, _ = self._contour_terms(scale_px, background)
+        return hessian, gradient
+
+    def depth_terms(self, scale_m: float) -> NormalEquations:
+        """The depth's term, weighed."""
         patch, drawn = self._depth_patch, self._drawn_depth
         if patch is None or drawn is None:
             return np.zeros((6, 6)), np.zeros(6)

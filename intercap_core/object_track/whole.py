@@ -14,7 +14,6 @@ from intercap_core.object_track.constants import (
     COMMON_TURN_VARIANCE,
     CONTRADICTED_LOG_RATIO,
     FREE_AXIS_SIGMA_RAD,
-    MIN_NOISE_VARIANCE,
     RELOOK_LOG_RATIO,
     REST_FRAMES_SEEN_AGAIN,
     SEEN_LOG_RATIO,
@@ -23,10 +22,11 @@ from intercap_core.object_track.constants import (
     UNSURE_M,
     UNSURE_RAD,
 )
-from intercap_core.object_track.evidence import PoseEvidence
+from intercap_core.object_track.evidence import PoseEvidence, views_noise
 from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult
+from intercap_core.object_track.free_turns import free_turns, without_turns
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
@@ -152,7 +152,7 @@ class WholeTrack:
         """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
         rests, for which what is ``filled`` in does not count."""
         count = len(looked)
-        noise = _noise([e for e in found if e is not None])
+        noise = COMMON_ERROR_VARIANCE * views_noise([e for e in found if e is not None])
         information, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
         for t, evidence in enumerate(found):
             if evidence is not None:
@@ -185,36 +185,19 @@ class WholeTrack:
             frames += list(rest[some])
         return sorted(map(int, frames))
 
-    def _axes(self, pose: np.ndarray) -> np.ndarray:
-        """Steps (N, 6) of a pose that leave all images as they are: turns about the symmetry's
-        axis, or any of a sphere's."""
-        symmetry = self._mesh.symmetry
-        if symmetry.sphere:
-            axes, offset = np.eye(3), np.zeros(3)
-        elif symmetry.axis is not None and symmetry.offset is not None:
-            axes, offset = symmetry.axis[None], symmetry.offset
-        else:
-            return np.zeros((0, 6))
-        turn = axes @ pose[:3, :3].T
-        return np.concatenate([turn, -np.cross(turn, pose[:3, :3] @ offset)], axis=1)
-
     def _without_symmetry(self, evidence: FrameEvidence) -> FrameEvidence:
         """The evidence without the spurious information of a round mesh's facets about its spin."""
         information, gradient = evidence.information.copy(), evidence.gradient.copy()
         for t, pose in enumerate(evidence.poses):
-            for step in self._axes(pose):
-                row = information[t] @ step
-                size = float(step @ row)
-                if size > 1e-9:
-                    gradient[t] -= row * (step @ gradient[t]) / size
-                    information[t] -= np.outer(row, row) / size
+            steps = free_turns(self._mesh, pose)
+            information[t], gradient[t] = without_turns(information[t], gradient[t], steps)
         return FrameEvidence(evidence.poses, information, gradient)
 
     def _free_axes(self, poses: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Axes (T, 3) about which a turn shows nothing; ``covariance`` becomes wide about them."""
         axes = np.zeros((len(poses), 3))
         for t, pose in enumerate(poses):
-            steps = self._axes(pose)
+            steps = free_turns(self._mesh, pose)
             for step in steps:
                 along = step[:3] @ covariance[t][:3, :3] @ step[:3]
                 covariance[t] += np.outer(step, step) * max(UNKNOWN_SIGMA[0] ** 2 - along, 0)
@@ -225,27 +208,6 @@ class WholeTrack:
             if variance[-1] > FREE_AXIS_SIGMA_RAD**2:
                 axes[t] = vectors[:, -1]
         return axes
-
-
-def _noise(found: list[PoseEvidence]) -> float:
-    """Factor of the evidence's stated variance, from how far the views' gradients disagree.
-
-    At the minimum each view v of a frame still has a gradient g_v; if its errors are independent,
-    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What
-    all views have in common (calibration, masks that are too large) does not show and comes on top.
-    """
-    squares = freedom = 0.0
-    for evidence in found:
-        total = evidence.information.sum(0) + np.diag(UNKNOWN_SIGMA**-2)
-        inverse = np.linalg.inv(total)
-        share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
-        gradient = evidence.gradient
-        squares += float(np.einsum("vi,ij,vj->", gradient, inverse, gradient))
-        freedom += float((6 * share * (1 - share)).sum())
-    apart = squares / freedom if freedom > 1 else 1.0
-    return COMMON_ERROR_VARIANCE * float(
-        np.clip(apart, MIN_NOISE_VARIANCE / COMMON_ERROR_VARIANCE, 1.0)
-    )
 
 
 def _ratio(evidence: PoseEvidence) -> float:
