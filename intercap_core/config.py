@@ -173,6 +173,11 @@ class JointSettings(Model):
     """Weight of the body's smooth motion (lambda_S)."""
     object_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the object's small acceleration (lambda_A)."""
+    look_again: bool = True
+    """Compare the object with the images anew in each round; else its track stands for them."""
+    refine_cameras: bool = True
+    """Correct poses and depth bias of the cameras by what body and object show (beyond the paper);
+    needs ``look_again``."""
     detect_contact: bool = True
     """Find contact from the geometry where it is not annotated."""
 

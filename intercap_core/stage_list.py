@@ -59,7 +59,7 @@ STAGES: dict[str, Stage] = {
         Stage(
             "joint",
             "Body and object together, over all frames, with contact.",
-            ("frames", "scene", "person", "object_track", "body_fit"),
+            ("frames", "scene", "detections", "person", "object_track", "body_fit"),
             on_device=True,
             estimates=True,
         ),

@@ -37,6 +37,7 @@ from intercap_core.body_fit.free_space import seen_through
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.terms import Views
+from intercap_core.camera.rig import Rig
 from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
 from intercap_core.energy.body_cloud import CloudRows, Matches
 from intercap_core.energy.body_keypoints import KeypointSet
@@ -118,6 +119,15 @@ class Evidence:
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
+
+    def take_cameras(self, rig: Rig, depth_bias: np.ndarray) -> None:
+        """See through other poses of the cameras and depth biases (C,), metres, from now on."""
+        seen = self.seen
+        self.clouds = [
+            None if cloud is None else cloud.through(rig, depth_bias, seen.rig, seen.depth_bias)
+            for cloud in self.clouds
+        ]
+        self.seen = replace(seen, rig=rig, depth_bias=depth_bias)
 
     def observe_keypoints(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +130,22 @@ class PersonCloud:
     trust: Tensor
     view: Tensor
     windows: tuple[DepthWindow, ...] = ()
+
+    def through(
+        self, rig: Rig, bias: np.ndarray, before: Rig, bias_before: np.ndarray
+    ) -> PersonCloud:
+        """The same pixels through cameras ``rig`` with depth ``bias`` (C,), metres, instead of
+        those ``before``."""
+        points, normals = self.points.clone(), self.normals.clone()
+        for view in np.unique(self.view.cpu().numpy()):
+            mine = self.view == int(view)
+            old, new = before[view].depth_from_master, rig[view].master_from_depth
+            measured = apply(old, points[mine].double().cpu().numpy())
+            measured -= (bias[view] - bias_before[view]) * measured / measured[:, 2:]
+            turn = new[:3, :3] @ old[:3, :3]
+            points[mine] = torch.as_tensor(apply(new, measured)).to(points)
+            normals[mine] = normals[mine] @ torch.as_tensor(turn.T).to(normals)
+        return replace(self, points=points, normals=normals)
 
 
 def person_clouds(

@@ -38,7 +38,8 @@ differences from the paper are in ``docs/equations.md``.
 | beyond | free space | body_fit/free_space.py | seen_through | body_fit.cloud_weight |
 | 6 | E: sum of terms | joint/problem.py | joint_terms | - |
 | 6 | E_B | joint/terms/body_data.py | BodyData | - |
-| 6 | E_O | joint/terms/object_data.py | ObjectData | - |
+| 6 | E_O, looked at anew | joint/terms/object_images.py | ObjectImagesData | joint.look_again |
+| 6 | E_O, the track for them | joint/terms/object_data.py | ObjectData | joint.look_again |
 | 6, A.4 | E_C: residuals | energy/contact.py | term | joint.contact_weight |
 | 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
 | 6 | Q_t, annotated | contact/detect.py | annotation_evidence | - |
@@ -57,6 +58,8 @@ differences from the paper are in ``docs/equations.md``.
 | 6, A.3 | E_A | joint/terms/motion.py | ObjectMotion | joint.object_smoothness |
 | beyond | drift of the body | joint/terms/drift.py | BodyDrift | - |
 | beyond | drift of the object | joint/terms/drift.py | ObjectDrift | - |
+| beyond | the cameras, corrected | joint/cameras.py | CameraFit | joint.refine_cameras |
+| beyond | what the body says of them | joint/terms/body_cameras.py | add_by_cameras | - |
 | beyond | time offsets of the cameras | joint/time_offsets.py | estimate_offsets | - |
 
 Terms take arrays and return residuals, weights and Jacobians, or add to normal equations. Their

@@ -23,6 +23,18 @@ MIN_STANDING_VERTICES = 4
 # themselves. Tuned on the studio.
 TRACK_FLOOR_TURN = radians(0.1)
 TRACK_FLOOR_SHIFT = 0.001
+# Evidence of the images this many standard deviations from the pose counts a quarter. Tuned on the
+# studio.
+IMAGES_OUTLIER = 5.0
+# Errors of masks and keypoints last about so long, seconds: what the frames of that time say of the
+# cameras is one observation. Tuned on the studio.
+ERROR_LASTING_S = 0.3
+# What the body says of the cameras beside that: a detector's errors follow view and pose, and
+# clothing is of unknown thickness. Tuned on the studio.
+BODY_SHARE = 0.05
+# Images that are kept as they were read, bytes. Chosen by memory: 300 frames of six cameras need
+# about half.
+VIEWS_KEPT_BYTES = 500_000_000
 # What is added where different poses explain a frame equally well, rad and metres: it is nearly
 # always the rotation (on which side the handle is). Tuned on the studio.
 AMBIGUOUS_TURN = radians(10.0)
@@ -100,6 +112,9 @@ MIN_INNOVATIONS = 50  # fewer seen points of successive frames give no estimate;
 OFFSET_UNCHANGED_S = 0.0003
 # Changes of offsets above this call for another round, seconds: 3 mm of that hand's motion.
 OFFSET_CHANGED_S = 0.001
+
+# Corrections of cameras below this are not worth another round, metres.
+CAMERAS_CHANGED_M = 0.0005
 
 # --- solver effort
 

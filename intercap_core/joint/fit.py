@@ -12,14 +12,19 @@ import numpy as np
 from intercap_core.config import ContactInterval, JointSettings
 from intercap_core.contact.detect import annotation_evidence, contact_probability
 from intercap_core.contact.motion import region_motion
+from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.constants import (
+    BODY_SHARE,
+    CAMERAS_CHANGED_M,
     CONTACT_CONVERGED,
+    ERROR_LASTING_S,
     FLAGGED_DEPTH,
     OFFSET_CHANGED_S,
     ROUND_STEPS,
 )
 from intercap_core.joint.geometry import Geometry
-from intercap_core.joint.minimise import minimise
+from intercap_core.joint.minimise import limited, minimise
+from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.problem import Problem, joint_terms
 from intercap_core.joint.sequential import Flags, SequentialFits
 from intercap_core.joint.state import State
@@ -27,6 +32,7 @@ from intercap_core.joint.terms.body_data import BodyData, Residuals
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
+from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -69,13 +75,21 @@ def fit(
     prior: OffsetPrior,
     settings: JointSettings,
     intervals: Sequence[ContactInterval] | None,
+    images: ObjectImages | None = None,
+    cameras: CameraFit | None = None,
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    ``intervals`` are the annotated contacts, None where contact is to be detected.
+    ``intervals`` are the annotated contacts, None where contact is to be detected. Without
+    ``images`` the object's track stands for them; without ``cameras`` these stay as they are.
     """
     state = sequential.state
-    object_data = ObjectData(sequential.tracked)
+    share = min(1.0, 1 / (fps * ERROR_LASTING_S))
+    object_data: ObjectData | ObjectImagesData = (
+        ObjectImagesData(sequential.tracked, images, share)
+        if images
+        else ObjectData(sequential.tracked)
+    )
     contact = Contact(geometry, settings.contact_weight)
     problem = Problem(
         joint_terms(
@@ -111,6 +125,16 @@ def fit(
             and contact_change < CONTACT_CONVERGED
             and offset_change < OFFSET_CHANGED_S
         )
+        if cameras is not None and isinstance(object_data, ObjectImagesData):
+            shown = body_data.sights(state, BODY_SHARE * share), object_data.sights(state)
+            found = cameras.settle(shown)
+            if max_steps is not ROUND_STEPS[-1]:
+                settled = settled and found.shift < CAMERAS_CHANGED_M
+                log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
+                cameras.take(found)
+                state = state.moved(limited(found.along))
+                body_data.take_cameras(cameras.now)
+                object_data.take_cameras(cameras.now)
         if settled:
             break
     stuck = steps == 0 and refused > 0 and not settled

@@ -63,7 +63,7 @@ def minimise(
         if step is None:
             damping, refused = damping * DAMPING_UP, refused + 1
             continue
-        trial = state.moved(_limited(step))
+        trial = state.moved(limited(step))
         there = linearise(trial)
         log.info("energy %.4g -> %.4g (damping %.0e)", here.total, there.total, damping)
         if not there.total < here.total:
@@ -83,7 +83,7 @@ def minimise(
     return Minimum(state, here, before, accepted, refused, converged)
 
 
-def _limited(step: np.ndarray) -> np.ndarray:
+def limited(step: np.ndarray) -> np.ndarray:
     """Limit every frame's step to the range in which the linearisation holds."""
 
     def largest(*columns: slice) -> np.ndarray:

@@ -148,12 +148,13 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """True displacement of the cameras that have images, mean and worst, before and after.
+    """True displacement of the cameras that have images, mean and worst: as given, after the scene,
+    after the joint fit.
 
     The master is left out: poses are relative to it.
     """
     figures: Figures = {}
-    for when in ("before", "after"):
+    for when in ("before", "after", "joint"):
         found = [
             s.values[f"truth/extrinsics_{when}"]
             for s in sequences

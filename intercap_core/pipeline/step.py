@@ -40,6 +40,7 @@ def run_step(
         "output": output,
         "settings": getattr(project.config, stage),
         "body_settings": project.config.body_fit,
+        "track_settings": project.config.object_track,
         "sequence": row,
         "object_": project.objects[row.object],
         "subject": project.subjects[row.subject],

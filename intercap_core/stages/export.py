@@ -46,11 +46,12 @@ def run(
     _check_replaceable(output)
     mesh = ObjectMesh.load(object_)
     with artefacts.read(scene, SCENE) as setting:
-        rig = Rig.from_artefact(setting)
+        given = Rig.from_artefact(setting)
         zup_from_master = setting["zup_from_master"]
         image_of, times = setting["image_of"], setting["times"]
         fps = float(setting.attributes["fps"])
     with artefacts.read(joint, JOINT) as fit:
+        rig = given.moved(fit["master_from_colour"])
         exposures = bop.Exposures(image_of, times, fit["time_offset"])
     motion = read_motion(joint, fps, body_models, subject.gender)
     z_up = settings.frame == "z-up"

@@ -16,23 +16,30 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.model import BodyModel
+from intercap_core.camera.rig import Rig
+from intercap_core.capture.frames import Frames
 from intercap_core.config import (
     BodyFitSettings,
     BodyModels,
     ContactInterval,
     JointSettings,
     ObjectEntry,
+    ObjectTrackSettings,
     SubjectEntry,
     digest,
 )
 from intercap_core.contact.patches import contact_patches
+from intercap_core.detections.read import Detections
+from intercap_core.joint.cameras import CameraFit, Cameras
 from intercap_core.joint.fit import JointFit, fit
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.time_offsets import OffsetPrior
+from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, SCENE
@@ -54,6 +61,7 @@ def run(
     *,
     frames: Path,
     scene: Path,
+    detections: Path,
     person: Path,
     object_track: Path,
     body_fit: Path,
@@ -63,12 +71,14 @@ def run(
     body_models: BodyModels,
     settings: JointSettings,
     body_settings: BodyFitSettings,
+    track_settings: ObjectTrackSettings,
     contact: Sequence[ContactInterval] | None = None,
     device: str = "cpu",
 ) -> None:
     """Write joint.h5 from the sequential fits.
 
-    ``body_settings`` say what the body fit had fitted. ``contact`` are the annotated intervals,
+    ``body_settings`` say what the body fit had fitted, ``track_settings`` how the tracker compares
+    images. ``contact`` are the annotated intervals,
     None where contact is to be detected from the geometry. Raises UserError where an artefact or
     the mesh cannot be used.
     """
@@ -93,17 +103,27 @@ def run(
         )
         floor, prior = _floor(source), _offset_prior(source)
         fps = float(source.attributes["fps"])
+        cameras = _cameras(source)
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-    fitted = fit(
-        Geometry(model, mesh, field, contact_patches(model)),
-        sequential,
-        body_data,
-        floor=floor,
-        fps=fps,
-        prior=prior,
-        settings=settings,
-        intervals=contact,
-    )
+    with Frames.open(frames) as recording:
+        images = None
+        if settings.look_again:
+            seen = ObjectRecording(
+                recording, Detections.load(detections), scene, person, mesh.diameter
+            )
+            images = ObjectImages(seen, mesh, track_settings, object_.labels)
+        fitted = fit(
+            Geometry(model, mesh, field, contact_patches(model)),
+            sequential,
+            body_data,
+            floor=floor,
+            fps=fps,
+            prior=prior,
+            settings=settings,
+            intervals=contact,
+            images=images,
+            cameras=cameras if images and settings.refine_cameras else None,
+        )
     with artefacts.write(
         output,
         JOINT,
@@ -117,6 +137,7 @@ def run(
     ) as writer:
         _put_body(writer, model, fitted.state)
         _put(writer, fitted)
+        _put_cameras(writer, cameras)
 
 
 def _floor(scene: Artefact) -> Ground | None:
@@ -128,6 +149,19 @@ def _floor(scene: Artefact) -> Ground | None:
 def _offset_prior(scene: Artefact) -> OffsetPrior:
     master = scene.text("camera_names").index(str(scene.attributes["master"]))
     return OffsetPrior(scene["time_offset"], scene["time_offset_sigma"], master)
+
+
+def _cameras(scene: Artefact) -> CameraFit:
+    """The scene's cameras and what is known of them."""
+    start = Cameras(Rig.from_artefact(scene), scene["depth_bias"])
+    return CameraFit(start, scene["camera_covariance"])
+
+
+def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:
+    writer.put("camera_names", list(cameras.now.rig.names))
+    writer.put("master_from_colour", cameras.now.rig.master_from_colour)
+    writer.put("depth_bias", cameras.now.depth_bias)
+    writer.put("camera_covariance", cameras.covariance)
 
 
 def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:

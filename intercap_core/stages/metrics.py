@@ -62,8 +62,12 @@ def run(
     with contextlib.ExitStack() as stack:
         images = stack.enter_context(Frames.open(frames))
         setting = stack.enter_context(artefacts.read(scene, SCENE))
+        fitted = stack.enter_context(artefacts.read(joint, JOINT))
         images = images.showing(setting["image_of"])
-        clouds = _clouds(images, setting, detections, person, object_track)
+        rig = Rig.from_artefact(setting).moved(fitted["master_from_colour"])
+        clouds = _clouds(
+            images, rig, fitted["depth_bias"], setting["image_of"], detections, person, object_track
+        )
         known = None
         if truth is not None:
             vertices = fitted_body.model.num_vertices
@@ -73,7 +77,7 @@ def run(
             fitted_body,
             fitted_object,
             clouds,
-            Rig.from_artefact(setting),
+            rig,
             settings.contact_mm * 1e-3,
         )
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
@@ -90,7 +94,7 @@ def run(
             values |= errors.of_object("joint", fitted_object)
             values |= errors.of_body("joint", fitted_body, fitted_object)
             values |= errors.about_truth(fitted_body.model.regions) | _extrinsics_errors(
-                setting, known
+                setting, fitted["master_from_colour"], known
             )
         attributes = {
             "sequence": images.sequence,
@@ -105,9 +109,15 @@ def run(
 
 
 def _clouds(
-    images: Frames, scene: artefacts.Artefact, detections: Path, person: Path, object_track: Path
+    images: Frames,
+    rig: Rig,
+    depth_bias: np.ndarray,
+    image_of: np.ndarray,
+    detections: Path,
+    person: Path,
+    object_track: Path,
 ) -> SegmentedClouds:
-    found = Detections.load(detections).showing(scene["image_of"]).with_candidates_of(person)
+    found = Detections.load(detections).showing(image_of).with_candidates_of(person)
     with artefacts.read(object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]
     total, cameras = kept.shape
@@ -117,10 +127,10 @@ def _clouds(
     ]
     return SegmentedClouds(
         images,
-        Rig.from_artefact(scene),
+        rig,
         read_person_masks(person),
         candidates,
-        scene["depth_bias"],
+        depth_bias,
     )
 
 
@@ -169,7 +179,11 @@ def _stated(
     }
 
 
-def _extrinsics_errors(scene: artefacts.Artefact, truth: truths.Truth) -> Values:
+def _extrinsics_errors(
+    scene: artefacts.Artefact, settled: np.ndarray, truth: truths.Truth
+) -> Values:
+    """Errors of the cameras as given, as the scene has them, and as joint has ``settled`` them
+    (C, 4, 4)."""
     names = scene.text("camera_names")
     if not set(names) <= set(truth.camera_names):
         return {}
@@ -178,10 +192,12 @@ def _extrinsics_errors(scene: artefacts.Artefact, truth: truths.Truth) -> Values
     master = names.index(str(scene.attributes["master"]))
     counted = scene["present"] & (np.arange(len(names)) != master)
     return {
-        f"truth/extrinsics_{when}": np.where(
-            counted, displacement(scene[key], true, master), np.nan
+        f"truth/extrinsics_{when}": np.where(counted, displacement(poses, true, master), np.nan)
+        for when, poses in (
+            ("before", scene["master_from_colour_start"]),
+            ("after", scene["master_from_colour"]),
+            ("joint", settled),
         )
-        for when, key in (("before", "master_from_colour_start"), ("after", "master_from_colour"))
     }
 
 

@@ -279,10 +279,11 @@ def test_the_joint_fit_needs_no_depth(people, objects, tmp_path):
     ball = no_depth.apply(objects["football"].paths, tmp_path / "object")
     track = tracked(ball, tmp_path / "track.h5", "football")
     joint.run(
-        frames=paths["frames"], scene=paths["scene"], person=paths["person"], object_track=track,
-        body_fit=tmp_path / "body_fit.h5", output=tmp_path / "joint.h5",
+        frames=paths["frames"], scene=paths["scene"], detections=paths["detections"],
+        person=paths["person"], object_track=track, body_fit=tmp_path / "body_fit.h5",
+        output=tmp_path / "joint.h5",
         object_=catalogue()["football"], subject=SUBJECT, body_models=BodyModels(),
-        settings=JointSettings(), body_settings=FAST,
+        settings=JointSettings(), body_settings=FAST, track_settings=ObjectTrackSettings(),
     )  # fmt: skip
     with artefacts.read(tmp_path / "joint.h5", JOINT) as found:
         assert np.isnan(found["cloud_residual"]).all()

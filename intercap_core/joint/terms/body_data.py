@@ -21,6 +21,7 @@ from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
+from intercap_core.joint.cameras import FREEDOMS, Cameras, Sights
 from intercap_core.joint.constants import (
     BRIDGED_BODY_SHIFT,
     BRIDGED_BODY_TURN,
@@ -29,6 +30,7 @@ from intercap_core.joint.constants import (
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.sightings import cloud_sightings, keypoint_sightings
 from intercap_core.joint.state import BODY, BODY_SHIFT, State
+from intercap_core.joint.terms.body_cameras import add_by_cameras
 from intercap_core.joint.terms.term import Term
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets, estimate_offsets
 
@@ -97,6 +99,10 @@ class BodyData(Term):
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
+        equations.add_blocks(self.name, BODY, *self._equations(state))
+
+    def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, float]:
+        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy."""
         assert self._bridged is not None, "refresh comes first"
         pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
         shared = pose.new_zeros(0)  # nothing that all frames share is free here
@@ -114,7 +120,24 @@ class BodyData(Term):
         hessian[bridged] = np.diag(precision)
         gradient[bridged] = precision * offset
         energy += 0.5 * float((precision * offset**2).sum())
-        equations.add_blocks(self.name, BODY, hessian, gradient, energy)
+        return hessian, gradient, energy
+
+    def take_cameras(self, cameras: Cameras) -> None:
+        """See through these cameras from the next :meth:`refresh` on."""
+        self._fitter.evidence.take_cameras(cameras.rig, cameras.depth_bias)
+
+    def sights(self, state: State, share: float) -> Sights:
+        """What keypoints and clouds of the trusted frames say of poses and cameras, at
+        ``state``."""
+        self._place(state)
+        count = FREEDOMS * len(self._fitter.evidence.seen.rig)
+        hessian, gradient, _ = self._equations(state)
+        cross = np.zeros((len(state), BODY.stop, count))
+        seen = Sights(
+            BODY, hessian, gradient, cross, np.zeros((count, count)), np.zeros(count), share
+        )
+        add_by_cameras(self._fitter.evidence, self._problem, self._trusted, seen)
+        return seen
 
     def residuals(self, state: State) -> Residuals:
         """How far the images are from ``state``."""

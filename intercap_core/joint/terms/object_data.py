@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.transforms import rigid
+from intercap_core.joint.cameras import Cameras
 from intercap_core.joint.constants import (
     AMBIGUOUS_SHIFT,
     AMBIGUOUS_TURN,
@@ -44,7 +45,9 @@ class TrackedPoses:
     covariance of (turn on the left, shift).
 
     ``twist`` (T, 6) is the motion in a second, ``share`` (T, C) each camera's part in the evidence
-    for a pose and ``time_offset`` (C,) what the tracker took the cameras' to be, seconds.
+    for a pose and ``time_offset`` (C,) what the tracker took the cameras' to be, seconds. Frames
+    (T,) that are ``seen`` and in which it is ``resting``, their ``times``, seconds; ``spread``
+    (T, 6) the variance of a pose, beside what the images of a frame leave open.
     """
 
     rotation: np.ndarray
@@ -53,6 +56,10 @@ class TrackedPoses:
     twist: np.ndarray
     share: np.ndarray
     time_offset: np.ndarray
+    seen: np.ndarray
+    resting: np.ndarray
+    times: np.ndarray
+    spread: np.ndarray
 
     @classmethod
     def from_track(
@@ -77,11 +84,23 @@ class TrackedPoses:
         tracked = ~lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
         floor = np.where(ambiguous[:, None], np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
-        total += np.eye(6) * np.where(tracked[:, None], floor, _BRIDGED)[:, None, :] ** 2
+        spread = np.where(tracked[:, None], floor, _BRIDGED) ** 2
+        total += np.eye(6) * spread[:, None, :]
         twist = twists(rigid(rotation, translation), ~lost, times)
         twist[resting] = 0
         share = visible / np.maximum(visible.sum(axis=1, keepdims=True), 1)
-        return cls(rotation, translation, np.linalg.inv(total), twist, share, time_offset)
+        return cls(
+            rotation,
+            translation,
+            np.linalg.inv(total),
+            twist,
+            share,
+            time_offset,
+            tracked,
+            resting,
+            times,
+            spread,
+        )
 
     def at(self, time_offset: np.ndarray) -> TrackedPoses:
         """The poses if the cameras had these offsets (C,), seconds: earlier by the mean change of
@@ -104,6 +123,9 @@ class ObjectData(Term):
     def take_offsets(self, time_offset: np.ndarray) -> None:
         """Compare with the poses that offsets (C,), seconds, give from now on."""
         self._poses = self._tracked.at(time_offset)
+
+    def take_cameras(self, cameras: Cameras) -> None:
+        """A track says nothing of what other cameras would show."""
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_O at ``state``."""

@@ -1,0 +1,98 @@
+"""What the images show of the object, looked at anew through corrected cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.joint.cameras import Cameras
+from intercap_core.joint.constants import VIEWS_KEPT_BYTES
+from intercap_core.object_track.constants import TRACKING_FACES
+from intercap_core.object_track.evidence import PoseEvidence, evidence_at
+from intercap_core.object_track.free_turns import free_turns, without_turns
+from intercap_core.object_track.recording import ObjectRecording
+from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import open_renderer
+
+
+class ObjectImages:
+    """The views of every moment, as the tracker sees them (equation 1: silhouettes and depth of
+    the candidate that fits best, hidden by the person's mask).
+
+    ``cameras`` (V,) places of those with images and a pose among the ``count`` of the rig; ``mesh``
+    simplified.
+    """
+
+    def __init__(
+        self,
+        recording: ObjectRecording,
+        mesh: ObjectMesh,
+        settings: ObjectTrackSettings,
+        labels: tuple[str, ...],
+    ) -> None:
+        self._views = ViewCache(recording.views, VIEWS_KEPT_BYTES)
+        self._geometry = list(recording.geometry)
+        self._settings, self._labels = settings, labels
+        self._renderer = open_renderer(settings.render_on)
+        self.mesh, self.cameras = mesh.simplified(TRACKING_FACES), recording.cameras
+        self.count = recording.count
+
+    def take_cameras(self, cameras: Cameras) -> None:
+        """See through these cameras from now on."""
+        self._geometry = [
+            given.corrected(
+                cameras.rig[c],
+                float(np.nan_to_num(cameras.depth_bias[c])),
+                given.time_offset_s,
+            )
+            for c, given in zip(self.cameras, self._geometry, strict=True)
+        ]
+
+    def take_offsets(self, time_offset: np.ndarray) -> float:
+        """Take the cameras to expose ``time_offset`` (C,) seconds late; returns the largest change,
+        seconds."""
+        late = [float(time_offset[c]) for c in self.cameras]
+        change = [abs(s - g.time_offset_s) for s, g in zip(late, self._geometry, strict=True)]
+        self._geometry = [
+            given.corrected(given.camera, given.depth_bias_m, seconds)
+            for seconds, given in zip(late, self._geometry, strict=True)
+        ]
+        return max(change, default=0.0)
+
+    def look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
+        """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,), without
+        what facets seem to say of the turns of a round one."""
+        views = [
+            view.through(geometry)
+            for view, geometry in zip(self._views(t), self._geometry, strict=True)
+        ]
+        found = evidence_at(
+            self.mesh,
+            views,
+            pose,
+            min_overlap=self._settings.min_overlap,
+            background_term=self._settings.background_term,
+            labels=self._labels,
+            twist=twist,
+            renderer=self._renderer,
+        )
+        turns = free_turns(self.mesh, pose)
+        depth = without_turns(found.of_depth, found.depth_gradient, turns)
+        contour = without_turns(
+            found.information - found.of_depth, found.gradient - found.depth_gradient, turns
+        )
+        return PoseEvidence(
+            depth[0] + contour[0], depth[1] + contour[1], depth[0], depth[1], found.reports
+        )
+
+    def rays(self, place: np.ndarray) -> np.ndarray:
+        """By how much (V, 3), metres, what is at ``place`` (3,) seems farther to each camera, for
+        a metre of depth."""
+        poses = np.array([geometry.master_from_colour for geometry in self._geometry])
+        away = place - poses[:, :3, 3]
+        return away / (away * poses[:, :3, 2]).sum(axis=1, keepdims=True)
+
+    def centres(self) -> np.ndarray:
+        """(V, 3) of the cameras, master frame."""
+        return np.array([geometry.master_from_colour[:3, 3] for geometry in self._geometry])

@@ -1,0 +1,173 @@
+"""Object images: E_O of equation 6 from the images, looked at anew in each round.
+
+Every frame's evidence (equation 1, silhouettes and depth of every view v) is a quadratic form of
+small steps x of the pose where it was looked at and of the cameras' corrections d_v,
+
+    E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
+
+with A_v the step that a correction looks like. e is what the mesh differs from the thing itself: at
+the best e the matrix of x is I - I K I, K = (I + F^-1)^-1, I = sum I_v. Frames in which the object
+is lost stay near the track's poses, as in :mod:`.object_data`; evidence that is far from its own
+pose counts little (Geman-McClure). No setting weighs E_O: its strength is the images'.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.camera.transforms import rigid
+from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, Cameras, Sights
+from intercap_core.joint.constants import IMAGES_OUTLIER, OFFSET_UNCHANGED_S
+from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.object_images import ObjectImages
+from intercap_core.joint.state import OBJECT, State
+from intercap_core.joint.terms.object_data import TrackedPoses
+from intercap_core.joint.terms.term import Term
+from intercap_core.object_track.constants import UNKNOWN_SIGMA
+from intercap_core.object_track.evidence import PoseEvidence, views_noise
+from intercap_core.rigid.twist import step_between, twists
+from intercap_core.solve.robust import geman_mcclure_weight
+
+
+@dataclass(frozen=True, eq=False)
+class _ByCameras:
+    """A frame's ``hessian`` (D, D) and ``gradient`` (D,) by the corrections of its D / 7 views, and
+    ``cross`` (6, D) with the object's step."""
+
+    hessian: np.ndarray
+    gradient: np.ndarray
+    cross: np.ndarray
+
+
+class ObjectImagesData(Term):
+    """E_O of what ``images`` show of the tracked frames, and of the other poses of the track."""
+
+    name = "object_data"
+
+    def __init__(self, tracked: TrackedPoses, images: ObjectImages, share: float) -> None:
+        """``share`` of an independent observation that a frame is."""
+        self._tracked, self._images, self._share = tracked, images, share
+        self._looked = rigid(tracked.rotation, tracked.translation)
+        self._matrix = tracked.information
+        self._gradient = np.zeros((len(tracked.seen), 6))
+        self._by_cameras: dict[int, _ByCameras] = {}
+        self._last: State | None = None
+        self._noise = 1.0
+
+    def take_cameras(self, cameras: Cameras) -> None:
+        """See through these cameras from the next look on."""
+        self._images.take_cameras(cameras)
+
+    def take_offsets(self, time_offset: np.ndarray) -> None:
+        """Take the cameras to expose so late (C,), seconds; looks again where that tells."""
+        if self._images.take_offsets(time_offset) > OFFSET_UNCHANGED_S and self._last is not None:
+            self.refresh(self._last)
+
+    def refresh(self, state: State) -> None:
+        """Look at the images at ``state``."""
+        self._last = state
+        tracked = self._tracked
+        poses = rigid(state.rotation, state.translation)
+        motion = twists(poses, tracked.seen, tracked.times)
+        motion[tracked.resting] = 0
+        frames = np.flatnonzero(tracked.seen)
+        found = [self._images.look(int(t), poses[t], motion[t]) for t in frames]
+        self._noise = noise = views_noise(found)
+        self._looked[frames] = poses[frames]
+        self._by_cameras = {}
+        for t, evidence in zip(frames.tolist(), found, strict=True):
+            self._take(t, evidence, noise)
+
+    def _take(self, t: int, evidence: PoseEvidence, noise: float) -> None:
+        """Hold the frame's quadratic form, its stated variance times ``noise``."""
+        information, gradient = (
+            evidence.information.sum(0) / noise,
+            evidence.gradient.sum(0) / noise,
+        )
+        own = -np.linalg.solve(information + np.diag(UNKNOWN_SIGMA**-2), gradient)
+        weight = geman_mcclure_weight(own @ information @ own, IMAGES_OUTLIER)
+        information, gradient = weight * information, weight * gradient
+        held = np.linalg.inv(information + np.diag(1 / self._tracked.spread[t]))  # K
+        freed = np.eye(6) - information @ held
+        self._matrix = self._matrix.copy()
+        self._matrix[t] = freed @ information
+        self._gradient[t] = freed @ gradient
+        self._by_cameras[t] = self._seen_by(t, evidence, weight / noise, held, gradient)
+
+    def _seen_by(
+        self,
+        t: int,
+        evidence: PoseEvidence,
+        weight: float,
+        held: np.ndarray,
+        gradient: np.ndarray,
+    ) -> _ByCameras:
+        """The frame's form by the corrections of all views, less what the mesh's error takes."""
+        place = self._looked[t, :3, 3]
+        arms, rays = place - self._images.centres(), self._images.rays(place)
+        count = len(arms)
+        steps = np.zeros((2, count, 6, FREEDOMS))  # A_v of silhouettes and of depth
+        steps[:, :, :3, TURN] = np.eye(3)
+        steps[:, :, 3:, TURN] = np.cross(np.eye(3), arms[:, None]).transpose(0, 2, 1)
+        steps[:, :, 3:, SHIFT] = np.eye(3)
+        steps[1, :, 3:, BIAS] = -rays
+        of_depth = weight * evidence.of_depth, weight * evidence.depth_gradient
+        of_contour = (
+            weight * evidence.information - of_depth[0],
+            weight * evidence.gradient - of_depth[1],
+        )
+        size = count * FREEDOMS
+        hessian, pull = np.zeros((count, FREEDOMS, count, FREEDOMS)), np.zeros((count, FREEDOMS))
+        cross = np.zeros((6, count, FREEDOMS))
+        each = np.arange(count)
+        for step, (information, slope) in zip(steps, (of_contour, of_depth), strict=True):
+            seen = information @ step
+            hessian[each, :, each] += step.transpose(0, 2, 1) @ seen
+            pull -= np.einsum("vif,vi->vf", step, slope)
+            cross += seen.transpose(1, 0, 2)
+        flat = cross.reshape(6, size)
+        freed = np.eye(6) - weight * evidence.information.sum(0) @ held
+        return _ByCameras(
+            hessian.reshape(size, size) - flat.T @ held @ flat,
+            pull.ravel() + flat.T @ held @ gradient,
+            -freed @ flat,
+        )
+
+    def add(self, state: State, equations: NormalEquations) -> None:
+        """Add E_O at ``state``, as of the last :meth:`refresh`."""
+        offset = self._offset(state)
+        slope = np.einsum("tij,tj->ti", self._matrix, offset)
+        energy = 0.5 * np.einsum("ti,ti->", offset, slope)
+        energy += np.einsum("ti,ti->", offset, self._gradient)
+        loose = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
+        lowest = np.linalg.solve(loose, self._gradient[..., None])[..., 0]
+        energy += 0.5 * np.einsum("ti,ti->", lowest, self._gradient)  # counted from its minimum
+        gradient = slope + self._gradient
+        equations.add_blocks(self.name, OBJECT, self._matrix, gradient, float(energy))
+
+    def sights(self, state: State) -> Sights:
+        """What the frames that were looked at say of pose and cameras, at ``state``."""
+        offset, count = self._offset(state), self._images.count
+        columns = np.concatenate(
+            [np.arange(FREEDOMS * c, FREEDOMS * (c + 1)) for c in self._images.cameras]
+        )
+        size = FREEDOMS * count
+        hessian, pull, cross = (
+            np.zeros((size, size)),
+            np.zeros(size),
+            np.zeros((len(offset), 6, size)),
+        )
+        for t, found in self._by_cameras.items():
+            hessian[np.ix_(columns, columns)] += found.hessian
+            pull[columns] += found.gradient + found.cross.T @ offset[t]
+            cross[t][:, columns] = found.cross
+        gradient = np.einsum("tij,tj->ti", self._matrix, offset) + self._gradient
+        matrix = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
+        # what lasts is not seen in how the views of a moment differ: the variance as stated
+        share = self._share * self._noise
+        return Sights(OBJECT, matrix, gradient, cross, hessian, pull, share)
+
+    def _offset(self, state: State) -> np.ndarray:
+        return step_between(self._looked, rigid(state.rotation, state.translation))
