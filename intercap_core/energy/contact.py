@@ -61,8 +61,8 @@ def term(
     patch_of: np.ndarray,
     spread: Shares,
     probability: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Residuals (T, N) in metres, weights (T, N) and energy (m^2) of all contact vertices.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals (T, N) in metres, weights (T, N) and energies (T,) (m^2) of all contact vertices.
 
     ``distance`` (T, N) signed distances to the object, metres; ``probability`` (T, P) that each
     patch's region touches. One patch in one frame has the energy q rho(s) / 2, with q probability
@@ -78,7 +78,7 @@ def term(
     gate = probability * spread.gate
     weight = spread.area * (gate * geman_mcclure_weight(square, CONTACT_OUTLIER))[:, patch_of]
     rho = CONTACT_OUTLIER**2 / (CONTACT_OUTLIER**2 + square)  # over the square
-    return residual, weight, 0.5 * float((gate * square * rho).sum())
+    return residual, weight, 0.5 * (gate * square * rho).sum(axis=1)
 
 
 def _closeness(farther: np.ndarray) -> np.ndarray:

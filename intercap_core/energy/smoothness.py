@@ -27,11 +27,11 @@ def accelerations(points: np.ndarray, fps: float) -> np.ndarray:
     return (points[:-2] - 2 * points[1:-1] + points[2:]) * fps**2
 
 
-def robust(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
-    """Pseudo-Huber weights (T-2, N) and energy of accelerations (T-2, N, 3): quadratic below
-    ``scale``, linear above."""
+def robust(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pseudo-Huber weights (T-2, N) and energies (T-2,) of accelerations (T-2, N, 3): quadratic
+    below ``scale``, linear above."""
     root = np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
-    return 1.0 / root, float(scale**2 * (root - 1.0).sum())
+    return 1.0 / root, scale**2 * (root - 1.0).sum(axis=1)
 
 
 def jitter(points: np.ndarray, valid: np.ndarray) -> float:

@@ -31,9 +31,9 @@ def local_by_object(
     return np.concatenate([by_turn, np.broadcast_to(-axes, by_turn.shape)], axis=3)
 
 
-def robust(rate: np.ndarray, weight: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
-    """Geman-McClure weights (T, N) and energy of rates (T, N, 3) that have ``weight`` (T, N): what
-    slides faster than ``scale`` truly slides."""
+def robust(rate: np.ndarray, weight: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Geman-McClure weights (T, N) and energies (T,) of rates (T, N, 3) that have ``weight``
+    (T, N): what slides faster than ``scale`` truly slides."""
     square = np.square(rate).sum(2)
     share = scale**2 / (scale**2 + square)
-    return weight * share**2, 0.5 * float((weight * square * share).sum())
+    return weight * share**2, 0.5 * (weight * square * share).sum(axis=1)

@@ -125,6 +125,8 @@ OFFSET_ITERATIONS = 4  # reweightings of the offsets' normal equations; tuned on
 # Damping of Levenberg-Marquardt, share of the diagonal. Tuned on the studio.
 INITIAL_DAMPING = 1e-3
 MIN_DAMPING = 1e-6
+# A frame that ends with more hardly moves any more. Tuned on the studio.
+HELD_DAMPING = 1.0
 DAMPING_UP, DAMPING_DOWN = 10.0, 5.0  # factors after a rejected and an accepted step
 # Largest change in one step, rad and metres: beyond it a linearisation of skinning is poor.
 # Tuned on the studio.

@@ -24,7 +24,8 @@ class NormalEquations:
     """Sums weighted J^T J and J^T r of terms.
 
     ``bands`` (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or fewer for short recordings,
-    ``gradient`` (T, n) and ``energy`` of each term, one half of the weighted sum of squares.
+    ``gradient`` (T, n) and ``energies`` (T,) of each term, one half of the weighted sum of squares;
+    a difference over frames is shared by them.
     ``damped`` (T, n) is the diagonal without its stiff parts: damping by their large values would
     freeze an object that has to move as one over many frames.
     """
@@ -33,21 +34,33 @@ class NormalEquations:
         self.bands = np.zeros((min(3, frames), frames, ALL.stop, ALL.stop))
         self.damped = np.zeros((frames, ALL.stop))
         self.gradient = np.zeros((frames, ALL.stop))
-        self.energy: dict[str, float] = {}
+        self.energies: dict[str, np.ndarray] = {}
 
-    def step(self, damping: float) -> np.ndarray | None:
-        """The damped Gauss-Newton step (T, n), or None where the matrix is not definite."""
+    def step(self, damping: np.ndarray) -> np.ndarray | None:
+        """The Gauss-Newton step (T, n), damped by ``damping`` (T,) of each frame, or None where the
+        matrix is not definite."""
         matrix = torch.tensor(self.bands)
-        matrix[0].diagonal(dim1=1, dim2=2).add_(torch.from_numpy(damping * self.damped))
+        damped = torch.from_numpy(damping[:, None] * self.damped)
+        matrix[0].diagonal(dim1=1, dim2=2).add_(damped)
         factor = BandedSystem(matrix).factorise(in_place=True)
         if factor is None:
             return None
         return factor.solve(-torch.from_numpy(self.gradient)).numpy()
 
     @property
+    def energy(self) -> dict[str, float]:
+        """Of each term, over all frames."""
+        return {term: float(values.sum()) for term, values in self.energies.items()}
+
+    @property
     def total(self) -> float:
         """Energy of all terms."""
-        return float(sum(self.energy.values()))
+        return float(sum(values.sum() for values in self.energies.values()))
+
+    @property
+    def by_frame(self) -> np.ndarray:
+        """Energy (T,) of all terms."""
+        return np.sum(list(self.energies.values()), axis=0)
 
     def add_blocks(
         self,
@@ -55,13 +68,14 @@ class NormalEquations:
         columns: slice,
         hessian: np.ndarray,
         gradient: np.ndarray,
-        energy: float,
+        energy: np.ndarray,
     ) -> None:
-        """Add ready J^T W J (T, m, m) and J^T W r (T, m) over ``columns`` of every frame."""
+        """Add ready J^T W J (T, m, m), J^T W r (T, m) and energy (T,) over ``columns`` of every
+        frame."""
         self.bands[0][:, columns, columns] += hessian
         self.damped[:, columns] += hessian.diagonal(axis1=1, axis2=2)
         self.gradient[:, columns] += gradient
-        self.energy[term] = self.energy.get(term, 0.0) + energy
+        self.energies[term] = self.energies.get(term, 0.0) + energy
 
     def add_rows(
         self,
@@ -70,7 +84,7 @@ class NormalEquations:
         rows: Rows,
         weights: np.ndarray,
         residuals: np.ndarray,
-        energy: float | None = None,
+        energy: np.ndarray | None = None,
         *,
         stencil: tuple[float, ...] = (1.0,),
         stiff: bool = False,
@@ -79,12 +93,15 @@ class NormalEquations:
 
         ``rows`` derive the values by ``columns``, ``stencil`` (w+1,) are the factors of frames
         t .. t+w; ``weights`` (T-w, N) and ``residuals`` (T-w, N, R) are those of the differences.
-        ``energy`` is that of a robust term, None for plain least squares.
+        ``energy`` (T-w,) is that of a robust term, None for plain least squares.
         """
-        if energy is None:
-            energy = 0.5 * float((weights[..., None] * residuals**2).sum())
-        self.energy[term] = self.energy.get(term, 0.0) + energy
         frames, ahead = len(self.gradient), len(stencil) - 1
+        if energy is None:
+            energy = 0.5 * (weights[..., None] * residuals**2).sum(axis=(1, 2))
+        shared = np.zeros(frames)
+        if frames > ahead:
+            shared = _over_stencil(np.full(ahead + 1, 1 / (ahead + 1)), energy)
+        self.energies[term] = self.energies.get(term, 0.0) + shared
         if frames <= ahead:
             return
         forces = _over_stencil(stencil, weights[..., None] * residuals)
@@ -115,7 +132,7 @@ class NormalEquations:
                     self.damped[here, columns] += block.diagonal(axis1=1, axis2=2)
 
 
-def _over_stencil(factors: Sequence[float], values: np.ndarray) -> np.ndarray:
+def _over_stencil(factors: Sequence[float] | np.ndarray, values: np.ndarray) -> np.ndarray:
     """Sum over k of ``factors`` (k,) times ``values`` (T - w, ...) of k frames before."""
     out = np.zeros((len(values) + len(factors) - 1, *values.shape[1:]))
     for k, factor in enumerate(factors):

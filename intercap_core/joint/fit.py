@@ -108,6 +108,7 @@ def fit(
         return _estimate_contact(geometry, at, sequential, fps, settings, intervals)
 
     steps, refused, energy_before, settled = 0, 0, None, False
+    held = np.ones(len(state), bool)
     estimate = estimate_contact(state)
     for max_steps in ROUND_STEPS:
         contact.take_probability(estimate.probability)
@@ -117,6 +118,7 @@ def fit(
         minimum = minimise(problem.equations, state, max_steps=max_steps)
         state, steps, refused = minimum.state, steps + minimum.steps, refused + minimum.refused
         energy_before = energy_before or minimum.energy_before
+        held &= minimum.held
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
         previous, estimate = estimate, estimate_contact(state)
         contact_change = np.abs(estimate.probability - previous.probability).max()
@@ -140,9 +142,10 @@ def fit(
     stuck = steps == 0 and refused > 0 and not settled
     log.log(
         logging.WARNING if stuck else logging.INFO,
-        "%d steps taken, %d refused, %s",
+        "%d steps taken, %d refused, %d frames held, %s",
         steps,
         refused,
+        held.sum(),
         "settled" if settled else "ended before it settled",
     )
     residuals = body_data.residuals(state)
@@ -156,7 +159,7 @@ def fit(
         steps=steps,
         refused=refused,
         converged=settled,
-        flag_reasons=_flag_reasons(geometry, state, sequential.flags, stuck),
+        flag_reasons=_flag_reasons(geometry, state, sequential.flags, held | stuck),
     )
 
 
@@ -189,8 +192,9 @@ def _estimate_contact(
     return ContactEstimate(contact_probability(motion, fps, given=given), labels)
 
 
-def _flag_reasons(geometry: Geometry, state: State, flags: Flags, stuck: bool) -> list[str]:
-    """Why each frame (T,) should not be trusted; "" where it can be."""
+def _flag_reasons(geometry: Geometry, state: State, flags: Flags, stuck: np.ndarray) -> list[str]:
+    """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
+    lowered its energy."""
     deep = geometry.at(state).proximity.distance.min(axis=1) < -FLAGGED_DEPTH
     causes = (
         (flags.filled, "body not seen well enough, filled in"),
@@ -198,6 +202,6 @@ def _flag_reasons(geometry: Geometry, state: State, flags: Flags, stuck: bool) -
         (flags.lost, "object lost, filled in"),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
-        (np.full(len(state), stuck), "no step of the joint fit lowered its energy"),
+        (stuck, "no step of the joint fit lowered its energy"),
     )
     return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]

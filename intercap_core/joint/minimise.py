@@ -11,6 +11,7 @@ import numpy as np
 from intercap_core.joint.constants import (
     DAMPING_DOWN,
     DAMPING_UP,
+    HELD_DAMPING,
     INITIAL_DAMPING,
     MAX_STEP_SHIFT,
     MAX_STEP_TURN,
@@ -33,8 +34,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Minimum:
     """The final state, the equations there, the energy of each term at the start, the numbers of
-    accepted ``steps`` and of ``refused`` ones, and whether the last one gained little or would
-    have."""
+    accepted ``steps`` and of ``refused`` ones, whether the last one gained little or would have,
+    and the frames (T,) that were ``held``: what would have moved them raised the energy."""
 
     state: State
     equations: NormalEquations
@@ -42,6 +43,7 @@ class Minimum:
     steps: int
     refused: int
     converged: bool
+    held: np.ndarray
 
 
 def minimise(
@@ -52,10 +54,12 @@ def minimise(
 ) -> Minimum:
     """Try at most ``max_steps`` steps from ``state``, each accepted only if it lowers the energy.
 
-    Progress is measured against the round's own, since most of the energy is noise that no state
-    explains.
+    Every frame has its own damping, which grows where the energy of a refused step rose, so that a
+    frame or a term that is badly linearised holds up its neighbourhood alone. Progress is measured
+    against the round's own, since most of the energy is noise that no state explains.
     """
-    damping, accepted, refused, gained, converged = INITIAL_DAMPING, 0, 0, 0.0, False
+    accepted, refused, gained, converged = 0, 0, 0.0, False
+    damping = np.full(len(state), INITIAL_DAMPING)
     here = linearise(state)
     before = here.energy
     for _ in range(max_steps):
@@ -65,9 +69,16 @@ def minimise(
             continue
         trial = state.moved(limited(step))
         there = linearise(trial)
-        log.info("energy %.4g -> %.4g (damping %.0e)", here.total, there.total, damping)
+        log.info(
+            "energy %.4g -> %.4g (damping %.0e to %.0e)",
+            here.total,
+            there.total,
+            damping.min(),
+            damping.max(),
+        )
         if not there.total < here.total:
-            damping, refused = damping * DAMPING_UP, refused + 1
+            rose = _risen(there.by_frame - here.by_frame)
+            damping, refused = np.where(rose, damping * DAMPING_UP**2, damping), refused + 1
             # of a quadratic energy, half of what its slope promises
             if -0.5 * float((here.gradient * step).sum()) < NEGLIGIBLE_SHARE * here.total:
                 converged = True
@@ -76,11 +87,19 @@ def minimise(
         gain = here.total - there.total
         gained += gain
         state, here, accepted = trial, there, accepted + 1
-        damping = max(damping / DAMPING_DOWN, MIN_DAMPING)
+        damping = np.maximum(damping / DAMPING_DOWN, MIN_DAMPING)
         if gain < MIN_GAIN_SHARE * gained:
             converged = True
             break
-    return Minimum(state, here, before, accepted, refused, converged)
+    return Minimum(state, here, before, accepted, refused, converged, damping > HELD_DAMPING)
+
+
+def _risen(change: np.ndarray) -> np.ndarray:
+    """Frames (T,) bool around which the energy rose by ``change`` (T,), or is no number; all of
+    them where it rose nowhere in particular."""
+    around = np.convolve(np.nan_to_num(change, nan=np.inf), np.ones(3), mode="same")
+    rose = ~(around <= 0)
+    return rose if rose.any() else np.ones(len(change), bool)
 
 
 def limited(step: np.ndarray) -> np.ndarray:

@@ -91,8 +91,8 @@ def test_contact_weights_are_the_derivative_of_its_energy():
     for t, n in ((0, 1), (1, 5), (2, 11)):
         step = np.zeros_like(distance)
         step[t, n] = 1e-7
-        up = contact.term(distance + step, patch_of, spread, probability)[2]
-        down = contact.term(distance - step, patch_of, spread, probability)[2]
+        up = contact.term(distance + step, patch_of, spread, probability)[2].sum()
+        down = contact.term(distance - step, patch_of, spread, probability)[2].sum()
         numeric = (up - down) / 2e-7
         assert (weight * residual)[t, n] == pytest.approx(numeric, rel=1e-4, abs=1e-10)
 

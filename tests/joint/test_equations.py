@@ -65,7 +65,7 @@ def test_what_is_stiff_is_not_damped() -> None:
             stiff=stiff,
         )
     before = equations.bands.copy()
-    step = equations.step(1.0)
+    step = equations.step(np.ones(2))
     assert step is not None
     np.testing.assert_allclose(step, -0.5, rtol=1e-6)
     assert np.array_equal(before, equations.bands)

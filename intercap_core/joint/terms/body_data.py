@@ -101,8 +101,8 @@ class BodyData(Term):
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
         equations.add_blocks(self.name, BODY, *self._equations(state))
 
-    def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, float]:
-        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy."""
+    def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,)."""
         assert self._bridged is not None, "refresh comes first"
         pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
         shared = pose.new_zeros(0)  # nothing that all frames share is free here
@@ -112,14 +112,15 @@ class BodyData(Term):
         gradient = np.zeros((len(state), BODY.stop))
         hessian[frames] = normal.hessian.cpu().numpy()[self._trusted]
         gradient[frames] = normal.gradient.cpu().numpy()[self._trusted]
-        energy = float(normal.cost.double().cpu().numpy()[self._trusted].sum())
+        energy = np.zeros(len(state))
+        energy[frames] = normal.cost.double().cpu().numpy()[self._trusted]
         bridged = np.setdiff1d(np.arange(len(state)), frames)
         precision = np.full(BODY.stop, BRIDGED_BODY_TURN**-2)
         precision[BODY_SHIFT] = BRIDGED_BODY_SHIFT**-2
         offset = state.body[bridged] - self._bridged[bridged]
         hessian[bridged] = np.diag(precision)
         gradient[bridged] = precision * offset
-        energy += 0.5 * float((precision * offset**2).sum())
+        energy[bridged] = 0.5 * (precision * offset**2).sum(axis=1)
         return hessian, gradient, energy
 
     def take_cameras(self, cameras: Cameras) -> None:

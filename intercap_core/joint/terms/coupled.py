@@ -16,13 +16,13 @@ def add_distances(
     posed: PosedGeometry,
     residual: np.ndarray,
     weight: np.ndarray,
-    energy: float | None,
+    energy: np.ndarray | None,
     equations: NormalEquations,
 ) -> None:
     """Add rows of the N skin vertices' distances to the object.
 
     ``residual`` (T, N) metres, whose derivative is that of the distance wherever ``weight`` (T, N),
-    1/m^2, is not 0; ``energy`` that of a robust term, None for plain least squares.
+    1/m^2, is not 0; ``energy`` (T,) that of a robust term, None for plain least squares.
     """
     near = posed.proximity
 

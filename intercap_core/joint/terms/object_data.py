@@ -133,5 +133,5 @@ class ObjectData(Term):
         turn = Rotation.from_matrix(state.rotation @ poses.rotation.transpose(0, 2, 1))
         offset = np.concatenate([turn.as_rotvec(), state.translation - poses.translation], axis=1)
         gradient = np.einsum("tij,tj->ti", poses.information, offset)
-        energy = 0.5 * float(np.einsum("ti,ti->", offset, gradient))
+        energy = 0.5 * (offset * gradient).sum(axis=1)
         equations.add_blocks(self.name, OBJECT, poses.information, gradient, energy)

@@ -139,13 +139,11 @@ class ObjectImagesData(Term):
         """Add E_O at ``state``, as of the last :meth:`refresh`."""
         offset = self._offset(state)
         slope = np.einsum("tij,tj->ti", self._matrix, offset)
-        energy = 0.5 * np.einsum("ti,ti->", offset, slope)
-        energy += np.einsum("ti,ti->", offset, self._gradient)
         loose = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
         lowest = np.linalg.solve(loose, self._gradient[..., None])[..., 0]
-        energy += 0.5 * np.einsum("ti,ti->", lowest, self._gradient)  # counted from its minimum
+        energy = 0.5 * (offset * slope + lowest * self._gradient) + offset * self._gradient
         gradient = slope + self._gradient
-        equations.add_blocks(self.name, OBJECT, self._matrix, gradient, float(energy))
+        equations.add_blocks(self.name, OBJECT, self._matrix, gradient, energy.sum(axis=1))
 
     def sights(self, state: State) -> Sights:
         """What the frames that were looked at say of pose and cameras, at ``state``."""
