@@ -419,7 +419,8 @@ class ObjectEntry(Model):
     mesh: Path
     """Watertight mesh in metres (.ply or .obj)."""
     contact_vertices: Path | None = None
-    """Vertices that people are likely to touch: a JSON list, or a pickle as InterCap released."""
+    """Vertices that people are likely to touch: a JSON list (or one that also says on which mesh it
+    was chosen, see rigid/contact_vertices.py), or a pickle as InterCap released."""
     symmetry: Symmetry = Symmetry()
     """Symmetry group."""
     labels: tuple[str, ...] = ()

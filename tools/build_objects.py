@@ -1,7 +1,7 @@
 """Build the meshes of the ten objects: ``python tools/build_objects.py [--output config/objects]``.
 
 Writes ``<NN>_<name>.ply`` (binary, metres, z up in the standing pose, origin at the centre of
-mass, vertex colours) and ``<NN>_<name>.contact.json`` (ids of likely-contact vertices), and with
+mass, vertex colours) and ``<NN>_<name>.contact.json`` (likely-contact vertices), and with
 ``--picture`` a sheet that shows all of them from two sides, contact vertices highlighted.
 Needs ``manifold3d`` (the ``bake`` extra).
 """
@@ -16,6 +16,8 @@ from pathlib import Path
 import trimesh
 from object_shapes import furniture, luggage, sports, vessels
 from object_shapes.parts import Built
+
+from intercap_core.rigid.contact_vertices import contact_list
 
 BUILDERS: dict[str, Callable[[], Built]] = {
     "01_suitcase": luggage.suitcase,
@@ -40,7 +42,7 @@ def write(name: str, built: Built, folder: Path) -> None:
     (folder / f"{name}.ply").write_bytes(
         mesh.export(file_type="ply", encoding="binary", vertex_normal=False)
     )
-    contact = json.dumps([int(vertex) for vertex in built.contact_vertices])
+    contact = json.dumps(contact_list(built.contact_vertices, mesh.vertices))
     (folder / f"{name}.contact.json").write_text(contact + "\n")
 
 

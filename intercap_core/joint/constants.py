@@ -146,3 +146,9 @@ CONTACT_CONVERGED = 0.1
 # A frame with a skin vertex deeper than this inside the object is flagged, metres: far beyond what
 # skin yields, so one of the two poses is wrong. Tuned on the studio.
 FLAGGED_DEPTH = 0.03
+# Feet so far below the floor, or feet and object so far above it, contradict it, metres: several
+# times what sequential fits err there (at most 0.03). Tuned on the studio.
+FLOOR_CONTRADICTED = 0.10
+# Share of the frames in which feet or object should reach the floor: a jump ends, and so does a
+# walk with the object in the air. Tuned on the studio.
+REACHED_SHARE = 0.1

@@ -22,6 +22,7 @@ from intercap_core.joint.constants import (
     OFFSET_CHANGED_S,
     ROUND_STEPS,
 )
+from intercap_core.joint.floor import contradiction
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import limited, minimise
 from intercap_core.joint.object_images import ObjectImages
@@ -81,9 +82,14 @@ def fit(
     """Minimise equation 6 from the sequential fits.
 
     ``intervals`` are the annotated contacts, None where contact is to be detected. Without
-    ``images`` the object's track stands for them; without ``cameras`` these stay as they are.
+    ``images`` the object's track stands for them; without ``cameras`` these stay as they are. A
+    ``floor`` that the sequential fits contradict is left out, which flags every frame.
     """
     state = sequential.state
+    against_floor = contradiction(geometry, sequential, floor) if floor else ""
+    if against_floor:
+        log.warning("%s: every frame is flagged; look at the scene's ground", against_floor)
+        floor = None
     share = min(1.0, 1 / (fps * ERROR_LASTING_S))
     object_data: ObjectData | ObjectImagesData = (
         ObjectImagesData(sequential.tracked, images, share)
@@ -159,7 +165,9 @@ def fit(
         steps=steps,
         refused=refused,
         converged=settled,
-        flag_reasons=_flag_reasons(geometry, state, sequential.flags, held | stuck),
+        flag_reasons=_flag_reasons(
+            geometry, state, sequential.flags, held | stuck, against_floor
+        ),
     )
 
 
@@ -192,7 +200,9 @@ def _estimate_contact(
     return ContactEstimate(contact_probability(motion, fps, given=given), labels)
 
 
-def _flag_reasons(geometry: Geometry, state: State, flags: Flags, stuck: np.ndarray) -> list[str]:
+def _flag_reasons(
+    geometry: Geometry, state: State, flags: Flags, stuck: np.ndarray, against_floor: str
+) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
     lowered its energy."""
     deep = geometry.at(state).proximity.distance.min(axis=1) < -FLAGGED_DEPTH
@@ -203,5 +213,6 @@ def _flag_reasons(geometry: Geometry, state: State, flags: Flags, stuck: np.ndar
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
         (stuck, "no step of the joint fit lowered its energy"),
+        (np.full(len(state), bool(against_floor)), against_floor),
     )
     return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from intercap_core import safe_pickle
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.rigid.constants import (
@@ -24,6 +22,7 @@ from intercap_core.rigid.constants import (
     MIN_FILLED,
     SIMPLIFIED_TOLERANCE_M,
 )
+from intercap_core.rigid.contact_vertices import read_contact_vertices
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
@@ -55,10 +54,11 @@ class ObjectMesh:
         and faces without area left out, each with a warning; a surface that stays open is told
         (``watertight`` is false) and used. Raises UserError naming the file, what is wrong with it
         and what to do: no such file, no faces, coordinates that are not numbers, another unit than
-        metres, loose faces without an inside, contact vertices that are not vertices.
+        metres, loose faces without an inside, contact vertices that are not its vertices.
         """
         path = Path(entry.mesh)
         mesh = _read(path)
+        in_file = np.asarray(mesh.vertices)
         _check_size(path, mesh)
         mesh, place = _without_loose_vertices(path, mesh)
         mesh, new_id = _repair(path, mesh)
@@ -70,7 +70,7 @@ class ObjectMesh:
                 f"object {entry.name!r}: symmetry is impossible ({error}); correct it in "
                 "objects.yaml"
             ) from None
-        contact = _contact_vertices(entry.contact_vertices, place)
+        contact = _contact_places(entry.contact_vertices, path, in_file, place)
         ids = np.arange(len(mesh.vertices)) if contact is None else np.unique(new_id[contact])
         return cls(
             entry.name,
@@ -299,67 +299,20 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
     return mesh, new_id.reshape(-1)
 
 
-def _contact_vertices(path: Path | None, place: np.ndarray) -> np.ndarray | None:
+def _contact_places(
+    listed: Path | None, path: Path, vertices: np.ndarray, place: np.ndarray
+) -> np.ndarray | None:
     """Places (K,) of likely-contact vertices, or None where there is no list.
 
-    ``place`` (V,) of each vertex of the file, -1 = left out.
+    ``vertices`` (V, 3) of the file ``path``, ``place`` (V,) of each, -1 = left out.
     """
-    if path is None:
+    if listed is None:
         return None
-    path = Path(path)
-    if not path.is_file():
-        raise UserError(
-            f"{path}: there is no such list of contact vertices; correct 'contact_vertices' in "
-            "objects.yaml or leave it out"
-        )
-    if path.suffix == ".pkl":
-        values = safe_pickle.load(path)
-    elif path.suffix == ".npz":
-        values = _from_npz(path)
-    else:
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-        except (ValueError, RecursionError):
-            raise UserError(
-                f"{path}: not a JSON list of vertex ids; write it as [0, 1, ...]"
-            ) from None
-    if isinstance(values, set | frozenset):
-        values = list(values)
-    try:
-        ids = np.asarray(values)
-    except (ValueError, TypeError, OverflowError):
-        ids = np.empty(0, object)
-    whole = ids.dtype.kind in "iu" or (
-        ids.dtype.kind == "f" and bool(np.isfinite(ids).all()) and np.array_equal(ids, ids.round())
-    )
-    if ids.ndim != 1 or len(ids) == 0 or not whole:
-        raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
-    if ids.min() < 0 or ids.max() >= len(place):
-        outside = int(ids.max() if ids.max() >= len(place) else ids.min())
-        raise UserError(
-            f"{path}: names vertex {outside}, the mesh has {len(place)}; the list belongs to "
-            "another mesh"
-        )
-    places = place[ids.astype(np.int64)]
+    ids = read_contact_vertices(Path(listed), path, vertices)
+    places = place[ids]
     if (places < 0).all():
         raise UserError(
-            f"{path}: no face of the mesh uses any of its {len(ids)} vertices; the list belongs to "
-            "another mesh"
+            f"{listed}: no face of the mesh uses any of its {len(ids)} vertices; the list belongs "
+            f"to another mesh than {path}: choose the vertices anew"
         )
     return places[places >= 0]
-
-
-def _from_npz(path: Path) -> Any:
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            raise ValueError("it is a single array")
-        with loaded as file:
-            names = file.files
-            return file["contact_vertices" if "contact_vertices" in names else names[0]]
-    except Exception as error:  # a damaged archive can raise nearly anything
-        raise UserError(
-            f"{path}: not a readable .npz of vertex ids ({error}); save it again"
-        ) from None

@@ -14,6 +14,7 @@ import trimesh
 from intercap_core import safe_pickle
 from intercap_core.config import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
+from intercap_core.rigid.contact_vertices import contact_list
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 
@@ -27,8 +28,8 @@ def _write(mesh, path: Path) -> Path:
     return path
 
 
-def _ball():
-    return trimesh.creation.icosphere(subdivisions=3, radius=0.11)
+def _ball(subdivisions=3):
+    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.11)
 
 
 def _no_faces(path):
@@ -244,6 +245,28 @@ def test_bad_contact_lists_are_refused(tmp_path, text, words):
     with pytest.raises(UserError, match=words) as caught:
         ObjectMesh.load(_entry(mesh, contact_vertices=contact))
     assert str(contact) in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["json", "npz"])
+def test_a_list_knows_the_mesh_that_it_was_chosen_on(tmp_path, suffix):
+    """A mesh built anew is noticed by its number of vertices, and by where they are."""
+    ball = _ball()
+    stored = contact_list([3, 9], ball.vertices)
+    contact = tmp_path / f"thing.contact.{suffix}"
+    if suffix == "json":
+        contact.write_text(json.dumps(stored))
+    else:
+        np.savez(contact, **stored)
+    entry = _entry(_write(ball, tmp_path / "thing.ply"), contact_vertices=contact)
+    np.testing.assert_array_equal(ObjectMesh.load(entry).contact_vertices, [3, 9])
+    reordered = trimesh.Trimesh(
+        ball.vertices[::-1], len(ball.vertices) - 1 - ball.faces, process=False
+    )
+    for other, words in ((_ball(2), "mesh_vertices 642.*has 162"), (reordered, "mesh_digest")):
+        again = _entry(_write(other, tmp_path / "again.ply"), contact_vertices=contact)
+        with pytest.raises(UserError, match=f"{words}.*built anew.*choose") as caught:
+            ObjectMesh.load(again)
+        assert str(contact) in str(caught.value) and "again.ply" in str(caught.value)
 
 
 def _npz(**arrays):

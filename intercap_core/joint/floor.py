@@ -1,0 +1,46 @@
+"""Whether the floor that the scene gives is one on which the tracked body can be.
+
+A floor decides how high a body stands, by several terms at once: where it is wrong by decimetres,
+they would carry the body there. The sequential fits know nothing of it, so they can contradict it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.joint.constants import FLOOR_CONTRADICTED, REACHED_SHARE
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.sequential import SequentialFits
+from intercap_core.joint.terms.ground import Ground
+from intercap_core.schemas import CONTACT_REGIONS
+
+_FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"))
+
+
+def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground) -> str:
+    """What the sequential fits say against ``floor``, in words; "" = nothing.
+
+    The lower foot is below it in most frames, or neither feet nor object ever come near it: feet
+    may hang from a chair or stand on a board, but then these reach it. Frames in which the body was
+    filled in or the object is lost have no say.
+    """
+    posed = geometry.at(sequential.state)
+    feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]
+    lowest = _height(posed.skin[:, feet], floor).min(axis=1)
+    known = ~sequential.flags.filled
+    if not known.any():
+        return ""
+    sunk = float(np.median(lowest[known]))
+    if sunk < -FLOOR_CONTRADICTED:
+        return f"floor {-sunk:.2f} m above the feet, not used"
+    objects = _height(posed.object_vertices, floor).min(axis=1)
+    reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))[known]
+    nearest = float(np.quantile(reach, REACHED_SHARE))
+    if nearest > FLOOR_CONTRADICTED:
+        return f"floor {nearest:.2f} m below feet and object, not used"
+    return ""
+
+
+def _height(points: np.ndarray, floor: Ground) -> np.ndarray:
+    """Heights (T, N) of points (T, N, 3) above the floor, metres."""
+    return (points - floor.point) @ floor.normal
