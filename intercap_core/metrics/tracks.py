@@ -37,6 +37,11 @@ class BodyTrack:
     flagged: np.ndarray
     sigma: np.ndarray | None = None
 
+    def frame(self, t: int) -> np.ndarray:
+        """Posed vertices (V, 3) float32 of one frame."""
+        with torch.no_grad():
+            return self.model.forward(self.parameters.frames(slice(t, t + 1))).vertices[0].numpy()
+
     def vertices(self) -> Iterator[np.ndarray]:
         """Posed vertices (V, 3) float32 of one frame after another."""
         for start in range(0, len(self.joints), _CHUNK):

@@ -126,5 +126,10 @@ def run_dataset(project: Project) -> Path:
         heatmaps=folder / "heatmaps.h5",
         tables_folder=folder / "tables",
         failed={name: reason for name, reason in reasons.items() if reason},
+        truths={
+            name: row.truth
+            for name, row in project.sequences.items()
+            if row.truth is not None and row.truth.is_file()
+        },
     )
     return folder / "report.html"

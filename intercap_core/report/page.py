@@ -22,6 +22,7 @@ from intercap_core.report import track as tracks
 from intercap_core.report.body import BodyFacts
 from intercap_core.report.capture import CaptureFacts
 from intercap_core.report.capture_pictures import CapturePicture
+from intercap_core.report.closeups import CloseUp
 from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
 from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
 from intercap_core.report.sheets import Sheet
@@ -36,11 +37,13 @@ _LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "sci
 
 @dataclass(frozen=True, eq=False)
 class Detail:
-    """What the page shows of one sequence: overlays by camera, or why there are none."""
+    """What the page shows of one sequence: overlays by camera, or why there are none, and close-ups
+    of hands that hold."""
 
     name: str
     overlays: Sequence[Overlay]
     note: str = ""
+    closeups: Sequence[CloseUp] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +270,7 @@ def _detail(content: Content, detail: Detail) -> dict[str, Any]:
         "fps": s.fps,
         "cameras": list(cameras.values()),
         "note": detail.note,
+        "closeups": [_embedded(picture, picture.hold.caption) for picture in detail.closeups],
         "timeline": charts.timeline(bands, len(s)),
     }
 
@@ -308,11 +312,11 @@ def _counted(count: int, what: str) -> str:
 
 
 def _embedded(
-    picture: HeatPicture | Overlay | CapturePicture | Sheet, caption: str
+    picture: HeatPicture | Overlay | CapturePicture | CloseUp | Sheet, caption: str
 ) -> dict[str, Any]:
     if isinstance(picture, CapturePicture):
         kind, data = picture.kind, picture.data
-    elif isinstance(picture, Overlay | Sheet):
+    elif isinstance(picture, Overlay | CloseUp | Sheet):
         kind, data = "jpeg", picture.jpeg
     else:
         kind, data = "png", picture.png

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from intercap_core.metrics.heatmaps import Heatmaps, collect
 from intercap_core.report import tables
 from intercap_core.report.body import read_fit
 from intercap_core.report.capture import read_capture
+from intercap_core.report.closeups import CloseUp, closeup, holds, read_handling
 from intercap_core.report.heat_pictures import body_pictures, object_pictures
 from intercap_core.report.overlays import Fit, choose_cameras, choose_frames, overlays
 from intercap_core.report.page import Content, Detail, ObjectHeat, render
@@ -36,6 +38,7 @@ log = logging.getLogger(__name__)
 
 _MAX_OBJECTS = 12  # objects whose heatmaps are drawn; all are in heatmaps.h5
 
+_MAX_CLOSEUPS = 2  # holds drawn of each sequence; `intercap closeups` draws all
 
 SequenceArtefacts = Mapping[str, Path]  # of one sequence, by the stage that wrote each
 
@@ -53,11 +56,13 @@ def run(
     heatmaps: Path,
     tables_folder: Path,
     failed: Mapping[str, str] | None = None,
+    truths: Mapping[str, Path] | None = None,
 ) -> None:
     """Write the report, summary.json, heatmaps.h5 and the tables of a dataset.
 
     ``sequences`` by name, in the order of the table; ``failed`` are sequences without a result,
-    with the reason. Raises UserError where there is no sequence at all or an artefact is broken.
+    with the reason; ``truths``, where known, are drawn beside close-ups of hands. Raises UserError
+    where there is no sequence at all or an artefact is broken.
     """
     if not sequences:
         raise UserError(
@@ -76,7 +81,16 @@ def run(
     ranked = by_sequence.sort_values("rank")["sequence"].tolist()
     shown = set(ranked[: settings.max_sequences])
     details = [
-        _detail(name, sequences[name], s, objects, subjects, body_models, settings)
+        replace(
+            _detail(name, sequences[name], s, objects, subjects, body_models, settings),
+            closeups=_closeups(
+                sequences[name],
+                objects[s.object_],
+                body_models,
+                subjects[s.subject].gender,
+                (truths or {}).get(name),
+            ),
+        )
         for name, s in zip(sequences, measured, strict=True)
         if name in shown
     ]
@@ -150,6 +164,20 @@ def _detail(
     except UserError as error:  # one image that does not decode must not cost the whole report
         log.warning("%s: no overlays: %s", name, error)
         return Detail(name, [], str(error))
+
+
+def _closeups(
+    paths: SequenceArtefacts,
+    entry: ObjectEntry,
+    body_models: BodyModels,
+    gender: str,
+    truth: Path | None,
+) -> list[CloseUp]:
+    """The longest holds of a sequence."""
+    handling = read_handling(
+        paths, entry=entry, body_models=body_models, gender=gender, truth=truth
+    )
+    return [closeup(handling, hold) for hold in holds(handling.probability)[:_MAX_CLOSEUPS]]
 
 
 def _track(

@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,7 +18,7 @@ import pytest
 from intercap_core import artefacts
 from intercap_core.config import MetricsSettings, ReportSettings
 from intercap_core.errors import UserError
-from intercap_core.schemas import HEATMAPS, METRICS
+from intercap_core.schemas import CONTACT_REGIONS, HEATMAPS, METRICS
 from intercap_core.stage_list import SEQUENCE_STAGES
 from intercap_core.stages import dataset, metrics
 from tests.helpers import fitted_capture as fitted
@@ -33,6 +34,10 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
     for name, object_name in (("s01_o03", "football"), ("s01_o09", "cup")):
         folder = tmp_path_factory.mktemp(name)
         made[name] = fitted.make_capture(folder, name=name, object_name=object_name, total=4)
+        with h5py.File(made[name].paths["joint"], "r+") as file:  # the ball is held, the cup is not
+            hands = [CONTACT_REGIONS.index(f"{side}_hand") for side in ("left", "right")]
+            file["contact_probability"][:2, hands] = 0.9 if object_name == "football" else 0.1
+            file["contact_probability"][3, hands] = 0.9 if object_name == "football" else 0.1
         metrics.run(
             **made[name].inputs(*STAGES),
             output=made[name].paths["metrics"],
@@ -58,6 +63,7 @@ def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Pat
         heatmaps=out / "heatmaps.h5",
         tables_folder=out / "tables",
         failed=FAILED,
+        truths={name: capture.paths["truth"] for name, capture in captures.items()},
     )
     return out
 
@@ -141,6 +147,10 @@ def test_page_shows_overlays_heatmaps_flags_and_failures(page: _Reader) -> None:
     assert {"front", "back", "left hand, palm", "right hand, back", "one side"} <= set(captions)
     for name in ("s01_o03", "s01_o09"):
         assert sum(c.startswith(f"{name}, frame ") for c in captions) == 6  # two sides, one slice
+    assert [c for c in captions if " hand, frames " in c] == [
+        "left hand, frames 0–1, drawn at 0",
+        "right hand, frames 0–1, drawn at 0",
+    ]  # of four holds the longest
     for part in (FAILED["s03_o01"], "object lost", "Against truth", "InterCap, as published"):
         assert part in text
 
