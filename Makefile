@@ -10,6 +10,8 @@
 # make evaluate-quick  five recordings to the end within ten minutes, beside the recorded figures
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker
 #                and the body's fit beside the paper's recipe, results/bench.json
+# make ablation  what each term of the joint fit is worth: the fit without it on the recordings of
+#                evaluate-quick (run that first), a table, results/ablation.json and three pictures
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -20,7 +22,7 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench docs environment clean
+    evaluate evaluate-quick bench ablation docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -62,6 +64,9 @@ bench: $(STAMP)
 	$(BIN)/intercap bench --cores $(CORES)
 	$(BIN)/python -m bench.object_speed
 	$(BIN)/python -m bench.body_speed
+
+ablation: $(STAMP)
+	$(BIN)/python -m bench.ablation
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

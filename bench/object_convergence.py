@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from bench.figures import figure_class
 from bench.object_baseline import Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
 from intercap_core.camera.transforms import rigid
-from intercap_core.errors import UserError
 from intercap_core.object_track.fit import fit_pose
 from intercap_core.rigid.twist import moved
 
@@ -29,7 +28,7 @@ def draw_convergence(clip: ObjectClip, output: Path) -> None:
     is done for one frame. Ours are fits that were stopped after as many steps. Raises UserError
     where matplotlib is not installed.
     """
-    figure_of = _figure()
+    figure_of = figure_class()
 
     frames = np.flatnonzero(clip.seen)
     frames = frames[np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().astype(int)]
@@ -49,18 +48,6 @@ def draw_convergence(clip: ObjectClip, output: Path) -> None:
     figure.axes[0].legend(fontsize="small")
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=150, metadata={"Software": None})
-
-
-def _figure() -> Any:
-    """matplotlib's class of figures."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UserError(
-            "the picture of convergence is drawn by matplotlib, which is not installed; install "
-            "it with pip install 'intercap-core[bench]'"
-        ) from error
-    return Figure
 
 
 def _start(clip: ObjectClip, t: int) -> np.ndarray:

@@ -115,10 +115,10 @@ def content_key(settings: Path, sequences: Sequence[str], run: Run) -> str:
     for sequence in sequences:
         row = project.sequences[sequence]
         for name in sorted(reads - set(STAGES[run.room])):
-            state.update(_file_digest(project.artefact(sequence, name)))
+            state.update(file_digest(project.artefact(sequence, name)))
         if row.truth is None:
             raise UserError(f"{settings}: sequence {sequence!r} has no truth to be held to")
-        state.update(_file_digest(row.truth))
+        state.update(file_digest(row.truth))
     state.update(json.dumps([list(sequences), _plain(run)]).encode())
     return state.hexdigest()[:24]
 
@@ -126,7 +126,8 @@ def content_key(settings: Path, sequences: Sequence[str], run: Run) -> str:
 _digests: dict[Path, bytes] = {}
 
 
-def _file_digest(path: Path) -> bytes:
+def file_digest(path: Path) -> bytes:
+    """SHA-256 of a file, read once in a process; raises UserError where it is not there."""
     if path not in _digests:
         if not path.is_file():
             raise UserError(f"{path}: not there; take the recordings to their metrics first")

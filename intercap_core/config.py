@@ -173,6 +173,8 @@ class JointSettings(Model):
     """Weight of the body's smooth motion (lambda_S)."""
     object_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the object's small acceleration (lambda_A)."""
+    drift_weight: Annotated[float, Field(ge=0)] = 1.0
+    """Weight of corrections of the sequential fits that last (without a symbol in equation 6)."""
     look_again: bool = True
     """Compare the object with the images anew in each round; else its track stands for them."""
     refine_cameras: bool = True

@@ -56,8 +56,8 @@ differences from the paper are in ``docs/equations.md``.
 | 6, A.1 | E_S | joint/terms/motion.py | BodyMotion | joint.body_smoothness |
 | 6, A.3 | E_A: residuals | energy/smoothness.py | accelerations | joint.object_smoothness |
 | 6, A.3 | E_A | joint/terms/motion.py | ObjectMotion | joint.object_smoothness |
-| beyond | drift of the body | joint/terms/drift.py | BodyDrift | - |
-| beyond | drift of the object | joint/terms/drift.py | ObjectDrift | - |
+| beyond | drift of the body | joint/terms/drift.py | BodyDrift | joint.drift_weight |
+| beyond | drift of the object | joint/terms/drift.py | ObjectDrift | joint.drift_weight |
 | beyond | the cameras, corrected | joint/cameras.py | CameraFit | joint.refine_cameras |
 | beyond | what the body says of them | joint/terms/body_cameras.py | add_by_cameras | - |
 | beyond | time offsets of the cameras | joint/time_offsets.py | estimate_offsets | - |

@@ -67,9 +67,9 @@ def joint_terms(
         *((BodyGround(geometry, floor, settings.ground_weight),) if floor else ()),
         Plant(geometry, floor, fps, settings.plant_weight),
         BodyMotion(geometry, fps, settings.body_smoothness),
-        BodyDrift(geometry, sequential, fps, trust.body),
+        BodyDrift(geometry, sequential, fps, trust.body, settings.drift_weight),
         ObjectMotion(geometry, fps, settings.object_smoothness),
-        ObjectDrift(geometry, sequential, fps, trust.object_, trust.still),
+        ObjectDrift(geometry, sequential, fps, trust.object_, trust.still, settings.drift_weight),
         *((ObjectGround(geometry, floor, settings.ground_weight),) if floor else ()),
     )
 

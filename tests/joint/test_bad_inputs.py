@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
-from intercap_core.config import BodyModels, JointSettings, ObjectEntry
+from intercap_core.config import BodyModels, JointSettings, ObjectEntry, ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.rigid.contact_vertices import contact_list
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, OBJECT_TRACK
@@ -83,8 +83,10 @@ class Held:
             object_=self.entry,
             subject=SUBJECT,
             body_models=BodyModels(),
-            settings=JointSettings(),
+            detections=output.with_name("detections.h5"),  # not read: the ball is in no image
+            settings=JointSettings(look_again=False, refine_cameras=False),
             body_settings=SETTINGS,
+            track_settings=ObjectTrackSettings(),
         )
         with artefacts.read(output, JOINT) as found:
             read = {key: found[key] for key in found.keys("")}

@@ -284,3 +284,21 @@ def test_jitter_is_the_noise_of_a_smooth_motion():
     noisy = smooth + rng.normal(scale=0.003, size=smooth.shape)
     assert smoothness.jitter(noisy, np.ones(200, bool)) == pytest.approx(0.003, rel=0.2)
     assert smoothness.jitter(smooth, np.ones(200, bool)) < 1e-5
+
+
+def test_without_its_weight_drift_is_gone_but_for_what_rests(model, box):
+    """Of both drift terms only the object at rest is left."""
+    state = _state(model, 0.5)
+    rng = np.random.default_rng(4)
+    moved = state.moved(rng.normal(scale=0.002, size=(FRAMES, ALL.stop)))
+    energies = {}
+    for still in (False, True):
+        for weight in (0.0, 1.0, 2.0):
+            settings = JointSettings(drift_weight=weight)
+            scene = _Scene(model, box, moved, start=state, still=still, settings=settings)
+            energies[still, weight] = scene.equations(moved).energy
+    for still in (False, True):
+        assert energies[still, 0.0]["body_drift"] == 0
+        assert energies[still, 2.0]["body_drift"] == 2 * energies[still, 1.0]["body_drift"] > 0
+    assert energies[False, 0.0]["object_drift"] == 0 < energies[False, 1.0]["object_drift"]
+    assert energies[True, 0.0]["object_drift"] == energies[True, 1.0]["object_drift"] > 0

@@ -5,7 +5,8 @@
 A sequential fit's errors last: calibration, clothing and a mask's errors are the same in the next
 frame. sigma^2 is that of a random walk over one frame plus the sequential fit's own jitter.
 Without it contact that comes and goes would shake a fit that was steady. While the object rests
-(``object_still``) its corrections are the same in all frames. No setting weighs these terms.
+(``object_still``) its corrections are the same in all frames. Weighed by ``drift_weight``, but for
+what rests.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class BodyDrift(Term):
         sequential: State,
         fps: float,
         trusted: np.ndarray,
+        weight: float,
     ) -> None:
         self._geometry = geometry
         model = geometry.model
@@ -44,7 +46,7 @@ class BodyDrift(Term):
             body = model(sequential.parameters(model), vertex_ids=np.array([0]))
         self._sequential = body.joints.double().cpu().numpy()
         self._sigma = _sigma(self._sequential, trusted, BODY_DRIFT, fps)
-        self._pairs = trusted[1:] & trusted[:-1]
+        self._weights = weight * (trusted[1:] & trusted[:-1])
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the drift at ``state``."""
@@ -52,7 +54,7 @@ class BodyDrift(Term):
             return
         joints, jacobian = self._geometry.at(state).joints
         correction = joints - self._sequential
-        _add_pairs(self.name, BODY, correction, jacobian, self._pairs, self._sigma, equations)
+        _add_pairs(self.name, BODY, correction, jacobian, self._weights, self._sigma, equations)
 
 
 class ObjectDrift(Term):
@@ -68,11 +70,13 @@ class ObjectDrift(Term):
         fps: float,
         trusted: np.ndarray,
         still: np.ndarray,
+        weight: float,
     ) -> None:
         self._geometry = geometry
         self._sequential, _ = geometry.at(sequential).moments
         self._sigma = _sigma(self._sequential, trusted, OBJECT_DRIFT, fps)
-        self._pairs, self._still = trusted[1:] & trusted[:-1] & ~still, still
+        self._weights = weight * (trusted[1:] & trusted[:-1] & ~still)
+        self._still = still.astype(float)
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the drift at ``state``."""
@@ -80,7 +84,7 @@ class ObjectDrift(Term):
             return
         points, jacobian = self._geometry.at(state).moments
         correction = points - self._sequential
-        _add_pairs(self.name, OBJECT, correction, jacobian, self._pairs, self._sigma, equations)
+        _add_pairs(self.name, OBJECT, correction, jacobian, self._weights, self._sigma, equations)
         _add_pairs(
             self.name,
             OBJECT,
@@ -104,16 +108,16 @@ def _add_pairs(
     columns: slice,
     correction: np.ndarray,
     jacobian: np.ndarray,
-    pairs: np.ndarray,
+    weights: np.ndarray,
     sigma: float,
     equations: NormalEquations,
     *,
     stiff: bool = False,
 ) -> None:
-    """Add the changes of ``correction`` (T, N, 3) over the steps ``pairs`` (T-1,), with the points'
-    ``jacobian`` (T, N, 3, m) over ``columns`` and standard deviation ``sigma``, metres."""
+    """Add the changes of ``correction`` (T, N, 3) over each step, by ``weights`` (T-1,), with the
+    points' ``jacobian`` (T, N, 3, m) over ``columns`` and standard deviation ``sigma``, metres."""
     change = np.diff(correction, axis=0)
-    weight = np.repeat(pairs[:, None] / sigma**2, change.shape[1], axis=1)
+    weight = np.repeat(weights[:, None] / sigma**2, change.shape[1], axis=1)
     equations.add_rows(
         name,
         columns,

@@ -1,0 +1,257 @@
+"""What each term of the joint fit is worth: the fit without it, held to truth.
+
+    python -m bench.ablation [SETTINGS] [--sequences NAME ...] [--variants NAME ...]
+        [--output results/ablation.json] [--folder results/ablation]
+
+Only the stages `joint` and `metrics` are computed, once for each variant of the settings in
+``VARIANTS``, from the artefacts that a run of SETTINGS has left: by default those of `make
+evaluate-quick`, so run that first. What is there already, by its content, is taken as it is: a run
+that was ended goes on. Prints one table, writes its figures with keys ``<variant>.<measure>``, the
+table as Markdown and three pictures (grasps.jpg, acceleration.png, contact_path.png) into the
+folder. Nothing of the project is written over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bench.replay import file_digest
+from intercap_core.errors import UserError
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+
+SETTINGS = Path("config/evaluation/quick.yaml")
+EVERYTHING, SEQUENTIAL = "everything", "sequential only"
+WITHOUT_CONTACT, WITHOUT_STICK = "without contact and stick", "without stick"
+WITHOUT_SMOOTHNESS = "without smoothness"
+# Settings of `joint` that differ from the project's, by the variant's name.
+VARIANTS: dict[str, dict[str, Any]] = {
+    EVERYTHING: {},
+    "without contact": {"contact_weight": 0.0},
+    WITHOUT_STICK: {"stick_weight": 0.0},
+    WITHOUT_CONTACT: {"contact_weight": 0.0, "stick_weight": 0.0},
+    "without planting": {"plant_weight": 0.0},
+    WITHOUT_SMOOTHNESS: {"body_smoothness": 0.0, "object_smoothness": 0.0},
+    "without penetration": {"penetration_weight": 0.0},
+    "without ground": {"ground_weight": 0.0},
+    "without drift": {"drift_weight": 0.0},
+    "without cameras": {"refine_cameras": False},
+    "without renewed images": {"look_again": False, "refine_cameras": False},
+}
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A column: its title, the figure's name, and the areas that have it of the joint fit and of
+    the sequential fits, "" where these have none."""
+
+    title: str
+    name: str
+    joint: str = "joint"
+    sequential: str = "body_fit"
+
+
+MEASURES = (
+    Measure("body PVE mm", "body_pve_mm"),
+    Measure("hands in grasp mm", "hand_grasp_mpjpe_mm"),
+    Measure("slip mm/s", "slip_mm_s"),
+    Measure("planted mm/s", "planted_mm_s"),
+    Measure("floor mm", "floor_mm"),
+    Measure("acceleration body", "acceleration_body_mm"),
+    Measure("hands", "acceleration_hands_mm"),
+    Measure("object mm", "object_translation_mm", sequential="object_track"),
+    Measure("p95", "object_translation_p95_mm", sequential="object_track"),
+    Measure("contact by vertex", "contact_f1"),
+    Measure("detected F1", "contact_detected_f1", sequential=""),
+    Measure("penetration mm", "mean_mm", joint="penetration", sequential=""),
+)
+Figures = dict[str, float]
+Paths = dict[str, dict[str, dict[str, Path]]]  # by variant, sequence and stage
+
+
+def ablate(
+    settings: Path, sequences: Sequence[str], variants: Sequence[str], folder: Path
+) -> tuple[Paths, dict[str, Figures]]:
+    """Compute all variants; their artefacts, and figures by variant with the sequential fits' last.
+
+    Raises UserError where a sequence or a variant is unknown, or has no truth or artefacts.
+    """
+    plain = load_project(settings)
+    names = list(sequences or plain.sequences)
+    _check(settings, plain, names, variants)
+    paths: Paths = {}
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        console=Console(stderr=True),
+    )  # fmt: skip
+    with bar as progress:
+        task = progress.add_task("", total=len(variants) * len(names))
+        for variant in variants:
+            project = load_project(settings, {"joint": VARIANTS[variant]})
+            paths[variant] = {}
+            for name in names:
+                progress.update(task, description=f"{variant}: {name}")
+                begin = time.perf_counter()
+                paths[variant][name] = _fit(project, name, folder / slug(variant))
+                seconds = time.perf_counter() - begin
+                progress.console.print(f"{variant}: {name}, {seconds:.0f} s", highlight=False)
+                progress.advance(task)
+    return paths, {
+        **{variant: _figures(found, sequential=False) for variant, found in paths.items()},
+        SEQUENTIAL: _figures(next(iter(paths.values())), sequential=True),
+    }
+
+
+def slug(variant: str) -> str:
+    """A variant's name in keys and folders."""
+    return variant.replace(" ", "_")
+
+
+def _check(
+    settings: Path, project: Project, sequences: Sequence[str], variants: Sequence[str]
+) -> None:
+    unknown = [name for name in sequences if name not in project.sequences]
+    if unknown:
+        known = ", ".join(project.sequences)
+        raise UserError(f"{settings}: there is no sequence {unknown[0]!r}; it lists {known}")
+    strange = [name for name in variants if name not in VARIANTS]
+    if strange:
+        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
+    for name in sequences:
+        truth = project.sequences[name].truth
+        if truth is None:
+            raise UserError(f"{settings}: sequence {name!r} has no truth to be held to")
+        needed = set(STAGES["joint"].reads) | set(STAGES["metrics"].reads) - {"joint"}
+        for path in [truth, *(project.artefact(name, stage) for stage in sorted(needed))]:
+            if not path.is_file():
+                raise UserError(
+                    f"{path}: not there, expected what a run of {settings} leaves; take {name} to "
+                    f"its metrics first: intercap run {settings} (or make evaluate-quick)"
+                )
+
+
+def _fit(project: Project, sequence: str, folder: Path) -> dict[str, Path]:
+    """The sequence's artefacts with joint and metrics of this variant, computed where missing."""
+    paths = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
+    for stage in ("joint", "metrics"):
+        output = folder / sequence / f"{stage}.h5"
+        key, known = output.with_suffix(".key"), _content(project, sequence, stage, paths)
+        if not (output.exists() and key.exists() and key.read_text() == known):
+            inputs = {name: paths[name] for name in STAGES[stage].reads}
+            run_step(stage, project, sequence, inputs=inputs, output=output)
+            key.write_text(known)
+        paths[stage] = output
+    return paths
+
+
+def _content(project: Project, sequence: str, stage: str, paths: Mapping[str, Path]) -> str:
+    """Digest of all that a stage's artefact depends on."""
+    state = hashlib.sha256(code_digest(f"stages.{stage}").encode())
+    state.update(project.config.model_dump_json(exclude={"studio", "report", "export"}).encode())
+    state.update(repr(project.annotation(sequence)).encode())
+    truth = project.sequences[sequence].truth
+    files = [paths[name] for name in STAGES[stage].reads]
+    for path in [*files, *([truth] if stage == "metrics" and truth else [])]:
+        state.update(file_digest(path))
+    return state.hexdigest()
+
+
+def _figures(paths: Mapping[str, Mapping[str, Path]], *, sequential: bool) -> Figures:
+    from intercap_core.evaluation.sequences import areas
+
+    found = areas([SequenceMetrics.read(by_stage["metrics"]) for by_stage in paths.values()])
+    return {
+        measure.name if measure.joint == "joint" else f"{measure.joint}_{measure.name}": value
+        for measure in MEASURES
+        if (area := measure.sequential if sequential else measure.joint)
+        and (value := found[area].get(measure.name)) is not None
+    }
+
+
+def rows(figures: Mapping[str, Figures]) -> list[list[str]]:
+    """The table's cells, one row a variant, "–" where a variant has no such figure."""
+    keys = [m.name if m.joint == "joint" else f"{m.joint}_{m.name}" for m in MEASURES]
+    return [
+        [variant, *(_number(found[key]) if key in found else "–" for key in keys)]
+        for variant, found in figures.items()
+    ]
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+
+
+def markdown(figures: Mapping[str, Figures], settings: Path, sequences: Sequence[str]) -> str:
+    """A section for bench/RESULTS.md, without its heading's date and commit."""
+    titles = ["variant", *(measure.title for measure in MEASURES)]
+    lines = [
+        "## What each term of the joint fit is worth",
+        f"`python -m bench.ablation {settings}`, {', '.join(sequences)}. Accelerations are errors,",
+        "mm a frame^2 at 30 fps; contact is F1; penetration is the joint fit's:",
+        "",
+        f"| {' | '.join(titles)} |",
+        f"|{'---|' * len(titles)}",
+        *(f"| {' | '.join(row)} |" for row in rows(figures)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line, compute, and write table, figures and pictures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
+    parser.add_argument("--sequences", nargs="+", metavar="NAME", help="default: all of SETTINGS")
+    parser.add_argument(
+        "--variants", nargs="+", metavar="NAME", help=f"default: all, {', '.join(VARIANTS)}"
+    )
+    parser.add_argument("--output", type=Path, default=Path("results/ablation.json"))
+    parser.add_argument("--folder", type=Path, default=Path("results/ablation"))
+    told = parser.parse_args(arguments)
+    try:
+        from bench.ablation_pictures import draw_pictures
+
+        names = told.sequences or list(load_project(told.settings).sequences)
+        variants = told.variants or list(VARIANTS)
+        paths, figures = ablate(told.settings, names, variants, told.folder)
+        pictures = draw_pictures(load_project(told.settings), paths, told.folder)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    table = Table("variant", *(measure.title for measure in MEASURES), box=None)
+    for row in rows(figures):
+        table.add_row(*row)
+    console = Console()
+    console.width = max(console.width, 150)
+    console.print(table)
+    section = told.folder / "RESULTS.md"
+    section.write_text(markdown(figures, told.settings, names), encoding="utf-8")
+    flat = {
+        f"{slug(variant)}.{key}": round(value, 4)
+        for variant, found in figures.items()
+        for key, value in found.items()
+    }
+    told.output.parent.mkdir(parents=True, exist_ok=True)
+    told.output.write_text(json.dumps(flat, indent=1) + "\n", encoding="utf-8")
+    for path in (told.output, section, *pictures):
+        print(path)
+
+
+if __name__ == "__main__":
+    main()
