@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ def draw_pictures(project: Project, paths: Paths, folder: Path) -> list[Path]:
 
 
 def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
-    """The longest hold of every sequence with and without contact, beside truth."""
+    """The longest hold of every sequence with and without contact and stick, beside truth."""
     if not {EVERYTHING, WITHOUT_CONTACT} <= set(paths):
         return None
     sheets = []
@@ -57,7 +57,7 @@ def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
             gender=project.subjects[row.subject].gender,
             truth=row.truth,
             joints={
-                "without contact": paths[WITHOUT_CONTACT][name]["joint"],
+                "no contact/stick": paths[WITHOUT_CONTACT][name]["joint"],
                 "joint": by_stage["joint"],
             },
         )
@@ -121,41 +121,48 @@ def _read(project: Project, paths: Paths, sequence: str, versions: Mapping[str, 
 
 
 def _accelerations(project: Project, paths: Paths, output: Path, figure: Any) -> Path | None:
-    """Acceleration over time of the skin vertex that touches the object longest, in each sequence
-    where a hand holds it."""
+    """Acceleration over time, in each sequence, of the skin vertex whose acceleration smoothing
+    changes most, for better or worse; the legend has the mean errors against truth."""
     if not {EVERYTHING, WITHOUT_SMOOTHNESS} <= set(paths):
         return None
     versions = {"without smoothness": WITHOUT_SMOOTHNESS, "joint": EVERYTHING}
-    known = _held(project, paths, versions)
-    if not known:
-        return None
-    sheet = figure(figsize=(8, 2.4 * len(known)), layout="constrained")
-    for axes, (name, (found, vertex, _)) in zip(
-        _rows(sheet, len(known)), known.items(), strict=True
-    ):
-        for label, track in found.tracks.items():
-            points = track.skin[:, vertex].astype(np.float64)
-            size = np.linalg.norm(np.diff(points, n=2, axis=0), axis=1) * found.fps**2
+    names = list(paths[EVERYTHING])
+    sheet = figure(figsize=(9, 2.3 * len(names)), layout="constrained")
+    rows = np.atleast_1d(sheet.subplots(len(names), 1))
+    for axes, name in zip(rows, names, strict=True):
+        found = _read(project, paths, name, versions)
+        every = {
+            label: np.diff(track.skin, n=2, axis=0) * np.float32(found.fps**2)
+            for label, track in found.tracks.items()
+        }
+        change = np.linalg.norm(every["joint"] - every["without smoothness"], axis=2)
+        vertex = int(change.mean(0).argmax())
+        for label, vectors in every.items():
+            size = np.linalg.norm(vectors[:, vertex], axis=1)
+            off = np.linalg.norm((vectors - every["truth"])[:, vertex], axis=1).mean()
+            words = label if label == "truth" else f"{label}, off by {off:.1f} m/s²"
             when = (np.arange(len(size)) + 1) / found.fps
-            axes.plot(when, size, label=label, color=_colour(label), linewidth=1.6)
-        axes.set(ylabel="m/s²", title=f"{name}: acceleration of a vertex of the holding hand")
+            axes.plot(when, size, label=words, color=_colour(label), linewidth=1.4)
+        region = next((r for r, ids in found.regions.items() if vertex in ids), "skin")
+        axes.set(ylabel="m/s²", title=f"{name}: a vertex of the {region.replace('_', ' ')}")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-    axes.set_xlabel("seconds")
-    sheet.axes[0].legend(fontsize="small", loc="upper right", ncols=len(versions) + 1)
+        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    rows[-1].set_xlabel("seconds; acceleration of the vertex that smoothing changes most")
     sheet.savefig(output, dpi=110, metadata={"Software": None})
     return output
 
 
 def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) -> Path | None:
-    """Where the vertex that touches longest goes in the object's frame while it touches."""
+    """Where the vertex that truly touches longest goes in the object's frame while it does, from
+    the middle of the true path; a large dot is its begin."""
     if not {EVERYTHING, WITHOUT_STICK} <= set(paths):
         return None
     versions = {"sequential": "", "without stick": WITHOUT_STICK, "joint": EVERYTHING}
     known = _held(project, paths, versions)
     if not known:
         return None
-    sheet = figure(figsize=(3.6 * len(known), 4.1), layout="constrained")
+    sheet = figure(figsize=(4.0 * len(known), 4.8), layout="constrained")
     columns = np.atleast_1d(sheet.subplots(1, len(known)))
     for axes, (name, (found, vertex, frames)) in zip(columns, known.items(), strict=True):
         local = {label: track.local(vertex)[frames] for label, track in found.tracks.items()}
@@ -168,11 +175,14 @@ def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) ->
             axes.plot(x, y, label=f"{label}, {1e3 * length:.0f} mm", color=_colour(label),
                       linewidth=1.2, marker=".", markersize=3)  # fmt: skip
             axes.plot(x[0], y[0], "o", color=_colour(label), markersize=5)
-        axes.set(title=name, xlabel="mm", aspect="equal", adjustable="datalim")
+        axes.set(
+            title=f"{name}\na contact point on the object", xlabel="mm", aspect="equal",
+            adjustable="datalim",
+        )  # fmt: skip
         axes.grid(alpha=0.3)
-        axes.legend(fontsize="x-small", title="length of the path", title_fontsize="x-small")
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 2}
+        axes.legend(fontsize="small", title="length of the path", title_fontsize="small", **below)
     columns[0].set_ylabel("mm")
-    sheet.suptitle("a contact point in the object's frame, from truth's middle", fontsize="medium")
     sheet.savefig(output, dpi=110, metadata={"Software": None})
     return output
 
@@ -202,10 +212,6 @@ def _held(
         if len(frames) >= _MIN_HOLD_S * known.fps:
             found[name] = (known, int(hands[longest]), frames)
     return found
-
-
-def _rows(sheet: Any, count: int) -> Sequence[Any]:
-    return np.atleast_1d(sheet.subplots(count, 1))
 
 
 def _colour(label: str) -> str:
