@@ -25,7 +25,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from bench.replay import file_digest
 from intercap_core.errors import UserError
@@ -234,11 +234,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    table = Table("variant", *(measure.title for measure in MEASURES), box=None)
+    variant = Column("variant", no_wrap=True)
+    table = Table(variant, *(measure.title for measure in MEASURES), box=None)
     for row in rows(figures):
         table.add_row(*row)
     console = Console()
-    console.width = max(console.width, 150)
+    console.width = max(console.width, 170)
     console.print(table)
     section = told.folder / "RESULTS.md"
     section.write_text(markdown(figures, told.settings, names), encoding="utf-8")

@@ -162,7 +162,7 @@ def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) ->
     known = _held(project, paths, versions)
     if not known:
         return None
-    sheet = figure(figsize=(4.0 * len(known), 4.8), layout="constrained")
+    sheet = figure(figsize=(4.2 * len(known), 5.8), layout="constrained")
     columns = np.atleast_1d(sheet.subplots(1, len(known)))
     for axes, (name, (found, vertex, frames)) in zip(columns, known.items(), strict=True):
         local = {label: track.local(vertex)[frames] for label, track in found.tracks.items()}
@@ -175,9 +175,12 @@ def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) ->
             axes.plot(x, y, label=f"{label}, {1e3 * length:.0f} mm", color=_colour(label),
                       linewidth=1.2, marker=".", markersize=3)  # fmt: skip
             axes.plot(x[0], y[0], "o", color=_colour(label), markersize=5)
+        drawn = 1e3 * np.concatenate([path - start for path in local.values()]) @ plane.T
+        middle, reach = (drawn.max(0) + drawn.min(0)) / 2, 0.54 * np.ptp(drawn, axis=0).max()
         axes.set(
             title=f"{name}\na contact point on the object", xlabel="mm", aspect="equal",
-            adjustable="datalim",
+            xlim=(middle[0] - reach, middle[0] + reach),
+            ylim=(middle[1] - reach, middle[1] + reach),
         )  # fmt: skip
         axes.grid(alpha=0.3)
         below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 2}
