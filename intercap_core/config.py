@@ -182,6 +182,9 @@ class JointSettings(Model):
     needs ``look_again``."""
     detect_contact: bool = True
     """Find contact from the geometry where it is not annotated."""
+    annotation_uncertainty_frames: Annotated[int, Field(ge=0, le=100)] = 5
+    """Frames by which annotators err at the ends of an interval of contact: within them what is
+    seen may move the ends."""
 
 
 class MetricsSettings(Model):
@@ -440,12 +443,12 @@ class ContactInterval(Model):
     these intervals."""
     start: FrameNumber
     """First frame set in contact, from 0."""
-    end: Annotated[int, Field(gt=0, strict=True)]
-    """First frame set after the contact."""
+    end: FrameNumber
+    """First frame set after the contact; start = no frame, which is told and ignored."""
 
     @model_validator(mode="after")
     def _forward(self) -> ContactInterval:
-        if self.end <= self.start:
+        if self.end < self.start:
             raise ValueError(f"interval is reversed: start {self.start}, end {self.end}")
         return self
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.contact.constants import MIN_DISTANCE_SIGMA, NEAREST_VERTICES
+from intercap_core.contact.constants import LASTING_SIGMA, SOFT_MINIMUM
 from intercap_core.contact.detect import RegionMotion
 from intercap_core.contact.patches import Patches
 from intercap_core.energy.proximity import Proximity
@@ -20,7 +20,8 @@ def region_motion(
     object_sigma: np.ndarray,
     fps: float,
 ) -> RegionMotion:
-    """Summarise the patches' vertices by region.
+    """Summarise the patches' vertices by region: means that weigh the nearest ones most, which
+    for the distance is a soft minimum.
 
     ``points`` (T, N, 3) patch vertices and ``near`` their proximity, object pose ``rotation``
     (T, 3, 3), ``translation`` (T, 3), master frame, metres; ``joint_sigma`` (T, 55) and
@@ -34,14 +35,15 @@ def region_motion(
     distance, slip, speed, sigma = (np.zeros((frames, regions)) for _ in range(4))
     for r in range(regions):
         members = np.flatnonzero(patches.region == r)
-        order = np.argsort(near.distance[:, members], axis=1, kind="stable")[:, :NEAREST_VERTICES]
-        nearest = members[order]  # (T, k)
-        rows = np.arange(frames)[:, None]
-        distance[:, r] = near.distance[rows, nearest].mean(axis=1)
-        slip[:, r] = skin_speed[rows, nearest].mean(axis=1)
-        speed[:, r] = surface_speed[rows, nearest].mean(axis=1)
-        joint = joint_sigma[rows, patches.joint[nearest]].mean(axis=1)
-        sigma[:, r] = np.sqrt(joint**2 + object_sigma**2 + MIN_DISTANCE_SIGMA**2)
+        away = near.distance[:, members]
+        weight = np.exp((away.min(axis=1, keepdims=True) - away) / SOFT_MINIMUM)
+        weight *= patches.share[members]
+        weight /= weight.sum(axis=1, keepdims=True)
+        distance[:, r] = (weight * away).sum(axis=1)
+        slip[:, r] = (weight * skin_speed[:, members]).sum(axis=1)
+        speed[:, r] = (weight * surface_speed[:, members]).sum(axis=1)
+        joint = (weight * joint_sigma[:, patches.joint[members]]).sum(axis=1)
+        sigma[:, r] = np.sqrt(joint**2 + object_sigma**2 + LASTING_SIGMA**2)
     return RegionMotion(distance, slip, speed, sigma)
 
 

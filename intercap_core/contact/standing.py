@@ -5,19 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.contact.chain import Chain
 from intercap_core.contact.constants import (
+    STANDING_BEGINS,
     STANDING_HEIGHT,
+    STANDING_S,
     STANDING_SPEED,
     SWING_HEIGHT,
     SWING_SPEED,
 )
-from intercap_core.contact.detect import smooth
 from intercap_core.contact.patches import Patches
 from intercap_core.schemas import CONTACT_REGIONS
 
 _SOLES = tuple(
     JOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("ankle", "foot")
 )
+
+_STAND = Chain(STANDING_BEGINS, (STANDING_S,), (1.0,))
 
 
 def sole_parts(patches: Patches, count: int) -> list[np.ndarray]:
@@ -47,7 +51,7 @@ def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float
     if height is not None:
         low = np.abs(height).mean(1)
         odds = odds + _log_ratio(np.maximum(low[1:], low[:-1]), STANDING_HEIGHT, SWING_HEIGHT)
-    return smooth(odds[:, None], fps)[:, 0]
+    return _STAND.posterior(odds[:, None], fps)[:, 0]
 
 
 def _log_ratio(values: np.ndarray, narrow: float, wide: float) -> np.ndarray:

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ContactInterval, JointSettings
-from intercap_core.contact.detect import annotation_evidence, contact_probability
-from intercap_core.contact.motion import region_motion
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.constants import (
     BODY_SHARE,
@@ -22,6 +20,7 @@ from intercap_core.joint.constants import (
     OFFSET_CHANGED_S,
     ROUND_STEPS,
 )
+from intercap_core.joint.contact_estimate import ContactEstimate, ContactEstimator
 from intercap_core.joint.floor import contradiction
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import limited, minimise
@@ -35,17 +34,8 @@ from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
-from intercap_core.schemas import CONTACT_REGIONS
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class ContactEstimate:
-    """``probability`` (T, R) and the ``labels`` (T, R) of the annotation, -1 where none."""
-
-    probability: np.ndarray
-    labels: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -110,12 +100,10 @@ def fit(
         )
     )
 
-    def estimate_contact(at: State) -> ContactEstimate:
-        return _estimate_contact(geometry, at, sequential, fps, settings, intervals)
-
+    estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
     steps, refused, energy_before, settled = 0, 0, None, False
     held = np.ones(len(state), bool)
-    estimate = estimate_contact(state)
+    estimate = estimator.at(state)
     for max_steps in ROUND_STEPS:
         contact.take_probability(estimate.probability)
         problem.refresh(state)
@@ -126,7 +114,7 @@ def fit(
         energy_before = energy_before or minimum.energy_before
         held &= minimum.held
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
-        previous, estimate = estimate, estimate_contact(state)
+        previous, estimate = estimate, estimator.at(state)
         contact_change = np.abs(estimate.probability - previous.probability).max()
         settled = (
             minimum.converged
@@ -166,42 +154,18 @@ def fit(
         refused=refused,
         converged=settled,
         flag_reasons=_flag_reasons(
-            geometry, state, sequential.flags, held | stuck, against_floor
+            geometry, state, sequential.flags, estimate, held | stuck, against_floor
         ),
     )
 
 
-def _estimate_contact(
+def _flag_reasons(
     geometry: Geometry,
     state: State,
-    sequential: SequentialFits,
-    fps: float,
-    settings: JointSettings,
-    intervals: Sequence[ContactInterval] | None,
-) -> ContactEstimate:
-    """Contact by region at ``state``: detected, annotated, or none where both are switched off."""
-    shape = (len(state), len(CONTACT_REGIONS))
-    given, labels = np.zeros(shape), np.full(shape, -1, np.int8)
-    if intervals is not None:
-        given, labels = annotation_evidence(intervals, CONTACT_REGIONS, len(state))
-    elif not settings.detect_contact:
-        return ContactEstimate(np.zeros(shape), labels)
-    posed, at_patch = geometry.at(state), geometry.skin.patch
-    motion = region_motion(
-        geometry.patches,
-        posed.skin[:, at_patch],
-        posed.proximity.at(at_patch),
-        state.rotation,
-        state.translation,
-        sequential.joint_sigma,
-        sequential.object_sigma,
-        fps,
-    )
-    return ContactEstimate(contact_probability(motion, fps, given=given), labels)
-
-
-def _flag_reasons(
-    geometry: Geometry, state: State, flags: Flags, stuck: np.ndarray, against_floor: str
+    flags: Flags,
+    estimate: ContactEstimate,
+    stuck: np.ndarray,
+    against_floor: str,
 ) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
     lowered its energy."""
@@ -212,6 +176,7 @@ def _flag_reasons(
         (flags.lost, "object lost, filled in"),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
+        *estimate.distrust(),
         (stuck, "no step of the joint fit lowered its energy"),
         (np.full(len(state), bool(against_floor)), against_floor),
     )

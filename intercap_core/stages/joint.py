@@ -6,6 +6,7 @@ the two sequential stages end. The energy's terms are listed in :mod:`intercap_c
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -43,6 +44,8 @@ from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, SCENE
+
+log = logging.getLogger(__name__)
 
 _BODY_PARAMETERS = (
     "expression",
@@ -123,6 +126,11 @@ def run(
             intervals=contact,
             images=images,
             cameras=cameras if images and settings.refine_cameras else None,
+        )
+    for odd in fitted.contact.oddities:
+        first, last = odd.frames.start, max(odd.frames.start, odd.frames.stop - 1)
+        log.warning(
+            "sequence %s, frames %d to %d: %s", attributes["sequence"], first, last, odd.text
         )
     with artefacts.write(
         output,

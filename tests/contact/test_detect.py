@@ -2,13 +2,11 @@
 
 import numpy as np
 
-from intercap_core.config import ContactInterval
-from intercap_core.contact.constants import CHANGES_PER_SECOND, TOUCHING_PRIOR
+from intercap_core.contact.constants import FRAME_SIGMA
 from intercap_core.contact.detect import (
     RegionMotion,
-    annotation_evidence,
     contact_probability,
-    smooth,
+    lasting_error,
 )
 
 FPS = 15.0
@@ -46,45 +44,6 @@ def test_a_near_hand_that_lets_a_moving_object_slide_past_is_less_likely_than_on
     assert (probability[:, 0] > probability[:, 1] + 0.3).all()
 
 
-def test_posterior_equals_enumeration_of_all_paths():
-    evidence = np.array([[1.0], [-2.0], [0.5], [3.0]])
-    got = smooth(evidence, FPS)
-    change = CHANGES_PER_SECOND / FPS
-    begin, end = 2 * change * TOUCHING_PRIOR, 2 * change * (1 - TOUCHING_PRIOR)
-    transition = np.array([[1 - begin, begin], [end, 1 - end]])
-    total, touching = 0.0, np.zeros(4)
-    for code in range(16):
-        path = [(code >> t) & 1 for t in range(4)]
-        weight = TOUCHING_PRIOR if path[0] else 1 - TOUCHING_PRIOR
-        for t in range(3):
-            weight *= transition[path[t], path[t + 1]]
-        weight *= np.exp(sum(evidence[t, 0] for t in range(4) if path[t]))
-        total += weight
-        touching += weight * np.array(path)
-    np.testing.assert_allclose(got[:, 0], touching / total, rtol=1e-9)
-
-
-def test_annotation_is_certain_inside_and_undecided_at_its_ends():
-    intervals = [ContactInterval(part="left_hand", start=20, end=40)]
-    evidence, labels = annotation_evidence(intervals, ["left_hand", "seat"], 60)
-    assert labels[:, 0].sum() == 20 and labels[:, 1].sum() == 0
-    assert evidence[30, 0] > 5 and evidence[5, 0] < -5
-    assert abs(evidence[20, 0]) < 1 and abs(evidence[39, 0]) < 1
-    assert (evidence[:, 1] < -5).all()
-
-
-def test_contact_of_an_unnamed_part_rules_out_what_lies_outside_it_alone():
-    intervals = [
-        ContactInterval(part="left_hand", start=20, end=30),
-        ContactInterval(part="any", start=10, end=40),
-    ]
-    evidence, labels = annotation_evidence(intervals, ["left_hand", "seat"], 60)
-    assert (labels[:10] == 0).all() and (labels[40:] == 0).all()
-    assert (labels[10:40, 1] == -1).all() and (evidence[10:40, 1] == 0).all()
-    assert (labels[20:30, 0] == 1).all() and (labels[10:20, 0] == -1).all()
-    assert evidence[0, 1] < -5 and evidence[55, 0] < -5 and evidence[25, 0] > 0
-
-
 def test_not_knowing_where_the_object_is_does_not_refute_a_grasp():
     sigma = np.full((60, 1), 0.012)
     sigma[20:50] = 0.5
@@ -95,3 +54,36 @@ def test_not_knowing_where_the_object_is_does_not_refute_a_grasp():
 
 def test_a_hand_deep_in_the_object_touches_it():
     assert (contact_probability(_motion(np.full((30, 1), -0.04), 0.0, 0.0), FPS) > 0.9).all()
+
+
+def test_a_sip_of_a_third_of_a_second_is_found():
+    distance = np.full((30, 1), 0.20)
+    distance[10:19, 0] = [0.09, 0.045, 0.001, 0.0, 0.0, 0.0, 0.0, 0.05, 0.12]
+    probability = contact_probability(_motion(distance, 0.3, 0.05, sigma=0.009), FPS)[:, 0]
+    assert (probability[12:17] > 0.5).all()
+    assert (probability[:11] < 0.5).all() and (probability[18:] < 0.5).all()
+
+
+def test_a_hand_that_stays_three_deviations_off_does_not_touch():
+    motion = _motion(np.full((45, 1), 0.024), 0.0, 0.0, sigma=0.008)
+    probability = contact_probability(motion, FPS)
+    assert (probability < 0.5).all()
+
+
+def test_the_lasting_error_of_a_long_contact_sharpens_its_ends():
+    """All distances of one region are 8 mm too small: with that known, 6 mm are no contact."""
+    true = np.concatenate([[0.05, 0.03, 0.014, 0.014], np.zeros(25), [0.014, 0.014, 0.03, 0.05]])
+    motion = _motion(true[:, None] - 0.008, 0.0, 0.0, sigma=0.009)
+    probability = contact_probability(motion, FPS)[:, 0]
+    np.testing.assert_array_equal(probability > 0.5, true == 0.0)
+
+
+def test_a_lasting_error_is_the_weighted_mean_of_prior_and_measurements():
+    motion = _motion(np.full((10, 1), 0.004), 0.0, 0.0, sigma=0.01)
+    error, sigma = lasting_error(motion, np.ones((10, 1)), 2.0)
+    precision = 5 / FRAME_SIGMA**2
+    np.testing.assert_allclose(error, 0.004 * precision / (precision + 1e4), rtol=1e-9)
+    np.testing.assert_allclose(sigma, np.hypot((precision + 1e4) ** -0.5, FRAME_SIGMA), rtol=1e-9)
+    untouched, sigma = lasting_error(motion, np.full((10, 1), 0.4), 2.0)
+    assert untouched == 0
+    np.testing.assert_allclose(sigma, np.hypot(0.01, FRAME_SIGMA), rtol=1e-9)
