@@ -208,13 +208,14 @@ class ReportSettings(Model):
 class ExportSettings(Model):
     """Files for other people's tools."""
 
-    formats: tuple[Literal["intercap", "amass", "bop", "glb"], ...] = (
+    formats: tuple[Literal["intercap", "amass", "bop", "glb", "contact"], ...] = (
         "intercap",
         "amass",
         "bop",
         "glb",
+        "contact",
     )
-    """Which exports are written."""
+    """Which exports are written; contact = its probability by frame, and a draft annotation."""
     frame: Literal["z-up", "camera"] = "z-up"
     """Frame of amass and glb: gravity-aligned with the ground at z = 0, or the master camera.
     The intercap and bop layouts are in camera frames by definition."""

@@ -50,10 +50,16 @@ glb/*.glb           skinned body (55 joints) and object, animated; metres, y up 
   four weights a vertex, first frame's expression, no pose correctives
 """
 
+_CONTACT = """
+contact/contact.tsv           by frame and body region: probability that it touches the object, as
+  the joint stage states it; annotated = 1 touching, 0 not, empty = not annotated
+contact/annotation_draft.yaml the same as intervals, in the format of an annotation file
+"""
+
 
 def readme(motion: Motion, viewed: Motion, mesh: ObjectMesh, formats: Sequence[str]) -> str:
     """README.txt for these formats; ``viewed`` is the motion in the frame of amass and glb."""
-    parts = {"intercap": _INTERCAP, "amass": _AMASS, "bop": _BOP, "glb": _GLB}
+    parts = {"intercap": _INTERCAP, "amass": _AMASS, "bop": _BOP, "glb": _GLB, "contact": _CONTACT}
     text = _HEAD + "".join(parts[name] for name in formats)
     return text.format(
         sequence=motion.sequence,

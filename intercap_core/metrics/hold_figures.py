@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.metrics import motion
-from intercap_core.metrics.detected import detected_figures
+from intercap_core.metrics.detected import Reliability, detected_figures, reliability
 from intercap_core.metrics.figures import Figures, SequenceMetrics, object_figures, pooled
 from intercap_core.schemas import METRIC_REGIONS
 
@@ -54,14 +54,29 @@ def slip_by_object(sequences: Sequence[SequenceMetrics], stage: str) -> dict[str
 
 def stated_contact_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """How well the joint stage's own contact agrees with the true one."""
+    found = _stated_and_true(sequences)
+    if found is None:
+        return {}
+    figures = detected_figures(*found, METRIC_REGIONS)
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def contact_reliability(sequences: Sequence[SequenceMetrics]) -> Reliability | None:
+    """How often what is stated as contact with some probability is contact; None without truth."""
+    found = _stated_and_true(sequences)
+    return None if found is None else reliability(*found[:2])
+
+
+def _stated_and_true(
+    sequences: Sequence[SequenceMetrics],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Stated probability, true contact and true distance (N, 12) over all sequences' frames."""
     have = [s for s in sequences if "truth/region_distance" in s.values]
     probability, true = pooled(have, "contact_probability"), pooled(have, "truth/contact_region")
     distance = pooled(have, "truth/region_distance")
     if probability is None or true is None or distance is None:
-        return {}
-    of_truth = probability[:, : len(METRIC_REGIONS)]  # the others have no true contact
-    figures = detected_figures(of_truth, true, distance, METRIC_REGIONS)
-    return {name: value for name, value in figures.items() if np.isfinite(value)}
+        return None
+    return probability[:, : len(METRIC_REGIONS)], true, distance  # the others have no true contact
 
 
 def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.metrics import figures
+from intercap_core.metrics import figures, hold_figures
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.report import charts
 from intercap_core.stage_list import ESTIMATES
@@ -85,6 +85,7 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
         "flags": figures.flag_figures(known),
         "own_penetration": own_mm,
         "sweep": _sweep(known),
+        "reliability": _reliability(known),
     }
 
 
@@ -104,6 +105,23 @@ def _sweep(known: Sequence[SequenceMetrics]) -> str:
         x_range=(0, 30),
         y_range=(0, 1),
         marks=((4.5, "4.5 mm"),),
+    )
+
+
+def _reliability(known: Sequence[SequenceMetrics]) -> str:
+    """Share of true contact over the stated probability of contact, in bins."""
+    table = hold_figures.contact_reliability(known)
+    if table is None or len(table.count) < 2:
+        return ""
+    return charts.line_chart(
+        [
+            charts.Series("joint", "c1", table.stated, table.true),
+            charts.Series("calibrated", "c2", np.array([0.0, 1.0]), np.array([0.0, 1.0])),
+        ],
+        x_label="stated probability of contact",
+        y_label="share that truly touches",
+        x_range=(0, 1),
+        y_range=(0, 1),
     )
 
 

@@ -259,9 +259,13 @@ def _detail(content: Content, detail: Detail) -> dict[str, Any]:
     ]
     names = list(s.values["region_names"])
     for region in METRIC_REGIONS:
+        says = region.replace("_", " ")
+        stated = s.values["contact_probability"][:, names.index(region)]
+        if (stated >= 0.5).any():
+            bands.append(charts.Band(f"{says}, stated", "touch", _stated_runs(stated)))
         touching = s.values["region_contact"][:, names.index(region)]
         if touching.any():
-            bands.append(charts.Band(region.replace("_", " "), "touch", _runs(touching)))
+            bands.append(charts.Band(f"{says}, meshes", "any", _runs(touching)))
     return {
         "name": s.name,
         "subject": s.subject,
@@ -301,6 +305,14 @@ def _trace(content: Content) -> dict[str, Any]:
 def _runs(mask: np.ndarray) -> list[tuple[int, int, str]]:
     runs = flags.ranges(["x" if value else "" for value in mask])
     return [(first, last, _span(first, last)) for first, last, _ in runs]
+
+
+def _stated_runs(probability: np.ndarray) -> list[tuple[int, int, str]]:
+    """Runs in which contact is likelier than not, with the mean probability (T,) in words."""
+    return [
+        (first, last, f"{span}: {100 * probability[first : last + 1].mean():.0f} %")
+        for first, last, span in _runs(probability >= 0.5)
+    ]
 
 
 def _span(first: int, last: int) -> str:

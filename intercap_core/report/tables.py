@@ -96,6 +96,8 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
             "contact": s.values["contact_frame"],
             "contact_regions": [";".join(names[row]) for row in s.values["region_contact"]],
         }
+        for r, region in enumerate(names):
+            columns[f"contact_probability.{region}"] = s.values["contact_probability"][:, r]
         for name in sorted(_MILLIMETRES | _ACCELERATIONS):
             columns[f"{name}_mm"] = 1e3 * s.values[name].astype(np.float64)
         for stage in ESTIMATES:

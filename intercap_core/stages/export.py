@@ -15,7 +15,7 @@ from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.config import BodyModels, ExportSettings, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
-from intercap_core.export import amass, bop, glb, intercap
+from intercap_core.export import amass, bop, contact, glb, intercap
 from intercap_core.export.motion import Motion, read_motion
 from intercap_core.export.readme import readme
 from intercap_core.rigid.mesh import ObjectMesh
@@ -67,6 +67,8 @@ def run(
             elif name == "bop":
                 number = bop.object_id(object_.mesh)
                 bop.write(folder / "bop", motion, rig, mesh, number, exposures)
+            elif name == "contact":
+                contact.write(folder / "contact", contact.StatedContact.read(joint))
             else:
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, z_up=z_up)
