@@ -30,6 +30,7 @@ def sequence(name: str = "a", total: int = 4, **values: object) -> SequenceMetri
         "contact_frame": np.ones(total, bool),
         "region_names": np.array(CONTACT_REGIONS, object),
         "region_contact": np.zeros((total, len(CONTACT_REGIONS)), bool),
+        "contact_probability": np.zeros((total, len(CONTACT_REGIONS)), np.float32),
     }
     known |= {key: np.asarray(value) for key, value in values.items()}
     truth = any(key.startswith("truth/") for key in known)
@@ -215,8 +216,11 @@ def test_ranks_put_the_worst_sequence_first() -> None:
 def test_frame_table_has_a_row_a_frame(tmp_path: Path) -> None:
     regions = np.zeros((4, len(CONTACT_REGIONS)), bool)
     regions[1, [0, 11]] = True
-    frames = tables.frame_table([_tracked(region_contact=regions), sequence("b")])
+    stated = np.where(regions, 0.9, 0.1)
+    tracked = _tracked(region_contact=regions, contact_probability=stated)
+    frames = tables.frame_table([tracked, sequence("b")])
     assert len(frames) == 8
+    assert frames["contact_probability.mouth"].tolist()[:3] == pytest.approx([0.1, 0.9, 0.1])
     assert frames["contact_regions"].tolist()[:2] == ["", "left_hand;mouth"]
     assert frames["joint.object_translation_mm"][0] == pytest.approx(1)
     assert frames["joint.object_translation_mm"].isna().sum() == 4
