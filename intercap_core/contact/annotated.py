@@ -1,4 +1,4 @@
-"""Annotated contact: what intervals say of each frame, and what is odd about them."""
+"""Annotated contact, Q_t of equation 6: what intervals say of each frame, and what is odd."""
 
 from __future__ import annotations
 

@@ -42,8 +42,8 @@ differences from the paper are in ``docs/equations.md``.
 | 6 | E_O, the track for them | joint/terms/object_data.py | ObjectData | joint.look_again |
 | 6, A.4 | E_C: residuals | energy/contact.py | term | joint.contact_weight |
 | 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
-| 6 | Q_t, annotated | contact/detect.py | annotation_evidence | - |
-| beyond | Q_t, detected | contact/detect.py | contact_probability | joint.detect_contact |
+| 6 | Q_t given | contact/annotated.py | annotation_evidence | joint.annotation_uncertainty_frames |
+| beyond | Q_t found | contact/detect.py | contact_probability | joint.detect_contact |
 | beyond | stick: points on the object | energy/stick.py | local_points | joint.stick_weight |
 | beyond | stick | joint/terms/stick.py | Stick | joint.stick_weight |
 | beyond | plant | joint/terms/plant.py | Plant | joint.plant_weight |
