@@ -1,4 +1,4 @@
-"""Annotated contact, Q_t of equation 6: what intervals say of each frame, and what is odd."""
+"""Q_t given by annotation, of equation 6: what intervals say of each frame, and what is odd."""
 
 from __future__ import annotations
 
