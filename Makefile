@@ -8,8 +8,9 @@
 #                the latter), tables and results/evaluation.json; about an hour on two cores, goes
 #                on where it was ended
 # make evaluate-quick  five recordings to the end within ten minutes, beside the recorded figures
-# make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker
-#                and the body's fit beside the paper's recipe, results/bench.json
+# make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker,
+#                the body's fit and the joint stage beside the paper's recipe, the joint stage's memory
+#                on long sequences, results/bench.json
 # make ablation  what each term of the joint fit is worth: the fit without it on the recordings of
 #                evaluate-quick (run that first), a table, results/ablation.json and three pictures
 # make docs      the generated pages and schemas, and the rule graph
@@ -64,6 +65,7 @@ bench: $(STAMP)
 	$(BIN)/intercap bench --cores $(CORES)
 	$(BIN)/python -m bench.object_speed
 	$(BIN)/python -m bench.body_speed
+	$(BIN)/python -m bench.joint_speed
 
 ablation: $(STAMP)
 	$(BIN)/python -m bench.ablation

@@ -18,16 +18,22 @@ def add_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
 
 
 def from_command_line(
-    measure: Callable[[Path, Path, int], None], description: str, frames: int
+    measure: Callable[[Path, Path, int], None],
+    description: str,
+    count: int,
+    counted: str = "frames",
 ) -> None:
-    """Read the command line and ``measure(settings, output, frames)``."""
+    """Read the command line and ``measure(settings, output, count)``.
+
+    ``counted`` names the option that sets ``count``.
+    """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
-    parser.add_argument("--frames", type=int, default=frames)
+    parser.add_argument(f"--{counted}", type=int, default=count)
     arguments = parser.parse_args()
     try:
-        measure(arguments.settings, arguments.output, arguments.frames)
+        measure(arguments.settings, arguments.output, getattr(arguments, counted))
     except UserError as error:
         print(error, file=sys.stderr)
         raise SystemExit(1) from None

@@ -226,7 +226,7 @@ class Energy:
         """The energy, a scalar, differentiable."""
         points = self._vertices @ rotation_matrix(turn).T + place
         local = torch.matmul(points, self._rotation.mT) + self._shift  # (V, N, 3)
-        coverage, depth = self._rasteriser(_Project.apply(local, self._lens), local[..., 2])
+        coverage, depth = self._rasteriser(Project.apply(local, self._lens), local[..., 2])
         silhouette = ((1 - coverage) ** 2).sum()
         drawn = self._known & (coverage.detach() > COVERED)
         squared = torch.where(drawn, depth - self._depth, torch.zeros_like(depth)) ** 2
@@ -236,7 +236,7 @@ class Energy:
         return silhouette + self._recipe.depth_weight * squared.sum()
 
 
-class _Project(torch.autograd.Function):
+class Project(torch.autograd.Function):
     """Pixels (V, N, 2) of points (V, N, 3) through each view's full lens (V, 1, 13)."""
 
     @staticmethod

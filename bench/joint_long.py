@@ -1,0 +1,165 @@
+"""The joint stage on long sequences: its peak memory, in a process of its own.
+
+A recording is played forward and backward until it is as long as wanted, so that motion goes on
+without a jump: every dataset of the stage's inputs that has an axis of frames is extended and
+written by the artefacts' writer. Images are not stored again, frames point to those that are there.
+Where it is played backward the cameras expose as much too early as they expose late otherwise:
+enough to measure memory with, not to measure errors with, and no truth goes with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts, schemas
+from intercap_core.artefacts import Artefact, Writer
+from intercap_core.errors import UserError
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import STAGES
+
+MEGABYTE = 1 << 10  # in kilobytes
+# By file, what is stored end to end: offsets with an entry an image, and what they point into.
+_PER_IMAGE = {
+    "mask_offsets": ("mask_rle",),
+    "candidate_offsets": (
+        "candidate_scores", "candidate_extents", "candidate_things", "candidate_rle",
+    ),
+}  # fmt: skip
+_OFFSETS_WITHIN = {"candidate_rle": "candidate_rle_offsets"}  # of parts that have a length each
+
+
+def there_and_back(frames: int, count: int) -> np.ndarray:
+    """Numbers (count,) of ``frames`` frames, played forward and backward, none twice in a row."""
+    turn = np.r_[np.arange(frames), np.arange(frames - 2, 0, -1)]
+    return np.resize(turn, count)
+
+
+def lengthen(source: Path, stage: str, output: Path, count: int) -> None:
+    """Write the artefact of ``stage`` with ``count`` frames.
+
+    Raises UserError where the source has fewer than two frames.
+    """
+    schema = getattr(schemas, stage.upper())
+    with artefacts.read(source, schema) as read:
+        attributes = {name: read.attributes[name] for name in _declared(read, schema)}
+        frames = _frames(read, schema)
+        if frames < 2:
+            raise UserError(f"{source}: has {frames} frame, expected two or more to play back")
+        order = there_and_back(frames, count)
+        with artefacts.write(output, schema, **attributes) as writer:
+            ragged = {key for key in _PER_IMAGE if key in read}
+            parts = {part for key in ragged for part in _PER_IMAGE[key]}
+            parts |= {_OFFSETS_WITHIN[part] for part in parts if part in _OFFSETS_WITHIN}
+            for key in read.keys(""):
+                if key not in ragged and key not in parts:
+                    writer.put(key, _extended(read, schema, key, order))
+            for key in sorted(ragged):
+                _put_ragged(read, writer, key, order, frames)
+
+
+def _declared(read: Artefact, schema: artefacts.Schema) -> list[str]:
+    names = {*schema.attributes, *schema.optional_attributes}
+    return sorted(names & read.attributes.keys())
+
+
+def _frames(read: Artefact, schema: artefacts.Schema) -> int:
+    keys = (key for key in read.keys("") if schema.field_of(key).dims[:1] == ("T",))
+    return len(read[next(keys)])
+
+
+def _extended(read: Artefact, schema: artefacts.Schema, key: str, order: np.ndarray) -> np.ndarray:
+    values = read[key]
+    if schema.field_of(key).dims[:1] != ("T",):
+        return values
+    if key == "times":
+        return values[0] + np.median(np.diff(values)) * np.arange(len(order))
+    if key == "image_of":
+        return _nearest_sets(values, order)
+    return values[order]
+
+
+def _nearest_sets(image_of: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Sets (N, C) that show each moment: of those with the set's images, the nearest in time."""
+    wanted = image_of[order]
+    found = np.full_like(wanted, -1)
+    for number in np.unique(wanted[wanted >= 0]):
+        at = np.flatnonzero(order == number)
+        i, c = np.nonzero(wanted == number)
+        found[i, c] = at[np.abs(at[None] - i[:, None]).argmin(1)]
+    return found
+
+
+def _put_ragged(read: Artefact, writer: Writer, key: str, order: np.ndarray, frames: int) -> None:
+    """Write offsets that have an entry for each image, in the order of (T, C), and their parts."""
+    offsets = read[key]
+    views = (len(offsets) - 1) // frames
+    image = (order[:, None] * views + np.arange(views)).ravel()
+    lengths = np.diff(offsets)[image]
+    writer.put(key, np.concatenate([[0], np.cumsum(lengths)]))
+    rows = _runs(offsets[image], lengths)
+    for part in _PER_IMAGE[key]:
+        within = _OFFSETS_WITHIN.get(part)
+        if within is None:
+            writer.put(part, read[part][rows])
+        else:
+            starts = read[within]
+            sizes = np.diff(starts)[rows]
+            writer.put(within, np.concatenate([[0], np.cumsum(sizes)]))
+            writer.put(part, read[part][_runs(starts[rows], sizes)])
+
+
+def _runs(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """start, start + 1, ... of every run, end to end."""
+    ends = np.cumsum(lengths)
+    return np.repeat(starts - (ends - lengths), lengths) + np.arange(lengths.sum())
+
+
+def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) -> float:
+    """Peak resident memory of the joint stage on ``count`` frames, in a process that does no more.
+
+    Raises UserError where the stage fails.
+    """
+    with tempfile.TemporaryDirectory(dir=project.results) as folder:
+        for stage in STAGES["joint"].reads:
+            source = project.artefact(sequence, stage)
+            lengthen(source, stage, Path(folder) / f"{stage}.h5", count)
+        command = [sys.executable, "-m", "bench.joint_long", str(settings), sequence, folder]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        if done.returncode:
+            raise UserError(
+                f"{sequence}: the joint stage failed on {count} frames; see the lines above"
+            )
+    return float(done.stdout.split()[-1])
+
+
+def _peak_mb() -> float:
+    """Of this process since it was started. Not that of getrusage, which knows the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
+    return int(peak) / MEGABYTE
+
+
+def _main(arguments: Sequence[str] | None = None) -> None:
+    """Run the stage on a folder's inputs and print its peak memory, megabytes."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("settings", type=Path)
+    parser.add_argument("sequence")
+    parser.add_argument("folder", type=Path)
+    given = parser.parse_args(arguments)
+    project = load_project(given.settings)
+    inputs = {name: given.folder / f"{name}.h5" for name in STAGES["joint"].reads}
+    output = given.folder / "joint.h5"
+    run_step("joint", project, given.sequence, inputs=inputs, output=output)
+    print(f"{_peak_mb():.1f}")
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,144 @@
+"""The joint stage beside the paper's recipe: seconds a frame, memory and errors, in one run.
+
+    python -m bench.joint_speed [config/bench/config.yaml] [--output results/bench.json]
+
+Wants the artefacts that ``intercap bench`` computes. Both refine the whole first sequence from the
+same sequential fits, keypoints, clouds, crops, cameras and threads. Ours is timed as the stage is,
+files read and written, without the start of its process; the recipe from inputs in memory, by its
+own steps (``--steps``) and until the truth says that it is as good as ours, or else at its best.
+Then the stage's peak memory on the same recording played to 300 and 1,000 frames. Adds its figures,
+keys ``joint.<measure>``, to the output, those of ``intercap bench`` among them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "2")  # read when the libraries start
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from bench.command import add_figures, from_command_line
+from bench.joint_baseline import STEPS, Energy, refine
+from bench.joint_clip import Errors, JointClip, read_state
+from bench.joint_long import peak_memory_mb
+from intercap_core.joint.state import State
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import STAGES
+
+THREADS = int(os.environ["OMP_NUM_THREADS"])
+LONG = (300, 1000)  # frames
+AS_GOOD = 1.02  # times our error: reached
+
+
+def ours(project: Project, sequence: str) -> tuple[float, State]:
+    """Seconds of the whole stage, and what it ends with."""
+    inputs = {name: project.artefact(sequence, name) for name in STAGES["joint"].reads}
+    with tempfile.TemporaryDirectory(dir=project.results) as folder:
+        output = Path(folder) / "joint.h5"
+        begin = time.perf_counter()
+        run_step("joint", project, sequence, inputs=inputs, output=output)
+        return time.perf_counter() - begin, read_state(output)
+
+
+def moment(errors: np.ndarray, wanted: float) -> tuple[int, bool]:
+    """Number of the first state whose error (R,) is as good as wanted, else of the best; which."""
+    near = errors <= AS_GOOD * wanted
+    return (int(near.argmax()), True) if near.any() else (int(errors.argmin()), False)
+
+
+def measure(settings: Path, output: Path, steps: int) -> None:
+    """Measure, print and add to the output; see the module's text."""
+    torch.set_num_threads(THREADS)
+    project = load_project(settings)
+    sequence = next(iter(project.sequences))
+    clip = JointClip.load(project, sequence)
+    ours(project, sequence)  # imports and warms up
+    energy = Energy(clip)
+    refine(energy, len(clip), 1)
+
+    first, state = ours(project, sequence)
+    recipe = refine(energy, len(clip), steps)
+    again, _ = ours(project, sequence)  # before and after, should the machine have been disturbed
+    seconds = (first + again) / 2
+    found = [clip.errors(one) for one in recipe.states]
+    start, end, reached = clip.errors(clip.start), found[-1], clip.errors(state)
+    at, is_as_good = moment(np.array([one.mean for one in found]), reached.mean)
+    memory = {
+        f"peak_memory_{count}_mb": peak_memory_mb(settings, project, sequence, count)
+        for count in LONG
+    }
+    figures = {
+        **_known(output, "joint.peak_memory_mb"),
+        "seconds_per_frame": seconds / len(clip),
+        **memory,
+        "baseline_seconds_per_frame": recipe.seconds[-1] / len(clip),
+        "baseline_until_seconds_per_frame": recipe.seconds[at] / len(clip),
+        "baseline_steps": recipe.steps[-1],
+        "baseline_until_steps": recipe.steps[at],
+        "baseline_reaches_our_accuracy": float(is_as_good),
+        "baseline_seconds_per_step": recipe.seconds[-1] / max(recipe.steps[-1], 1),
+        "speedup_recipe": recipe.seconds[-1] / seconds,
+        "speedup_accuracy": recipe.seconds[at] / seconds,
+        "speedup": min(recipe.seconds[-1], recipe.seconds[at]) / seconds,
+        **_errors("", reached),
+        **_errors("sequential_", start),
+        **_errors("baseline_", end),
+        **_errors("baseline_until_", found[at]),
+        "frames": len(clip),
+        "threads": THREADS,
+    }
+    add_figures(output, "joint", figures)
+    rows = {
+        "sequential fits": (0.0, 0, start),
+        "ours": (seconds, 0, reached),
+        "the recipe": (recipe.seconds[-1], recipe.steps[-1], end),
+        "until our accuracy" if is_as_good else "until its best": (
+            recipe.seconds[at], recipe.steps[at], found[at],
+        ),
+    }  # fmt: skip
+    _print(f"{sequence}: {len(clip)} frames, {THREADS} threads each", rows, figures)
+    print(output)
+
+
+def _errors(prefix: str, errors: Errors) -> dict[str, float]:
+    return {f"{prefix}pve_mm": errors.pve, f"{prefix}object_translation_mm": errors.object_}
+
+
+def _known(output: Path, key: str) -> dict[str, float]:
+    """The figure of ``intercap bench`` that is in the output, which this area would replace."""
+    known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
+    return {key.partition(".")[2]: known[key]} if key in known else {}
+
+
+def _print(
+    title: str, rows: dict[str, tuple[float, int, Errors]], figures: dict[str, float]
+) -> None:
+    console = Console()
+    heads = ("joint", "seconds", "times ours", "steps", "body, mm", "object, mm", "mean")
+    table = Table(*heads, title=title, box=None)
+    for name, (seconds, steps, errors) in rows.items():
+        table.add_row(
+            name, f"{seconds:.1f}", f"{seconds / rows['ours'][0]:.1f}", str(steps or ""),
+            f"{errors.pve:.2f}", f"{errors.object_:.2f}", f"{errors.mean:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(
+        f"{figures['seconds_per_frame']:.3f} s a frame; speed-up {figures['speedup_recipe']:.0f} "
+        f"over the recipe, {figures['speedup_accuracy']:.0f} to "
+        f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy; peak "
+        + ", ".join(f"{figures[f'peak_memory_{n}_mb']:.0f} MB at {n} frames" for n in LONG),
+        highlight=False,
+    )
+
+
+if __name__ == "__main__":
+    from_command_line(measure, (__doc__ or "").splitlines()[0], STEPS, "steps")
