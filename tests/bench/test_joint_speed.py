@@ -18,6 +18,11 @@ def test_the_best_state_where_none_is_as_good() -> None:
     assert moment(np.array([6.0, 5.6, 5.5, 5.8]), 5.0) == (2, False)
 
 
+def test_the_start_is_nobodys_result() -> None:
+    assert moment(np.array([4.0, 6.0, 5.0, 5.0]), 5.0) == (2, True)
+    assert moment(np.array([4.0, 6.0, 5.6]), 5.0) == (2, False)
+
+
 def test_the_figure_of_the_whole_run_stays(tmp_path: Path) -> None:
     output = tmp_path / "bench.json"
     assert _known(output, "joint.peak_memory_mb") == {}
