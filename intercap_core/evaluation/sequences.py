@@ -84,9 +84,10 @@ def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Fi
     if sequences:
         worse = hold_figures.worse_objects(sequences)
         beside |= {"object_worse_count": float(len(worse))}
-    if "joint_mean_mm" in found["extrinsics"]:
-        beside["extrinsics_mm"] = found["extrinsics"]["joint_mean_mm"]
-        beside["extrinsics_scene_mm"] = found["extrinsics"]["after_mean_mm"]
+    cameras = figures.extrinsics_figures(sequences)
+    if "joint_mean_mm" in cameras:
+        beside["extrinsics_mm"] = cameras["joint_mean_mm"]
+        beside["extrinsics_scene_mm"] = cameras["after_mean_mm"]
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
         slips = hold_figures.slip_by_object(sequences, stage)
         beside |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
