@@ -1,7 +1,7 @@
 """True objects of the studio: the catalogue's meshes made a little different from what is tracked.
 
 A real object is never the scanned mesh: it is scaled by half a percent, its surface is off by a
-smooth millimetre, and another scan would have other triangles.
+smooth part of its size, and another scan would have other triangles.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ import trimesh
 from intercap_core.config import ObjectEntry
 
 SCALE_ERROR = 0.005  # of the true size, up or down
-SURFACE_ERROR_M = 0.001  # RMS of the smooth displacement along the normal
+# RMS of the smooth displacement along the normal, in parts of the object's radius (root mean square
+# distance of its surface from its origin): 0.3 mm of a cup, 0.7 of a football, 1.4 of a suitcase,
+# 1.9 of a chair. Waves are as long as the radius says, so a cup is no more crumpled than a chair.
+SURFACE_ERROR = 0.006
 WAVELENGTHS = (0.25, 0.9)  # of the surface error, in parts of the object's radius
 WAVES = 48
 
@@ -91,4 +94,4 @@ def _smooth_displacement(
     motion = np.linalg.lstsq(root * rigid, root[:, 0] * (field * normals).sum(1), rcond=1e-4)[0]
     field -= np.cross(motion[:3], vertices) + motion[3:]
     rms = np.sqrt(weight @ (field * normals).sum(1) ** 2)
-    return field * SURFACE_ERROR_M / rms
+    return field * SURFACE_ERROR * radius / rms
