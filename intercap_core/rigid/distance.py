@@ -89,6 +89,11 @@ class DistanceField:
         query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
         return self._scene.compute_distance(query).numpy().astype(np.float64)
 
+    def met(self, start: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        """Whether rays from ``start`` (N, 3) along ``ahead`` (N, 3) meet the surface (N,)."""
+        rays = o3d.core.Tensor.from_numpy(np.concatenate([start, ahead], 1).astype(np.float32))
+        return self._scene.test_occlusions(rays).numpy()
+
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Whether points (N, 3) are inside the solid: (N,) bool.
 
