@@ -72,6 +72,17 @@ CASES = {
         "umbrella", "s09", 25, {"right_hand"}, (16, 37), ((0.0, 0.93), (2.57, 3.0)),
         on_floor=False, object_m_s=6.5,
     ),
+    "racquet_glide": Case(
+        "tennis_racquet", "s03", 6, {"right_hand"}, (16, 37), ((0.0, 0.93), (2.57, 3.0)),
+        on_floor=False, object_m_s=10.0, joint_m_s=6.5, joint_m_s2=150.0,
+    ),
+    "umbrella_turn": Case(
+        "umbrella", "s09", 26, {"right_hand"}, (16, 37), ((0.0, 0.93), (2.57, 3.0)),
+        on_floor=False, object_m_s=6.5,
+    ),
+    "bottle_regrasp": Case(
+        "bottle", "s08", 27, {"right_hand"}, (21, 37), ((0.0, 1.36), (2.53, 3.0)), on_floor=False
+    ),
     "stool_sit": Case(
         "stool", "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),), pressed_m=0.018
     ),

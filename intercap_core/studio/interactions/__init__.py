@@ -11,6 +11,7 @@ from intercap_core.studio.interactions.cup_drink import CupDrink
 from intercap_core.studio.interactions.football_kick import FootballKick
 from intercap_core.studio.interactions.passing import BottlePass, CupPass, FootballPass
 from intercap_core.studio.interactions.skateboard_ride import SkateboardRide
+from intercap_core.studio.interactions.slipping import BottleRegrasp, RacquetGlide, UmbrellaTurn
 from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
 from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
@@ -28,6 +29,9 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "football_pass": FootballPass,
     "football_kick": FootballKick,
     "skateboard_ride": SkateboardRide,
+    "bottle_regrasp": BottleRegrasp,
+    "racquet_glide": RacquetGlide,
+    "umbrella_turn": UmbrellaTurn,
     "racquet_swing": RacquetSwing,
     "umbrella_swing": UmbrellaSwing,
     "stool_sit": StoolSit,

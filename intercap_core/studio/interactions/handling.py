@@ -33,6 +33,7 @@ class Handling(Interaction):
     lead = RIGHT
     clear_m = 0.075  # an open hand leaves the thing by this much, away from its palm,
     back_m = 0.03  # and towards the wrist
+    rests_until_s = 0.0  # the thing stays where it is until then, held or not
     taken: np.ndarray
     put: np.ndarray
 
@@ -59,9 +60,21 @@ class Handling(Interaction):
             for side, (on, off) in self.hold_s.items()
         }
 
+    def slide(self, times: np.ndarray) -> np.ndarray:
+        """How the leading hand has moved along the thing since it took it (N, 4, 4), the thing's
+        frame: what is held slips, turns in the fingers or is taken anew."""
+        return np.broadcast_to(np.eye(4), (len(times), 4, 4))
+
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """How far an elbow is lifted outward (N,), as `Puppet.arm_to` takes it."""
         return np.zeros(len(times))
+
+    def object_from_wrist(self, side: int, times: np.ndarray) -> np.ndarray:
+        """Where a hand's wrist is on the thing (N, 4, 4) at script times."""
+        grip = self.grips[side].object_from_wrist
+        if side == self.lead:
+            return self.slide(times) @ grip
+        return np.broadcast_to(grip, (len(times), 4, 4))
 
     # --- helpers of plans ------------------------------------------------------------------------
 
@@ -148,7 +161,7 @@ class Handling(Interaction):
             return idle
         (on, off), q = self.hold_s[side], self.haste.get(side, 1.0)
         hand = self.puppet.hands[side]
-        at = thing @ self.grips[side].object_from_wrist
+        at = thing @ self.object_from_wrist(side, times)
         beside = at.copy()
         beside[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
         over = beside.copy()
@@ -207,8 +220,9 @@ class Handling(Interaction):
         joints = self.puppet.skeleton.forward(world, pelvis)
         index = self.puppet.hands[self.lead].wrist
         wrist = _matrices(Pose(joints[:, index], world[:, index]))
-        held = wrist @ invert(self.grips[self.lead].object_from_wrist)
+        held = wrist @ invert(self.object_from_wrist(self.lead, times))
         on, off = self.hold_s[self.lead]
+        on = max(on, self.rests_until_s)
         pose = np.where((times <= on)[:, None, None], self.taken, held)
         return np.where((times >= off)[:, None, None], self.put, pose)
 

@@ -126,15 +126,14 @@ class Swinging(Handling):
             place = shoulder + puppet.arm * self.size * key.wrist
             goal = Pose(place, np.broadcast_to(rotation, (count, 3, 3)))
             wrist = wrist.towards(goal, ramp(times, key.start, key.end))
-        last = Pose.still(self.put @ grip, count)
+        at_rest = self.put @ self.object_from_wrist(RIGHT, times)
+        last = Pose(at_rest[:, :3, 3], at_rest[:, :3, :3])
         above = Pose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
         wrist = wrist.towards(above, ramp(times, 2.0, 2.44))
         wrist = wrist.towards(last, ramp(times, 2.32, RELEASE_S - 0.03))
-        wrist_from_object = invert(grip)
-        return Pose(
-            wrist.position + wrist.rotation @ wrist_from_object[:3, 3],
-            wrist.rotation @ wrist_from_object[:3, :3],
-        )
+        wrist_from_object = invert(self.object_from_wrist(RIGHT, times))
+        offset = np.einsum("nij,nj->ni", wrist.rotation, wrist_from_object[:, :3, 3])
+        return Pose(wrist.position + offset, wrist.rotation @ wrist_from_object[:, :3, :3])
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """The elbow is a little away from the body in the swing."""
