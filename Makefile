@@ -7,7 +7,7 @@
 #                of config/object to the object's track and the body's fit, those of config/body to
 #                the latter), tables and results/evaluation.json; about an hour on two cores, goes
 #                on where it was ended
-# make evaluate-quick  five recordings to the end within ten minutes, beside the recorded figures
+# make evaluate-quick  six recordings to the end within ten minutes, beside the recorded figures
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker,
 #                the body's fit and the joint stage beside the paper's recipe, the joint stage's memory
 #                on long sequences, results/bench.json

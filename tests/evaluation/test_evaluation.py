@@ -41,7 +41,7 @@ def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
     others = [
         Path(f"config/{other}/config.yaml") for other in ("demo", "test", "bench", "evaluation")
     ]
-    others.append(QUICK_SETTINGS)
+    others += [QUICK_SETTINGS, Path("config/evaluation/long.yaml")]
     for path in [*others, *objects]:
         studio = load_project(path).config.studio
         assert studio is not None
