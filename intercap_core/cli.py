@@ -51,6 +51,7 @@ class Part(StrEnum):
 
 
 DEFAULT_SETTINGS = Path("config/config.yaml")
+SEQUENCE_SETTINGS = [Path("config/evaluation/config.yaml"), Path("config/object/config.yaml")]
 CAPTURE_SETTINGS = [
     Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
 ]
@@ -197,7 +198,10 @@ def report(settings: Settings = DEFAULT_SETTINGS) -> None:
 
 @app.command(rich_help_panel=WHOLE)
 def evaluate(
-    settings: Settings = Path("config/evaluation/config.yaml"),
+    settings: Annotated[
+        list[Path],
+        typer.Argument(metavar="SETTINGS", help="Recordings taken to the end; one or more."),
+    ] = SEQUENCE_SETTINGS,
     captures: Annotated[
         list[Path],
         typer.Option(metavar="SETTINGS", help="Recordings taken to the scene alone; may repeat."),
@@ -247,7 +251,7 @@ def evaluate(
     if quick:
         raise typer.Exit(evaluate_quick(output, cores=cores))
     parts = {
-        Part.sequences: [settings],
+        Part.sequences: settings,
         Part.captures: captures,
         Part.objects: objects,
         Part.bodies: bodies,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -25,6 +26,25 @@ SEQUENTIAL = {
     "floor_mm": "floor_sequential_mm",
     "foot_swing_mm": "foot_swing_sequential_mm",
     "acceleration_feet_mm": "acceleration_feet_sequential_mm",
+}
+# Other names under which the joint stage's goals are stated.
+ALSO = {
+    "object_translation_median_mm": ("joint", "object_translation_mm"),
+    "contact_vertex_f1": ("joint", "contact_f1"),
+    "penetration_mean_mm": ("penetration", "mean_mm"),
+}
+# Of each object, after which stage and how it is called there, beside the joint stage.
+BY_OBJECT = {
+    "body mm": ("body_fit", "body_pve_mm"),
+    "grasp mm": ("body_fit", "hand_grasp_mpjpe_mm"),
+    "tips mm": ("body_fit", "fingertip_touching_mm"),
+    "slip mm/s": ("body_fit", "slip_mm_s"),
+    "planted mm/s": ("body_fit", "planted_mm_s"),
+    "object mm": ("object_track", "object_translation_mm"),
+    "p95": ("object_track", "object_translation_p95_mm"),
+    "turn deg": ("object_track", "object_rotation_deg"),
+    "p95 ": ("object_track", "object_rotation_p95_deg"),
+    "contact F1": ("body_fit", "contact_f1"),
 }
 Areas = dict[str, Figures]
 
@@ -67,9 +87,14 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
         sweep = figures.contact_sweep(sequences, stage)
         found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
     found["joint"] |= hold_figures.stated_contact_figures(known) | _beside_sequential(known, found)
+    penetration = figures.penetration_figures(sequences)
+    for name, (area, measure) in ALSO.items():
+        figure = {**found, "penetration": penetration}[area].get(measure)
+        if figure is not None:
+            found["joint"][name] = figure
     return {
         **found,
-        "penetration": figures.penetration_figures(sequences),
+        "penetration": penetration,
         "vertex_to_cloud": figures.cloud_figures(sequences),
         "vertex_to_cloud_floor": figures.floor_figures(sequences),
         "extrinsics": figures.extrinsics_figures(sequences),
@@ -91,7 +116,20 @@ def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Fi
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
         slips = hold_figures.slip_by_object(sequences, stage)
         beside |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
+    for name, some in _by_object(sequences).items():
+        turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")
+        if turn is not None:
+            beside[f"{name}.object_rotation_p95_deg"] = turn
+    depths = [figures.penetration_figures(some) for some in _by_object(sequences).values()]
+    deepest = [found["mean_mm"] for found in depths if np.isfinite(found.get("mean_mm", np.nan))]
+    if deepest:
+        beside["penetration_worst_object_mm"] = max(deepest)
     return beside
+
+
+def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceMetrics]]:
+    names = sorted({s.object_ for s in sequences})
+    return {name: [s for s in sequences if s.object_ == name] for name in names}
 
 
 def with_spread(sequences: Sequence[SequenceMetrics]) -> Areas:
@@ -108,6 +146,8 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
     for group, sequences in groups(evaluations).items():
         for area, measures in with_spread(sequences).items():
             found |= keyed(f"{area}{'' if group == PLAIN else '_annotated'}.", measures)
+    if "joint_annotated.contact_detected_f1" in found:
+        found["joint.contact_detected_annotated_f1"] = found["joint_annotated.contact_detected_f1"]
     return found
 
 
@@ -130,8 +170,24 @@ def print_sequences(evaluations: Sequence[Sequences]) -> None:
         for name in _names(columns):
             table.add_row(f"{area}.{name}", *(_cell(column, name) for column in columns))
     console.print(table)
+    for group, some in groups(evaluations).items():
+        table = Table("object", *BY_OBJECT, "stated F1", "penetration mm", box=None)
+        table.title = f"sequential fits > joint, {group}"
+        for name, of_object in _by_object(some).items():
+            table.add_row(name, *_row(areas(of_object)))
+        console.print(table)
     for name in (name for measured in evaluations for name in measured.missing):
         console.print(f"{name}: no metrics", highlight=False, markup=False)
+
+
+def _row(found: Areas) -> list[str]:
+    joint = found["joint"]
+    cells = [
+        f"{number(found[stage].get(measure), 2)} > {number(joint.get(measure), 2)}"
+        for stage, measure in BY_OBJECT.values()
+    ]
+    stated = number(joint.get("contact_detected_f1"), 2)
+    return [*cells, stated, number(joint.get("penetration_mean_mm"), 1)]
 
 
 def _names(columns: Sequence[Figures]) -> list[str]:

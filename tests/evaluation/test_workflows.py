@@ -6,15 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.cli import BODY_SETTINGS, CAPTURE_SETTINGS, OBJECT_SETTINGS
-from intercap_core.evaluation import bodies, budget, objects
+from intercap_core.cli import (
+    BODY_SETTINGS,
+    CAPTURE_SETTINGS,
+    OBJECT_SETTINGS,
+    SEQUENCE_SETTINGS,
+)
+from intercap_core.evaluation import budget
 from intercap_core.evaluation.evaluate import PARTS
 from intercap_core.evaluation.reference import worse
 from intercap_core.evaluation.workflows import Order, orders_of, progress
 from intercap_core.project import Project, load_project
 
 SETTINGS = {
-    "sequences": [Path("config/evaluation/config.yaml")],
+    "sequences": SEQUENCE_SETTINGS,
     "captures": CAPTURE_SETTINGS,
     "objects": OBJECT_SETTINGS,
     "bodies": BODY_SETTINGS,
@@ -40,7 +45,8 @@ def test_projects_wait_for_those_that_make_their_recordings(
     by_name = {order.project.config.dataset: order for order in orders}
     assert len(orders) == len(by_name) == 1 + 3 + 7 + 7
     assert orders[0] is by_name["object"]  # what most wait for comes first
-    assert by_name["object"].stages == [objects.PART.stage, bodies.PART.stage]
+    stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
+    assert by_name["object"].stages == stages
     for name in ("object_no_detector", "body_two_view"):
         assert by_name[name].after == [by_name["object"]]
     assert by_name["object_noise2"].after == []
