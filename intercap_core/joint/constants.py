@@ -8,7 +8,7 @@ from math import radians
 
 # Distance of a patch that truly touches, after errors of skin, mesh and calibration, metres.
 # Tuned on the studio.
-CONTACT_SIGMA = 0.003
+CONTACT_SIGMA = 0.004
 # Depth of a vertex inside the object beyond the tolerance, metres. Tuned on the studio.
 PENETRATION_SIGMA = 0.003
 # Depth of a vertex below the floor, metres: the ground plane's own error. Tuned on the studio.
@@ -21,8 +21,8 @@ VERTICES_PER_MEASUREMENT = 10.0
 MIN_STANDING_VERTICES = 4
 # A tracked pose is never surer than this, rad and metres: the meshes differ from the things
 # themselves. Tuned on the studio.
-TRACK_FLOOR_TURN = radians(0.1)
-TRACK_FLOOR_SHIFT = 0.001
+TRACK_FLOOR_TURN = radians(0.05)
+TRACK_FLOOR_SHIFT = 0.0005
 # Evidence of the images this many standard deviations from the pose counts a quarter. Tuned on the
 # studio.
 IMAGES_OUTLIER = 5.0
@@ -65,6 +65,9 @@ ACCELERATION_OUTLIER = 2.0
 STICK_WALK, PLANT_WALK = 0.003, 0.003
 # Speeds of what truly slides, m/s: beyond the jitter of the fits. Tuned on the studio.
 STICK_OUTLIER, PLANT_OUTLIER = 0.15, 0.15
+# What has come so far over the object within so long truly slides, metres and seconds. Tuned on the
+# studio.
+GLIDE_M, GLIDE_S = 0.02, 0.4
 # Probability of a hold below which a patch is left out, and share of the most that a vertex of it
 # holds below which others are; vertices of a patch, and of each half of a sole, at most: they move
 # nearly as one.

@@ -97,7 +97,7 @@ def minimise(
 def _risen(change: np.ndarray) -> np.ndarray:
     """Frames (T,) bool around which the energy rose by ``change`` (T,), or is no number; all of
     them where it rose nowhere in particular."""
-    around = np.convolve(np.nan_to_num(change, nan=np.inf), np.ones(3), mode="same")
+    around = np.convolve(np.nan_to_num(change, nan=np.inf), np.ones(3))[1:-1]
     rose = ~(around <= 0)
     return rose if rose.any() else np.ones(len(change), bool)
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.minimise import minimise
-from intercap_core.joint.state import OBJECT, State
+from intercap_core.joint.state import ALL, OBJECT, State
 
 FRAMES, BROKEN = 9, 4
 
@@ -65,3 +66,26 @@ def test_an_energy_that_is_no_number_in_a_frame_is_refused() -> None:
     found = minimise(breaks, _state(), max_steps=12)
     assert np.isfinite(found.equations.total) and found.steps > 0
     assert np.linalg.norm(found.state.translation[0]) < 0.001
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_a_few_frames_can_be_refused_too(frames: int) -> None:
+    state = _state()
+    few = State(
+        state.body[:frames],
+        state.betas,
+        state.expression[:frames],
+        state.rotation[:frames],
+        state.translation[:frames],
+    )
+
+    def rises(at: State) -> NormalEquations:
+        equations = NormalEquations(frames)
+        offset = np.full((frames, ALL.stop), 0.1)
+        energy = np.linalg.norm(at.translation - 0.05, axis=1) + 1.0
+        matrix = np.tile(np.eye(ALL.stop), (frames, 1, 1))
+        equations.add_blocks("any", ALL, matrix, offset, energy)
+        return equations
+
+    found = minimise(rises, few, max_steps=6)
+    assert found.steps == 0 and found.refused > 0 and found.held.all()

@@ -5,7 +5,8 @@
 q is the vertex in the object's frame (:mod:`intercap_core.energy.stick`), Q the probability that
 its region touches in both frames and its patch takes part, a its share of its patch's area. sigma
 is that of a random walk: real grips creep. Robust, so that what truly slides, turns in the fingers
-or is taken anew does so. Weighed by the setting ``stick_weight``.
+or is taken anew does so; and left out where a vertex has come far over the object at the start of
+the fit, in a time in which jitter goes nowhere. Weighed by the setting ``stick_weight``.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 
 from intercap_core.energy import stick
 from intercap_core.joint.constants import (
+    GLIDE_M,
+    GLIDE_S,
     STICK_LEAST,
     STICK_NEAR,
     STICK_OUTLIER,
@@ -27,6 +30,7 @@ from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.coupled import add_steps
 from intercap_core.joint.terms.term import Term
 from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.solve.robust import geman_mcclure_weight
 
 # Hands grip and soles stand; what sits or leans glides as it settles.
 _GRIPPING = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith(("_hand", "_foot"))]
@@ -41,6 +45,7 @@ class Stick(Term):
         self._geometry, self._contact, self._fps = geometry, contact, fps
         self._scale = weight * fps / STICK_WALK**2
         self._grips = np.isin(geometry.patches.region, _GRIPPING)
+        self._holds: np.ndarray | None = None
         self._index = np.zeros(0, int)  # of the skin's vertices
         self._weight = np.zeros((0, 0))
 
@@ -50,6 +55,9 @@ class Stick(Term):
         holds = self._contact.holding()
         both = np.minimum(holds[1:], holds[:-1])
         patch = self._geometry.patches.patch
+        if self._holds is None:
+            self._holds = self._still(state)
+        both = both * self._holds
         kept, weights = [np.zeros(0, int)], [np.zeros((len(both), 0))]
         for number in np.unique(patch[self._grips]):
             members = np.flatnonzero(patch == number)
@@ -60,6 +68,17 @@ class Stick(Term):
                 weights.append(weight)
         self._index = self._geometry.skin.patch[np.concatenate(kept)]
         self._weight = np.concatenate(weights, axis=1) * self._scale
+
+    def _still(self, state: State) -> np.ndarray:
+        """Weights (T - 1, M) of the steps of all vertices of patches, by how far each has come over
+        the object around a step, at the start: jitter goes nowhere, what glides does."""
+        points = self._geometry.at(state).skin[:, self._geometry.skin.patch]
+        local = stick.local_points(points, state.rotation, state.translation)
+        half = max(1, round(GLIDE_S * self._fps / 2))
+        step = np.arange(max(len(state) - 1, 0))
+        before, after = np.maximum(step - half + 1, 0), np.minimum(step + half, len(state) - 1)
+        way = np.square(local[after] - local[before]).sum(axis=2)
+        return geman_mcclure_weight(way, GLIDE_M)
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the slips at ``state``."""
