@@ -26,14 +26,20 @@ from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
 MEGABYTE = 1 << 10  # in kilobytes
-# By file, what is stored end to end: offsets with an entry an image, and what they point into.
+# What is stored end to end, of all cameras or in a camera's group: offsets with an entry an image,
+# and what they point into.
 _PER_IMAGE = {
     "mask_offsets": ("mask_rle",),
     "candidate_offsets": (
         "candidate_scores", "candidate_extents", "candidate_things", "candidate_rle",
     ),
 }  # fmt: skip
-_OFFSETS_WITHIN = {"candidate_rle": "candidate_rle_offsets"}  # of parts that have a length each
+_PER_SET = {
+    "people_offsets": ("people",),
+    "candidate_offsets": ("candidate_labels", "candidate_scores", "candidate_boxes", "rle"),
+}
+# of parts that have a length each
+_OFFSETS_WITHIN = {"candidate_rle": "candidate_rle_offsets", "rle": "rle_offsets"}
 
 
 def there_and_back(frames: int, count: int) -> np.ndarray:
@@ -55,14 +61,21 @@ def lengthen(source: Path, stage: str, output: Path, count: int) -> None:
             raise UserError(f"{source}: has {frames} frame, expected two or more to play back")
         order = there_and_back(frames, count)
         with artefacts.write(output, schema, **attributes) as writer:
-            ragged = {key for key in _PER_IMAGE if key in read}
-            parts = {part for key in ragged for part in _PER_IMAGE[key]}
-            parts |= {_OFFSETS_WITHIN[part] for part in parts if part in _OFFSETS_WITHIN}
+            ragged = {key: _parts(key) for key in read.keys("") if _parts(key)}
+            parts = {part for found in ragged.values() for pair in found for part in pair}
             for key in read.keys(""):
                 if key not in ragged and key not in parts:
                     writer.put(key, _extended(read, schema, key, order))
             for key in sorted(ragged):
                 _put_ragged(read, writer, key, order, frames)
+
+
+def _parts(key: str) -> list[tuple[str, ...]]:
+    """What the offsets ``key`` point into, each with the offsets within it where it has such."""
+    group, _, name = key.rpartition("/")
+    names = (_PER_SET if group else _PER_IMAGE).get(name, ())
+    within = [(part, *filter(None, [_OFFSETS_WITHIN.get(part)])) for part in names]
+    return [tuple(f"{group}/{one}" if group else one for one in pair) for pair in within]
 
 
 def _declared(read: Artefact, schema: artefacts.Schema) -> list[str]:
@@ -105,14 +118,13 @@ def _put_ragged(read: Artefact, writer: Writer, key: str, order: np.ndarray, fra
     lengths = np.diff(offsets)[image]
     writer.put(key, np.concatenate([[0], np.cumsum(lengths)]))
     rows = _runs(offsets[image], lengths)
-    for part in _PER_IMAGE[key]:
-        within = _OFFSETS_WITHIN.get(part)
-        if within is None:
+    for part, *within in _parts(key):
+        if not within:
             writer.put(part, read[part][rows])
         else:
-            starts = read[within]
+            starts = read[within[0]]
             sizes = np.diff(starts)[rows]
-            writer.put(within, np.concatenate([[0], np.cumsum(sizes)]))
+            writer.put(within[0], np.concatenate([[0], np.cumsum(sizes)]))
             writer.put(part, read[part][_runs(starts[rows], sizes)])
 
 

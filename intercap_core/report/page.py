@@ -37,13 +37,14 @@ _LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "sci
 
 @dataclass(frozen=True, eq=False)
 class Detail:
-    """What the page shows of one sequence: overlays by camera, or why there are none, and close-ups
-    of hands that hold."""
+    """What the page shows of one sequence: overlays by camera, or why there are none, how the joint
+    fit went, in words, and close-ups of hands that hold."""
 
     name: str
     overlays: Sequence[Overlay]
     note: str = ""
     closeups: Sequence[CloseUp] = ()
+    joint: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,6 +275,7 @@ def _detail(content: Content, detail: Detail) -> dict[str, Any]:
         "fps": s.fps,
         "cameras": list(cameras.values()),
         "note": detail.note,
+        "joint": detail.joint,
         "closeups": [_embedded(picture, picture.hold.caption) for picture in detail.closeups],
         "timeline": charts.timeline(bands, len(s)),
     }

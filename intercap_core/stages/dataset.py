@@ -21,6 +21,7 @@ from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
 from intercap_core.metrics.contact import CONTACT_M
+from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.heatmaps import Heatmaps, collect
 from intercap_core.report import tables
@@ -154,16 +155,37 @@ def _detail(
         parameters = read_parameters(joint)
         model = load_model(body_models, subjects[measured.subject].gender, joint)
         fit = Fit(model, parameters, joint["rotation"], joint["translation"], mesh)
-    with artefacts.read(paths["scene"], SCENE) as scene:
-        rig, image_of = Rig.from_artefact(scene), scene["image_of"]
+        settled = joint["master_from_colour"]
+        with artefacts.read(paths["scene"], SCENE) as scene:
+            rig, image_of = Rig.from_artefact(scene), scene["image_of"]
+            master = rig.names.index(str(scene.attributes["master"]))
+        said = _of_joint(joint, rig, master)
+    rig = rig.moved(settled)
     chosen = choose_frames(measured.values["object_visible_to_cloud"], settings.frames)
     cameras = choose_cameras(fit, rig, chosen, settings.cameras)
     try:
         with Frames.open(paths["frames"]) as images:
-            return Detail(name, overlays(images.showing(image_of), rig, fit, cameras, chosen))
+            shown = overlays(images.showing(image_of), rig, fit, cameras, chosen)
+            return Detail(name, shown, joint=said)
     except UserError as error:  # one image that does not decode must not cost the whole report
         log.warning("%s: no overlays: %s", name, error)
-        return Detail(name, [], str(error))
+        return Detail(name, [], str(error), joint=said)
+
+
+def _of_joint(joint: artefacts.Artefact, rig: Rig, master: int) -> str:
+    """How the joint fit went, and by how much it has moved the cameras of ``rig``, in words."""
+    steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
+    settled = "settled" if joint.attributes["converged"] else "ended before it settled"
+    moved = displacement(joint["master_from_colour"], rig.master_from_colour, master)
+    variance = np.einsum("cici->ci", joint["camera_covariance"])
+    sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # of the shift
+    cameras = ", ".join(
+        f"{name} {1e3 * by:.1f} (+- {1e3 * error:.1f})"
+        for name, by, error in zip(rig.names, moved, sigma, strict=True)
+        if by > 0
+    )
+    corrected = f"; cameras corrected, mm over 2 m: {cameras}" if cameras else ""
+    return f"Joint fit: {steps} steps taken, {refused} refused, {settled}{corrected}."
 
 
 def _closeups(

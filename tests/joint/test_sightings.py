@@ -24,7 +24,7 @@ LATE = np.array([0.0, 0.007, -0.006, 0.004])
 NOTHING = OffsetPrior(np.zeros(CAMERAS), np.full(CAMERAS, np.nan), 0)
 
 
-def _moving(model: BodyModel, times: np.ndarray) -> torch.Tensor:
+def moving_vectors(model: BodyModel, times: np.ndarray) -> torch.Tensor:
     """Parameter vectors (T,P): somebody sways through the ring with both arms swinging."""
     x = model.zeros(len(times)).vector().double().numpy()
     x[:, 75:120], x[:, 120:165] = model.hand_mean.numpy()
@@ -43,7 +43,7 @@ def fitted(tmp_path_factory):
     """A fitter and its problem at the true bodies, in a capture whose cameras are ``LATE``."""
     model = open_body()
     times = np.arange(FRAMES) / FPS
-    seen = [model.forward(model.parameters(_moving(model, times + late))) for late in LATE]
+    seen = [model.forward(model.parameters(moving_vectors(model, times + late))) for late in LATE]
     inputs = write_capture(
         tmp_path_factory.mktemp("moving"),
         ring(CAMERAS),
@@ -62,7 +62,7 @@ def fitted(tmp_path_factory):
         torch.tensor([covering.noise for covering in COVERINGS]),
         fitter.evidence.keypoint_doubt,
     )
-    problem = fitter.resume(_moving(model, times), settled)
+    problem = fitter.resume(moving_vectors(model, times), settled)
     fitter.observe(problem)
     return fitter, problem
 
