@@ -50,16 +50,17 @@ def jitter(points: np.ndarray, valid: np.ndarray) -> float:
     )
 
 
-def moment_points(vertices: np.ndarray) -> np.ndarray:
+def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
     """Six points (6, 3) with the mean and covariance of ``vertices`` (V, 3).
 
     Mean + and - sqrt(3 lambda_i) e_i along the principal axes: any sum of squares of an affine map
-    over the vertices is V / 6 times the same sum over these points.
+    over the vertices is V / 6 times the same sum over these points. None is nearer to the mean than
+    ``least``, metres: a thin thing's own points would leave its spin free.
     """
     mean = vertices.mean(axis=0)
     covariance = np.cov((vertices - mean).T, bias=True)
     values, axes = np.linalg.eigh(covariance)
-    arms = (axes * np.sqrt(3 * np.maximum(values, 0.0))).T
+    arms = (axes * np.maximum(np.sqrt(3 * np.maximum(values, 0.0)), least)).T
     return np.concatenate([mean + arms, mean - arms])
 
 

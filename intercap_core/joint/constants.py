@@ -32,9 +32,9 @@ ERROR_LASTING_S = 0.3
 # What the body says of the cameras beside that: a detector's errors follow view and pose, and
 # clothing is of unknown thickness. Tuned on the studio.
 BODY_SHARE = 0.05
-# Images that are kept as they were read, bytes. Chosen by memory: 300 frames of six cameras need
-# about half.
-VIEWS_KEPT_BYTES = 500_000_000
+# Images that are kept as they were read, bytes: those of some hundred frames of six cameras. Others
+# are read again in the next round.
+VIEWS_KEPT_BYTES = 200_000_000
 # What is added where different poses explain a frame equally well, rad and metres: it is nearly
 # always the rotation (on which side the handle is). Tuned on the studio.
 AMBIGUOUS_TURN = radians(10.0)
@@ -57,6 +57,9 @@ UNTRACKED_SIGMA = 0.5
 BODY_ACCELERATION = 6.0
 FINGER_ACCELERATION = 10.0
 OBJECT_ACCELERATION = 6.0
+# Turns are as smooth as those of a thing of this radius, metres: hands turn what they hold with
+# 20 rad/s^2 where they move it with 6 m/s^2. Tuned on the studio.
+OBJECT_ARM = 0.3
 # Accelerations beyond so many standard deviations count as a start, a stop or an impact. Tuned on
 # the studio.
 ACCELERATION_OUTLIER = 2.0

@@ -101,10 +101,12 @@ def fit(
     )
 
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
-    steps, refused, energy_before, settled = 0, 0, None, False
+    steps, refused, settled = 0, 0, False
+    energy_before: dict[str, float] | None = None
+    energy_after: dict[str, float] = {}
     held = np.ones(len(state), bool)
     estimate = estimator.at(state)
-    for max_steps in ROUND_STEPS:
+    for number, max_steps in enumerate(ROUND_STEPS, 1):
         contact.take_probability(estimate.probability)
         problem.refresh(state)
         offset_change = body_data.take_offsets(body_data.estimate_offsets(prior).offset)
@@ -112,7 +114,7 @@ def fit(
         minimum = minimise(problem.equations, state, max_steps=max_steps)
         state, steps, refused = minimum.state, steps + minimum.steps, refused + minimum.refused
         energy_before = energy_before or minimum.energy_before
-        held &= minimum.held
+        energy_after, held = minimum.equations.energy, held & minimum.held
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
         previous, estimate = estimate, estimator.at(state)
         contact_change = np.abs(estimate.probability - previous.probability).max()
@@ -121,10 +123,11 @@ def fit(
             and contact_change < CONTACT_CONVERGED
             and offset_change < OFFSET_CHANGED_S
         )
+        del minimum  # its equations are most of the memory
         if cameras is not None and isinstance(object_data, ObjectImagesData):
             shown = body_data.sights(state, BODY_SHARE * share), object_data.sights(state)
             found = cameras.settle(shown)
-            if max_steps is not ROUND_STEPS[-1]:
+            if number < len(ROUND_STEPS):
                 settled = settled and found.shift < CAMERAS_CHANGED_M
                 log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
                 cameras.take(found)
@@ -149,7 +152,7 @@ def fit(
         time_offsets=body_data.estimate_offsets(prior),
         residuals=residuals,
         energy_before=energy_before or {},
-        energy_after=minimum.equations.energy,
+        energy_after=energy_after,
         steps=steps,
         refused=refused,
         converged=settled,

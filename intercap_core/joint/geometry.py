@@ -12,6 +12,7 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.contact.patches import Patches
 from intercap_core.energy import smoothness
 from intercap_core.energy.proximity import Proximity, proximity
+from intercap_core.joint.constants import OBJECT_ARM
 from intercap_core.joint.skin import Skin
 from intercap_core.joint.state import BODY, State
 from intercap_core.rigid.distance import DistanceField
@@ -30,7 +31,7 @@ class Geometry:
     ) -> None:
         self.model, self.mesh, self.field, self.patches = model, mesh, field, patches
         self.skin = Skin.select(model, patches)
-        self.moments = smoothness.moment_points(mesh.vertices)
+        self.moments = smoothness.moment_points(mesh.vertices, OBJECT_ARM)
         self._last: PosedGeometry | None = None
 
     def at(self, state: State) -> PosedGeometry:
