@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.rig import Rig
+from intercap_core.joint.constants import MAX_CAMERA_SIGMAS
 from intercap_core.joint.state import ALL
 
 FREEDOMS = 7  # of a camera: turn about its centre, shift, depth bias
@@ -59,7 +60,7 @@ class Sights:
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class CameraStep:
     """The cameras' ``step`` (C, 7) and what the frames' unknowns do with it, ``along`` (T, N)."""
 
     step: np.ndarray
@@ -81,13 +82,18 @@ class CameraFit:
         self._away = np.zeros((len(start.rig), FREEDOMS))
         flat = covariance.reshape(self._away.size, -1)
         self._free = np.flatnonzero(flat.diagonal() > 0)
+        self._sigma = np.sqrt(flat.diagonal()[self._free])
         self._information = np.linalg.inv(flat[np.ix_(self._free, self._free)])
 
-    def take(self, settled: Settled) -> None:
-        """Move the cameras."""
-        self.now, self._away = self.now.moved(settled.step), self._away + settled.step
+    def take(self, found: CameraStep) -> bool:
+        """Move the cameras, unless that goes beyond what the scene leaves open; whether it did."""
+        away = self._away + found.step
+        if not (np.abs(away.ravel()[self._free]) < MAX_CAMERA_SIGMAS * self._sigma).all():
+            return False
+        self.now, self._away = self.now.moved(found.step), away
+        return True
 
-    def settle(self, sights: Sequence[Sights]) -> Settled:
+    def settle(self, sights: Sequence[Sights]) -> CameraStep:
         """The best corrections beside those that were taken, of what can be corrected."""
         free = self._free
         total, pull = self._information, self._information @ self._away.ravel()[free]
@@ -112,4 +118,4 @@ class CameraFit:
         along = np.zeros((len(sights[0].matrix), ALL.stop))
         for seen, follow in zip(sights, follows, strict=True):
             along[:, seen.columns] -= follow @ step[free]
-        return Settled(step.reshape(self._away.shape), along)
+        return CameraStep(step.reshape(self._away.shape), along)

@@ -119,6 +119,9 @@ OFFSET_UNCHANGED_S = 0.0003
 # Changes of offsets above this call for another round, seconds: 3 mm of that hand's motion.
 OFFSET_CHANGED_S = 0.001
 
+# Corrections of so many of the scene's standard deviations say that body or object are wrong, not
+# the cameras. Tuned on the studio: none of its recordings comes to half of it.
+MAX_CAMERA_SIGMAS = 5.0
 # Corrections of cameras below this are not worth another round, metres.
 CAMERAS_CHANGED_M = 0.0005
 

@@ -129,8 +129,16 @@ def fit(
             found = cameras.settle(shown)
             if number < len(ROUND_STEPS):
                 settled = settled and found.shift < CAMERAS_CHANGED_M
+                if not cameras.take(found):
+                    log.warning(
+                        "body and object would move a camera by %.0f mm, far beyond what the scene "
+                        "leaves open: no camera is corrected; look at its pose, the body and the "
+                        "object",
+                        1e3 * found.shift,
+                    )
+                    cameras = None
+                    continue
                 log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
-                cameras.take(found)
                 state = state.moved(limited(found.along))
                 body_data.take_cameras(cameras.now)
                 object_data.take_cameras(cameras.now)

@@ -31,7 +31,7 @@ from intercap_core.config import (
 )
 from intercap_core.contact.patches import contact_patches
 from intercap_core.detections.read import Detections
-from intercap_core.joint.cameras import CameraFit, Cameras
+from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
 from intercap_core.joint.fit import JointFit, fit
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.object_images import ObjectImages
@@ -162,7 +162,13 @@ def _offset_prior(scene: Artefact) -> OffsetPrior:
 def _cameras(scene: Artefact) -> CameraFit:
     """The scene's cameras and what is known of them."""
     start = Cameras(Rig.from_artefact(scene), scene["depth_bias"])
-    return CameraFit(start, scene["camera_covariance"])
+    covariance = scene["camera_covariance"]
+    usable = scene["present"] & np.isfinite(start.rig.master_from_colour).all((1, 2))
+    covariance[~usable] = 0
+    covariance[:, :, ~usable] = 0
+    covariance[~np.isfinite(start.depth_bias), BIAS] = 0
+    covariance[:, :, ~np.isfinite(start.depth_bias), BIAS] = 0
+    return CameraFit(start, covariance)
 
 
 def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:

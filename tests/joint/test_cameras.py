@@ -12,7 +12,16 @@ from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
 from intercap_core.energy.body_samples import COVERINGS
-from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraFit, Cameras, Sights
+from intercap_core.joint.cameras import (
+    BIAS,
+    FREEDOMS,
+    SHIFT,
+    TURN,
+    CameraFit,
+    Cameras,
+    CameraStep,
+    Sights,
+)
 from intercap_core.joint.state import BODY, OBJECT
 from intercap_core.joint.terms.body_cameras import add_by_cameras
 from tests.helpers.bodies import open_body
@@ -165,3 +174,41 @@ def test_poses_go_along_and_the_prior_holds() -> None:
     np.testing.assert_allclose(found.step[0, TURN], 0)
     free = cameras.settle([replace(sights(known=0.0), pull=frames * np.ones(FREEDOMS))])
     np.testing.assert_allclose(free.along[:, OBJECT][:, 3:], np.tile(free.step[0, SHIFT], (5, 1)))
+
+
+def test_what_goes_far_beyond_the_scene_s_covariance_is_not_taken() -> None:
+    covariance = np.zeros((1, FREEDOMS, 1, FREEDOMS))
+    covariance[0, SHIFT, 0, SHIFT] = np.eye(3) * 0.003**2
+    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), covariance)
+    before = cameras.now.rig.master_from_colour.copy()
+    step = np.zeros((1, FREEDOMS))
+    for metres, taken in ((0.1, False), (0.005, True)):
+        step[0, SHIFT] = metres
+        assert cameras.take(CameraStep(step, np.zeros((1, 1)))) == taken
+    step[0, SHIFT] = 0.011  # with what was taken before: too far
+    assert not cameras.take(CameraStep(step, np.zeros((1, 1))))
+    np.testing.assert_allclose(
+        cameras.now.rig.master_from_colour[:, :3, 3] - before[:, :3, 3], 0.005
+    )
+
+
+def test_a_camera_without_a_pose_says_nothing(fitter: Fitter) -> None:
+    evidence = fitter.evidence
+    given = evidence.seen
+    poses = given.rig.master_from_colour.copy()
+    poses[3] = np.nan
+    confidence = given.confidence.copy()
+    confidence[:, 3] = 0
+    problem = _problem(fitter)
+    problem.views = replace(
+        problem.views,
+        colour_from_master=torch.as_tensor(given.rig.moved(poses).colour_from_master).float(),
+        confidence=torch.as_tensor(confidence[:, :, problem.keypoints.index.numpy()]).float(),
+    )
+    evidence.by_view.points[:, 3] = 0
+    evidence.seen = replace(given, rig=given.rig.moved(poses), confidence=confidence)
+    seen = _seen_from(fitter, problem, held=1.0)
+    evidence.seen = given
+    mine = slice(3 * FREEDOMS, 4 * FREEDOMS)
+    assert np.isfinite(seen.hessian).all() and np.isfinite(seen.cross).all()
+    assert not seen.hessian[mine].any() and not seen.pull[mine].any()

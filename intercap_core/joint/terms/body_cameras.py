@@ -62,7 +62,7 @@ def _add_keypoints(
     weight = views.confidence[part] * geman_mcclure_weight((residual**2).sum(-1), KEYPOINT_SCALE)
     by_point = by_camera @ rotation[:, None] / sigma[..., None]  # (b, C, K, 2, 3)
     by_point = torch.where(known[..., None], by_point, 0)
-    centre = torch.as_tensor(evidence.seen.rig.master_from_colour[:, :3, 3]).to(points)
+    centre = _poses(evidence).to(points)[:, :3, 3]
     arm = (points - centre[:, None])[..., None, :].expand(by_point.shape)
     nothing = by_point.new_zeros(*by_point.shape[:-1], 1)
     rows = -torch.cat([torch.linalg.cross(arm, by_point), by_point, nothing], -1)
@@ -82,13 +82,13 @@ def _add_clouds(evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen
     rows, by_view = problem.rows, evidence.by_view
     if rows is None or by_view is None:
         return
-    model, rig = problem.model, evidence.seen.rig
+    model = problem.model
     linear = model.linearise(model.parameters(problem.base[part]), vertex_ids=evidence.sample_ids)
     normal, points = rows.normal[part], linear.vertices
     by_body = -linear.along(normal[:, :, None])[:, :, 0][..., BODY]
     own = body_cloud.CloudRows(*(values[part] for values in rows))
     residual = body_cloud.residuals(points, own, problem.thickness_of_group(), evidence.group)
-    poses = torch.as_tensor(rig.master_from_colour).to(points)
+    poses = _poses(evidence).to(points)
     arm = points[:, None] - poses[:, None, :3, 3]  # (b, C, S, 3)
     ray = arm / (arm @ poses[:, :3, 2, None]).clamp_min(0.1)
     facing = normal[:, None].expand(arm.shape)
@@ -102,6 +102,11 @@ def _add_clouds(evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen
     seen.hessian[:] += _array(torch.einsum("bsd,bse->de", weighted, flat))
     seen.pull[:] += _array(torch.einsum("bsd,bs->d", weighted, residual))
     seen.cross[evidence.frames[part], BODY] += _array(by_body.transpose(1, 2) @ weighted)
+
+
+def _poses(evidence: Evidence) -> torch.Tensor:
+    """(C, 4, 4) of the cameras; zeros for one without, which shows nothing."""
+    return torch.as_tensor(np.nan_to_num(evidence.seen.rig.master_from_colour))
 
 
 def _array(values: torch.Tensor) -> np.ndarray:
