@@ -323,6 +323,11 @@ JOINT = Schema(
         "energy_names": Field(("E",), "str", "terms of the energy"),
         "energy_before": Field(("E",), "float64", "weighted energy of each term at the start"),
         "energy_after": Field(("E",), "float64", "weighted energy of each term at the end"),
+        "hand_undetermined": Field(
+            ("T", "2"),
+            "bool",
+            "left and right hand: what was seen does not determine it, or contradicts it; such a frame is not flagged for that",
+        ),
         "flagged": Field(("T",), "bool", "body or object of this frame should not be trusted"),
         "flag_reason": Field(("T",), "str", "why, in words; empty = not flagged"),
     },

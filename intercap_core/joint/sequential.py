@@ -31,13 +31,15 @@ class Flags:
     """Frames (T,) that a sequential fit has flagged.
 
     ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
-    was seen; ``lost`` and ``ambiguous``: the object track's.
+    was seen; ``lost`` and ``ambiguous``: the object track's. ``hands`` (T, 2), left and right: the
+    hand is not determined by what was seen, or not fitted at all; no reason to flag the frame.
     """
 
     filled: np.ndarray
     uncertain: np.ndarray
     lost: np.ndarray
     ambiguous: np.ndarray
+    hands: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,13 @@ class SequentialFits:
         """Read body_fit.h5, object_track.h5 and, for the cameras' times, scene.h5."""
         state = _state(body, track)
         failed, lost = body["failed"], track["lost"]
+        filled = failed | body["bridged"]
         flags = Flags(
-            filled=failed | body["bridged"],
+            filled=filled,
             uncertain=body["uncertain"],
             lost=lost,
             ambiguous=track["ambiguous"],
+            hands=_undetermined_hands(body) | filled[:, None],
         )
         resting = track["resting"]
         tracked = TrackedPoses.from_track(
@@ -87,6 +91,13 @@ class SequentialFits:
             joint_sigma=body["joint_sigma"].astype(float),
             object_sigma=np.where(lost | ~np.isfinite(sigma), UNTRACKED_SIGMA, sigma),
         )
+
+
+def _undetermined_hands(body: Artefact) -> np.ndarray:
+    """Left and right hands (T, 2) bool that the body fit says nothing determines."""
+    parts = body.text("part_names")
+    hands = [parts.index(f"{side}_hand") for side in ("left", "right")]
+    return np.asarray(body["undetermined"][:, hands])
 
 
 def _state(body: Artefact, track: Artefact) -> State:

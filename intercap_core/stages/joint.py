@@ -145,6 +145,7 @@ def run(
     ) as writer:
         _put_body(writer, model, fitted.state)
         _put(writer, fitted)
+        writer.put("hand_undetermined", sequential.flags.hands)
         _put_cameras(writer, cameras)
 
 

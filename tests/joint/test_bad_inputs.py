@@ -256,6 +256,21 @@ def test_very_short_recordings(model: BodyModel, tmp_path: Path, frames: int) ->
     assert found["energy_after"].sum() <= found["energy_before"].sum()
 
 
+def test_a_hand_that_nothing_determines_is_told_and_not_flagged(
+    model: BodyModel, tmp_path: Path
+) -> None:
+    held = hold(model, tmp_path, 3)
+    with h5py.File(held.paths["body_fit"], "r+") as file:
+        parts = file["part_names"].asstr()[()].tolist()
+        file["undetermined"][:] = False
+        file["undetermined"][1, parts.index("right_hand")] = True
+        file["undetermined"][1, parts.index("left_arm")] = True
+        file["bridged"][2] = True
+    found = held.run()
+    assert found["hand_undetermined"].tolist() == [[False, False], [False, True], [True, True]]
+    assert not found["flagged"][1]
+
+
 @pytest.mark.parametrize("subdivisions", [2, 4])
 def test_an_object_meshed_anew_under_old_contact_vertices(
     held: Held, tmp_path: Path, subdivisions: int
