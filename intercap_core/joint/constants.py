@@ -152,6 +152,9 @@ CONTACT_CONVERGED = 0.1
 
 # --- decision
 
+# A hand whose keypoints are mostly seen in so many views or fewer is undetermined: what hides it
+# from the others hides fingers from these.
+FEW_HAND_VIEWS = 2
 # A frame with a skin vertex deeper than this inside the object is flagged, metres: far beyond what
 # skin yields, so one of the two poses is wrong. Tuned on the studio.
 FLAGGED_DEPTH = 0.03

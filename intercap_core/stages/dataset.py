@@ -185,7 +185,13 @@ def _of_joint(joint: artefacts.Artefact, rig: Rig, master: int) -> str:
         if by > 0
     )
     corrected = f"; cameras corrected, mm over 2 m: {cameras}" if cameras else ""
-    return f"Joint fit: {steps} steps taken, {refused} refused, {settled}{corrected}."
+    frames = joint["hand_undetermined"].sum(axis=0)
+    hands = "".join(
+        f" The {side} hand is undetermined in {count} frames (few views see it)."
+        for side, count in zip(("left", "right"), frames, strict=True)
+        if count
+    )
+    return f"Joint fit: {steps} steps taken, {refused} refused, {settled}{corrected}.{hands}"
 
 
 def _closeups(

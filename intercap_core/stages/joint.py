@@ -16,6 +16,7 @@ import torch
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, load_pose_prior
+from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
@@ -32,6 +33,7 @@ from intercap_core.config import (
 from intercap_core.contact.patches import contact_patches
 from intercap_core.detections.read import Detections
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
+from intercap_core.joint.constants import FEW_HAND_VIEWS
 from intercap_core.joint.fit import JointFit, fit
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.object_images import ObjectImages
@@ -43,7 +45,7 @@ from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, SCENE
+from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, PERSON, SCENE
 
 log = logging.getLogger(__name__)
 
@@ -145,7 +147,7 @@ def run(
     ) as writer:
         _put_body(writer, model, fitted.state)
         _put(writer, fitted)
-        writer.put("hand_undetermined", sequential.flags.hands)
+        writer.put("hand_undetermined", sequential.flags.hands | _hands_of_few_views(person))
         _put_cameras(writer, cameras)
 
 
@@ -158,6 +160,15 @@ def _floor(scene: Artefact) -> Ground | None:
 def _offset_prior(scene: Artefact) -> OffsetPrior:
     master = scene.text("camera_names").index(str(scene.attributes["master"]))
     return OffsetPrior(scene["time_offset"], scene["time_offset_sigma"], master)
+
+
+def _hands_of_few_views(person: Path) -> np.ndarray:
+    """Left and right hands (T, 2) bool that few views see: most of their keypoints in two or
+    fewer."""
+    with artefacts.read(person, PERSON) as artefact:
+        views = artefact["joint_views"]
+    few = [np.median(views[:, hand], axis=1) <= FEW_HAND_VIEWS for hand in (LEFT_HAND, RIGHT_HAND)]
+    return np.stack(few, axis=1)
 
 
 def _cameras(scene: Artefact) -> CameraFit:
