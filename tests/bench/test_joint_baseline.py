@@ -29,6 +29,7 @@ from bench.joint_clip import JointClip
 from bench.object_baseline import Crops, Recipe
 from bench.object_baseline import Energy as ObjectEnergy
 from intercap_core.contact.patches import contact_patches
+from intercap_core.joint.constants import CONTACT_SIGMA
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import BODY, OBJECT, State
@@ -127,7 +128,7 @@ def test_contact_is_measured_by_our_distances(geometry: Geometry, start: State) 
     assert distance == pytest.approx(geometry.at(start).proximity.distance, abs=1e-5)
     at_hand = geometry.skin.patch[geometry.patches.region == LEFT_HAND]
     squared = distance[1, at_hand] ** 2
-    wanted = np.mean(0.05**2 * squared / (squared + 0.05**2)) / 2 / 0.003**2
+    wanted = np.mean(0.05**2 * squared / (squared + 0.05**2)) / 2 / CONTACT_SIGMA**2
     found = contact(torch.as_tensor(distance[:, geometry.skin.patch]), weights)
     assert found.item() == pytest.approx(wanted, rel=1e-3)
 
