@@ -179,7 +179,7 @@ class JointSettings(Model):
     """Compare the object with the images anew in each round; else its track stands for them."""
     refine_cameras: bool = True
     """Correct poses and depth bias of the cameras by what body and object show (beyond the paper);
-    needs ``look_again``."""
+    needs ``look_again``. Switch off where given poses are to be kept."""
     detect_contact: bool = True
     """Find contact from the geometry where it is not annotated."""
     annotation_uncertainty_frames: Annotated[int, Field(ge=0, le=100)] = 5

@@ -289,7 +289,8 @@ JOINT = Schema(
         "body_model": "digest of the body file",
         "iterations": "Gauss-Newton steps taken",
         "refused": "steps that would not have lowered the energy",
-        "converged": "the last steps changed little, contact and time offsets too",
+        "converged": "the last steps changed little; contact, time offsets and cameras too",
+        "cameras_corrected": "the cameras were corrected; else they are the scene's",
     },
     fields={
         **_body(one_shape=True),

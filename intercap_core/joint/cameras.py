@@ -10,7 +10,8 @@ the images' evidence over all poses, with the prior that the scene's covariance 
 
 summed over frames, body (E_B) and object (E_O), x its pose, which goes along: -H_xx^-1 H_xd step. a
 is the share of an independent observation that a frame is, as errors last. S^-1 is the covariance.
-Contact, which says where body and object are to each other, says nothing of cameras.
+Contact, which says where body and object are to each other, says nothing of cameras. The keypoints
+that helped the scene's registration count once more here, with the little that the body counts.
 """
 
 from __future__ import annotations
@@ -22,7 +23,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.rig import Rig
-from intercap_core.joint.constants import MAX_CAMERA_SIGMAS
+from intercap_core.joint.constants import (
+    CAMERA_REACH_M,
+    MAX_CAMERA_SHIFT_M,
+    MAX_CAMERA_SIGMAS,
+)
 from intercap_core.joint.state import ALL
 
 FREEDOMS = 7  # of a camera: turn about its centre, shift, depth bias
@@ -61,10 +66,12 @@ class Sights:
 
 @dataclass(frozen=True, eq=False)
 class CameraStep:
-    """The cameras' ``step`` (C, 7) and what the frames' unknowns do with it, ``along`` (T, N)."""
+    """The cameras' ``step`` (C, 7), what the frames' unknowns do with it, ``along`` (T, N), and the
+    ``covariance`` (C, 7, C, 7) of the corrections after it."""
 
     step: np.ndarray
     along: np.ndarray
+    covariance: np.ndarray
 
     @property
     def shift(self) -> float:
@@ -75,23 +82,42 @@ class CameraStep:
 
 class CameraFit:
     """The cameras ``now``, from what the scene says of them: poses and biases ``start`` with their
-    ``covariance`` (C, 7, C, 7), 0 for what is held."""
+    ``covariance`` (C, 7, C, 7), 0 for what is held. Raises LinAlgError where that is none."""
 
     def __init__(self, start: Cameras, covariance: np.ndarray) -> None:
+        self._given = start, covariance
         self.now, self.covariance = start, covariance
         self._away = np.zeros((len(start.rig), FREEDOMS))
         flat = covariance.reshape(self._away.size, -1)
         self._free = np.flatnonzero(flat.diagonal() > 0)
         self._sigma = np.sqrt(flat.diagonal()[self._free])
-        self._information = np.linalg.inv(flat[np.ix_(self._free, self._free)])
+        own = flat[np.ix_(self._free, self._free)]
+        np.linalg.cholesky(own)
+        self._information = np.linalg.inv(own)
 
     def take(self, found: CameraStep) -> bool:
-        """Move the cameras, unless that goes beyond what the scene leaves open; whether it did."""
+        """Move the cameras; where that goes far beyond what the scene leaves open, put all of them
+        back instead. Returns whether they were moved."""
         away = self._away + found.step
-        if not (np.abs(away.ravel()[self._free]) < MAX_CAMERA_SIGMAS * self._sigma).all():
+        if not self._is_likely(away):
+            (self.now, self.covariance), self._away = self._given, np.zeros_like(away)
             return False
         self.now, self._away = self.now.moved(found.step), away
+        self.covariance = found.covariance
         return True
+
+    def _is_likely(self, away: np.ndarray) -> bool:
+        """Whether corrections (C, 7) are within the scene's standard deviations, each by itself and
+        all together, and small where things happen."""
+        free = away.ravel()[self._free]
+        together = np.sqrt(free @ self._information @ free / max(len(free), 1))
+        size = np.linalg.norm(away[:, TURN], axis=1) * CAMERA_REACH_M
+        size += np.linalg.norm(away[:, SHIFT], axis=1) + np.abs(away[:, BIAS])
+        return bool(
+            (np.abs(free) < MAX_CAMERA_SIGMAS * self._sigma).all()
+            and together < MAX_CAMERA_SIGMAS
+            and (size < MAX_CAMERA_SHIFT_M).all()
+        )
 
     def settle(self, sights: Sequence[Sights]) -> CameraStep:
         """The best corrections beside those that were taken, of what can be corrected."""
@@ -114,8 +140,9 @@ class CameraFit:
         step[free] = -covariance @ pull
         stated = np.zeros((step.size, step.size))
         stated[np.ix_(free, free)] = covariance
-        self.covariance = stated.reshape(self.covariance.shape)
         along = np.zeros((len(sights[0].matrix), ALL.stop))
         for seen, follow in zip(sights, follows, strict=True):
             along[:, seen.columns] -= follow @ step[free]
-        return CameraStep(step.reshape(self._away.shape), along)
+        return CameraStep(
+            step.reshape(self._away.shape), along, stated.reshape(self.covariance.shape)
+        )

@@ -122,6 +122,9 @@ OFFSET_CHANGED_S = 0.001
 # Corrections of so many of the scene's standard deviations say that body or object are wrong, not
 # the cameras. Tuned on the studio: none of its recordings comes to half of it.
 MAX_CAMERA_SIGMAS = 5.0
+# Largest correction of what a camera shows so far away, metres: beyond it a calibration is wrong
+# and has to be made again. Tuned on the studio, whose corrections stay below a third of it.
+MAX_CAMERA_SHIFT_M, CAMERA_REACH_M = 0.03, 2.5
 # Corrections of cameras below this are not worth another round, metres.
 CAMERAS_CHANGED_M = 0.0005
 
@@ -135,7 +138,7 @@ OFFSET_ITERATIONS = 4  # reweightings of the offsets' normal equations; tuned on
 INITIAL_DAMPING = 1e-3
 MIN_DAMPING = 1e-6
 # A frame that ends with more hardly moves any more. Tuned on the studio.
-HELD_DAMPING = 1.0
+HELD_DAMPING = 0.5
 DAMPING_UP, DAMPING_DOWN = 10.0, 5.0  # factors after a rejected and an accepted step
 # Largest change in one step, rad and metres: beyond it a linearisation of skinning is poor.
 # Tuned on the studio.

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 class JointFit:
     """The refined state, with contact, time offsets and residuals there, the energy by term before
     and after, the numbers of ``steps`` and of ``refused`` ones, whether it ``converged``, and the
-    reasons (T,) not to trust a frame, "" = none."""
+    reasons (T,) not to trust a frame, "" = none; whether the ``cameras`` were corrected."""
 
     state: State
     contact: ContactEstimate
@@ -54,6 +54,7 @@ class JointFit:
     refused: int
     converged: bool
     flag_reasons: list[str]
+    cameras: bool
 
 
 def fit(
@@ -101,7 +102,7 @@ def fit(
     )
 
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
-    steps, refused, settled = 0, 0, False
+    steps, refused, settled, camera_change, refused_mm = 0, 0, False, 0.0, 0.0
     energy_before: dict[str, float] | None = None
     energy_after: dict[str, float] = {}
     held = np.ones(len(state), bool)
@@ -124,27 +125,34 @@ def fit(
             and offset_change < OFFSET_CHANGED_S
         )
         del minimum  # its equations are most of the memory
+        if number == len(ROUND_STEPS):
+            break
         if cameras is not None and isinstance(object_data, ObjectImagesData):
             shown = body_data.sights(state, BODY_SHARE * share), object_data.sights(state)
             found = cameras.settle(shown)
-            if number < len(ROUND_STEPS):
-                settled = settled and found.shift < CAMERAS_CHANGED_M
-                if not cameras.take(found):
-                    log.warning(
-                        "body and object would move a camera by %.0f mm, far beyond what the scene "
-                        "leaves open: no camera is corrected; look at its pose, the body and the "
-                        "object",
-                        1e3 * found.shift,
-                    )
-                    cameras = None
-                    continue
+            camera_change = found.shift
+            if cameras.take(found):
                 log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
                 state = state.moved(limited(found.along))
-                body_data.take_cameras(cameras.now)
-                object_data.take_cameras(cameras.now)
-        if settled:
+            else:
+                refused_mm = 1e3 * found.shift
+            body_data.take_cameras(cameras.now)
+            object_data.take_cameras(cameras.now)
+            if refused_mm:
+                cameras = None
+                log.warning(
+                    "body and object would move a camera by %.0f mm, far beyond what the scene "
+                    "leaves open: all cameras stay as the scene has them; look at their poses, the "
+                    "body and the object",
+                    refused_mm,
+                )
+        if settled and camera_change < CAMERAS_CHANGED_M:
             break
+    settled = settled and camera_change < CAMERAS_CHANGED_M
     stuck = steps == 0 and refused > 0 and not settled
+    against_images = np.zeros(len(state), bool)
+    if isinstance(object_data, ObjectImagesData):
+        against_images = object_data.contradicted(state)
     log.log(
         logging.WARNING if stuck else logging.INFO,
         "%d steps taken, %d refused, %d frames held, %s",
@@ -165,8 +173,9 @@ def fit(
         refused=refused,
         converged=settled,
         flag_reasons=_flag_reasons(
-            geometry, state, sequential.flags, estimate, held | stuck, against_floor
+            geometry, state, sequential.flags, estimate, held | stuck, against_floor, against_images
         ),
+        cameras=cameras is not None,
     )
 
 
@@ -177,9 +186,10 @@ def _flag_reasons(
     estimate: ContactEstimate,
     stuck: np.ndarray,
     against_floor: str,
+    against_images: np.ndarray,
 ) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
-    lowered its energy."""
+    lowered its energy; ``against_images`` (T,): they contradict the object's final pose."""
     deep = geometry.at(state).proximity.distance.min(axis=1) < -FLAGGED_DEPTH
     causes = (
         (flags.filled, "body not seen well enough, filled in"),
@@ -189,6 +199,7 @@ def _flag_reasons(
         (deep, "body deep inside the object"),
         *estimate.distrust(),
         (stuck, "no step of the joint fit lowered its energy"),
+        (against_images, "the images contradict the object's pose"),
         (np.full(len(state), bool(against_floor)), against_floor),
     )
     return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]

@@ -77,10 +77,11 @@ def minimise(
             damping.max(),
         )
         if not there.total < here.total:
-            rose = _risen(there.by_frame - here.by_frame)
+            rose, tried = _risen(there.by_frame - here.by_frame), damping
             damping, refused = np.where(rose, damping * DAMPING_UP**2, damping), refused + 1
-            # of a quadratic energy, half of what its slope promises
-            if -0.5 * float((here.gradient * step).sum()) < NEGLIGIBLE_SHARE * here.total:
+            # of a quadratic energy, half of what its slope promises; nothing where damped much
+            promised = -0.5 * float((here.gradient * step).sum())
+            if promised < NEGLIGIBLE_SHARE * here.total and tried.max() < HELD_DAMPING:
                 converged = True
                 break
             continue
@@ -91,7 +92,7 @@ def minimise(
         if gain < MIN_GAIN_SHARE * gained:
             converged = True
             break
-    return Minimum(state, here, before, accepted, refused, converged, damping > HELD_DAMPING)
+    return Minimum(state, here, before, accepted, refused, converged, damping >= HELD_DAMPING)
 
 
 def _risen(change: np.ndarray) -> np.ndarray:

@@ -89,7 +89,12 @@ class ObjectImages:
     def rays(self, place: np.ndarray) -> np.ndarray:
         """By how much (V, 3), metres, what is at ``place`` (3,) seems farther to each camera, for
         a metre of depth."""
-        poses = np.array([geometry.master_from_colour for geometry in self._geometry])
+        poses = np.array(
+            [
+                geometry.master_from_depth if geometry.camera.depth else geometry.master_from_colour
+                for geometry in self._geometry
+            ]
+        )
         away = place - poses[:, :3, 3]
         return away / (away * poses[:, :3, 2]).sum(axis=1, keepdims=True)
 

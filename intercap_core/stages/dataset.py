@@ -176,15 +176,24 @@ def _of_joint(joint: artefacts.Artefact, rig: Rig, master: int) -> str:
     """How the joint fit went, and by how much it has moved the cameras of ``rig``, in words."""
     steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
     settled = "settled" if joint.attributes["converged"] else "ended before it settled"
-    moved = displacement(joint["master_from_colour"], rig.master_from_colour, master)
-    variance = np.einsum("cici->ci", joint["camera_covariance"])
-    sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # of the shift
-    cameras = ", ".join(
-        f"{name} {1e3 * by:.1f} (+- {1e3 * error:.1f})"
-        for name, by, error in zip(rig.names, moved, sigma, strict=True)
-        if by > 0
-    )
-    corrected = f"; cameras corrected, mm over 2 m: {cameras}" if cameras else ""
+    corrected = ""
+    if joint.attributes["cameras_corrected"]:
+        posed = np.isfinite(rig.master_from_colour).all((1, 2))
+        moved = np.full(len(rig), np.nan)
+        order = np.flatnonzero(posed)
+        moved[posed] = displacement(
+            joint["master_from_colour"][posed],
+            rig.master_from_colour[posed],
+            int(np.flatnonzero(order == master)[0]),
+        )
+        variance = np.einsum("cici->ci", joint["camera_covariance"])
+        sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # of the shift
+        cameras = ", ".join(
+            f"{rig.names[c]} {1e3 * moved[c]:.1f} (+- {1e3 * sigma[c]:.1f})"
+            for c in order
+            if sigma[c] > 0
+        )
+        corrected = f"; cameras corrected, mm over 2 m: {cameras}"
     frames = joint["hand_undetermined"].sum(axis=0)
     hands = "".join(
         f" The {side} hand is undetermined in {count} frames (few views see it)."

@@ -32,6 +32,7 @@ from intercap_core.config import (
 )
 from intercap_core.contact.patches import contact_patches
 from intercap_core.detections.read import Detections
+from intercap_core.errors import UserError
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
 from intercap_core.joint.constants import FEW_HAND_VIEWS
 from intercap_core.joint.fit import JointFit, fit
@@ -112,6 +113,8 @@ def run(
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
     with Frames.open(frames) as recording:
         images = None
+        if settings.refine_cameras and not settings.look_again:
+            log.warning("refine_cameras needs look_again: the cameras stay as the scene has them")
         if settings.look_again:
             seen = ObjectRecording(
                 recording, Detections.load(detections), scene, person, mesh.diameter
@@ -143,6 +146,7 @@ def run(
         iterations=fitted.steps,
         refused=fitted.refused,
         converged=fitted.converged,
+        cameras_corrected=fitted.cameras,
         **attributes,
     ) as writer:
         _put_body(writer, model, fitted.state)
@@ -180,7 +184,13 @@ def _cameras(scene: Artefact) -> CameraFit:
     covariance[:, :, ~usable] = 0
     covariance[~np.isfinite(start.depth_bias), BIAS] = 0
     covariance[:, :, ~np.isfinite(start.depth_bias), BIAS] = 0
-    return CameraFit(start, covariance)
+    try:
+        return CameraFit(start, covariance)
+    except np.linalg.LinAlgError:
+        raise UserError(
+            f"{scene.path}: sequence {scene.attributes['sequence']}: camera_covariance is not "
+            "positive definite; re-run stage 'scene' for this sequence"
+        ) from None
 
 
 def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:

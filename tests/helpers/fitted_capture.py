@@ -348,7 +348,8 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         _fill(writer, BODY_FIT, T=total, C=count)
     with artefacts.write(
         capture.paths["joint"], JOINT, body_model=file_digest(OPEN_BODY),
-        object=capture.object_.name, iterations=3, refused=0, converged=True, **identity,
+        object=capture.object_.name, iterations=3, refused=0, converged=True,
+        cameras_corrected=True, **identity,
     ) as writer:  # fmt: skip
         for key, value in body.items():
             writer.put(key, value[0] if key == "betas" else value)

@@ -176,20 +176,48 @@ def test_poses_go_along_and_the_prior_holds() -> None:
     np.testing.assert_allclose(free.along[:, OBJECT][:, 3:], np.tile(free.step[0, SHIFT], (5, 1)))
 
 
-def test_what_goes_far_beyond_the_scene_s_covariance_is_not_taken() -> None:
+def _free(part: slice, sigma: float) -> np.ndarray:
     covariance = np.zeros((1, FREEDOMS, 1, FREEDOMS))
-    covariance[0, SHIFT, 0, SHIFT] = np.eye(3) * 0.003**2
+    covariance[0, part, 0, part] = np.eye(3) * sigma**2
+    return covariance
+
+
+def _step(covariance: np.ndarray, **parts: float) -> CameraStep:
+    step = np.zeros((1, FREEDOMS))
+    for name, value in parts.items():
+        step[0, {"turn": TURN, "shift": SHIFT}[name]] = value
+    return CameraStep(step, np.zeros((1, 1)), covariance)
+
+
+def test_what_goes_far_beyond_the_scene_s_covariance_is_not_taken() -> None:
+    covariance = _free(SHIFT, 0.003)
     cameras = CameraFit(Cameras(ring(1), np.zeros(1)), covariance)
     before = cameras.now.rig.master_from_colour.copy()
-    step = np.zeros((1, FREEDOMS))
-    for metres, taken in ((0.1, False), (0.005, True)):
-        step[0, SHIFT] = metres
-        assert cameras.take(CameraStep(step, np.zeros((1, 1)))) == taken
-    step[0, SHIFT] = 0.011  # with what was taken before: too far
-    assert not cameras.take(CameraStep(step, np.zeros((1, 1))))
-    np.testing.assert_allclose(
-        cameras.now.rig.master_from_colour[:, :3, 3] - before[:, :3, 3], 0.005
-    )
+    assert not cameras.take(_step(covariance, shift=0.1))
+    assert cameras.take(_step(covariance / 4, shift=0.005))
+    moved = cameras.now.rig.master_from_colour[:, :3, 3] - before[:, :3, 3]
+    np.testing.assert_allclose(moved, 0.005)
+    np.testing.assert_array_equal(cameras.covariance, covariance / 4)
+    # with what was taken before it is too far: all go back
+    assert not cameras.take(_step(covariance / 9, shift=0.011))
+    np.testing.assert_array_equal(cameras.now.rig.master_from_colour, before)
+    np.testing.assert_array_equal(cameras.covariance, covariance)
+
+
+def test_small_parts_may_be_too_much_together_or_far_away() -> None:
+    tied = _free(TURN, 0.01) + _free(SHIFT, 0.01)
+    for axis in range(3):  # a turn and a shift that hide each other
+        tied[0, axis, 0, 3 + axis] = tied[0, 3 + axis, 0, axis] = -0.9999 * 0.01**2
+    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), tied)
+    assert not cameras.take(_step(tied, turn=0.004, shift=0.004))
+    loose = _free(TURN, 0.02)
+    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), loose)
+    assert not cameras.take(_step(loose, turn=0.03))
+    indefinite = np.zeros_like(loose)
+    indefinite[0, :, 0] = np.eye(FREEDOMS)
+    indefinite[0, 0, 0, 1] = indefinite[0, 1, 0, 0] = 2.0
+    with pytest.raises(np.linalg.LinAlgError):
+        CameraFit(Cameras(ring(1), np.zeros(1)), indefinite)
 
 
 def test_a_camera_without_a_pose_says_nothing(fitter: Fitter) -> None:

@@ -6,9 +6,11 @@ small steps x of the pose where it was looked at and of the cameras' corrections
     E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
 
 with A_v the step that a correction looks like. e is what the mesh differs from the thing itself: at
-the best e the matrix of x is I - I K I, K = (I + F^-1)^-1, I = sum I_v. Frames in which the object
-is lost stay near the track's poses, as in :mod:`.object_data`; evidence that is far from its own
-pose counts little (Geman-McClure). No setting weighs E_O: its strength is the images'.
+the best e the matrix of x is I - I K I, K = (I + F^-1)^-1, I = sum I_v. I_v is stated by how far
+the views of a moment disagree; what they have in common, which the tracker adds to its covariance,
+is here the cameras' and e. Frames in which the object is lost, or whose images contradict the pose,
+stay near the track's, as in :mod:`.object_data`; evidence that is far from its own pose counts
+little (Geman-McClure). No setting weighs E_O: its strength is the images'.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.state import OBJECT, State
 from intercap_core.joint.terms.object_data import TrackedPoses
 from intercap_core.joint.terms.term import Term
-from intercap_core.object_track.constants import UNKNOWN_SIGMA
+from intercap_core.object_track.constants import CONTRADICTED_LOG_RATIO, UNKNOWN_SIGMA
 from intercap_core.object_track.evidence import PoseEvidence, views_noise
 from intercap_core.rigid.twist import step_between, twists
 from intercap_core.solve.robust import geman_mcclure_weight
@@ -68,33 +70,46 @@ class ObjectImagesData(Term):
     def refresh(self, state: State) -> None:
         """Look at the images at ``state``."""
         self._last = state
-        tracked = self._tracked
         poses = rigid(state.rotation, state.translation)
+        found = self._look(poses)
+        agree = {t: evidence for t, evidence in found.items() if not _contradicts(evidence)}
+        self._noise = views_noise(list(agree.values()))
+        tracked = self._tracked
+        self._looked = rigid(tracked.rotation, tracked.translation)
+        self._matrix = tracked.information.copy()
+        self._gradient = np.zeros((len(tracked.seen), 6))
+        self._by_cameras = {}
+        for t, evidence in agree.items():
+            self._looked[t] = poses[t]
+            self._take(t, evidence)
+
+    def contradicted(self, state: State) -> np.ndarray:
+        """Tracked frames (T,) bool whose images contradict the object's pose at ``state``."""
+        found = self._look(rigid(state.rotation, state.translation))
+        wrong = np.zeros(len(state), bool)
+        wrong[[t for t, evidence in found.items() if _contradicts(evidence)]] = True
+        return wrong
+
+    def _look(self, poses: np.ndarray) -> dict[int, PoseEvidence]:
+        """The evidence of every tracked frame at its pose (T, 4, 4)."""
+        tracked = self._tracked
         motion = twists(poses, tracked.seen, tracked.times)
         motion[tracked.resting] = 0
-        frames = np.flatnonzero(tracked.seen)
-        found = [self._images.look(int(t), poses[t], motion[t]) for t in frames]
-        self._noise = noise = views_noise(found)
-        self._looked[frames] = poses[frames]
-        self._by_cameras = {}
-        for t, evidence in zip(frames.tolist(), found, strict=True):
-            self._take(t, evidence, noise)
+        frames = np.flatnonzero(tracked.seen).tolist()
+        return {t: self._images.look(t, poses[t], motion[t]) for t in frames}
 
-    def _take(self, t: int, evidence: PoseEvidence, noise: float) -> None:
-        """Hold the frame's quadratic form, its stated variance times ``noise``."""
-        information, gradient = (
-            evidence.information.sum(0) / noise,
-            evidence.gradient.sum(0) / noise,
-        )
+    def _take(self, t: int, evidence: PoseEvidence) -> None:
+        """Hold the frame's quadratic form."""
+        information = evidence.information.sum(0) / self._noise
+        gradient = evidence.gradient.sum(0) / self._noise
         own = -np.linalg.solve(information + np.diag(UNKNOWN_SIGMA**-2), gradient)
         weight = geman_mcclure_weight(own @ information @ own, IMAGES_OUTLIER)
         information, gradient = weight * information, weight * gradient
         held = np.linalg.inv(information + np.diag(1 / self._tracked.spread[t]))  # K
         freed = np.eye(6) - information @ held
-        self._matrix = self._matrix.copy()
         self._matrix[t] = freed @ information
         self._gradient[t] = freed @ gradient
-        self._by_cameras[t] = self._seen_by(t, evidence, weight / noise, held, gradient)
+        self._by_cameras[t] = self._seen_by(t, evidence, weight / self._noise, held, gradient)
 
     def _seen_by(
         self,
@@ -169,3 +184,8 @@ class ObjectImagesData(Term):
 
     def _offset(self, state: State) -> np.ndarray:
         return step_between(self._looked, rigid(state.rotation, state.translation))
+
+
+def _contradicts(evidence: PoseEvidence) -> bool:
+    """Whether the views say that the object is not at this pose."""
+    return sum(view.log_ratio for view in evidence.reports) < CONTRADICTED_LOG_RATIO
