@@ -46,6 +46,7 @@ BY_OBJECT = {
     "p95 ": ("object_track", "object_rotation_p95_deg"),
     "contact F1": ("body_fit", "contact_f1"),
 }
+BY_OBJECT_WIDTH = 190  # columns of its table, also where a file takes it
 Areas = dict[str, Figures]
 
 
@@ -175,7 +176,7 @@ def print_sequences(evaluations: Sequence[Sequences]) -> None:
         table.title = f"sequential fits > joint, {group}"
         for name, of_object in _by_object(some).items():
             table.add_row(name, *_row(areas(of_object)))
-        console.print(table)
+        Console(width=max(console.width, BY_OBJECT_WIDTH)).print(table)
     for name in (name for measured in evaluations for name in measured.missing):
         console.print(f"{name}: no metrics", highlight=False, markup=False)
 
