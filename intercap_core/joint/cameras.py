@@ -82,11 +82,12 @@ class CameraStep:
 
 class CameraFit:
     """The cameras ``now``, from what the scene says of them: poses and biases ``start`` with their
-    ``covariance`` (C, 7, C, 7), 0 for what is held. Raises LinAlgError where that is none."""
+    ``covariance`` (C, 7, C, 7), 0 for what is held. ``refused``: corrections were, and all are
+    taken back. Raises LinAlgError where the covariance is not positive definite."""
 
     def __init__(self, start: Cameras, covariance: np.ndarray) -> None:
         self._given = start, covariance
-        self.now, self.covariance = start, covariance
+        self.now, self.covariance, self.refused = start, covariance, False
         self._away = np.zeros((len(start.rig), FREEDOMS))
         flat = covariance.reshape(self._away.size, -1)
         self._free = np.flatnonzero(flat.diagonal() > 0)
@@ -101,6 +102,7 @@ class CameraFit:
         away = self._away + found.step
         if not self._is_likely(away):
             (self.now, self.covariance), self._away = self._given, np.zeros_like(away)
+            self.refused = True
             return False
         self.now, self._away = self.now.moved(found.step), away
         self.covariance = found.covariance

@@ -102,7 +102,7 @@ def fit(
     )
 
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
-    steps, refused, settled, camera_change, refused_mm = 0, 0, False, 0.0, 0.0
+    steps, refused, settled, camera_change = 0, 0, False, 0.0
     energy_before: dict[str, float] | None = None
     energy_after: dict[str, float] = {}
     held = np.ones(len(state), bool)
@@ -130,21 +130,20 @@ def fit(
         if cameras is not None and isinstance(object_data, ObjectImagesData):
             shown = body_data.sights(state, BODY_SHARE * share), object_data.sights(state)
             found = cameras.settle(shown)
-            camera_change = found.shift
             if cameras.take(found):
+                camera_change = found.shift
                 log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
                 state = state.moved(limited(found.along))
-            else:
-                refused_mm = 1e3 * found.shift
             body_data.take_cameras(cameras.now)
             object_data.take_cameras(cameras.now)
-            if refused_mm:
-                cameras = None
+            if cameras.refused:
+                # what the cameras were until now was fitted to: at least one more round
+                cameras, camera_change, settled = None, 0.0, False
                 log.warning(
                     "body and object would move a camera by %.0f mm, far beyond what the scene "
                     "leaves open: all cameras stay as the scene has them; look at their poses, the "
                     "body and the object",
-                    refused_mm,
+                    1e3 * found.shift,
                 )
         if settled and camera_change < CAMERAS_CHANGED_M:
             break

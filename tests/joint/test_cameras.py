@@ -202,6 +202,7 @@ def test_what_goes_far_beyond_the_scene_s_covariance_is_not_taken() -> None:
     assert not cameras.take(_step(covariance / 9, shift=0.011))
     np.testing.assert_array_equal(cameras.now.rig.master_from_colour, before)
     np.testing.assert_array_equal(cameras.covariance, covariance)
+    assert cameras.refused
 
 
 def test_small_parts_may_be_too_much_together_or_far_away() -> None:
