@@ -32,9 +32,9 @@ def annotation_evidence(
 
     Regions that no interval names are annotated as free throughout: a sequence's contact is
     annotated as a whole. While some unnamed part touches (``any``), regions have no label (-1) and
-    no evidence unless they are named as well. Annotators err by ``uncertainty`` frames at an end:
-    towards it the log odds fade to zero, but not over more than half of what lies between two ends,
-    so that the middle of the shortest interval is certain.
+    no evidence unless they are named as well. Annotators err by up to ``uncertainty`` frames at an
+    end, wherever within them it is: so near to one the annotation says nothing, and what is seen
+    decides. The middle between two ends is certain, however near they are.
     """
     labels = np.zeros((frames, len(regions)), np.int8)
     for interval in sorted(intervals, key=lambda interval: interval.part != ANY_REGION):
@@ -43,17 +43,17 @@ def annotation_evidence(
             labels[during] = -1
         else:
             labels[during, regions.index(interval.part)] = 1
-    certainty = np.ones(labels.shape)
+    certain = np.ones(labels.shape, bool)
     for r in range(len(regions)):
         ends = [0, *(np.flatnonzero(np.diff(labels[:, r])) + 1), frames]
         for start, end in pairwise(ends):
             inside = np.arange(start, end) + 0.5
             begins = inside - start if start > 0 else np.full(end - start, np.inf)
             finishes = end - inside if end < frames else np.full(end - start, np.inf)
-            fade = max(min(uncertainty, (end - start) / 2), 0.5)
-            certainty[start:end, r] = np.clip(np.minimum(begins, finishes) / fade, 0.0, 1.0)
+            away = np.minimum(begins, finishes)
+            certain[start:end, r] = away > min(uncertainty, (end - start) / 2 - 1)
     sign = np.choose(labels + 1, (0.0, -1.0, 1.0))
-    return sign * certainty * ANNOTATED_LOGIT, labels
+    return sign * certain * ANNOTATED_LOGIT, labels
 
 
 def oddities(

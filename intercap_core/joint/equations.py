@@ -38,8 +38,11 @@ class NormalEquations:
 
     def step(self, damping: np.ndarray) -> np.ndarray | None:
         """The Gauss-Newton step (T, n), damped by ``damping`` (T,) of each frame, or None where the
-        matrix is not definite."""
-        matrix = torch.tensor(self.bands)
+        matrix is not definite.
+
+        It spends ``bands``, most of a long recording's memory: another step needs new equations.
+        """
+        matrix, self.bands = torch.from_numpy(self.bands), np.zeros((0, 0, 0, 0))
         damped = torch.from_numpy(damping[:, None] * self.damped)
         matrix[0].diagonal(dim1=1, dim2=2).add_(damped)
         factor = BandedSystem(matrix).factorise(in_place=True)

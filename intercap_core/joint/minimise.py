@@ -56,7 +56,8 @@ def minimise(
 
     Every frame has its own damping, which grows where the energy of a refused step rose, so that a
     frame or a term that is badly linearised holds up its neighbourhood alone. Progress is measured
-    against the round's own, since most of the energy is noise that no state explains.
+    against the round's own, since most of the energy is noise that no state explains. Refused steps
+    are rare, so equations are made anew after one rather than kept for it.
     """
     accepted, refused, gained, converged = 0, 0, 0.0, False
     damping = np.full(len(state), INITIAL_DAMPING)
@@ -66,6 +67,7 @@ def minimise(
         step = here.step(damping)
         if step is None:
             damping, refused = damping * DAMPING_UP, refused + 1
+            here = linearise(state)
             continue
         trial = state.moved(limited(step))
         there = linearise(trial)
@@ -84,6 +86,7 @@ def minimise(
             if promised < NEGLIGIBLE_SHARE * here.total and tried.max() < HELD_DAMPING:
                 converged = True
                 break
+            here = linearise(state)
             continue
         gain = here.total - there.total
         gained += gain
