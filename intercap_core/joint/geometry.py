@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from intercap_core.body.joints import NUM_JOINTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.contact.patches import Patches
@@ -17,6 +18,8 @@ from intercap_core.joint.skin import Skin
 from intercap_core.joint.state import BODY, State
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+
+_FRAMES_TOGETHER = 32  # frames whose derivatives are made at a time
 
 
 class Geometry:
@@ -84,12 +87,20 @@ class PosedGeometry:
 
     @cached_property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """The body's joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body."""
-        lin = self._geometry.model.linearise(
-            self._parameters, vertex_ids=np.zeros(0, np.int64), joints=True
-        )
-        jacobian = lin.full()[..., BODY].double().cpu().numpy()
-        return lin.joints.double().cpu().numpy(), jacobian
+        """The body's joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body, in
+        single precision."""
+        g = self._geometry
+        vector = self._parameters.vector()
+        points = np.empty((len(vector), NUM_JOINTS, 3))
+        jacobian = np.empty((*points.shape, BODY.stop), np.float32)
+        for start in range(0, len(vector), _FRAMES_TOGETHER):
+            at = slice(start, start + _FRAMES_TOGETHER)
+            lin = g.model.linearise(
+                g.model.parameters(vector[at]), vertex_ids=np.zeros(0, np.int64), joints=True
+            )
+            points[at] = lin.joints.double().cpu().numpy()
+            jacobian[at] = lin.full()[..., BODY].cpu().numpy()
+        return points, jacobian
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:

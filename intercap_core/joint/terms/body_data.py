@@ -36,6 +36,8 @@ from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets, estimate_
 
 log = logging.getLogger(__name__)
 
+_FRAMES_TOGETHER = 64  # frames whose equations are held in single precision at a time
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -106,14 +108,17 @@ class BodyData(Term):
         assert self._bridged is not None, "refresh comes first"
         pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
         shared = pose.new_zeros(0)  # nothing that all frames share is free here
-        normal = self._problem.linearise(pose, shared, self._index)
-        frames = self._fitter.frames[self._trusted]
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
-        hessian[frames] = normal.hessian.cpu().numpy()[self._trusted]
-        gradient[frames] = normal.gradient.cpu().numpy()[self._trusted]
         energy = np.zeros(len(state))
-        energy[frames] = normal.cost.double().cpu().numpy()[self._trusted]
+        for some in self._index.split(_FRAMES_TOGETHER):
+            normal = self._problem.linearise(pose[some], shared, some)
+            trusted = self._trusted[some.cpu()]
+            at = self._fitter.frames[some.cpu()][trusted]
+            hessian[at] = normal.hessian.cpu().numpy()[trusted]
+            gradient[at] = normal.gradient.cpu().numpy()[trusted]
+            energy[at] = normal.cost.double().cpu().numpy()[trusted]
+        frames = self._fitter.frames[self._trusted]
         bridged = np.setdiff1d(np.arange(len(state)), frames)
         precision = np.full(BODY.stop, BRIDGED_BODY_TURN**-2)
         precision[BODY_SHIFT] = BRIDGED_BODY_SHIFT**-2
