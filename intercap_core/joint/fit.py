@@ -117,14 +117,15 @@ def fit(
         energy_before = energy_before or minimum.energy_before
         energy_after, held = minimum.equations.energy, held & minimum.held
         log.info("%d steps, energy %.4g", steps, minimum.equations.total)
+        converged = minimum.converged
+        del minimum  # its equations are most of the memory
         previous, estimate = estimate, estimator.at(state)
         contact_change = np.abs(estimate.probability - previous.probability).max()
         settled = (
-            minimum.converged
+            converged
             and contact_change < CONTACT_CONVERGED
             and offset_change < OFFSET_CHANGED_S
         )
-        del minimum  # its equations are most of the memory
         if number == len(ROUND_STEPS):
             break
         if cameras is not None and isinstance(object_data, ObjectImagesData):
