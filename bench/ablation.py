@@ -1,4 +1,4 @@
-"""What each term of the joint fit is worth: the fit without it, held to truth.
+"""What each term of the joint fit is worth: the fit without it, or with another, held to truth.
 
     python -m bench.ablation [SETTINGS] [--sequences NAME ...] [--variants NAME ...]
         [--output results/ablation.json] [--folder results/ablation]
@@ -52,6 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "without drift": {"drift_weight": 0.0},
     "without cameras": {"refine_cameras": False},
     "without renewed images": {"look_again": False, "refine_cameras": False},
+    "contact to annotated vertices": {"contact_to": "annotated"},
 }
 
 

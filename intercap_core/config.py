@@ -161,6 +161,9 @@ class JointSettings(Model):
 
     contact_weight: Annotated[float, Field(ge=0)] = 1.0
     """Weight of contact (lambda_Q)."""
+    contact_to: Literal["any", "annotated"] = "any"
+    """What touching skin is drawn to: any point of the object (the paper's appendix), or what the
+    object's ``contact_vertices`` span (its text). Contact is found on all of it with both."""
     stick_weight: Annotated[float, Field(ge=0)] = 1.0
     """Weight of held skin not sliding over the object (without a symbol in equation 6)."""
     plant_weight: Annotated[float, Field(ge=0)] = 1.0
@@ -185,6 +188,15 @@ class JointSettings(Model):
     annotation_uncertainty_frames: Annotated[int, Field(ge=0, le=100)] = 5
     """Frames by which annotators err at the ends of an interval of contact: within them what is
     seen may move the ends."""
+
+    def check_object(self, entry: ObjectEntry) -> str:
+        """What these settings need and the object's entry lacks, "" = nothing."""
+        if self.contact_to == "annotated" and entry.contact_vertices is None:
+            return (
+                f"object {entry.name!r} has no contact_vertices, which joint.contact_to: annotated "
+                "needs; name its list there, or set joint.contact_to to any"
+            )
+        return ""
 
 
 class MetricsSettings(Model):

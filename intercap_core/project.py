@@ -171,6 +171,9 @@ def _check_files(project: Project) -> None:
                     f"{tidy(project.path.parent / project.config.objects)}: object {name!r} has "
                     f"{field} {file}, and there is no such file; correct the path"
                 )
+        problem = project.config.joint.check_object(entry)
+        if problem:
+            raise UserError(f"{tidy(project.path.parent / project.config.objects)}: {problem}")
     for field, file in project.config.body_models:
         if isinstance(file, Path) and not file.is_file():
             raise UserError(

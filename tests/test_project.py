@@ -111,6 +111,10 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
     ),
     (settings("dataset: x\nexclude: [three]\n"), ["exclude", "'three'"]),
     (
+        settings("dataset: x\njoint: {contact_to: annotated}\n"),
+        ["objects.yaml", "'cup'", "no contact_vertices", "joint.contact_to to any"],
+    ),
+    (
         settings("dataset: x\nbody_models: {female: SMPLX_FEMALE.npz}\n"),
         ["config.yaml", "body_models.female", "SMPLX_FEMALE.npz", "no such file"],
     ),

@@ -42,6 +42,7 @@ differences from the paper are in ``docs/equations.md``.
 | 6 | E_O, the track for them | joint/terms/object_data.py | ObjectData | joint.look_again |
 | 6, A.4 | E_C: residuals | energy/contact.py | term | joint.contact_weight |
 | 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
+| 6, A.4 | E_C: to any or annotated points | energy/proximity.py | proximity | joint.contact_to |
 | 6 | Q_t given | contact/annotated.py | annotation_evidence | joint.annotation_uncertainty_frames |
 | beyond | Q_t found | contact/detect.py | contact_probability | joint.detect_contact |
 | beyond | stick: points on the object | energy/stick.py | local_points | joint.stick_weight |

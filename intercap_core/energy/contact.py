@@ -3,9 +3,12 @@
     E_C = CD( H(W(body)), H'(W'(object)) )
 
 CD is the Chamfer distance between H, the body's likely-contact vertices, and H', their closest
-points on the object: the signed distances of :mod:`.proximity`. Equation 6 weighs it by the binary
-Q_t (here the probability that a region touches) times lambda_Q, and adds an E_C without Q_t, which
-is left out: a body that does not touch is not drawn to the object.
+points on the object: the signed distances of :mod:`.proximity`. By the appendix these are of the
+whole object, by the paper's text of the vertices labelled as likely touched: the setting
+``joint.contact_to``, where the latter are the faces between them, as vertices of a mesh may be
+centimetres apart. Equation 6 weighs it by the binary Q_t (here the probability that a region
+touches) times lambda_Q, and adds an E_C without Q_t, which is left out: a body that does not touch
+is not drawn to the object.
 
 Beyond the paper each region is cut into patches (a palm, each finger, a sole). The nearest patches
 carry the weight, within a patch the nearest vertices, and a patch that is far is an outlier

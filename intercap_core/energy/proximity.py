@@ -1,5 +1,7 @@
-"""Signed distances of body points to the moving object, with derivatives: shared by E_C of equation
-6 (A.4) and the term of body in object, which goes beyond it.
+"""Signed distances of body points to the moving object, with derivatives.
+
+Shared by E_C of equation 6 (A.4) and the term of body in object, which goes beyond it. E_C may ask
+for those to the part of the surface that is annotated as likely touched.
 
 d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
 from q to x. Both terms are functions of this one distance.
@@ -8,13 +10,21 @@ from q to x. Both terms are functions of this one distance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from intercap_core.energy.constants import ON_SURFACE
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.distance import Closest
 
 _FRAMES_TOGETHER = 32  # what is between the points and the result is kept of so many at a time
+
+
+class Surface(Protocol):
+    """An object's surface, or a part of it."""
+
+    def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
+        """Which of points (N, 3) of its frame are inside, and its closest points."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,7 @@ class Proximity:
 
 
 def proximity(
-    field: DistanceField,
+    surface: Surface,
     points: np.ndarray,
     rotation: np.ndarray,
     translation: np.ndarray,
@@ -47,13 +57,13 @@ def proximity(
     for start in range(0, len(points), _FRAMES_TOGETHER):
         at = slice(start, start + _FRAMES_TOGETHER)
         found.distance[at], found.normals[at], found.by_object[at] = _proximity(
-            field, points[at], rotation[at], translation[at]
+            surface, points[at], rotation[at], translation[at]
         )
     return found
 
 
 def _proximity(
-    field: DistanceField,
+    surface: Surface,
     points: np.ndarray,
     rotation: np.ndarray,
     translation: np.ndarray,
@@ -62,7 +72,7 @@ def _proximity(
     frames, count = points.shape[:2]
     local = (points - translation[:, None]) @ rotation
     flat = local.reshape(-1, 3)
-    inside, closest = field.boundary(flat)
+    inside, closest = surface.boundary(flat)
     offset = flat - closest.points
     length = np.linalg.norm(offset, axis=1)
     sign = np.where(inside, -1.0, 1.0)

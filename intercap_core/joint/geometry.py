@@ -12,7 +12,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.contact.patches import Patches
 from intercap_core.energy import smoothness
-from intercap_core.energy.proximity import Proximity, proximity
+from intercap_core.energy.proximity import Proximity, Surface, proximity
 from intercap_core.joint.constants import OBJECT_ARM
 from intercap_core.joint.skin import Skin
 from intercap_core.joint.state import BODY, State
@@ -31,8 +31,11 @@ class Geometry:
         mesh: ObjectMesh,
         field: DistanceField,
         patches: Patches,
+        touched: Surface | None = None,
     ) -> None:
+        """``touched`` is what contact draws skin to, None = the whole surface."""
         self.model, self.mesh, self.field, self.patches = model, mesh, field, patches
+        self.touched = touched
         self.skin = Skin.select(model, patches)
         self.moments = smoothness.moment_points(mesh.vertices, OBJECT_ARM)
         self._last: PosedGeometry | None = None
@@ -73,6 +76,14 @@ class PosedGeometry:
         """Distance of the N skin vertices to the object."""
         state = self.state
         return proximity(self._geometry.field, self.skin, state.rotation, state.translation)
+
+    @cached_property
+    def touching(self) -> Proximity:
+        """Distance of the N skin vertices to what contact draws them to."""
+        touched, state = self._geometry.touched, self.state
+        if touched is None:
+            return self.proximity
+        return proximity(touched, self.skin, state.rotation, state.translation)
 
     def skin_by_body(self, frames: slice, index: np.ndarray, axes: np.ndarray) -> np.ndarray:
         """Derivative (F, K, R, 168) by the body in ``frames``, of the skin vertices ``index`` (K,)

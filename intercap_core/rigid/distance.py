@@ -24,6 +24,8 @@ _DIRECTIONS = np.array(
     [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
      [0.41, 0.53, -0.74]]
 )  # fmt: skip
+# Distances that differ by less are those to the same point, metres: float32 at an object's size.
+_SAME_PLACE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,46 @@ class DistanceField:
     def closest(self, points: np.ndarray) -> Closest:
         """The closest surface points of points (N, 3)."""
         return _closest(self._scene, points)
+
+
+class SurfacePart:
+    """Distances to a part of a mesh's surface: what its vertices ``part`` (K,) span.
+
+    That is every face whose corners all belong to the part, and around a vertex that has no such
+    face all of its faces. ``whole`` says what is inside the object.
+    """
+
+    def __init__(
+        self, whole: DistanceField, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray
+    ) -> None:
+        corners = np.isin(faces, part)
+        spanned = corners.all(axis=1)
+        alone = np.setdiff1d(part, faces[spanned])
+        spanned |= np.isin(faces, alone).any(axis=1)
+        if not spanned.any():
+            raise ValueError(f"vertices {part.tolist()} are corners of no face")
+        self._whole = whole
+        self._scene = _scene(
+            np.ascontiguousarray(vertices, np.float32),
+            np.ascontiguousarray(faces[spanned], np.uint32),
+            threads=0,
+        )
+        self._face = np.flatnonzero(spanned).astype(np.int32)
+
+    def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
+        """Which of points (N, 3) are inside the object just below the part, and its closest point.
+
+        Inside the object but nearer to another part of its surface counts as outside: there the
+        distance to this part is no depth.
+        """
+        inside, nearest = self._whole.boundary(points)
+        found = _closest(self._scene, points)
+        query = np.reshape(points, (-1, 3))
+        way = np.linalg.norm(query - found.points, axis=1)
+        depth = np.linalg.norm(query - nearest.points, axis=1)
+        faces = self._face[found.faces]
+        below = inside & (way < depth + _SAME_PLACE)
+        return below, Closest(found.points, faces, found.barycentric, found.normals)
 
 
 class _OpenSurface:

@@ -44,7 +44,7 @@ from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.distance import DistanceField, SurfacePart
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, PERSON, SCENE
 
@@ -88,6 +88,9 @@ def run(
     None where contact is to be detected from the geometry. Raises UserError where an artefact or
     the mesh cannot be used.
     """
+    problem = settings.check_object(object_)
+    if problem:
+        raise UserError(problem)
     mesh = ObjectMesh.load(object_)
     with (
         artefacts.read(body_fit, BODY_FIT) as body,
@@ -121,7 +124,7 @@ def run(
             )
             images = ObjectImages(seen, mesh, track_settings, object_.labels)
         fitted = fit(
-            Geometry(model, mesh, field, contact_patches(model)),
+            Geometry(model, mesh, field, contact_patches(model), _touched(mesh, field, settings)),
             sequential,
             body_data,
             floor=floor,
@@ -153,6 +156,13 @@ def run(
         _put(writer, fitted)
         writer.put("hand_undetermined", sequential.flags.hands | _hands_of_few_views(person))
         _put_cameras(writer, cameras)
+
+
+def _touched(mesh: ObjectMesh, field: DistanceField, settings: JointSettings) -> SurfacePart | None:
+    """What contact draws skin to; None = any point of the object."""
+    if settings.contact_to == "any":
+        return None
+    return SurfacePart(field, mesh.vertices, mesh.faces, mesh.contact_vertices)
 
 
 def _floor(scene: Artefact) -> Ground | None:

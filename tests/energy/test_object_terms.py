@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.energy import contact, ground, penetration, smoothness
 from intercap_core.energy.constants import PENETRATION_TOLERANCE
 from intercap_core.energy.proximity import proximity
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.distance import DistanceField, SurfacePart
 
 RNG = np.random.default_rng(3)
 
@@ -31,9 +31,14 @@ def test_distance_to_a_moved_sphere_is_its_closed_form(sphere):
     np.testing.assert_allclose(near.distance, expected, atol=5e-4)  # facets of the icosphere
 
 
-def test_distance_derivatives_match_finite_differences():
+@pytest.mark.parametrize("annotated", [False, True])
+def test_distance_derivatives_match_finite_differences(annotated):
+    """Of the whole surface, and of its upper side."""
     box = trimesh.creation.box((0.2, 0.3, 0.1))
     field = DistanceField(box.vertices, box.faces)
+    if annotated:
+        upper = np.flatnonzero(box.vertices[:, 2] > 0)
+        field = SurfacePart(field, box.vertices, box.faces, upper)
     rotation, translation = _poses(3)
     points = translation[:, None] + RNG.normal(scale=0.15, size=(3, 40, 3))
     near = proximity(field, points, rotation, translation)

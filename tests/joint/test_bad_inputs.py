@@ -74,8 +74,8 @@ class Held:
         axis = np.linalg.svd(body - body.mean(0), full_matrices=False)[2][0]
         return axis * np.sign(axis @ along)
 
-    def run(self) -> Joint:
-        """The joint stage's artefact."""
+    def run(self, **settings: str) -> Joint:
+        """The joint stage's artefact, with other ``settings`` where they are given."""
         output = self.paths["scene"].parent / "joint.h5"
         joint.run(
             **self.paths,
@@ -84,7 +84,7 @@ class Held:
             subject=SUBJECT,
             body_models=BodyModels(),
             detections=output.with_name("detections.h5"),  # not read: the ball is in no image
-            settings=JointSettings(look_again=False, refine_cameras=False),
+            settings=JointSettings(look_again=False, refine_cameras=False, **settings),
             body_settings=SETTINGS,
             track_settings=ObjectTrackSettings(),
         )
@@ -269,6 +269,14 @@ def test_a_hand_that_nothing_determines_is_told_and_not_flagged(
     found = held.run()
     assert found["hand_undetermined"].tolist() == [[False, False], [False, True], [True, True]]
     assert not found["flagged"][1]
+
+
+def test_contact_to_annotated_vertices_that_the_object_has_not(held: Held, tmp_path: Path) -> None:
+    here = held.copy(tmp_path)
+    assert here.entry.contact_vertices is None
+    with pytest.raises(UserError, match=r"has no contact_vertices.*set joint.contact_to to any"):
+        here.run(contact_to="annotated")
+    assert not (tmp_path / "joint.h5").exists()
 
 
 @pytest.mark.parametrize("subdivisions", [2, 4])

@@ -17,7 +17,7 @@ from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData, TrackedPoses
 from intercap_core.joint.terms.term import Term
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.distance import DistanceField, SurfacePart
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import CONTACT_REGIONS
@@ -71,9 +71,11 @@ class _Scene:
         start=None,
         still=False,
         settings=None,
+        part=None,
     ) -> None:
         field = DistanceField(box.vertices, box.faces)
-        self.geometry = Geometry(model, box, field, contact_patches(model))
+        touched = None if part is None else SurfacePart(field, box.vertices, box.faces, part)
+        self.geometry = Geometry(model, box, field, contact_patches(model), touched)
         self.probability = np.zeros((len(state), len(CONTACT_REGIONS)))
         self.probability[:, list(touching)] = 1
         contact = Contact(self.geometry, 1.0)
@@ -166,6 +168,25 @@ def test_contact_closes_a_gap_between_hand_and_object(model, box):
     assert problem.distance(state)[:, hand].min() > 0.011
     after = problem.distance(minimum.state)[:, hand]
     assert (np.abs(after.min(axis=1)) < 0.004).all()
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_contact_draws_to_the_part_that_is_annotated(model, box, side):
+    """A hand above the box closes the gap to an annotated top, and comes nearer to an annotated
+    bottom; the distances that contact is found by are those to any point."""
+    state = _state(model, 0.012)
+    tracked = _tracked(state, 0.02, np.zeros(FRAMES, bool))
+    part = np.flatnonzero(side * box.vertices[:, 1] > 0)
+    data = (_Hold(state, 0.02), ObjectData(tracked))
+    scene = _Scene(model, box, state, data=data, touching=[LEFT_HAND], part=part)
+    posed = scene.geometry.at(state)
+    hand = scene.geometry.skin.patch[scene.geometry.patches.region == LEFT_HAND]
+    assert posed.proximity.distance[:, hand].min() == pytest.approx(0.012, abs=1e-3)
+    expected = 0.012 if side > 0 else 0.112
+    assert posed.touching.distance[:, hand].min() == pytest.approx(expected, abs=1e-3)
+    after = minimise(scene.problem.equations, state, max_steps=8).state
+    nearest = scene.geometry.at(after).touching.distance[:, hand].min(axis=1)
+    assert (nearest < (0.004 if side > 0 else expected - 0.005)).all()
 
 
 def test_penetration_is_pushed_out(model, box):

@@ -1,9 +1,10 @@
 """Signed distances against closed forms."""
 
 import numpy as np
+import pytest
 import trimesh
 
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.rigid.distance import DistanceField, SurfacePart
 
 
 def test_box_against_the_closed_form():
@@ -99,3 +100,49 @@ def test_a_tenth_of_the_faces_may_be_missing():
     found = -field.signed_distance(points)
     assert (np.sign(found) != np.sign(true)).mean() < 0.002
     np.testing.assert_allclose(found, true, atol=0.006)
+
+
+def test_a_part_that_is_all_of_a_surface_is_that_surface():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.11)
+    field = DistanceField(ball.vertices, ball.faces)
+    part = SurfacePart(field, ball.vertices, ball.faces, np.arange(len(ball.vertices)))
+    points = np.random.default_rng(3).normal(size=(1000, 3)) * 0.1
+    below, found = part.boundary(points)
+    inside, expected = field.boundary(points)
+    np.testing.assert_array_equal(below, inside)
+    np.testing.assert_equal(vars(found), vars(expected))
+
+
+def test_distances_to_the_top_of_a_box():
+    """Of what is inside only what is nearest to the top is below it."""
+    half = np.array([0.2, 0.1, 0.05])
+    box = trimesh.creation.box(2 * half)
+    top = np.flatnonzero(box.vertices[:, 2] > 0)
+    field = DistanceField(box.vertices, box.faces)
+    points = np.random.default_rng(4).uniform(-0.3, 0.3, (5000, 3))
+    below, found = SurfacePart(field, box.vertices, box.faces, top).boundary(points)
+    expected = np.column_stack(
+        [np.clip(points[:, :2], -half[:2], half[:2]), np.full(len(points), half[2])]
+    )
+    np.testing.assert_allclose(found.points, expected, atol=1e-6)
+    assert (np.asarray(box.vertices)[np.asarray(box.faces)[found.faces]][..., 2] > 0).all()
+    room = half - np.abs(points)  # to the nearest side along each axis
+    inside = (room > 0).all(1)
+    assert below.any() and (inside & ~below).any()
+    np.testing.assert_array_equal(
+        below, inside & (points[:, 2] > 0) & (room[:, 2] <= room[:, :2].min(1))
+    )
+
+
+def test_a_vertex_without_a_face_of_its_own_part_stands_for_those_around_it():
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    field = DistanceField(box.vertices, box.faces)
+    part = SurfacePart(field, box.vertices, box.faces, np.array([5]))
+    around = (np.asarray(box.faces) == 5).any(1)
+    only = DistanceField(box.vertices, np.asarray(box.faces)[around])
+    points = np.random.default_rng(5).normal(size=(200, 3)) * 0.2
+    found = part.boundary(points)[1]
+    np.testing.assert_allclose(found.points, only.closest(points).points, atol=1e-9)
+    assert around[found.faces].all()
+    with pytest.raises(ValueError, match="no face"):
+        SurfacePart(field, box.vertices, np.asarray(box.faces)[~around], np.array([5]))

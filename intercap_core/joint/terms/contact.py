@@ -1,7 +1,8 @@
 """Contact: Q_t E_C of equation 6 (A.4), weighed by lambda_Q (setting ``contact_weight``).
 
 The residuals, and what differs from the paper, are in :mod:`intercap_core.energy.contact`. The
-paper's binary Q_t is the probability that each region touches, annotated or detected.
+paper's binary Q_t is the probability that each region touches, annotated or detected. The setting
+``contact_to`` says what skin is drawn to: any point of the object, or its annotated part.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Contact(Term):
     def refresh(self, state: State) -> None:
         """Take anew which vertices carry the contact."""
         patches = self._geometry.patches
-        distance = self._geometry.at(state).proximity.distance[:, self._geometry.skin.patch]
+        distance = self._geometry.at(state).touching.distance[:, self._geometry.skin.patch]
         self._shares = contact.shares(distance, patches.patch, patches.region_of_patch)
 
     def add(self, state: State, equations: NormalEquations) -> None:
@@ -52,7 +53,8 @@ class Contact(Term):
         assert self._probability is not None, "take_probability comes first"
         patches, at_patch = self._geometry.patches, self._geometry.skin.patch
         posed = self._geometry.at(state)
-        distance = posed.proximity.distance
+        near = posed.touching
+        distance = near.distance
         touch, weight, energy = contact.term(
             distance[:, at_patch],
             patches.patch,
@@ -61,4 +63,4 @@ class Contact(Term):
         )
         residual, weights = np.zeros_like(distance), np.zeros_like(distance)
         residual[:, at_patch], weights[:, at_patch] = touch, weight * self._scale
-        add_distances(self.name, posed, residual, weights, energy * self._scale, equations)
+        add_distances(self.name, posed, near, residual, weights, energy * self._scale, equations)

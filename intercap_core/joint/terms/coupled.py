@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.energy import stick
+from intercap_core.energy.proximity import Proximity
 from intercap_core.energy.smoothness import RATE
 from intercap_core.joint.equations import NormalEquations, Rows
 from intercap_core.joint.geometry import PosedGeometry
@@ -14,17 +15,17 @@ from intercap_core.joint.state import ALL
 def add_distances(
     name: str,
     posed: PosedGeometry,
+    near: Proximity,
     residual: np.ndarray,
     weight: np.ndarray,
     energy: np.ndarray | None,
     equations: NormalEquations,
 ) -> None:
-    """Add rows of the N skin vertices' distances to the object.
+    """Add rows of the N skin vertices' distances ``near`` to the object.
 
     ``residual`` (T, N) metres, whose derivative is that of the distance wherever ``weight`` (T, N),
     1/m^2, is not 0; ``energy`` (T,) that of a robust term, None for plain least squares.
     """
-    near = posed.proximity
 
     def rows(frames: slice, index: np.ndarray) -> np.ndarray:
         normals = near.normals[frames, index, None]

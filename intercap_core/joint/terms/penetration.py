@@ -28,5 +28,6 @@ class Penetration(Term):
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add the depths at ``state``."""
         posed = self._geometry.at(state)
-        depth, weight = penetration.weights(posed.proximity.distance, self._geometry.skin.share)
-        add_distances(self.name, posed, depth, weight * self._scale, None, equations)
+        near = posed.proximity
+        depth, weight = penetration.weights(near.distance, self._geometry.skin.share)
+        add_distances(self.name, posed, near, depth, weight * self._scale, None, equations)
