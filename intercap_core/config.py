@@ -174,6 +174,9 @@ class JointSettings(Model):
     """Weight of body and object not entering each other (without a symbol in equation 6)."""
     body_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the body's smooth motion (lambda_S)."""
+    lemo: Path | None = None
+    """Folder of LEMO's release: the body's smooth motion is then that of its motion encoder, for
+    recordings at 30 frames a second. Without, small accelerations of the joints."""
     object_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the object's small acceleration (lambda_A)."""
     drift_weight: Annotated[float, Field(ge=0)] = 1.0
@@ -188,6 +191,17 @@ class JointSettings(Model):
     annotation_uncertainty_frames: Annotated[int, Field(ge=0, le=100)] = 5
     """Frames by which annotators err at the ends of an interval of contact: within them what is
     seen may move the ends."""
+
+    @property
+    def lemo_files(self) -> tuple[Path, Path] | None:
+        """Weights and statistics of LEMO's encoder of smooth motion, where its release has them."""
+        if self.lemo is None:
+            return None
+        statistics = "preprocess_stats_smooth_withHand_global_markers.npz"
+        return (
+            self.lemo / "runs" / "15217" / "Enc_last_model.pkl",
+            self.lemo / "preprocess_stats" / statistics,
+        )
 
     def check_object(self, entry: ObjectEntry) -> str:
         """What these settings need and the object's entry lacks, "" = nothing."""

@@ -142,6 +142,7 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
         update={
             "body_models": _absolute(config.body_models, path.parent),
             "detections": _absolute(config.detections, path.parent),
+            "joint": _absolute(config.joint, path.parent),
         }
     )
     project = Project(config, path, sequences, subjects, objects)
@@ -179,6 +180,13 @@ def _check_files(project: Project) -> None:
             raise UserError(
                 f"{project.path}: body_models.{field} is {file}, and there is no such file; "
                 "correct the path, or remove the line to use what is open"
+            )
+    for file in project.config.joint.lemo_files or ():
+        if not file.is_file():
+            raise UserError(
+                f"{project.path}: joint.lemo is {project.config.joint.lemo}, and there is no file "
+                f"{file}; name the folder of LEMO's release, or remove the line for small "
+                "accelerations of the joints"
             )
     _check_bodies(project)
     _check_detectors(project)

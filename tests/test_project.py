@@ -111,6 +111,10 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
     ),
     (settings("dataset: x\nexclude: [three]\n"), ["exclude", "'three'"]),
     (
+        settings("dataset: x\njoint: {lemo: LEMO}\n"),
+        ["config.yaml", "joint.lemo", "LEMO/runs/15217/Enc_last_model.pkl", "no file"],
+    ),
+    (
         settings("dataset: x\njoint: {contact_to: annotated}\n"),
         ["objects.yaml", "'cup'", "no contact_vertices", "joint.contact_to to any"],
     ),

@@ -28,10 +28,15 @@ class Fault:
 
 
 def check_bodies(project: Project) -> None:
-    """Open the body files and the pose prior that the settings name.
+    """Open the body files and the priors of pose and motion that the settings name.
 
     Raises UserError where one cannot be used: every sequence would fail by it, hours later.
     """
+    lemo = project.config.joint.lemo_files
+    if lemo is not None:
+        from intercap_core.body.lemo import MotionEncoder
+
+        MotionEncoder.load(*lemo)
     models = project.config.body_models
     genders = {project.subjects[row.subject].gender for row in project.sequences.values()}
     files = sorted({path for gender in genders if (path := models.of(gender)) is not None})

@@ -55,6 +55,8 @@ differences from the paper are in ``docs/equations.md``.
 | 6, A.5 | E_G | joint/terms/ground.py | BodyGround | joint.ground_weight |
 | 6, A.6 | E_G' | joint/terms/ground.py | ObjectGround | joint.ground_weight |
 | 6, A.1 | E_S | joint/terms/motion.py | BodyMotion | joint.body_smoothness |
+| 6, A.1 | E_S with LEMO's encoder | joint/terms/learned_motion.py | LearnedMotion | joint.lemo |
+| A.2 | F_S: LEMO's encoder | body/lemo.py | MotionEncoder | same |
 | 6, A.3 | E_A: residuals | energy/smoothness.py | accelerations | joint.object_smoothness |
 | 6, A.3 | E_A | joint/terms/motion.py | ObjectMotion | joint.object_smoothness |
 | beyond | drift of the body | joint/terms/drift.py | BodyDrift | joint.drift_weight |

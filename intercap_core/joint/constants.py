@@ -57,6 +57,12 @@ UNTRACKED_SIGMA = 0.5
 BODY_ACCELERATION = 6.0
 FINGER_ACCELERATION = 10.0
 OBJECT_ACCELERATION = 6.0
+# Steps of the motion that says how strong and how steep a learned prior of it is, and iterations in
+# which the steepest direction is found.
+PROBE_STEPS, SPECTRAL_ITERATIONS = 16, 5
+# A recording whose rate differs by more than this share from that of a learned prior shows it other
+# motion: AMASS, on which LEMO's was trained, holds walks that differ by more among themselves.
+MAX_RATE_ERROR = 0.1
 # Turns are as smooth as those of a thing of this radius, metres: hands turn what they hold with
 # 20 rad/s^2 where they move it with 6 m/s^2. Tuned on the studio.
 OBJECT_ARM = 0.3

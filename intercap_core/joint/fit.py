@@ -33,6 +33,7 @@ from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
+from intercap_core.joint.terms.term import Term
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
 
 log = logging.getLogger(__name__)
@@ -69,12 +70,14 @@ def fit(
     intervals: Sequence[ContactInterval] | None,
     images: ObjectImages | None = None,
     cameras: CameraFit | None = None,
+    motion: Term | None = None,
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
     ``intervals`` are the annotated contacts, None where contact is to be detected. Without
     ``images`` the object's track stands for them; without ``cameras`` these stay as they are. A
-    ``floor`` that the sequential fits contradict is left out, which flags every frame.
+    ``floor`` that the sequential fits contradict is left out, which flags every frame. ``motion``
+    is a learned E_S.
     """
     state = sequential.state
     against_floor = contradiction(geometry, sequential, floor) if floor else ""
@@ -98,6 +101,7 @@ def fit(
             floor=floor,
             fps=fps,
             trust=sequential.trust,
+            motion=motion,
         )
     )
 

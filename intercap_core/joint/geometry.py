@@ -88,9 +88,14 @@ class PosedGeometry:
     def skin_by_body(self, frames: slice, index: np.ndarray, axes: np.ndarray) -> np.ndarray:
         """Derivative (F, K, R, 168) by the body in ``frames``, of the skin vertices ``index`` (K,)
         along ``axes`` (F, K, R, 3)."""
-        g = self._geometry
-        parameters = g.model.parameters(self._parameters.vector()[frames])
-        lin = g.model.linearise(parameters, vertex_ids=g.skin.vertices[index])
+        return self.vertices_by_body(frames, self._geometry.skin.vertices[index], axes)
+
+    def vertices_by_body(self, frames: slice, ids: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Derivative (F, K, R, 168) by the body in ``frames``, of its vertices ``ids`` (K,) along
+        ``axes`` (F, K, R, 3)."""
+        model = self._geometry.model
+        parameters = model.parameters(self._parameters.vector()[frames])
+        lin = model.linearise(parameters, vertex_ids=ids)
         along = torch.as_tensor(
             np.ascontiguousarray(axes), dtype=lin.points.dtype, device=lin.points.device
         )

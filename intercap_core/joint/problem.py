@@ -53,11 +53,13 @@ def joint_terms(
     floor: Ground | None,
     fps: float,
     trust: Trust,
+    motion: Term | None = None,
 ) -> tuple[Term, ...]:
     """All terms of equation 6 and what goes beyond it, in the order in which they are added.
 
     ``sequential`` is the state of the sequential fits; ``data`` are E_B and E_O; ``floor`` is None
-    where none was seen: then nothing keeps body or object above it.
+    where none was seen: then nothing keeps body or object above it. ``motion`` takes the place of
+    the joints' small accelerations.
     """
     return (
         *data,
@@ -66,7 +68,7 @@ def joint_terms(
         Penetration(geometry, settings.penetration_weight),
         *((BodyGround(geometry, floor, settings.ground_weight),) if floor else ()),
         Plant(geometry, floor, fps, settings.plant_weight),
-        BodyMotion(geometry, fps, settings.body_smoothness),
+        motion or BodyMotion(geometry, fps, settings.body_smoothness),
         BodyDrift(geometry, sequential, fps, trust.body, settings.drift_weight),
         ObjectMotion(geometry, fps, settings.object_smoothness),
         ObjectDrift(geometry, sequential, fps, trust.object_, trust.still, settings.drift_weight),

@@ -17,6 +17,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
+from intercap_core.body.lemo import FEWEST_FRAMES, FRAMES_PER_SECOND, MotionEncoder
 from intercap_core.body.model import BodyModel
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
@@ -34,7 +35,7 @@ from intercap_core.contact.patches import contact_patches
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
-from intercap_core.joint.constants import FEW_HAND_VIEWS
+from intercap_core.joint.constants import FEW_HAND_VIEWS, MAX_RATE_ERROR
 from intercap_core.joint.fit import JointFit, fit
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.object_images import ObjectImages
@@ -42,6 +43,7 @@ from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.ground import Ground
+from intercap_core.joint.terms.learned_motion import LearnedMotion
 from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.rigid.distance import DistanceField, SurfacePart
@@ -98,6 +100,7 @@ def run(
         artefacts.read(scene, SCENE) as source,
     ):
         model = load_model(body_models, str(body.attributes["gender"]), body, device=device)
+        encoder = _motion_encoder(settings, source, model)
         sequential = SequentialFits.read(body, track, source)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
         body_data = BodyData.load(
@@ -113,7 +116,12 @@ def run(
         floor, prior = _floor(source), _offset_prior(source)
         fps = float(source.attributes["fps"])
         cameras = _cameras(source)
+        up = source["ground_normal"]
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+    geometry = Geometry(model, mesh, field, contact_patches(model), _touched(mesh, field, settings))
+    motion = None
+    if encoder is not None:
+        motion = LearnedMotion(geometry, encoder, up, settings.body_smoothness)
     with Frames.open(frames) as recording:
         images = None
         if settings.refine_cameras and not settings.look_again:
@@ -124,7 +132,7 @@ def run(
             )
             images = ObjectImages(seen, mesh, track_settings, object_.labels)
         fitted = fit(
-            Geometry(model, mesh, field, contact_patches(model), _touched(mesh, field, settings)),
+            geometry,
             sequential,
             body_data,
             floor=floor,
@@ -134,6 +142,7 @@ def run(
             intervals=contact,
             images=images,
             cameras=cameras if images and settings.refine_cameras else None,
+            motion=motion,
         )
     for odd in fitted.contact.oddities:
         first, last = odd.frames.start, max(odd.frames.start, odd.frames.stop - 1)
@@ -156,6 +165,35 @@ def run(
         _put(writer, fitted)
         writer.put("hand_undetermined", sequential.flags.hands | _hands_of_few_views(person))
         _put_cameras(writer, cameras)
+
+
+def _motion_encoder(
+    settings: JointSettings, scene: Artefact, model: BodyModel
+) -> MotionEncoder | None:
+    """The learned E_S that the settings name; None = small accelerations of the joints.
+
+    Raises UserError for files that hold none and for recordings that it is not for.
+    """
+    if settings.lemo_files is None:
+        return None
+    frames, fps = len(scene["times"]), float(scene.attributes["fps"])
+    problem = ""
+    if frames < FEWEST_FRAMES:
+        problem = f"has {frames} frames, and LEMO's encoder needs {FEWEST_FRAMES} or more"
+    elif abs(fps / FRAMES_PER_SECOND - 1) > MAX_RATE_ERROR:
+        problem = (
+            f"has {fps:g} frames a second, and LEMO's encoder knows steps of motion at "
+            f"{FRAMES_PER_SECOND:g}"
+        )
+    elif not scene.attributes["ground_found"]:
+        problem = "has no ground, and LEMO's encoder must know what is up; annotate the ground"
+    if problem:
+        raise UserError(
+            f"{scene.path}: sequence {scene.attributes['sequence']!r} {problem}; or leave "
+            "joint.lemo out for small accelerations of the joints"
+        )
+    weights, statistics = settings.lemo_files
+    return MotionEncoder.load(weights, statistics, device=model.device)
 
 
 def _touched(mesh: ObjectMesh, field: DistanceField, settings: JointSettings) -> SurfacePart | None:

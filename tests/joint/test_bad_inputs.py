@@ -25,6 +25,7 @@ from intercap_core.errors import UserError
 from intercap_core.rigid.contact_vertices import contact_list
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, OBJECT_TRACK
 from intercap_core.stages import joint
+from tests.helpers.lemo_release import write_release
 from tests.stages.test_body_fit import SETTINGS, SUBJECT, Capture
 
 FRAMES = 6
@@ -74,7 +75,7 @@ class Held:
         axis = np.linalg.svd(body - body.mean(0), full_matrices=False)[2][0]
         return axis * np.sign(axis @ along)
 
-    def run(self, **settings: str) -> Joint:
+    def run(self, **settings: object) -> Joint:
         """The joint stage's artefact, with other ``settings`` where they are given."""
         output = self.paths["scene"].parent / "joint.h5"
         joint.run(
@@ -84,7 +85,9 @@ class Held:
             subject=SUBJECT,
             body_models=BodyModels(),
             detections=output.with_name("detections.h5"),  # not read: the ball is in no image
-            settings=JointSettings(look_again=False, refine_cameras=False, **settings),
+            settings=JointSettings.model_validate(
+                {"look_again": False, "refine_cameras": False, **settings}
+            ),
             body_settings=SETTINGS,
             track_settings=ObjectTrackSettings(),
         )
@@ -277,6 +280,46 @@ def test_contact_to_annotated_vertices_that_the_object_has_not(held: Held, tmp_p
     with pytest.raises(UserError, match=r"has no contact_vertices.*set joint.contact_to to any"):
         here.run(contact_to="annotated")
     assert not (tmp_path / "joint.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"fps": 15.0}, ["has 15 frames a second", "motion at 30"]),
+        ({"ground_found": False}, ["has no ground", "what is up"]),
+        ({}, ["Enc_last_model.pkl does not exist"]),
+    ],
+)
+def test_recordings_and_folders_that_a_learned_motion_is_not_for(
+    model: BodyModel, tmp_path: Path, changes: dict[str, object], expected: list[str]
+) -> None:
+    here = hold(model, tmp_path, 10)
+    here.put_floor(0.0)
+    with h5py.File(here.paths["scene"], "r+") as file:
+        file.attrs.update({"fps": 30.0} | changes)
+    with pytest.raises(UserError) as caught:
+        here.run(lemo=tmp_path / "LEMO")
+    for words in [*expected, "joint.lemo"]:
+        assert words in str(caught.value)
+
+
+def test_a_recording_that_is_too_short_for_a_learned_motion(
+    model: BodyModel, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=r"has 3 frames.*needs 10 or more.*joint.lemo"):
+        hold(model, tmp_path, 3).run(lemo=tmp_path)
+
+
+def test_a_learned_motion_is_part_of_the_fit(model: BodyModel, tmp_path: Path) -> None:
+    """And random weights do not tear the body from what is seen."""
+    here = hold(model, tmp_path, 10)
+    here.put_floor(0.0)
+    with h5py.File(here.paths["scene"], "r+") as file:
+        file.attrs["fps"] = 30.0
+    found = here.run(lemo=write_release(tmp_path / "LEMO").lemo)
+    at = found["energy_names"].astype(str).tolist().index("body_motion")
+    assert 0 < found["energy_after"][at] < found["energy_before"][at]
+    assert np.linalg.norm(found["joints"] - here.joints, axis=2).mean() < 0.015
 
 
 @pytest.mark.parametrize("subdivisions", [2, 4])

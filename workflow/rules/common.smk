@@ -132,6 +132,11 @@ def pose_prior_file(wildcards):
     return existing(SETTINGS.body_models.vposer)
 
 
+def motion_prior_files(wildcards):
+    """Input function: the motion prior's weights and statistics, where the settings name them."""
+    return existing(*(SETTINGS.joint.lemo_files or ()))
+
+
 def settings_of(stage):
     """Param: digest of one stage's settings."""
     return digest(getattr(SETTINGS, stage))

@@ -5,6 +5,7 @@ rule joint:
         object=object_files,
         body=body_file,
         pose_prior=pose_prior_file,
+        motion_prior=motion_prior_files,
         annotation=ancient(annotation_input("contact")),
     output:
         joint=f"{RESULTS}/{{sequence}}/joint.h5",

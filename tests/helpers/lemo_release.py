@@ -1,0 +1,42 @@
+"""Files as LEMO's release has them, with random numbers: the weights are the user's to fetch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from intercap_core.config import JointSettings
+
+CHANNELS = (1, 32, 64, 64, 64, 64)
+COORDINATES = 243  # of 81 markers
+
+
+def random_state(seed: int = 0, *, bias: float = 0.1) -> dict[str, torch.Tensor]:
+    """An encoder's state: ten convolutions of 3 x 3, biases up to ``bias``."""
+    generator = torch.Generator().manual_seed(seed)
+    state = {}
+    for block in range(5):
+        sizes = CHANNELS[block], CHANNELS[block + 1]
+        for layer, inner in zip((0, 2), sizes, strict=True):
+            name = f"enc_blc{block + 1}.main.{layer}"
+            shape = (sizes[1], inner, 3, 3)
+            state[f"{name}.weight"] = torch.randn(shape, generator=generator) / (9 * inner) ** 0.5
+            state[f"{name}.bias"] = bias * torch.randn(sizes[1], generator=generator)
+    return state
+
+
+def write_release(
+    folder: Path, state: dict[str, torch.Tensor] | None = None, spread: float = 0.6
+) -> JointSettings:
+    """Write weights and statistics below ``folder``; settings that name it."""
+    settings = JointSettings(lemo=folder)
+    assert settings.lemo_files is not None
+    weights, statistics = settings.lemo_files
+    for path in (weights, statistics):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(state or random_state(), weights)
+    mean = np.zeros((1, 1, COORDINATES))
+    np.savez_compressed(statistics, Xmean=mean, Xstd=np.full(COORDINATES, spread))
+    return settings
