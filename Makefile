@@ -6,13 +6,17 @@
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track and the body's fit, those of config/body to
 #                the latter), tables and results/evaluation.json; about an hour on two cores, goes
-#                on where it was ended
+#                on where it was ended. Last, on three of them, the joint fit's oracle floors and what
+#                a mesh with holes costs it
 # make evaluate-quick  six recordings to the end within ten minutes, beside the recorded figures
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker,
 #                the body's fit and the joint stage beside the paper's recipe, the joint stage's memory
 #                on long sequences, results/bench.json
 # make ablation  what each term of the joint fit is worth: the fit without it on the recordings of
 #                evaluate-quick (run that first), a table, results/ablation.json and three pictures
+# make oracle    how far the studio's cameras, depth biases and mesh take the joint fit, and what a mesh
+#                with holes costs it, on the recordings of evaluate-quick (run that first):
+#                results/oracle.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -23,7 +27,7 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench ablation docs environment clean
+    evaluate evaluate-quick bench ablation oracle docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -57,6 +61,9 @@ snakemake-lint: $(STAMP)
 
 evaluate: $(STAMP)
 	$(BIN)/intercap evaluate --cores $(CORES)
+	$(BIN)/python -m bench.oracle config/object/config.yaml --output results/evaluation.json \
+	    --sequences cup_drink_s02 suitcase_carry_s10 stool_sit_s07 --cores $(CORES) \
+	    --variants "as it is" "true mesh" "starts at the truth" "open mesh"
 
 evaluate-quick: $(STAMP)
 	$(BIN)/intercap evaluate --quick --output results/evaluation-quick.json --cores $(CORES)
@@ -69,6 +76,9 @@ bench: $(STAMP)
 
 ablation: $(STAMP)
 	$(BIN)/python -m bench.ablation
+
+oracle: $(STAMP)
+	$(BIN)/python -m bench.oracle --cores $(CORES)
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

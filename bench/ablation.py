@@ -14,7 +14,6 @@ folder. Nothing of the project is written over.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 import time
@@ -27,15 +26,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
-from bench.replay import file_digest
+from bench.again import artefacts_of, check_run, compute_once
 from intercap_core.errors import UserError
 from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.pipeline.code_digest import code_digest
-from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 SETTINGS = Path("config/evaluation/quick.yaml")
+STAGES = ("joint", "metrics")  # what is computed for each variant
 EVERYTHING, SEQUENTIAL = "everything", "sequential only"
 WITHOUT_CONTACT, WITHOUT_STICK = "without contact and stick", "without stick"
 WITHOUT_SMOOTHNESS = "without smoothness"
@@ -94,7 +91,10 @@ def ablate(
     """
     plain = load_project(settings)
     names = list(sequences or plain.sequences)
-    _check(settings, plain, names, variants)
+    check_run(plain, names, STAGES)
+    strange = [name for name in variants if name not in VARIANTS]
+    if strange:
+        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
     paths: Paths = {}
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
@@ -123,53 +123,13 @@ def slug(variant: str) -> str:
     return variant.replace(" ", "_")
 
 
-def _check(
-    settings: Path, project: Project, sequences: Sequence[str], variants: Sequence[str]
-) -> None:
-    unknown = [name for name in sequences if name not in project.sequences]
-    if unknown:
-        known = ", ".join(project.sequences)
-        raise UserError(f"{settings}: there is no sequence {unknown[0]!r}; it lists {known}")
-    strange = [name for name in variants if name not in VARIANTS]
-    if strange:
-        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
-    for name in sequences:
-        truth = project.sequences[name].truth
-        if truth is None:
-            raise UserError(f"{settings}: sequence {name!r} has no truth to be held to")
-        needed = set(STAGES["joint"].reads) | set(STAGES["metrics"].reads) - {"joint"}
-        for path in [truth, *(project.artefact(name, stage) for stage in sorted(needed))]:
-            if not path.is_file():
-                raise UserError(
-                    f"{path}: not there, expected what a run of {settings} leaves; take {name} to "
-                    f"its metrics first: intercap run {settings} (or make evaluate-quick)"
-                )
-
-
 def _fit(project: Project, sequence: str, folder: Path) -> dict[str, Path]:
     """The sequence's artefacts with joint and metrics of this variant, computed where missing."""
-    paths = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
-    for stage in ("joint", "metrics"):
+    paths = artefacts_of(project, sequence)
+    for stage in STAGES:
         output = folder / sequence / f"{stage}.h5"
-        key, known = output.with_suffix(".key"), _content(project, sequence, stage, paths)
-        if not (output.exists() and key.exists() and key.read_text() == known):
-            inputs = {name: paths[name] for name in STAGES[stage].reads}
-            run_step(stage, project, sequence, inputs=inputs, output=output)
-            key.write_text(known)
-        paths[stage] = output
+        paths[stage] = compute_once(stage, project, sequence, paths, output)
     return paths
-
-
-def _content(project: Project, sequence: str, stage: str, paths: Mapping[str, Path]) -> str:
-    """Digest of all that a stage's artefact depends on."""
-    state = hashlib.sha256(code_digest(f"stages.{stage}").encode())
-    state.update(project.config.model_dump_json(exclude={"studio", "report", "export"}).encode())
-    state.update(repr(project.annotation(sequence)).encode())
-    truth = project.sequences[sequence].truth
-    files = [paths[name] for name in STAGES[stage].reads]
-    for path in [*files, *([truth] if stage == "metrics" and truth else [])]:
-        state.update(file_digest(path))
-    return state.hexdigest()
 
 
 def _figures(paths: Mapping[str, Mapping[str, Path]], *, sequential: bool) -> Figures:

@@ -123,17 +123,19 @@ def content_key(settings: Path, sequences: Sequence[str], run: Run) -> str:
     return state.hexdigest()[:24]
 
 
-_digests: dict[Path, bytes] = {}
+_digests: dict[tuple[Path, int], bytes] = {}
 
 
 def file_digest(path: Path) -> bytes:
-    """SHA-256 of a file, read once in a process; raises UserError where it is not there."""
-    if path not in _digests:
-        if not path.is_file():
-            raise UserError(f"{path}: not there; take the recordings to their metrics first")
+    """SHA-256 of a file, read once in a process until it is written anew; raises UserError where
+    it is not there."""
+    if not path.is_file():
+        raise UserError(f"{path}: not there; take the recordings to their metrics first")
+    key = (path, path.stat().st_mtime_ns)
+    if key not in _digests:
         with path.open("rb") as file:
-            _digests[path] = hashlib.file_digest(file, "sha256").digest()
-    return _digests[path]
+            _digests[key] = hashlib.file_digest(file, "sha256").digest()
+    return _digests[key]
 
 
 def _plain(run: Run) -> dict[str, Any]:

@@ -66,14 +66,23 @@ def add_figures(output: Path, figures: Mapping[str, float]) -> None:
     What is there of other areas stays: several commands write into one file. Raises UserError where
     the file is no JSON object.
     """
+    areas = {f"{key.partition('.')[0]}." for key in figures}
+    put_figures(output, figures, instead_of=tuple(areas))
+
+
+def put_figures(output: Path, figures: Mapping[str, float], *, instead_of: tuple[str, ...]) -> None:
+    """Put figures into the JSON that is there, in place of those of the same names and of those
+    that begin with any of ``instead_of``.
+
+    Raises UserError where the file is no JSON object.
+    """
     known = {}
     if output.exists():
         try:
             known = dict(json.loads(output.read_text(encoding="utf-8")))
         except (ValueError, TypeError):
             raise UserError(f"{output} holds no figures; remove it or name another file") from None
-    areas = {key.partition(".")[0] for key in figures}
-    kept = {key: value for key, value in known.items() if key.partition(".")[0] not in areas}
+    kept = {key: value for key, value in known.items() if not key.startswith(instead_of)}
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 

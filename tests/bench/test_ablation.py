@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from bench import ablation
+from bench import again
 from bench.ablation import EVERYTHING, SEQUENTIAL, VARIANTS, ablate, markdown, rows
 from intercap_core.config import JointSettings
 from intercap_core.errors import UserError
@@ -67,19 +67,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 @pytest.fixture
 def settings(capture: fitted.Capture, tmp_path: Path) -> Path:
     """A project whose one sequence was taken to the joint fit."""
-    results = tmp_path / "results" / "trial" / NAME
-    results.mkdir(parents=True)
-    for stage in ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint"):
-        shutil.copy(capture.paths[stage], results)
-    (tmp_path / "objects.yaml").write_text(f"football: {{mesh: {capture.object_.mesh}}}\n")
-    (tmp_path / "subjects.tsv").write_text("subject\tgender\np01\tneutral\n")
-    (tmp_path / "sequences.tsv").write_text(
-        "sequence\tsubject\tobject\trecordings\tcalibration\ttruth\n"
-        f"{NAME}\tp01\tfootball\trec\tcal\t{capture.paths['truth']}\n"
-    )
-    path = tmp_path / "config.yaml"
-    path.write_text(f"dataset: trial\nresults: {tmp_path / 'results'}\n")
-    return path
+    return fitted.write_project(tmp_path, capture, NAME)
 
 
 @pytest.fixture
@@ -87,7 +75,7 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]
     """Stages that were run and the joint settings' changes; a stage copies what the project has,
     and metrics are the real ones."""
     done: list[tuple[str, dict[str, Any]]] = []
-    whole = ablation.run_step
+    whole = again.run_step
 
     def run(stage: str, project: Any, sequence: str, *, inputs: Any, output: Path) -> None:
         done.append((stage, project.config.joint.model_dump(exclude_defaults=True)))
@@ -97,7 +85,7 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]
         else:
             whole(stage, project, sequence, inputs=inputs, output=output)
 
-    monkeypatch.setattr(ablation, "run_step", run)
+    monkeypatch.setattr(again, "run_step", run)
     return done
 
 

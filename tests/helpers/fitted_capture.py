@@ -6,6 +6,7 @@ moved by constants, so that every error against the truth can be worked out by h
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -150,6 +151,23 @@ def make_capture(
     _write_fits(capture, params, name)
     _write_truth(capture, tips, name)
     return capture
+
+
+def write_project(folder: Path, capture: Capture, name: str) -> Path:
+    """Settings of a project in ``folder`` whose one sequence is the capture, up to joint."""
+    results = folder / "results" / "trial" / name
+    results.mkdir(parents=True)
+    for stage in ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint"):
+        shutil.copy(capture.paths[stage], results)
+    (folder / "objects.yaml").write_text(f"football: {{mesh: {capture.object_.mesh}}}\n")
+    (folder / "subjects.tsv").write_text("subject\tgender\np01\tneutral\n")
+    (folder / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\ttruth\n"
+        f"{name}\tp01\tfootball\trec\tcal\t{capture.paths['truth']}\n"
+    )
+    path = folder / "config.yaml"
+    path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
+    return path
 
 
 def _drawables(capture: Capture, t: int, camera_from_master: np.ndarray) -> list[Drawable]:

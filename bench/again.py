@@ -1,0 +1,68 @@
+"""Stages computed again with other inputs or settings, from the artefacts that a run has left."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from bench.replay import file_digest
+from intercap_core.errors import UserError
+from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+
+
+def check_run(project: Project, sequences: Sequence[str], stages: Collection[str]) -> None:
+    """Raise UserError where a sequence is unknown or without truth, or where an artefact that one
+    of ``stages`` reads, and none of them writes, is not there."""
+    settings = project.path
+    unknown = [name for name in sequences if name not in project.sequences]
+    if unknown:
+        known = ", ".join(project.sequences)
+        raise UserError(f"{settings}: there is no sequence {unknown[0]!r}; it lists {known}")
+    needed = {name for stage in stages for name in STAGES[stage].reads} - set(stages)
+    for name in sequences:
+        truth = project.sequences[name].truth
+        if truth is None:
+            raise UserError(f"{settings}: sequence {name!r} has no truth to be held to")
+        for path in [truth, *(project.artefact(name, stage) for stage in sorted(needed))]:
+            if not path.is_file():
+                raise UserError(
+                    f"{path}: not there, expected what a run of {settings} leaves; take {name} to "
+                    f"its metrics first: intercap run {settings} (or make evaluate-quick)"
+                )
+
+
+def artefacts_of(project: Project, sequence: str) -> dict[str, Path]:
+    """Where the sequence's artefacts are, by stage."""
+    return {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
+
+
+def compute_once(
+    stage: str, project: Project, sequence: str, paths: Mapping[str, Path], output: Path
+) -> Path:
+    """``output``, computed from the artefacts ``paths`` unless it is there of the same content."""
+    key, content = output.with_suffix(".key"), _content(stage, project, sequence, paths)
+    if not (output.exists() and key.exists() and key.read_text() == content):
+        inputs = {name: paths[name] for name in STAGES[stage].reads}
+        run_step(stage, project, sequence, inputs=inputs, output=output)
+        key.write_text(content)
+    return output
+
+
+def _content(stage: str, project: Project, sequence: str, paths: Mapping[str, Path]) -> str:
+    """Digest of all that a stage's artefact depends on."""
+    state = hashlib.sha256(code_digest(f"stages.{stage}").encode())
+    state.update(project.config.model_dump_json(exclude={"studio", "report", "export"}).encode())
+    state.update(repr(project.annotation(sequence)).encode())
+    row = project.sequences[sequence]
+    entry = project.objects[row.object]
+    for told in (entry, project.subjects[row.subject]):
+        state.update(told.model_dump_json().encode())
+    files = [paths[name] for name in STAGES[stage].reads]
+    for path in [*files, Path(entry.mesh), *([row.truth] if stage == "metrics" else [])]:
+        if path is not None:
+            state.update(file_digest(path))
+    return state.hexdigest()

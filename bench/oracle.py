@@ -1,0 +1,314 @@
+"""How far truth that is put in takes the joint fit, and what a mesh with holes costs it.
+
+    python -m bench.oracle [SETTINGS] [--sequences NAME ...] [--variants NAME ...]
+        [--cores N] [--output results/oracle.json] [--folder results/oracle]
+
+From the artefacts that a run of SETTINGS has left (by default those of `make evaluate-quick`, so
+run that first) `object_track`, `joint` and `metrics` are computed once for each variant:
+
+    as it is                 what the stages are given
+    true cameras             the studio's poses, held; depth biases settle as before
+    true depth               and the studio's depth biases, held
+    true mesh                and the mesh that the studio drew: the object's floor
+    starts at the truth      the same three, but the cameras are free to move as far as the scene's
+                             covariance lets them: where the images themselves, with their noise,
+                             leave cameras that are right. The cameras' floor
+    open mesh                the given mesh with a tenth of its faces missing, in one patch and
+                             scattered, for the tracker as well
+
+The body's fit that joint starts from, the masks and the time offsets stay as they are. All is
+measured with the scene and the mesh that the run has. What is there already, by its content, is
+taken as it is: a run that was ended goes on. Prints tables by object and puts its figures into the
+JSON of ``--output`` beside what is there: keys ``oracle.<variant>.<measure>``,
+``oracle.<object>.<variant>.<measure>``, and the joint stage's ``joint.extrinsics_floor_mm``,
+``joint.object_..._floor_...`` and ``joint.open_mesh_ratio``. Nothing of the project is written
+over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import repeat
+from multiprocessing import get_context
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when the libraries start
+
+import numpy as np
+from rich.table import Column, Table
+
+from bench.again import artefacts_of, check_run, compute_once
+from bench.oracle_inputs import write_open_mesh, write_true_mesh, write_true_scene
+from intercap_core.commands.bench import put_figures
+from intercap_core.errors import UserError
+from intercap_core.evaluation.part import console_of, number
+from intercap_core.metrics import figures
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.project import Project, load_project
+
+SETTINGS = Path("config/evaluation/quick.yaml")
+STAGES = ("object_track", "joint", "metrics")
+AS_IT_IS, TRUE_MESH, FREE, OPEN = "as it is", "true mesh", "starts at the truth", "open mesh"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is put in: true poses of the ``cameras``, true depth ``biases``, and a ``mesh``, "true"
+    or "open". ``held``: cameras and biases that are put in stay as they are."""
+
+    cameras: bool = False
+    biases: bool = False
+    mesh: str = ""
+    held: bool = True
+
+
+VARIANTS = {
+    AS_IT_IS: Variant(),
+    "true cameras": Variant(cameras=True),
+    "true depth": Variant(cameras=True, biases=True),
+    TRUE_MESH: Variant(cameras=True, biases=True, mesh="true"),
+    FREE: Variant(cameras=True, biases=True, mesh="true", held=False),
+    OPEN: Variant(mesh="open"),
+}
+# Figures by their names in the tables; "tracked" is after `object_track`, all else after `joint`.
+MEASURES = {
+    "tracked mm": "tracked_translation_mm",
+    "object mm": "object_translation_mm",
+    "p95": "object_translation_p95_mm",
+    "turn deg": "object_rotation_deg",
+    "p95 ": "object_rotation_p95_deg",
+    "cameras mm": "extrinsics_mm",
+    "body mm": "body_pve_mm",
+    "penetration mm": "penetration_mean_mm",
+}
+# What ``joint.open_mesh_..._ratio`` compares; the first is `joint.open_mesh_ratio` itself.
+RATIOS = {
+    "": "object_translation_mm",
+    "p95_": "object_translation_p95_mm",
+    "body_": "body_pve_mm",
+    "penetration_": "penetration_mean_mm",
+}
+FLOORS = {
+    "object_translation_floor_mm": "object_translation_mm",
+    "object_translation_p95_floor_mm": "object_translation_p95_mm",
+    "object_rotation_floor_deg": "object_rotation_deg",
+}
+WIDTH = 120  # columns of the tables, also where a file takes them
+Figures = dict[str, float]
+Found = dict[str, dict[str, SequenceMetrics]]  # by variant and sequence
+
+
+def consult(
+    settings: Path,
+    sequences: Sequence[str],
+    folder: Path,
+    *,
+    variants: Sequence[str] = tuple(VARIANTS),
+    cores: int = 1,
+) -> Found:
+    """Compute the variants, ``cores`` sequences at a time; what `metrics` says of them.
+
+    Raises UserError where a sequence or a variant is unknown, or has no truth or artefacts.
+    """
+    project = load_project(settings)
+    names = list(sequences or project.sequences)
+    check_run(project, names, STAGES)
+    strange = [name for name in variants if name not in VARIANTS]
+    if strange:
+        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
+    given = (repeat(settings), names, repeat(folder), repeat(tuple(variants)))
+    if cores == 1 or len(names) == 1:
+        every = list(map(_consult_one, *given))
+    else:
+        context = get_context("spawn")  # numerical libraries keep threads that a fork would lose
+        with ProcessPoolExecutor(min(cores, len(names)), mp_context=context) as pool:
+            every = list(pool.map(_consult_one, *given))
+    return {
+        variant: {
+            name: SequenceMetrics.read(paths[variant])
+            for name, paths in zip(names, every, strict=True)
+        }
+        for variant in variants
+    }
+
+
+def _consult_one(
+    settings: Path, sequence: str, folder: Path, variants: Sequence[str]
+) -> dict[str, Path]:
+    """The metrics of one sequence by variant."""
+    project = load_project(settings)
+    tracks: dict[tuple[bool, bool, str], Path] = {}
+    found = {}
+    for name in variants:
+        variant = VARIANTS[name]
+        begin = time.perf_counter()
+        place = folder / sequence / slug(name)
+        plain = artefacts_of(project, sequence)
+        given, scene = _put_in(project, sequence, variant, place)
+        paths = plain | {"scene": scene}
+        # Whether cameras are held is nothing to the tracker.
+        key = variant.cameras, variant.biases, variant.mesh
+        if key not in tracks:
+            output = place / "object_track.h5"
+            tracks[key] = compute_once("object_track", given, sequence, paths, output)
+        paths["object_track"] = tracks[key]
+        paths["joint"] = compute_once("joint", given, sequence, paths, place / "joint.h5")
+        found[name] = compute_once(
+            "metrics", project, sequence, paths | {"scene": plain["scene"]}, place / "metrics.h5"
+        )
+        print(f"{sequence}, {name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
+    return found
+
+
+def _put_in(project: Project, sequence: str, variant: Variant, place: Path) -> tuple[Project, Path]:
+    """The project with the variant's mesh, and the scene with its cameras."""
+    row = project.sequences[sequence]
+    assert row.truth is not None
+    scene, entry = project.artefact(sequence, "scene"), project.objects[row.object]
+    if variant.cameras:
+        scene = write_true_scene(
+            scene, row.truth, place / "scene.h5", biases=variant.biases, held=variant.held
+        )
+    if variant.mesh == "true":
+        entry = write_true_mesh(row.truth, place / "mesh.ply", entry)
+    elif variant.mesh == "open":
+        entry = write_open_mesh(place / "mesh.ply", entry)
+    return replace(project, objects={**project.objects, row.object: entry}), scene
+
+
+def slug(variant: str) -> str:
+    """A variant's name in keys and folders."""
+    return variant.replace(" ", "_")
+
+
+def by_variant(found: Found) -> dict[str, Figures]:
+    """The figures ``MEASURES`` of each variant over all its sequences."""
+    return {variant: _measured(list(some.values())) for variant, some in found.items()}
+
+
+def by_object(found: Found) -> dict[str, dict[str, Figures]]:
+    """The same of each object's sequences."""
+    names = sorted({s.object_ for some in found.values() for s in some.values()})
+    return {
+        name: {
+            variant: _measured([s for s in some.values() if s.object_ == name])
+            for variant, some in found.items()
+        }
+        for name in names
+    }
+
+
+def _measured(sequences: Sequence[SequenceMetrics]) -> Figures:
+    joint = figures.truth_figures(sequences, "joint")
+    every = {
+        **joint,
+        "tracked_translation_mm": figures.object_figures(sequences, "object_track").get(
+            "object_translation_mm"
+        ),
+        "extrinsics_mm": figures.extrinsics_figures(sequences).get("joint_mean_mm"),
+        "extrinsics_scene_mm": figures.extrinsics_figures(sequences).get("after_mean_mm"),
+        "penetration_mean_mm": figures.penetration_figures(sequences).get("mean_mm"),
+    }
+    wanted = (*MEASURES.values(), "extrinsics_scene_mm")
+    return {key: float(value) for key in wanted if (value := every.get(key)) is not None}
+
+
+def joint_figures(found: Found) -> Figures:
+    """The floors, and what the open mesh costs: the error with it over the one with the closed
+    mesh, each the mean of the sequences' own figures."""
+    over_all = by_variant(found)
+    floors = {key: over_all.get(TRUE_MESH, {}).get(measure) for key, measure in FLOORS.items()}
+    floors["extrinsics_floor_mm"] = over_all.get(FREE, {}).get("extrinsics_mm")
+    ratios = {}
+    for what, measure in RATIOS.items():
+        closed, opened = (_of_each(found.get(name, {}), measure) for name in (AS_IT_IS, OPEN))
+        both = [name for name in closed if name in opened]
+        if sum(closed[name] for name in both) > 0:
+            ratios[f"open_mesh_{what}ratio"] = sum(opened[name] for name in both) / sum(
+                closed[name] for name in both
+            )
+    return {key: value for key, value in {**floors, **ratios}.items() if value is not None}
+
+
+def _of_each(sequences: Mapping[str, SequenceMetrics], measure: str) -> Figures:
+    measured = {name: _measured([metrics]) for name, metrics in sequences.items()}
+    return {
+        name: some[measure]
+        for name, some in measured.items()
+        if np.isfinite(some.get(measure, np.nan))
+    }
+
+
+def flat(found: Found) -> Figures:
+    """All keys that are written."""
+    keys = {f"joint.{key}": value for key, value in joint_figures(found).items()}
+    for variant, some in by_variant(found).items():
+        keys |= {f"oracle.{slug(variant)}.{key}": value for key, value in some.items()}
+    for name, variants in by_object(found).items():
+        for variant, some in variants.items():
+            keys |= {f"oracle.{name}.{slug(variant)}.{key}": value for key, value in some.items()}
+    return {key: round(value, 4) for key, value in keys.items() if np.isfinite(value)}
+
+
+def print_tables(found: Found) -> None:
+    """A table of all sequences and one of each object, and the joint stage's figures in words."""
+    console = console_of(WIDTH)
+    for title, variants in {"all": by_variant(found), **by_object(found)}.items():
+        table = Table(Column("put in", no_wrap=True), *MEASURES, title=title, box=None)
+        for variant, some in variants.items():
+            cells = (number(some.get(key), 2) for key in MEASURES.values())
+            table.add_row(variant, *cells)
+        console.print(table)
+    told, given = joint_figures(found), by_variant(found).get(AS_IT_IS, {})
+    if {"extrinsics_mm", "extrinsics_scene_mm"} <= set(given) and "extrinsics_floor_mm" in told:
+        scene, joint, floor = (
+            given["extrinsics_scene_mm"], given["extrinsics_mm"], told["extrinsics_floor_mm"],
+        )  # fmt: skip
+        console.print(
+            f"cameras: {scene:.2f} mm after scene, {joint:.2f} after joint, floor {floor:.2f}: "
+            f"{(scene - joint) / (scene - floor):.0%} of the way",
+            highlight=False,
+        )
+    for key, value in told.items():
+        console.print(f"joint.{key} {value:.3f}", highlight=False)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line, compute, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
+    parser.add_argument("--sequences", nargs="+", metavar="NAME", help="default: all of SETTINGS")
+    parser.add_argument(
+        "--variants", nargs="+", metavar="NAME", help=f"default: all, {', '.join(VARIANTS)}"
+    )
+    parser.add_argument("--cores", type=int, default=0, help="sequences at a time; 0: all cores")
+    parser.add_argument("--output", type=Path, default=Path("results/oracle.json"))
+    parser.add_argument("--folder", type=Path, default=Path("results/oracle"))
+    told = parser.parse_args(arguments)
+    try:
+        cores = told.cores or len(os.sched_getaffinity(0))
+        found = consult(
+            told.settings,
+            told.sequences or (),
+            told.folder,
+            variants=told.variants or tuple(VARIANTS),
+            cores=cores,
+        )
+        print_tables(found)
+        put_figures(told.output, flat(found), instead_of=("oracle.",))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    print(told.output)
+
+
+if __name__ == "__main__":
+    main()
