@@ -221,22 +221,24 @@ def _measured(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 def joint_figures(found: Found) -> Figures:
     """The floors, and what the open mesh costs: the error with it over the one with the closed
-    mesh, each the mean of the sequences' own figures."""
+    mesh, each the mean of the sequences' own figures, and the worst sequence's ratio."""
     over_all = by_variant(found)
     floors = {key: over_all.get(TRUE_MESH, {}).get(measure) for key, measure in FLOORS.items()}
     floors["extrinsics_floor_mm"] = over_all.get(FREE, {}).get("extrinsics_mm")
-    ratios = {}
+    told = {key: value for key, value in floors.items() if value is not None}
     for what, measure in RATIOS.items():
         closed, opened = (_of_each(found.get(name, {}), measure) for name in (AS_IT_IS, OPEN))
-        both = [name for name in closed if name in opened]
-        if sum(closed[name] for name in both) > 0:
-            ratios[f"open_mesh_{what}ratio"] = sum(opened[name] for name in both) / sum(
-                closed[name] for name in both
-            )
-    return {key: value for key, value in {**floors, **ratios}.items() if value is not None}
+        both = [name for name in closed if name in opened and closed[name] > 0]
+        if both:
+            whole = sum(closed[name] for name in both)
+            told[f"open_mesh_{what}ratio"] = sum(opened[name] for name in both) / whole
+        if both and not what:
+            told["open_mesh_worst_ratio"] = max(opened[name] / closed[name] for name in both)
+    return told
 
 
 def _of_each(sequences: Mapping[str, SequenceMetrics], measure: str) -> Figures:
+    """The figure of each sequence that has it."""
     measured = {name: _measured([metrics]) for name, metrics in sequences.items()}
     return {
         name: some[measure]
@@ -270,9 +272,9 @@ def print_tables(found: Found) -> None:
         scene, joint, floor = (
             given["extrinsics_scene_mm"], given["extrinsics_mm"], told["extrinsics_floor_mm"],
         )  # fmt: skip
+        way = f": {(scene - joint) / (scene - floor):.0%} of the way" if scene > floor else ""
         console.print(
-            f"cameras: {scene:.2f} mm after scene, {joint:.2f} after joint, floor {floor:.2f}: "
-            f"{(scene - joint) / (scene - floor):.0%} of the way",
+            f"cameras: {scene:.2f} mm after scene, {joint:.2f} after joint, floor {floor:.2f}{way}",
             highlight=False,
         )
     for key, value in told.items():

@@ -224,6 +224,7 @@ def test_floors_and_ratio_by_hand_beside_the_figures_of_others(
     assert written["oracle.as_it_is.extrinsics_mm"] == pytest.approx(10, abs=1e-3)
     assert written["oracle.football.open_mesh.object_translation_mm"] == pytest.approx(4, abs=1e-2)
     assert written["joint.open_mesh_ratio"] == pytest.approx(2, abs=1e-3)
+    assert written["joint.open_mesh_worst_ratio"] == pytest.approx(2, abs=1e-3)
     assert written["joint.open_mesh_p95_ratio"] == pytest.approx(2, abs=1e-3)
     assert written["joint.open_mesh_body_ratio"] == pytest.approx(1)
     # a part of the variants gives what it allows
