@@ -62,7 +62,8 @@ def _content(stage: str, project: Project, sequence: str, paths: Mapping[str, Pa
     for told in (entry, project.subjects[row.subject]):
         state.update(told.model_dump_json().encode())
     files = [paths[name] for name in STAGES[stage].reads]
-    for path in [*files, Path(entry.mesh), *([row.truth] if stage == "metrics" else [])]:
+    files += [path for path in (entry.mesh, entry.contact_vertices) if path is not None]
+    for path in [*files, *([row.truth] if stage == "metrics" else [])]:
         if path is not None:
             state.update(file_digest(path))
     return state.hexdigest()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
@@ -13,6 +15,7 @@ from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.joint.cameras import BIAS
+from intercap_core.rigid.contact_vertices import contact_list
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import SCENE, TRUTH
 
@@ -121,6 +124,13 @@ def _remove_patch(removed: np.ndarray, beside: list[list[int]], first: int, coun
 def _write_mesh(
     vertices: np.ndarray, faces: np.ndarray, output: Path, entry: ObjectEntry
 ) -> ObjectEntry:
+    """The object with this mesh in ``output``, likely-contact vertices at the same places."""
     output.parent.mkdir(parents=True, exist_ok=True)
     trimesh.Trimesh(vertices, faces, process=False, validate=False).export(output)
-    return entry.model_copy(update={"mesh": output, "contact_vertices": None})
+    listed = None
+    if entry.contact_vertices is not None:
+        given = ObjectMesh.load(entry)
+        _, ids = cKDTree(vertices).query(given.vertices[given.contact_vertices])
+        listed = output.with_suffix(".contact.json")
+        listed.write_text(json.dumps(contact_list(np.unique(ids), vertices)), encoding="utf-8")
+    return entry.model_copy(update={"mesh": output, "contact_vertices": listed})

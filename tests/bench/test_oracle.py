@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from bench import again, oracle
 from bench.oracle import (
@@ -131,6 +132,9 @@ def test_the_open_mesh_lacks_a_tenth_and_is_accepted(name: str, tmp_path: Path) 
     mesh = ObjectMesh.load(write_open_mesh(tmp_path / "open.ply", entry))
     assert not mesh.watertight
     assert len(mesh.faces) == pytest.approx((1 - REMOVED_SHARE) * len(whole.faces), rel=0.01)
+    touched = whole.vertices[whole.contact_vertices]  # those that faces still use stay listed
+    kept = mesh.vertices[mesh.contact_vertices]
+    assert cKDTree(touched).query(kept)[0].max() < 1e-5 and len(kept) > 0.7 * len(touched)
     removed = removed_faces(whole.vertices, whole.faces, 0)
     np.testing.assert_array_equal(removed, removed_faces(whole.vertices, whole.faces, 0))
     assert (removed != removed_faces(whole.vertices, whole.faces, 1)).any()
@@ -141,6 +145,7 @@ def test_the_true_mesh_is_the_studios(capture: fitted.Capture, tmp_path: Path) -
     assert entry.name == capture.object_.name and entry.symmetry == capture.object_.symmetry
     mesh = ObjectMesh.load(entry)
     np.testing.assert_allclose(mesh.vertices, capture.mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.contact_vertices, capture.mesh.contact_vertices)
 
 
 @pytest.fixture
