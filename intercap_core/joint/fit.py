@@ -126,9 +126,7 @@ def fit(
         previous, estimate = estimate, estimator.at(state)
         contact_change = np.abs(estimate.probability - previous.probability).max()
         settled = (
-            converged
-            and contact_change < CONTACT_CONVERGED
-            and offset_change < OFFSET_CHANGED_S
+            converged and contact_change < CONTACT_CONVERGED and offset_change < OFFSET_CHANGED_S
         )
         if number == len(ROUND_STEPS):
             break
