@@ -304,6 +304,7 @@ class CompiledTerms:
         if which not in self._priors:
             self._priors[which] = Priors.of(self._model, shape=which[0], body_pose=not which[1])
         priors = self._priors[which]
+        priors = priors._replace(hands=priors.hands * priors.hands.dtype.type(observed.hand_share))
         if observed.pose is None:
             return priors
         mean, precision = _array(observed.pose.mean), _array(observed.pose.precision)

@@ -38,8 +38,9 @@ class BodyProblem:
     fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they
     belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
     where ``fit_shared`` says so, else fixed. touching: the body's parts that are inside each other,
-    and the weight of that. pose: a learned prior of each frame's pose. terms: by default
-    the quickest form on the device of ``base``.
+    and the weight of that. pose: a learned prior of each frame's pose. hand_share: of an
+    observation that the prior of a hand's pose is in one frame, 1 where frames stand alone. terms:
+    by default the quickest form on the device of ``base``.
     """
 
     model: BodyModel
@@ -56,6 +57,7 @@ class BodyProblem:
     touching: body_self.Pairs | None = None
     self_weight: float = 1.0
     pose: PoseGaussian | None = None
+    hand_share: float = 1.0
     fit_shared: bool = False
     terms: Terms | None = None
 
@@ -143,4 +145,5 @@ class BodyProblem:
             self_weight=self.self_weight,
             pose=self.pose,
             shape_prior=not self.one_shape,
+            hand_share=self.hand_share,
         )

@@ -50,7 +50,8 @@ class Observations(NamedTuple):
 
     views and targets belong to E_J, rows to E_D, and pairs, times self_weight, to E_P_self. pose: a
     learned prior of each frame's body pose. shape_prior: betas belong to each frame, which then has
-    their prior; else they are shared, or fixed.
+    their prior; else they are shared, or fixed. hand_share: of an observation that E_theta_h is in
+    one frame.
     """
 
     keypoints: KeypointSet
@@ -61,6 +62,7 @@ class Observations(NamedTuple):
     self_weight: float
     pose: PoseGaussian | None
     shape_prior: bool
+    hand_share: float
 
 
 class Bodies(NamedTuple):

@@ -241,7 +241,13 @@ class PriorTerm:
     def cost(self, observed: Observations, bodies: Bodies) -> Tensor:
         """See :class:`Term`."""
         pose = None if observed.pose is None else observed.pose.of_frames(bodies.frames)
-        return body_priors.cost(self.model, bodies.vectors, shape=observed.shape_prior, pose=pose)
+        return body_priors.cost(
+            self.model,
+            bodies.vectors,
+            shape=observed.shape_prior,
+            pose=pose,
+            hand_share=observed.hand_share,
+        )
 
     def add(
         self,
@@ -256,6 +262,7 @@ class PriorTerm:
             bodies.vectors,
             shape=observed.shape_prior,
             pose=None if observed.pose is None else observed.pose.of_frames(bodies.frames),
+            hand_share=observed.hand_share,
         )
         at, n = columns.parameters, len(columns.parameters)
         equations.cost.add_(cost)

@@ -28,15 +28,16 @@ _BODY_POSE = slice(3, 66)
 
 
 def terms(
-    model: BodyModel, vector: Tensor, *, body_pose: bool = True
+    model: BodyModel, vector: Tensor, *, body_pose: bool = True, hand_share: float = 1.0
 ) -> list[tuple[priors.DiagonalRows | priors.LinearRows, float]]:
     """All prior terms and weights at parameter vectors (B,P), shape and expression left out.
 
-    ``body_pose``: with the open default's Gaussian of the 21 body joints.
+    ``body_pose``: with the open default's Gaussian of the 21 body joints. ``hand_share``: of an
+    observation that E_theta_h is in one frame.
     """
     deviation = model.hand_deviation.clamp_min(SMALLEST_HAND_DEVIATION)
     own = (model.hand_mean, model.hand_components, deviation)
-    hands = [(priors.hand_pose(vector, *own, side=side), 1.0) for side in (0, 1)]
+    hands = [(priors.hand_pose(vector, *own, side=side), hand_share**0.5) for side in (0, 1)]
     return [
         (priors.rest_pose(vector, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
         (priors.joint_limits(vector), LIMIT_WEIGHT),
@@ -46,20 +47,30 @@ def terms(
 
 
 def cost(
-    model: BodyModel, vector: Tensor, *, shape: bool, pose: PoseGaussian | None = None
+    model: BodyModel,
+    vector: Tensor,
+    *,
+    shape: bool,
+    pose: PoseGaussian | None = None,
+    hand_share: float = 1.0,
 ) -> Tensor:
     """(B,) at (B,P); ``shape``: betas included (else they are the caller's), expression always;
-    ``pose`` instead of the open prior of the body's pose."""
+    ``pose`` instead of the open prior of the body's pose; ``hand_share`` as in :func:`terms`."""
     total = 0.5 * (vector[:, quadratic(model, shape)] ** 2).sum(1)
     if pose is not None:
         total = total + pose.cost(vector[:, _BODY_POSE])
-    for rows, weight in terms(model, vector, body_pose=pose is None):
+    for rows, weight in terms(model, vector, body_pose=pose is None, hand_share=hand_share):
         total = total + rows.energy(weight)
     return total
 
 
 def assemble(
-    model: BodyModel, vector: Tensor, *, shape: bool, pose: PoseGaussian | None = None
+    model: BodyModel,
+    vector: Tensor,
+    *,
+    shape: bool,
+    pose: PoseGaussian | None = None,
+    hand_share: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (B,), gradient (B,P) and Gauss-Newton Hessian (B,P,P) of all priors at (B,P)."""
     batch, size = vector.shape
@@ -68,12 +79,13 @@ def assemble(
         difference = vector[:, _BODY_POSE] - pose.mean
         gradient[:, _BODY_POSE] += (pose.precision @ difference[..., None])[..., 0]
         hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
-    for rows, weight in terms(model, vector, body_pose=pose is None):
+    for rows, weight in terms(model, vector, body_pose=pose is None, hand_share=hand_share):
         rows.add_to(hessian, gradient, weight)
     at = quadratic(model, shape)
     gradient[:, at] += vector[:, at]
     hessian.diagonal(dim1=1, dim2=2)[:, at] += 1
-    return cost(model, vector, shape=shape, pose=pose), gradient, hessian
+    total = cost(model, vector, shape=shape, pose=pose, hand_share=hand_share)
+    return total, gradient, hessian
 
 
 def quadratic(model: BodyModel, shape: bool) -> slice:

@@ -29,6 +29,10 @@ IMAGES_OUTLIER = 5.0
 # Errors of masks and keypoints last about so long, seconds: what the frames of that time say of the
 # cameras is one observation. Tuned on the studio.
 ERROR_LASTING_S = 0.3
+# A hand's pose lasts about so long, seconds: what the prior of poses says in the frames of that
+# time is one observation, where the body fit's frames stand alone. A grasp lasts longer, fingers
+# on their way shorter. Tuned on the studio: 0.3 to 1 are alike.
+HAND_LASTING_S = 0.5
 # What the body says of the cameras beside that: a detector's errors follow view and pose, and
 # clothing is of unknown thickness. Tuned on the studio.
 BODY_SHARE = 0.05

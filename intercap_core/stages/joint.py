@@ -103,6 +103,7 @@ def run(
         encoder = _motion_encoder(settings, source, model)
         sequential = SequentialFits.read(body, track, source)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
+        fps = float(source.attributes["fps"])
         body_data = BodyData.load(
             frames=frames,
             scene=scene,
@@ -111,10 +112,10 @@ def run(
             model=model,
             state=sequential.state,
             settings=body_settings,
+            fps=fps,
             pose_prior=load_pose_prior(body_models, model),
         )
         floor, prior = _floor(source), _offset_prior(source)
-        fps = float(source.attributes["fps"])
         cameras = _cameras(source)
         up = source["ground_normal"]
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)

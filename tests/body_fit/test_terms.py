@@ -106,7 +106,7 @@ def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
             problem, columns=body, views=None, rows=None, touching=None, **alone
         ),
         "fingers of a standing body": replace(
-            problem, columns=torch.arange(75, 165), targets=None, rows=None, **alone
+            problem, columns=torch.arange(75, 165), targets=None, rows=None, hand_share=0.2, **alone
         ),
     }  # fmt: skip
 

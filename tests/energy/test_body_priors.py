@@ -33,3 +33,22 @@ def test_betas_are_left_to_the_caller(model: BodyModel) -> None:
     both = body_priors.cost(model, x, shape=True) - body_priors.cost(model, at_zero, shape=True)
     assert alone.item() == pytest.approx(0.0)
     assert both.item() == pytest.approx(0.5 * 10 * 4.0)
+
+
+def test_a_hand_s_pose_that_lasts_counts_once(model: BodyModel) -> None:
+    """Five frames with a fifth of the hands' prior each cost what one frame costs, and the rest of
+    the priors stays as it is."""
+    generator = torch.Generator().manual_seed(1)
+    x = torch.zeros(1, model.num_parameters, dtype=torch.float64)
+    x[:, 75:165] = torch.cat([model.hand_mean[0], model.hand_mean[1]])
+    at_mean = body_priors.cost(model, x, shape=True, hand_share=0.2)
+    torch.testing.assert_close(at_mean, body_priors.cost(model, x, shape=True))
+    y = x.clone()
+    y[:, 75:165] += 0.1 * torch.randn(90, dtype=torch.float64, generator=generator)
+    limits = sum(rows.energy(weight) for rows, weight in body_priors.terms(model, y)[:3]) - sum(
+        rows.energy(weight) for rows, weight in body_priors.terms(model, x)[:3]
+    )
+    once = body_priors.cost(model, y, shape=True) - at_mean - limits
+    fifth = body_priors.cost(model, y, shape=True, hand_share=0.2) - at_mean - limits
+    assert once.item() > 1
+    torch.testing.assert_close(5 * fifth, once)

@@ -2,7 +2,10 @@
 
 Shape, thickness of clothing and keypoint offsets stay as the body fit found them. E_B's own terms
 and weights are those of :mod:`intercap_core.body_fit.problem`; no setting of the joint fit weighs
-them. A frame without a fit stays near the pose interpolated there.
+them. E_theta_h alone counts less: a hand's pose lasts, so that over many frames its prior is seen
+again and again where keypoints bring something new; with full weight in every frame fingers stay
+tens of millimetres short of what several views agree on. A frame without a fit stays near the pose
+interpolated there.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from intercap_core.joint.cameras import FREEDOMS, Cameras, Sights
 from intercap_core.joint.constants import (
     BRIDGED_BODY_SHIFT,
     BRIDGED_BODY_TURN,
+    HAND_LASTING_S,
     OFFSET_UNCHANGED_S,
 )
 from intercap_core.joint.equations import NormalEquations
@@ -70,6 +74,7 @@ class BodyData(Term):
         model: BodyModel,
         state: State,
         settings: BodyFitSettings,
+        fps: float,
         pose_prior: VPoser | None = None,
     ) -> BodyData:
         """Read the observations and what the body fit found to be constant."""
@@ -90,6 +95,7 @@ class BodyData(Term):
         )
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
         problem.columns = torch.arange(BODY.stop, device=model.device)
+        problem.hand_share = min(1.0, 1 / (fps * HAND_LASTING_S))
         return cls(fitter, problem, ~body_fit["failed"])
 
     def refresh(self, state: State) -> None:
