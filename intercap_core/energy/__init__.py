@@ -51,6 +51,8 @@ differences from the paper are in ``docs/equations.md``.
 | beyond | what stands, detected | contact/standing.py | standing_probability | - |
 | beyond | body in object: residuals | energy/penetration.py | weights | joint.penetration_weight |
 | beyond | body in object | joint/terms/penetration.py | Penetration | joint.penetration_weight |
+| beyond | object in body: distances | energy/object_in_body.py | embedded | same |
+| beyond | object in body | joint/terms/object_in_body.py | ObjectInBody | same |
 | 6, A.5 | E_G: residuals | energy/ground.py | residuals | joint.ground_weight |
 | 6, A.5 | E_G | joint/terms/ground.py | BodyGround | joint.ground_weight |
 | 6, A.6 | E_G' | joint/terms/ground.py | ObjectGround | joint.ground_weight |

@@ -16,6 +16,11 @@ CONTACT_OUTLIER = 0.02
 CONTACT_TOLERANCE = 0.002
 # Contact leaves the mesh up to this deep in the surface, metres: skin yields. Tuned on the studio.
 PENETRATION_TOLERANCE = 0.001
+# Points of the object deeper than this inside the body are left out, metres: half of a hand's
+# thickness (anatomy), beyond which the nearest skin may be that of its far side.
+DEEPEST_IN_BODY = 0.015
+# Points so far outside the skin may enter it during a round, metres. Tuned on the studio.
+WATCHED_OUTSIDE = 0.003
 # Nearer to the surface than this, metres, the direction to the closest point is noise: the face's
 # normal is used. Tuned on the studio.
 ON_SURFACE = 1e-4

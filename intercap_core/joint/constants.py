@@ -11,6 +11,15 @@ from math import radians
 CONTACT_SIGMA = 0.004
 # Depth of a vertex inside the object beyond the tolerance, metres. Tuned on the studio.
 PENETRATION_SIGMA = 0.003
+# Points of the object's surface that are looked for inside the body: their spacing, metres, so that
+# a rim shows on a fingertip, and how many at most.
+OBJECT_SPACING, MAX_OBJECT_POINTS = 0.006, 6000
+# Area of the object inside the body that is one measurement, m^2: a hand's breadth of a handle.
+# Tuned on the studio.
+OBJECT_AREA_PER_MEASUREMENT = 1e-3
+# Skin whose nearest sample is farther than this from the object has none of it inside, metres: half
+# the spacing of samples, a thickness and the way of a round.
+NEAR_SKIN = 0.05
 # Depth of a vertex below the floor, metres: the ground plane's own error. Tuned on the studio.
 GROUND_SIGMA = 0.005
 # Vertices of the body's mesh, inside the object or below the floor, that are one measurement:

@@ -66,9 +66,12 @@ class PosedGeometry:
     @cached_property
     def skin(self) -> np.ndarray:
         """(T, N, 3) the skin's vertices."""
-        g = self._geometry
+        return self.posed(self._geometry.skin.vertices)
+
+    def posed(self, vertices: np.ndarray) -> np.ndarray:
+        """(T, K, 3) the body's ``vertices`` (K,)."""
         with torch.no_grad():
-            body = g.model(self._parameters, vertex_ids=g.skin.vertices)
+            body = self._geometry.model(self._parameters, vertex_ids=vertices)
         return body.vertices.double().cpu().numpy()
 
     @cached_property

@@ -1,13 +1,13 @@
 """The energy of equation 6 as an ordered tuple of terms, each in a file of :mod:`.terms`.
 
-    E = E_B + E_O + lambda_Q Q_t E_C + stick + body in object + lambda_G E_G + plant
-        + lambda_S E_S + drift + lambda_A E_A + drift + lambda_G E_G'
+    E = E_B + E_O + lambda_Q Q_t E_C + stick + body in object + object in body
+        + lambda_G E_G + plant + lambda_S E_S + drift + lambda_A E_A + drift + lambda_G E_G'
 
-The paper's E_P (equation 5) is part of E_B; body in object, stick, plant and drift go beyond the
-paper. To read a term, open its file; to leave one out or add one, change :func:`joint_terms`. Every
-residual is divided by the standard deviation that its source leaves unexplained, so that a term's
-weight in the settings is 1 where it is as strong as its evidence. The table of all equations is in
-:mod:`intercap_core.energy`.
+The paper's E_P (equation 5) is part of E_B; body in object and object in body, stick, plant and
+drift go beyond the paper. To read a term, open its file; to leave one out or add one, change
+:func:`joint_terms`. Every residual is divided by the standard deviation that its source leaves
+unexplained, so that a term's weight in the settings is 1 where it is as strong as its evidence. The
+table of all equations is in :mod:`intercap_core.energy`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.drift import BodyDrift, ObjectDrift
 from intercap_core.joint.terms.ground import BodyGround, Ground, ObjectGround
 from intercap_core.joint.terms.motion import BodyMotion, ObjectMotion
+from intercap_core.joint.terms.object_in_body import ObjectInBody
 from intercap_core.joint.terms.penetration import Penetration
 from intercap_core.joint.terms.plant import Plant
 from intercap_core.joint.terms.stick import Stick
@@ -66,6 +67,7 @@ def joint_terms(
         contact,
         Stick(geometry, contact, fps, settings.stick_weight),
         Penetration(geometry, settings.penetration_weight),
+        ObjectInBody(geometry, settings.penetration_weight),
         *((BodyGround(geometry, floor, settings.ground_weight),) if floor else ()),
         Plant(geometry, floor, fps, settings.plant_weight),
         motion or BodyMotion(geometry, fps, settings.body_smoothness),

@@ -12,10 +12,11 @@ from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
-from intercap_core.metrics.clouds import Cloud, sample_surface, visible_to_cloud
+from intercap_core.metrics.clouds import Cloud, visible_to_cloud
 from intercap_core.metrics.proximity import Sight, distance_to_body, face_normals
 from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
 from intercap_core.metrics.truth import Truth
+from intercap_core.rigid.surface_samples import sample_surface
 from intercap_core.schemas import SCENE
 
 EVERY = 5  # one frame in so many is compared with its points: neighbours are redundant

@@ -2,45 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import cKDTree
-
-# Steps of the two-dimensional golden-ratio sequence: evenly spread barycentric coordinates
-# without a random generator (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
-# Sequences").
-_STEP_U, _STEP_V = 0.7548776662466927, 0.5698402909980532
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceSamples:
-    """Points spread evenly over a mesh's area: ``faces`` (N,), ``barycentric`` (N, 3)."""
-
-    faces: np.ndarray
-    barycentric: np.ndarray
-
-    def of(self, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """Interpolate values (V, ...) at the vertices of ``triangles`` (F, 3): (N, ...)."""
-        corners = triangles[self.faces]
-        weights = self.barycentric.reshape(len(self.faces), 3, *([1] * (values.ndim - 1)))
-        return sum(values[corners[:, k]] * weights[:, k] for k in range(3))
-
-    def __len__(self) -> int:
-        return len(self.faces)
-
-
-def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> SurfaceSamples:
-    """Spread ``count`` points over the area of (V, 3), (F, 3); the same mesh gives the same."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    reached = np.cumsum(area)
-    faces = np.searchsorted(reached, (np.arange(count) + 0.5) / count * reached[-1])
-    number = np.arange(1, count + 1)
-    u, v = (number * _STEP_U) % 1, (number * _STEP_V) % 1
-    outside = u + v > 1
-    u[outside], v[outside] = 1 - u[outside], 1 - v[outside]
-    return SurfaceSamples(np.minimum(faces, len(triangles) - 1), np.column_stack([1 - u - v, u, v]))
 
 
 class Cloud:

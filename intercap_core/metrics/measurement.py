@@ -8,12 +8,13 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.metrics import contact, penetration
-from intercap_core.metrics.clouds import Cloud, sample_surface, vertex_to_cloud, visible_to_cloud
+from intercap_core.metrics.clouds import Cloud, vertex_to_cloud, visible_to_cloud
 from intercap_core.metrics.proximity import PosedObject, Sight, distance_to_body, face_normals
 from intercap_core.metrics.segmented import SegmentedClouds
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
 from intercap_core.metrics.truth import Truth
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.surface_samples import sample_surface
 from intercap_core.schemas import CONTACT_REGIONS
 
 BODY_SAMPLES = 4000  # points of the body compared with the cloud, area-sampled

@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.metrics import body, contact, motion, object_pose
-from intercap_core.metrics.clouds import SurfaceSamples
 from intercap_core.metrics.planted import Floor
 from intercap_core.metrics.times import match_times
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.surface_samples import SurfaceSamples
 from intercap_core.schemas import METRIC_REGIONS, TRUTH
 
 

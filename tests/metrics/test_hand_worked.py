@@ -7,9 +7,10 @@ import pytest
 
 from intercap_core.config import ContinuousSymmetry, Symmetry
 from intercap_core.metrics import body, contact, flags, motion, object_pose, penetration
-from intercap_core.metrics.clouds import Cloud, sample_surface, vertex_to_cloud, visible_to_cloud
+from intercap_core.metrics.clouds import Cloud, vertex_to_cloud, visible_to_cloud
 from intercap_core.metrics.extrinsics import displacement, rig_centre
 from intercap_core.metrics.proximity import PosedObject, Sight, distance_to_body, face_normals
+from intercap_core.rigid.surface_samples import sample_surface
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
