@@ -17,11 +17,3 @@ def residuals(points: np.ndarray, ground_point: np.ndarray, normal: np.ndarray) 
     Its derivative by a point is ``normal`` where the residual is negative and 0 elsewhere.
     """
     return np.minimum((points - ground_point) @ normal, 0.0)
-
-
-def by_object(points: np.ndarray, translation: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Derivative (T, N, 6) of the heights of object points (T, N, 3) by (w, d), for the motion
-    X' = exp(w)(X - t) + t + d with ``translation`` t (T, 3)."""
-    arm = points - translation[:, None]
-    turn = np.cross(arm, np.broadcast_to(normal, arm.shape))
-    return np.concatenate([turn, np.broadcast_to(normal, arm.shape)], axis=2)

@@ -51,9 +51,3 @@ def embedded(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Emb
     near = np.flatnonzero((distance > -DEEPEST_IN_BODY) & (distance < WATCHED_OUTSIDE))
     vertex = corners[near, closest.barycentric[near].argmax(axis=1)]
     return Embedded(near, vertex, normal[near], distance[near])
-
-
-def by_object(points: np.ndarray, normals: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """d distance / d (w, d) (T, N, 6) of points (T, N, 3) that move with the object,
-    X' = exp(w)(X - t) + t + d, along ``normals`` (T, N, 3); ``translation`` (T, 3) is t."""
-    return np.concatenate([np.cross(points - translation[:, None], normals), normals], axis=2)

@@ -31,17 +31,24 @@ class Surface(Protocol):
 class Proximity:
     """Distances of N points in T frames to the object's surface, master frame, metres.
 
-    ``distance`` (T, N), negative inside; ``normals`` (T, N, 3) d distance / d point;
-    ``by_object`` (T, N, 6) d distance / d (w, d) for the motion X' = exp(w)(X - t) + t + d.
+    ``distance`` (T, N), negative inside; ``normals`` (T, N, 3) d distance / d point. By the object
+    its derivative is minus that of a point at the same place that moves with it
+    (:func:`along_by_object`): x - q is parallel to n, and turning n changes nothing to first order.
     """
 
     distance: np.ndarray
     normals: np.ndarray
-    by_object: np.ndarray
 
     def at(self, index: np.ndarray) -> Proximity:
         """The same for the points ``index`` (M,) alone."""
-        return Proximity(self.distance[:, index], self.normals[:, index], self.by_object[:, index])
+        return Proximity(self.distance[:, index], self.normals[:, index])
+
+
+def along_by_object(points: np.ndarray, along: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """d (a . x) / d (w, d) (T, N, 6) of points x (T, N, 3) that move with the object,
+    X' = exp(w)(X - t) + t + d; ``along`` (T, N, 3) are the directions a, ``translation`` (T, 3)
+    is t."""
+    return np.concatenate([np.cross(points - translation[:, None], along), along], axis=2)
 
 
 def proximity(
@@ -53,10 +60,10 @@ def proximity(
     """Distances of ``points`` (T, N, 3) to the object at ``rotation`` (T, 3, 3) and
     ``translation`` (T, 3), all in the master frame, with exact first derivatives."""
     shape = points.shape[:2]
-    found = Proximity(np.empty(shape), np.empty((*shape, 3)), np.empty((*shape, 6)))
+    found = Proximity(np.empty(shape), np.empty((*shape, 3)))
     for start in range(0, len(points), _FRAMES_TOGETHER):
         at = slice(start, start + _FRAMES_TOGETHER)
-        found.distance[at], found.normals[at], found.by_object[at] = _proximity(
+        found.distance[at], found.normals[at] = _proximity(
             surface, points[at], rotation[at], translation[at]
         )
     return found
@@ -67,8 +74,8 @@ def _proximity(
     points: np.ndarray,
     rotation: np.ndarray,
     translation: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance, normals and derivative by the object, of a few frames."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance and normals of a few frames."""
     frames, count = points.shape[:2]
     local = (points - translation[:, None]) @ rotation
     flat = local.reshape(-1, 3)
@@ -78,10 +85,5 @@ def _proximity(
     sign = np.where(inside, -1.0, 1.0)
     direction = sign[:, None] * offset / np.maximum(length, ON_SURFACE)[:, None]
     direction = np.where((length < ON_SURFACE)[:, None], closest.normals, direction)
-    to_master = rotation.transpose(0, 2, 1)  # of rows
-    normals = direction.reshape(frames, count, 3) @ to_master
-    # d/dw of -n . (exp(w) (q - t)) = -((q - t) x n); turning n itself changes nothing to first
-    # order since x - q is parallel to it.
-    arm = closest.points.reshape(frames, count, 3) @ to_master
-    by_object = np.concatenate([-np.cross(arm, normals), -normals], axis=2)
-    return (sign * length).reshape(frames, count), normals, by_object
+    normals = direction.reshape(frames, count, 3) @ rotation.transpose(0, 2, 1)
+    return (sign * length).reshape(frames, count), normals

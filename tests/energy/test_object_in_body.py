@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from intercap_core.energy import object_in_body
 from intercap_core.energy.constants import DEEPEST_IN_BODY, WATCHED_OUTSIDE
@@ -30,17 +28,3 @@ def test_depth_and_direction_in_a_ball() -> None:
     assert ((held.normal * way[held.point]).sum(axis=1)[off] > 0.98).all()
     gap = np.linalg.norm(ball.vertices[held.vertex] - points[held.point], axis=1)
     assert (gap < np.abs(held.distance) + 0.008).all()
-
-
-def test_derivative_by_the_object() -> None:
-    rng = np.random.default_rng(1)
-    points, normals = rng.normal(size=(2, 4, 3)), rng.normal(size=(2, 4, 3))
-    translation, twist = rng.normal(size=(2, 3)), rng.normal(size=6)
-    found = object_in_body.by_object(points, normals, translation) @ twist
-
-    def moved(step: float) -> np.ndarray:
-        turn = Rotation.from_rotvec(step * twist[:3]).as_matrix()
-        there = (points - translation[:, None]) @ turn.T + translation[:, None] + step * twist[3:]
-        return (there * normals).sum(axis=2)
-
-    assert found == pytest.approx((moved(1e-5) - moved(-1e-5)) / 2e-5, abs=1e-6)

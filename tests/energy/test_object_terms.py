@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.energy import contact, ground, penetration, smoothness
 from intercap_core.energy.constants import PENETRATION_TOLERANCE
-from intercap_core.energy.proximity import proximity
+from intercap_core.energy.proximity import along_by_object, proximity
 from intercap_core.rigid.distance import DistanceField, SurfacePart
 
 RNG = np.random.default_rng(3)
@@ -42,6 +42,7 @@ def test_distance_derivatives_match_finite_differences(annotated):
     rotation, translation = _poses(3)
     points = translation[:, None] + RNG.normal(scale=0.15, size=(3, 40, 3))
     near = proximity(field, points, rotation, translation)
+    by_object = -along_by_object(points, near.normals, translation)
     step = 2e-3
 
     def moved(twist: np.ndarray) -> np.ndarray:
@@ -52,7 +53,7 @@ def test_distance_derivatives_match_finite_differences(annotated):
         twist = np.eye(6)[axis] * step
         numeric = (moved(twist) - moved(-twist)) / (2 * step)
         # points that change their nearest face within the step have no derivative
-        agree = np.abs(numeric - near.by_object[..., axis]) < 2e-3
+        agree = np.abs(numeric - by_object[..., axis]) < 2e-3
         assert agree.mean() > 0.9
     for axis in range(3):
         offset = np.eye(3)[axis] * step
@@ -115,16 +116,17 @@ def test_ground_counts_what_is_below_alone():
     np.testing.assert_allclose(height, [[0, -0.02]])
 
 
-def test_ground_derivative_matches_finite_differences():
-    points, translation = RNG.normal(size=(2, 5, 3)), RNG.normal(size=(2, 3))
-    normal = np.array([0.6, 0.0, 0.8])
-    rows = ground.by_object(points, translation, normal)
+def test_what_moves_with_the_object_has_the_derivative_of_finite_differences():
+    points, along = RNG.normal(size=(2, 2, 5, 3))
+    translation = RNG.normal(size=(2, 3))
+    rows = along_by_object(points, along, translation)
     step = 1e-6
     for axis in range(6):
         twist = np.eye(6)[axis] * step
         turn = Rotation.from_rotvec(twist[:3]).as_matrix()
         moved = (points - translation[:, None]) @ turn.T + translation[:, None] + twist[3:]
-        np.testing.assert_allclose(((moved - points) @ normal) / step, rows[..., axis], atol=1e-5)
+        change = ((moved - points) * along).sum(axis=2) / step
+        np.testing.assert_allclose(change, rows[..., axis], atol=1e-5)
 
 
 def test_six_points_carry_the_energy_of_all_vertices():

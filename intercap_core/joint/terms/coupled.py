@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.energy import stick
-from intercap_core.energy.proximity import Proximity
+from intercap_core.energy.proximity import Proximity, along_by_object
 from intercap_core.energy.smoothness import RATE
 from intercap_core.joint.equations import NormalEquations, Rows
 from intercap_core.joint.geometry import PosedGeometry
@@ -28,9 +28,10 @@ def add_distances(
     """
 
     def rows(frames: slice, index: np.ndarray) -> np.ndarray:
-        normals = near.normals[frames, index, None]
-        by_object = near.by_object[frames, index, None]
-        return np.concatenate([posed.skin_by_body(frames, index, normals), by_object], axis=3)
+        normals, skin = near.normals[frames, index], posed.skin[frames, index]
+        by_body = posed.skin_by_body(frames, index, normals[:, :, None])
+        by_object = -along_by_object(skin, normals, posed.state.translation[frames])
+        return np.concatenate([by_body, by_object[:, :, None]], axis=3)
 
     equations.add_rows(name, ALL, rows, weight, residual[..., None], energy)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.energy import ground
+from intercap_core.energy.proximity import along_by_object
 from intercap_core.joint.constants import (
     GROUND_SIGMA,
     MIN_STANDING_VERTICES,
@@ -78,7 +79,8 @@ class ObjectGround(Term):
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
             points, origin = vertices[frames, index], state.translation[frames]
-            return ground.by_object(points, origin, self._floor.normal)[:, :, None]
+            up = np.broadcast_to(self._floor.normal, points.shape)
+            return along_by_object(points, up, origin)[:, :, None]
 
         equations.add_rows(self.name, OBJECT, rows, weight, height[..., None])
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core.energy import object_in_body, penetration
 from intercap_core.energy.constants import PENETRATION_TOLERANCE
+from intercap_core.energy.proximity import along_by_object
 from intercap_core.joint.constants import (
     MAX_OBJECT_POINTS,
     NEAR_SKIN,
@@ -120,11 +121,13 @@ class ObjectInBody(Term):
         distance = ((points - skin) * normals).sum(axis=2) + self._beside
         residual, _ = penetration.weights(distance, np.ones(len(self._vertices)))
         weight = np.where(residual < 0, self._share, 0.0) * self._scale
-        by_object = object_in_body.by_object(points, normals, state.translation)
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
             axes = -normals[frames, index, None]
             by_body = posed.vertices_by_body(frames, self._vertices[index], axes)
-            return np.concatenate([by_body, by_object[frames, index, None]], axis=3)
+            by_object = along_by_object(
+                points[frames, index], normals[frames, index], state.translation[frames]
+            )
+            return np.concatenate([by_body, by_object[:, :, None]], axis=3)
 
         equations.add_rows(self.name, ALL, rows, weight, residual[..., None])
