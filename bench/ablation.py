@@ -95,6 +95,9 @@ def ablate(
     strange = [name for name in variants if name not in VARIANTS]
     if strange:
         raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
+    projects = {  # all of them first: settings that cannot be used are told before any is computed
+        variant: load_project(settings, {"joint": VARIANTS[variant]}) for variant in variants
+    }
     paths: Paths = {}
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
@@ -103,12 +106,11 @@ def ablate(
     with bar as progress:
         task = progress.add_task("", total=len(variants) * len(names))
         for variant in variants:
-            project = load_project(settings, {"joint": VARIANTS[variant]})
             paths[variant] = {}
             for name in names:
                 progress.update(task, description=f"{variant}: {name}")
                 begin = time.perf_counter()
-                paths[variant][name] = _fit(project, name, folder / slug(variant))
+                paths[variant][name] = _fit(projects[variant], name, folder / slug(variant))
                 seconds = time.perf_counter() - begin
                 progress.console.print(f"{variant}: {name}, {seconds:.0f} s", highlight=False)
                 progress.advance(task)

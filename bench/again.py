@@ -46,6 +46,7 @@ def compute_once(
     """``output``, computed from the artefacts ``paths`` unless it is there of the same content."""
     key, content = output.with_suffix(".key"), _content(stage, project, sequence, paths)
     if not (output.exists() and key.exists() and key.read_text() == content):
+        key.unlink(missing_ok=True)  # a run that is ended here leaves no key beside another content
         inputs = {name: paths[name] for name in STAGES[stage].reads}
         run_step(stage, project, sequence, inputs=inputs, output=output)
         key.write_text(content)
@@ -62,7 +63,9 @@ def _content(stage: str, project: Project, sequence: str, paths: Mapping[str, Pa
     for told in (entry, project.subjects[row.subject]):
         state.update(told.model_dump_json().encode())
     files = [paths[name] for name in STAGES[stage].reads]
-    files += [path for path in (entry.mesh, entry.contact_vertices) if path is not None]
+    models, gender = project.config.body_models, project.subjects[row.subject].gender
+    files += [entry.mesh, entry.contact_vertices, models.of(gender), models.vposer]
+    files += project.config.joint.lemo_files or ()
     for path in [*files, *([row.truth] if stage == "metrics" else [])]:
         if path is not None:
             state.update(file_digest(path))

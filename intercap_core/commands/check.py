@@ -30,7 +30,7 @@ class Fault:
 def check_bodies(project: Project) -> None:
     """Open the body files and the priors of pose and motion that the settings name.
 
-    Raises UserError where one cannot be used: every sequence would fail by it, hours later.
+    Raises UserError where one cannot be opened: every sequence would fail by it, hours later.
     """
     lemo = project.config.joint.lemo_files
     if lemo is not None:

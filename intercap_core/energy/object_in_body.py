@@ -1,6 +1,9 @@
 """Object in body, beside equation 6: points of the object's surface inside the body.
 
-    E = sum over points x of the object inside the body of a (depth(x) - tolerance)^2
+    E = sum over vertices v of the skin of a_v (depth(x_v) - tolerance)^2
+
+x_v is the deepest of the object's points that lie nearest to v, none deeper than
+``DEEPEST_IN_BODY``, and a_v the area of those that are inside.
 
 A rim, a thin handle or a seat's edge lies between the body's sparse vertices, so that none of them
 is inside the object while its points are inside the body. Beyond the paper; the other side of

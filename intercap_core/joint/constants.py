@@ -177,9 +177,11 @@ CONTACT_CONVERGED = 0.1
 # A hand whose keypoints are mostly seen in so many views or fewer is undetermined: what hides it
 # from the others hides fingers from these.
 FEW_HAND_VIEWS = 2
-# A frame with a skin vertex deeper than this inside the object is flagged, metres: far beyond what
-# skin yields, so one of the two poses is wrong. Tuned on the studio.
+# A frame with skin deeper than this inside the object, or the other way round, is flagged, metres:
+# far beyond what skin yields, so one of the two poses is wrong. Tuned on the studio.
 FLAGGED_DEPTH = 0.03
+# Points of the object's surface that are held against the body for that.
+DEPTH_POINTS = 400
 # Feet so far below the floor, or feet and object so far above it, contradict it, metres: several
 # times what sequential fits err there (at most 0.03). Tuned on the studio.
 FLOOR_CONTRADICTED = 0.10

@@ -192,13 +192,15 @@ def _flag_reasons(
 ) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
     lowered its energy; ``against_images`` (T,): they contradict the object's final pose."""
-    deep = geometry.at(state).proximity.distance.min(axis=1) < -FLAGGED_DEPTH
+    posed = geometry.at(state)
+    deep = posed.proximity.distance.min(axis=1) < -FLAGGED_DEPTH
     causes = (
         (flags.filled, "body not seen well enough, filled in"),
         (flags.uncertain, "body not determined by what was seen"),
         (flags.lost, "object lost, filled in"),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
+        (posed.object_depth() > FLAGGED_DEPTH, "object deep inside the body"),
         *estimate.distrust(),
         (stuck, "no step of the joint fit lowered its energy"),
         (against_images, "the images contradict the object's pose"),

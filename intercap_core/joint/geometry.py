@@ -13,11 +13,12 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.contact.patches import Patches
 from intercap_core.energy import smoothness
 from intercap_core.energy.proximity import Proximity, Surface, proximity
-from intercap_core.joint.constants import OBJECT_ARM
+from intercap_core.joint.constants import DEPTH_POINTS, OBJECT_ARM
 from intercap_core.joint.skin import Skin
 from intercap_core.joint.state import BODY, State
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.surface_samples import sample_surface
 
 _FRAMES_TOGETHER = 32  # frames whose derivatives are made at a time
 
@@ -73,6 +74,27 @@ class PosedGeometry:
         with torch.no_grad():
             body = self._geometry.model(self._parameters, vertex_ids=vertices)
         return body.vertices.double().cpu().numpy()
+
+    def object_depth(self) -> np.ndarray:
+        """(T,) how deep the object's surface is inside the body at most, metres, 0 = not at all: by
+        points spread over it, against all of the posed body."""
+        g, state = self._geometry, self.state
+        mesh, faces = g.mesh, g.model.faces.cpu().numpy()
+        points = sample_surface(mesh.vertices, mesh.faces, DEPTH_POINTS).of(
+            mesh.vertices, mesh.faces
+        )
+        vector, depth = self._parameters.vector(), np.zeros(len(state))
+        for start in range(0, len(state), _FRAMES_TOGETHER):
+            with torch.no_grad():
+                bodies = g.model(g.model.parameters(vector[start : start + _FRAMES_TOGETHER]))
+            for t, vertices in enumerate(bodies.vertices.cpu().numpy(), start):
+                placed = points @ state.rotation[t].T + state.translation[t]
+                beside = (placed > vertices.min(axis=0)) & (placed < vertices.max(axis=0))
+                near = placed[beside.all(axis=1)]
+                if len(near):
+                    distance = DistanceField(vertices, faces).signed_distance(near)
+                    depth[t] = max(0.0, -float(distance.min()))
+        return depth
 
     @cached_property
     def proximity(self) -> Proximity:

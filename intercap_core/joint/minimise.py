@@ -86,6 +86,7 @@ def minimise(
             if promised < NEGLIGIBLE_SHARE * here.total and tried.max() < HELD_DAMPING:
                 converged = True
                 break
+            del there  # two states' equations are never held at once
             here = linearise(state)
             continue
         gain = here.total - there.total

@@ -194,7 +194,9 @@ def _motion_encoder(
             "joint.lemo out for small accelerations of the joints"
         )
     weights, statistics = settings.lemo_files
-    return MotionEncoder.load(weights, statistics, device=model.device)
+    # in double precision: E_S is a small difference of large latents, which a GPU's convolutions
+    # round to ten bits otherwise
+    return MotionEncoder.load(weights, statistics, device=model.device, dtype=torch.float64)
 
 
 def _touched(mesh: ObjectMesh, field: DistanceField, settings: JointSettings) -> SurfacePart | None:

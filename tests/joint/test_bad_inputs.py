@@ -259,6 +259,18 @@ def test_very_short_recordings(model: BodyModel, tmp_path: Path, frames: int) ->
     assert found["energy_after"].sum() <= found["energy_before"].sum()
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_last_frame_without_a_fit_is_bridged(
+    model: BodyModel, tmp_path: Path, frames: int
+) -> None:
+    here = hold(model, tmp_path, frames)
+    failed = np.arange(frames) == frames - 1
+    here.put("body_fit", failed=failed, bridged=failed)
+    found = here.run()
+    assert np.isfinite(found["joints"]).all()
+    assert found["flagged"].tolist() == failed.tolist()
+
+
 def test_a_hand_that_nothing_determines_is_told_and_not_flagged(
     model: BodyModel, tmp_path: Path
 ) -> None:

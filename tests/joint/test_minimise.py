@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -66,6 +68,20 @@ def test_an_energy_that_is_no_number_in_a_frame_is_refused() -> None:
     found = minimise(breaks, _state(), max_steps=12)
     assert np.isfinite(found.equations.total) and found.steps > 0
     assert np.linalg.norm(found.state.translation[0]) < 0.001
+
+
+def test_one_state_s_matrices_are_held_at_a_time() -> None:
+    """Also after a step that was refused."""
+    broken, made, most = _pulled_to_the_origin(lies=True), [], []
+
+    def counted(state: State) -> NormalEquations:
+        most.append(sum(seen().bands.size > 0 for seen in made if seen() is not None))
+        equations = broken(state)
+        made.append(weakref.ref(equations))
+        return equations
+
+    assert minimise(counted, _state(), max_steps=12).refused > 1
+    assert max(most) == 0
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
 from intercap_core.contact.patches import contact_patches
@@ -102,6 +103,15 @@ class _Scene:
     def distance(self, state: State) -> np.ndarray:
         """(T, N) of the skin's vertices to the box."""
         return self.geometry.at(state).proximity.distance
+
+
+def test_how_deep_an_object_is_in_the_body(model, box):
+    state = _state(model, 0.05)
+    scene = _Scene(model, box, state)
+    assert (scene.geometry.at(state).object_depth() == 0).all()
+    chest = scene.geometry.at(state).joints[0][:, JOINT_INDEX["spine2"]]
+    within = State(state.body, state.betas, state.expression, state.rotation, chest)
+    assert (scene.geometry.at(within).object_depth() > 0.05).all()
 
 
 def _state(model: BodyModel, gap: float) -> State:

@@ -17,7 +17,7 @@ rule joint:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
+        mem_mb=memory(6000),
         runtime=120,
     params:
         settings=settings_of("joint"),

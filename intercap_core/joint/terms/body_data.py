@@ -95,7 +95,8 @@ class BodyData(Term):
         )
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
         problem.columns = torch.arange(BODY.stop, device=model.device)
-        problem.hand_share = min(1.0, 1 / (fps * HAND_LASTING_S))
+        lasting = min(fps * HAND_LASTING_S, len(fitter.frames))
+        problem.hand_share = 1 / max(lasting, 1.0)
         return cls(fitter, problem, ~body_fit["failed"])
 
     def refresh(self, state: State) -> None:
@@ -119,8 +120,9 @@ class BodyData(Term):
         energy = np.zeros(len(state))
         for some in self._index.split(_FRAMES_TOGETHER):
             normal = self._problem.linearise(pose[some], shared, some)
-            trusted = self._trusted[some.cpu()]
-            at = self._fitter.frames[some.cpu()][trusted]
+            places = some.cpu().numpy()  # a tensor of one place would be taken for a number
+            trusted = self._trusted[places]
+            at = self._fitter.frames[places][trusted]
             hessian[at] = normal.hessian.cpu().numpy()[trusted]
             gradient[at] = normal.gradient.cpu().numpy()[trusted]
             energy[at] = normal.cost.double().cpu().numpy()[trusted]

@@ -117,8 +117,8 @@ def _everyday(encoder: MotionEncoder) -> Tensor:
 
 
 def _squared_norm(encoder: MotionEncoder, steps: Tensor) -> float:
-    """Largest eigenvalue of K^T K, K the derivative of the latents by steps (N, 243) over their
-    spread; by power iteration from a body that moves as one."""
+    """Largest eigenvalue of K^T K, estimated from below, K the derivative of the latents by steps
+    (N, 243) over their spread; by power iteration from a body that moves as one."""
     along = torch.ones_like(steps) / steps.numel() ** 0.5
     largest = 0.0
     for _ in range(SPECTRAL_ITERATIONS):

@@ -1,7 +1,9 @@
 """Object in body (beyond the paper): the other side of :mod:`.penetration`, of the same weight.
 
-Residuals in :mod:`intercap_core.energy.object_in_body`. Left out where the skin's own vertex is
-inside the object, which :mod:`.penetration` pushes out: a depth counts once.
+Residuals in :mod:`intercap_core.energy.object_in_body`. Of hands alone: what they hold is thin
+enough to lie between their vertices. Who sits is in the seat by what clothes and flesh yield, over
+an area on which the vertices of :mod:`.penetration` are dense, and would be lifted off it. Left out
+where the skin's own vertex is inside the object, which that term pushes out: a depth counts once.
 """
 
 from __future__ import annotations
@@ -24,10 +26,13 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.term import Term
 from intercap_core.rigid.surface_samples import sample_surface
+from intercap_core.schemas import CONTACT_REGIONS
+
+_HANDS = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith("_hand")]
 
 
 class ObjectInBody(Term):
-    """Depth of the object's surface inside the body, at the vertices of the skin nearest to it."""
+    """Depth of the object's surface inside the hands, at the vertices of the skin nearest to it."""
 
     name = "object_in_body"
 
@@ -43,6 +48,8 @@ class ObjectInBody(Term):
         model = geometry.model
         self._faces = model.faces.cpu().numpy().astype(np.int64)
         template = model.template.double().cpu().numpy()
+        hands = np.isin(geometry.patches.region, _HANDS)
+        self._hands = np.isin(np.arange(len(geometry.skin.vertices)), geometry.skin.patch[hands])
         self._sample_of = cKDTree(template[geometry.skin.vertices]).query(template)[1]
         self._vertices = np.zeros(0, int)  # (K,) of the body, held against points of the object
         self._local = np.zeros((0, 0, 3))  # (T, K, 3) those points, in its frame
@@ -53,7 +60,7 @@ class ObjectInBody(Term):
     def refresh(self, state: State) -> None:
         """Look for the object's points inside the body anew."""
         posed, frames = self._geometry.at(state), len(state)
-        near = np.abs(posed.proximity.distance) < NEAR_SKIN  # (T, N)
+        near = self._hands & (np.abs(posed.proximity.distance) < NEAR_SKIN)  # (T, N)
         ids = np.flatnonzero(near.any(axis=0)[self._sample_of])
         skin = posed.posed(ids) if len(ids) else np.zeros((frames, 0, 3))
         place = np.full(len(self._sample_of), -1)
