@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.energy import object_in_body, penetration
 from intercap_core.energy.constants import PENETRATION_TOLERANCE
 from intercap_core.energy.proximity import along_by_object
@@ -26,9 +27,13 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.term import Term
 from intercap_core.rigid.surface_samples import sample_surface
-from intercap_core.schemas import CONTACT_REGIONS
 
-_HANDS = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith("_hand")]
+# Joints that carry the hands' skin.
+_HANDS = [
+    i
+    for name, i in JOINT_INDEX.items()
+    if name.endswith("_wrist") or i >= JOINT_INDEX["left_index1"]
+]
 
 
 class ObjectInBody(Term):
@@ -48,8 +53,8 @@ class ObjectInBody(Term):
         model = geometry.model
         self._faces = model.faces.cpu().numpy().astype(np.int64)
         template = model.template.double().cpu().numpy()
-        hands = np.isin(geometry.patches.region, _HANDS)
-        self._hands = np.isin(np.arange(len(geometry.skin.vertices)), geometry.skin.patch[hands])
+        carrier = model.skinning_weights.argmax(1).cpu().numpy()
+        self._hands = np.isin(carrier, _HANDS)[geometry.skin.vertices]
         self._sample_of = cKDTree(template[geometry.skin.vertices]).query(template)[1]
         self._vertices = np.zeros(0, int)  # (K,) of the body, held against points of the object
         self._local = np.zeros((0, 0, 3))  # (T, K, 3) those points, in its frame
