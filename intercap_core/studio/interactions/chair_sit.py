@@ -12,7 +12,7 @@ from intercap_core.studio.skeleton import local_rotations
 BACK_PRESSED_M = 0.006  # the back gives way by this much on the slats
 OVER_SEAT_M = 0.04  # what is lower meets the seat
 SITS_ABOVE_M = 0.13  # the pelvis above the seat, about
-UPRIGHT_RAD, RECLINED_RAD = 0.08, 0.45
+UPRIGHT_RAD, RECLINED_RAD = 0.08, 0.65
 FARTHEST_AHEAD_M = 0.04  # of the pelvis from the seat's middle
 
 
@@ -23,7 +23,8 @@ class ChairSit(Sitting):
     palm_at = (-0.02, -0.19)
     rise_s, risen_s = 2.40, 3.20
     sat_back = -0.12
-    front_edge, on_thigh_s = 0.215, 1.95
+    front_edge, on_thigh_s = 0.262, 1.95
+    back_by_s = 0.12
 
     def turned(self) -> float:
         return np.pi / 2 + self.rng.normal(0, 0.03)

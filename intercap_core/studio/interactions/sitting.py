@@ -52,6 +52,7 @@ class Sitting(Interaction):
     sat_back = 0.005  # where the pelvis sits, metres ahead of the seat's middle
     recline = 0.10  # rad
     front_edge = 0.0  # the seat's front from its middle, metres; 0 where the legs may spread
+    back_by_s = 0.30  # before the person sits, the pelvis is above its place
     on_thigh_s = 1.74  # when the hands lie on the thighs
 
     def plan(self) -> None:
@@ -157,7 +158,7 @@ class Sitting(Interaction):
         shift = self.weight_shift(times) * (0.0 if still else 1.0)
         # the hips go back before they go down, and up before they come forward
         down = ramp(times, SIT_S, SEATED_S) - ramp(times, self.rise_s, self.risen_s)
-        back = ramp(times, SIT_S - 0.12, SEATED_S - 0.30)
+        back = ramp(times, SIT_S - 0.12, SEATED_S - self.back_by_s)
         back -= ramp(times, self.rise_s + 0.16, self.risen_s + 0.05)
         lean = plateau(times, SIT_S - 0.12, SIT_S + 0.36, SEATED_S - 0.20, SEATED_S + 0.20)
         up = self.rise_s
