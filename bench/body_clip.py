@@ -68,7 +68,7 @@ class BodyClip:
                 f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
                 "recording with the body model that it was made for"
             )
-        clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
+        clouds = person_clouds(frames, seen, settings.points_per_frame, model.device)
         return cls(model, seen, clouds, settings, truth.vertices)
 
     def __len__(self) -> int:

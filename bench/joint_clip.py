@@ -106,7 +106,7 @@ class JointClip:
             floor = Ground(scene["ground_point"], scene["ground_normal"]) if found else None
             fps = float(scene.attributes["fps"])
         seen = read_observations(paths["scene"], paths["person"])
-        clouds = list(person_clouds(paths["frames"], seen, settings.points_per_frame, model.device))
+        clouds = person_clouds(paths["frames"], seen, settings.points_per_frame, model.device)
         terms = TorchTerms(model, choose_samples(model))
         fitter = Fitter(model, seen, clouds, settings, load_pose_prior(models, model), terms)
         start = sequential.state

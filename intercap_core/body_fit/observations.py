@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.errors import UserError
 from intercap_core.schemas import PERSON, SCENE
+from intercap_core.solve.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +150,13 @@ class PersonCloud:
 
 def person_clouds(
     frames: Path, seen: Observations, count: int, device: torch.device
-) -> Iterator[PersonCloud | None]:
-    """The cloud of every frame in order, about ``count`` points each; None = no depth, no mask."""
+) -> list[PersonCloud | None]:
+    """The cloud of every frame, about ``count`` points each; None = no depth, no mask."""
     with Frames.open(frames) as reader:
         reader = reader.showing(seen.image_of)
-        for t in range(seen.num_frames):
-            yield _fused(reader, seen, t, count, device)
+        return ThreadPool(torch.get_num_threads()).map(
+            lambda t: _fused(reader, seen, t, count, device), range(seen.num_frames)
+        )
 
 
 def _fused(

@@ -21,6 +21,9 @@ PENETRATION_TOLERANCE = 0.001
 DEEPEST_IN_BODY = 0.015
 # Points so far outside the skin may enter it during a round, metres. Tuned on the studio.
 WATCHED_OUTSIDE = 0.003
+# Farther from the object's box than this, metres, the box stands for the surface: many times what
+# any term or contact asks about.
+FAR_FROM_BOX = 0.25
 # Nearer to the surface than this, metres, the direction to the closest point is noise: the face's
 # normal is used. Tuned on the studio.
 ON_SURFACE = 1e-4

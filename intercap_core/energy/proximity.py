@@ -4,7 +4,8 @@ Shared by E_C of equation 6 (A.4) and the term of body in object, which goes bey
 for those to the part of the surface that is annotated as likely touched.
 
 d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
-from q to x. Both terms are functions of this one distance.
+from q to x. Both terms are functions of this one distance. Far from the object, where neither says
+anything, q is the nearest point of its box: the most costly searches of the surface are those.
 """
 
 from __future__ import annotations
@@ -14,14 +15,16 @@ from typing import Protocol
 
 import numpy as np
 
-from intercap_core.energy.constants import ON_SURFACE
+from intercap_core.energy.constants import FAR_FROM_BOX, ON_SURFACE
 from intercap_core.rigid.distance import Closest
 
 _FRAMES_TOGETHER = 32  # what is between the points and the result is kept of so many at a time
 
 
 class Surface(Protocol):
-    """An object's surface, or a part of it."""
+    """An object's surface, or a part of it; ``box`` (2, 3) holds it."""
+
+    box: np.ndarray
 
     def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
         """Which of points (N, 3) of its frame are inside, and its closest points."""
@@ -79,11 +82,16 @@ def _proximity(
     frames, count = points.shape[:2]
     local = (points - translation[:, None]) @ rotation
     flat = local.reshape(-1, 3)
-    inside, closest = surface.boundary(flat)
-    offset = flat - closest.points
+    offset = flat - np.clip(flat, *surface.box)
     length = np.linalg.norm(offset, axis=1)
-    sign = np.where(inside, -1.0, 1.0)
+    near = np.flatnonzero(length < FAR_FROM_BOX)
+    inside, closest = surface.boundary(flat[near])
+    offset[near] = flat[near] - closest.points
+    length[near] = np.linalg.norm(offset[near], axis=1)
+    sign = np.ones(len(flat))
+    sign[near[inside]] = -1.0
     direction = sign[:, None] * offset / np.maximum(length, ON_SURFACE)[:, None]
-    direction = np.where((length < ON_SURFACE)[:, None], closest.normals, direction)
+    touching = length[near] < ON_SURFACE
+    direction[near[touching]] = closest.normals[touching]
     normals = direction.reshape(frames, count, 3) @ rotation.transpose(0, 2, 1)
     return (sign * length).reshape(frames, count), normals

@@ -9,6 +9,7 @@ import torch
 
 from intercap_core.joint.state import ALL
 from intercap_core.solve.banded import BandedSystem
+from intercap_core.solve.thread_pool import ThreadPool
 
 # Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in the F frames of a slice.
 Rows = Callable[[slice, np.ndarray], np.ndarray]
@@ -17,7 +18,7 @@ Rows = Callable[[slice, np.ndarray], np.ndarray]
 _FRAMES_TOGETHER = 8
 # Values of less weight than this share of their term's largest change nothing: the tail of a
 # Gaussian over a contact patch would have a row of each of its vertices.
-_NEGLIGIBLE = 1e-12
+_NEGLIGIBLE = 1e-7
 
 
 class NormalEquations:
@@ -30,7 +31,9 @@ class NormalEquations:
     freeze an object that has to move as one over many frames.
     """
 
-    def __init__(self, frames: int) -> None:
+    def __init__(self, frames: int, threads: ThreadPool | None = None) -> None:
+        """``threads`` make rows, of a few frames each; None is one."""
+        self._threads = threads or ThreadPool()
         self.bands = np.zeros((min(3, frames), frames, ALL.stop, ALL.stop))
         self.damped = np.zeros((frames, ALL.stop))
         self.gradient = np.zeros((frames, ALL.stop))
@@ -114,12 +117,13 @@ class NormalEquations:
             for d in range(ahead + 1)
         ]
         counts = couplings[0] > _NEGLIGIBLE * couplings[0].max(initial=0.0)
-        for start in range(0, frames, _FRAMES_TOGETHER):
+
+        def add_chunk(start: int) -> None:
             stop = min(start + _FRAMES_TOGETHER, frames)
             last = min(stop + ahead, frames)
             used = np.flatnonzero(counts[start:last].any(axis=0))
             if not len(used):
-                continue
+                return
             jacobian = rows(slice(start, last), used)
             size = jacobian.shape[2]
             jacobian = jacobian.reshape(last - start, -1, jacobian.shape[3])
@@ -128,11 +132,19 @@ class NormalEquations:
             for d, coupling in enumerate(couplings):
                 here = slice(start, min(stop, frames - d))
                 count = max(here.stop - here.start, 0)
-                weighted = np.repeat(coupling[here, used], size, axis=1)[..., None]
-                block = (jacobian[d : d + count] * weighted).transpose(0, 2, 1) @ jacobian[:count]
-                self.bands[d, here, columns, columns] += block
-                if d == 0 and not stiff:
+                weight = np.repeat(coupling[here, used], size, axis=1)[..., None]
+                if d:
+                    ahead_of = (jacobian[d : d + count] * weight).transpose(0, 2, 1)
+                    self.bands[d, here, columns, columns] += ahead_of @ jacobian[:count]
+                    continue
+                # of a matrix with itself half of the products are enough, which numpy knows
+                scaled = jacobian[:count] * np.sqrt(weight)
+                block = scaled.transpose(0, 2, 1) @ scaled
+                self.bands[0, here, columns, columns] += block
+                if not stiff:
                     self.damped[here, columns] += block.diagonal(axis1=1, axis2=2)
+
+        self._threads.map(add_chunk, range(0, frames, _FRAMES_TOGETHER))
 
 
 def _over_stencil(factors: Sequence[float] | np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.terms.term import Term
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
+from intercap_core.solve.thread_pool import ThreadPool
 
 log = logging.getLogger(__name__)
 
@@ -71,13 +72,14 @@ def fit(
     images: ObjectImages | None = None,
     cameras: CameraFit | None = None,
     motion: Term | None = None,
+    threads: ThreadPool | None = None,
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
     ``intervals`` are the annotated contacts, None where contact is to be detected. Without
     ``images`` the object's track stands for them; without ``cameras`` these stay as they are. A
     ``floor`` that the sequential fits contradict is left out, which flags every frame. ``motion``
-    is a learned E_S.
+    is a learned E_S; ``threads`` make rows of the equations, None is one.
     """
     state = sequential.state
     against_floor = contradiction(geometry, sequential, floor) if floor else ""
@@ -102,7 +104,8 @@ def fit(
             fps=fps,
             trust=sequential.trust,
             motion=motion,
-        )
+        ),
+        threads or ThreadPool(),
     )
 
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
@@ -113,9 +116,10 @@ def fit(
     estimate = estimator.at(state)
     for number, max_steps in enumerate(ROUND_STEPS, 1):
         contact.take_probability(estimate.probability)
-        problem.refresh(state)
+        body_data.refresh(state)
         offset_change = body_data.take_offsets(body_data.estimate_offsets(prior).offset)
         object_data.take_offsets(body_data.time_offset)
+        problem.refresh(state, but=body_data)
         minimum = minimise(problem.equations, state, max_steps=max_steps)
         state, steps, refused = minimum.state, steps + minimum.steps, refused + minimum.refused
         energy_before = energy_before or minimum.energy_before
@@ -175,7 +179,14 @@ def fit(
         refused=refused,
         converged=settled,
         flag_reasons=_flag_reasons(
-            geometry, state, sequential.flags, estimate, held | stuck, against_floor, against_images
+            geometry,
+            state,
+            sequential.flags,
+            estimate,
+            held | stuck,
+            against_floor,
+            against_images,
+            problem.threads,
         ),
         cameras=cameras is not None,
     )
@@ -189,6 +200,7 @@ def _flag_reasons(
     stuck: np.ndarray,
     against_floor: str,
     against_images: np.ndarray,
+    threads: ThreadPool,
 ) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
     lowered its energy; ``against_images`` (T,): they contradict the object's final pose."""
@@ -200,7 +212,7 @@ def _flag_reasons(
         (flags.lost, "object lost, filled in"),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
-        (posed.object_depth() > FLAGGED_DEPTH, "object deep inside the body"),
+        (posed.object_depth(threads) > FLAGGED_DEPTH, "object deep inside the body"),
         *estimate.distrust(),
         (stuck, "no step of the joint fit lowered its energy"),
         (against_images, "the images contradict the object's pose"),

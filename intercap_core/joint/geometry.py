@@ -19,6 +19,7 @@ from intercap_core.joint.state import BODY, State
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.surface_samples import sample_surface
+from intercap_core.solve.thread_pool import ThreadPool
 
 _FRAMES_TOGETHER = 32  # frames whose derivatives are made at a time
 
@@ -75,7 +76,7 @@ class PosedGeometry:
             body = self._geometry.model(self._parameters, vertex_ids=vertices)
         return body.vertices.double().cpu().numpy()
 
-    def object_depth(self) -> np.ndarray:
+    def object_depth(self, threads: ThreadPool) -> np.ndarray:
         """(T,) how deep the object's surface is inside the body at most, metres, 0 = not at all: by
         points spread over it, against all of the posed body."""
         g, state = self._geometry, self.state
@@ -87,13 +88,19 @@ class PosedGeometry:
         for start in range(0, len(state), _FRAMES_TOGETHER):
             with torch.no_grad():
                 bodies = g.model(g.model.parameters(vector[start : start + _FRAMES_TOGETHER]))
-            for t, vertices in enumerate(bodies.vertices.cpu().numpy(), start):
+            posed = bodies.vertices.cpu().numpy()
+
+            def deepest(t: int, vertices: np.ndarray) -> float:
                 placed = points @ state.rotation[t].T + state.translation[t]
                 beside = (placed > vertices.min(axis=0)) & (placed < vertices.max(axis=0))
                 near = placed[beside.all(axis=1)]
-                if len(near):
-                    distance = DistanceField(vertices, faces).signed_distance(near)
-                    depth[t] = max(0.0, -float(distance.min()))
+                if not len(near):
+                    return 0.0
+                body = DistanceField(vertices, faces, threads=1)
+                return max(0.0, -float(body.signed_distance(near).min()))
+
+            some = list(enumerate(posed, start))
+            depth[start : start + len(posed)] = threads.map(lambda one: deepest(*one), some)
         return depth
 
     @cached_property

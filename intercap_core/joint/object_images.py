@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
@@ -14,6 +16,7 @@ from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import open_renderer
+from intercap_core.solve.thread_pool import ThreadPool
 
 
 class ObjectImages:
@@ -30,11 +33,16 @@ class ObjectImages:
         mesh: ObjectMesh,
         settings: ObjectTrackSettings,
         labels: tuple[str, ...],
+        threads: ThreadPool | None = None,
     ) -> None:
+        """``threads`` look at a frame each where the CPU draws, None is one."""
         self._views = ViewCache(recording.views, VIEWS_KEPT_BYTES)
         self._geometry = list(recording.geometry)
         self._settings, self._labels = settings, labels
-        self._renderer = open_renderer(settings.render_on)
+        self._renderer = open_renderer(settings.render_on, threads=1)
+        self._threads = ThreadPool()
+        if threads is not None and self._renderer.device == "cpu":
+            self._threads = threads
         self.mesh, self.cameras = mesh.simplified(TRACKING_FACES), recording.cameras
         self.count = recording.count
 
@@ -49,20 +57,22 @@ class ObjectImages:
             for c, given in zip(self.cameras, self._geometry, strict=True)
         ]
 
-    def take_offsets(self, time_offset: np.ndarray) -> float:
-        """Take the cameras to expose ``time_offset`` (C,) seconds late; returns the largest change,
-        seconds."""
-        late = [float(time_offset[c]) for c in self.cameras]
-        change = [abs(s - g.time_offset_s) for s, g in zip(late, self._geometry, strict=True)]
+    def take_offsets(self, time_offset: np.ndarray) -> None:
+        """Take the cameras to expose ``time_offset`` (C,) seconds late."""
         self._geometry = [
-            given.corrected(given.camera, given.depth_bias_m, seconds)
-            for seconds, given in zip(late, self._geometry, strict=True)
+            given.corrected(given.camera, given.depth_bias_m, float(time_offset[c]))
+            for c, given in zip(self.cameras, self._geometry, strict=True)
         ]
-        return max(change, default=0.0)
 
-    def look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
-        """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,), without
-        what facets seem to say of the turns of a round one."""
+    def look(
+        self, frames: Sequence[int], poses: np.ndarray, twists: np.ndarray
+    ) -> dict[int, PoseEvidence]:
+        """What each of ``frames`` says about its pose, of those (T, 4, 4) of an object that moves
+        by ``twists`` (T, 6), without what facets seem to say of the turns of a round one."""
+        found = self._threads.map(lambda t: self._look(t, poses[t], twists[t]), frames)
+        return dict(zip(frames, found, strict=True))
+
+    def _look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
         views = [
             view.through(geometry)
             for view, geometry in zip(self._views(t), self._geometry, strict=True)

@@ -13,7 +13,7 @@ table of all equations is in :mod:`intercap_core.energy`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from intercap_core.joint.terms.penetration import Penetration
 from intercap_core.joint.terms.plant import Plant
 from intercap_core.joint.terms.stick import Stick
 from intercap_core.joint.terms.term import Term
+from intercap_core.solve.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True)
@@ -80,18 +81,21 @@ def joint_terms(
 
 @dataclass(frozen=True)
 class Problem:
-    """The sum of ``terms``."""
+    """The sum of ``terms``, whose rows ``threads`` make."""
 
     terms: tuple[Term, ...]
+    threads: ThreadPool = field(default_factory=ThreadPool)
 
     def equations(self, state: State) -> NormalEquations:
         """Linearise every term at ``state``."""
-        equations = NormalEquations(len(state))
+        equations = NormalEquations(len(state), self.threads)
         for term in self.terms:
             term.add(state, equations)
         return equations
 
-    def refresh(self, state: State) -> None:
-        """Take anew at ``state`` what terms hold fixed during a round of minimisation."""
+    def refresh(self, state: State, but: Term | None = None) -> None:
+        """Take anew at ``state`` what terms, all ``but`` one, hold fixed during a round of
+        minimisation."""
         for term in self.terms:
-            term.refresh(state)
+            if term is not but:
+                term.refresh(state)

@@ -106,14 +106,18 @@ def estimate_offsets(
 
 @dataclass(eq=False)
 class _Innovations:
-    """Sightings as innovations over time, means subtracted: rows of T - 1 frames, in units of
-    their own standard deviation."""
+    """Sightings as innovations over time, means subtracted, in units of their own standard
+    deviation: the N that any view saw of T - 1 frames' points.
+
+    residual, velocity (N,C,D), by_point (N,C,D,P), weight (N,C), part and frame (N,) of each.
+    """
 
     residual: np.ndarray
     velocity: np.ndarray
     by_point: np.ndarray
     weight: np.ndarray
     part: np.ndarray
+    frame: np.ndarray
 
     @classmethod
     def of(cls, seen: Sightings, times: np.ndarray) -> _Innovations | None:
@@ -136,18 +140,20 @@ class _Innovations:
             size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
             scale[here] = SIGMA_PER_MAD * np.median(size) if len(size) else 1.0
         scale = np.maximum(scale, 1e-9)[:, None]
+        frame, point = np.nonzero(weight.any(axis=1))
         return cls(
-            residual / scale,
-            velocity / scale,
-            seen.by_point[1:] / scale[..., None],
-            weight,
-            seen.part,
+            (residual / scale)[frame, :, point],
+            (velocity / scale)[frame, :, point],
+            seen.by_point[1:][frame, :, point] / scale[point, None, :, None],
+            weight[frame, :, point],
+            seen.part[point],
+            frame,
         )
 
     def _remaining(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals (T-1,C,K,D) after offsets ``change`` (C,) and the best point errors, robust
-        weights (T-1,C,K), and the points' inverse matrices (T-1,K,P,P)."""
-        residual = self.residual + self.velocity * change[:, None, None]
+        """Residuals (N,C,D) after offsets ``change`` (C,) and the best point errors, robust
+        weights (N,C), and the points' inverse matrices (N,P,P)."""
+        residual = self.residual + self.velocity * change[:, None]
         weight = self._robust(residual)
         remaining, inverse = self._without_point_errors(residual, weight)
         for _ in range(2):
@@ -164,30 +170,30 @@ class _Innovations:
         residual: np.ndarray,
         weight: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        weighted = self.by_point * weight[..., None, None]
-        matrix = np.einsum("tckdp,tckdq->tkpq", weighted, self.by_point)
-        inverse = np.linalg.inv(matrix + np.eye(matrix.shape[-1]) * POINT_SIGMA_M**-2)
-        gradient = np.einsum("tckdp,tckd->tkp", weighted, residual)
-        error = np.einsum("tkpq,tkq->tkp", inverse, gradient)
-        return residual - np.einsum("tckdp,tkp->tckd", self.by_point, error), inverse
+        count, size = len(residual), self.by_point.shape[-1]
+        by_point = self.by_point.reshape(count, -1, size)
+        weighted = (self.by_point * weight[..., None, None]).reshape(by_point.shape)
+        matrix = weighted.transpose(0, 2, 1) @ by_point + np.eye(size) * POINT_SIGMA_M**-2
+        inverse = 1 / matrix if size == 1 else np.linalg.inv(matrix)
+        gradient = weighted.transpose(0, 2, 1) @ residual.reshape(count, -1, 1)
+        return residual - (by_point @ (inverse @ gradient)).reshape(residual.shape), inverse
 
     def normal_equations(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """H (C,C) and g (C,) of the offsets' next correction H^-1 g, point errors eliminated."""
         remaining, weight, inverse = self._remaining(change)
         along = self.velocity * weight[..., None]
-        own = (along * self.velocity).sum((0, 2, 3))
-        cross = np.einsum("tckd,tckdp->tckp", along, self.by_point)
-        shared = np.einsum("tckp,tkpq,tjkq->cj", cross, inverse, cross, optimize=True)
-        return np.diag(own) - shared, -(along * remaining).sum((0, 2, 3))
+        own = (along * self.velocity).sum((0, 2))
+        cross = (along[..., None] * self.by_point).sum(2)
+        shared = np.tensordot(cross @ inverse, cross, axes=((0, 2), (0, 2)))
+        return np.diag(own) - shared, -(along * remaining).sum((0, 2))
 
     def spread(self, change: np.ndarray) -> np.ndarray:
         """Covariance (C,C) of g, from its scatter over body parts (errors that last) and over
         frames (errors of a moment)."""
         remaining, weight, _ = self._remaining(change)
-        gradient = (self.velocity * weight[..., None] * remaining).sum(3)  # (T-1, C, K)
-        parts = [gradient[:, :, self.part == part].sum((0, 2)) for part in np.unique(self.part)]
-        groups = np.concatenate([np.array(parts), gradient.sum(2)])
-        return groups.T @ groups
+        gradient = (self.velocity * weight[..., None] * remaining).sum(2)  # (N, C)
+        groups = [gradient[by == one].sum(0) for by in (self.part, self.frame) for one in set(by)]
+        return np.transpose(groups) @ np.array(groups)
 
 
 def _centred(values: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
+from threading import Lock
 
 from intercap_core.object_track.constants import VIEW_CACHE_BYTES
 from intercap_core.object_track.view import View
@@ -19,9 +20,14 @@ class ViewCache:
         self._max_bytes = max_bytes
         self._kept: OrderedDict[int, list[View]] = OrderedDict()
         self._bytes = 0
+        self._lock = Lock()
 
     def __call__(self, t: int) -> list[View]:
-        """The views of frame t, one a camera."""
+        """The views of frame t, one a camera; one thread loads at a time."""
+        with self._lock:
+            return self._get(t)
+
+    def _get(self, t: int) -> list[View]:
         if t in self._kept:
             self._kept.move_to_end(t)
             return self._kept[t]

@@ -45,6 +45,7 @@ class Closest:
 class DistanceField:
     """Signed distance to a triangle mesh; negative inside. The hollow of a cup is outside.
 
+    ``box`` (2, 3) are the mesh's least and largest coordinates.
     ``vertices`` (V, 3) metres and ``faces`` (F, 3) outward; ``watertight`` says whether rays are
     enough to tell inside from outside. Queries are in the mesh's frame, float64 in and out,
     computed in float32: errors up to 1e-6 of the coordinates' size. ``threads`` = 0 takes all
@@ -63,6 +64,7 @@ class DistanceField:
         faces = np.ascontiguousarray(faces, np.uint32)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"vertices {vertices.shape} and faces {faces.shape} are no mesh")
+        self.box = np.array([vertices.min(0), vertices.max(0)], np.float64)
         self._scene = _scene(vertices, faces, threads)
         self._open = None if watertight else _OpenSurface(vertices, faces, threads)
 
@@ -138,7 +140,7 @@ class SurfacePart:
         spanned |= np.isin(faces, alone).any(axis=1)
         if not spanned.any():
             raise ValueError(f"vertices {part.tolist()} are corners of no face")
-        self._whole = whole
+        self._whole, self.box = whole, whole.box
         self._scene = _scene(
             np.ascontiguousarray(vertices, np.float32),
             np.ascontiguousarray(faces[spanned], np.uint32),

@@ -65,7 +65,7 @@ def run(
             "views, or one and its depth, place three keypoints of the subject's trunk; check the "
             "keypoints and the camera poses of this sequence"
         )
-    clouds = list(person_clouds(frames, seen, settings.points_per_frame, model.device))
+    clouds = person_clouds(frames, seen, settings.points_per_frame, model.device)
     fit = Fitter(model, seen, clouds, settings, pose_prior).run()
 
     fitted = np.zeros(seen.num_frames, bool)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
@@ -49,6 +50,7 @@ from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.rigid.distance import DistanceField, SurfacePart
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, CONTACT_REGIONS, JOINT, OBJECT_TRACK, PERSON, SCENE
+from intercap_core.solve.thread_pool import ThreadPool
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +125,10 @@ def run(
     motion = None
     if encoder is not None:
         motion = LearnedMotion(geometry, encoder, up, settings.body_smoothness)
-    with Frames.open(frames) as recording:
+    threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
+    # numpy divides its products among threads too; small ones gain nothing by that, and those of
+    # two threads would wait for each other
+    with Frames.open(frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
         if settings.refine_cameras and not settings.look_again:
             log.warning("refine_cameras needs look_again: the cameras stay as the scene has them")
@@ -131,7 +136,7 @@ def run(
             seen = ObjectRecording(
                 recording, Detections.load(detections), scene, person, mesh.diameter
             )
-            images = ObjectImages(seen, mesh, track_settings, object_.labels)
+            images = ObjectImages(seen, mesh, track_settings, object_.labels, threads)
         fitted = fit(
             geometry,
             sequential,
@@ -144,6 +149,7 @@ def run(
             images=images,
             cameras=cameras if images and settings.refine_cameras else None,
             motion=motion,
+            threads=threads,
         )
     for odd in fitted.contact.oddities:
         first, last = odd.frames.start, max(odd.frames.start, odd.frames.stop - 1)

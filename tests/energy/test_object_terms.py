@@ -25,10 +25,22 @@ def _poses(frames: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_distance_to_a_moved_sphere_is_its_closed_form(sphere):
     rotation, translation = _poses(4)
-    points = translation[:, None] + RNG.normal(scale=0.1, size=(4, 50, 3))
+    points = translation[:, None] + RNG.uniform(-0.19, 0.19, size=(4, 50, 3))
     near = proximity(sphere, points, rotation, translation)
     expected = np.linalg.norm(points - translation[:, None], axis=2) - 0.1
     np.testing.assert_allclose(near.distance, expected, atol=5e-4)  # facets of the icosphere
+
+
+def test_far_from_an_object_its_box_stands_for_it(sphere):
+    rotation, translation = _poses(4)
+    away = RNG.normal(size=(4, 50, 3))
+    away *= RNG.uniform(0.5, 3.0, (4, 50, 1)) / np.linalg.norm(away, axis=2, keepdims=True)
+    near = proximity(sphere, translation[:, None] + away, rotation, translation)
+    gap = np.linalg.norm(away, axis=2) - 0.1
+    assert ((near.distance <= gap + 5e-4) & (near.distance > gap - 0.1)).all()
+    assert (near.distance > 0.2).all()
+    along = away / np.linalg.norm(away, axis=2, keepdims=True)
+    assert ((near.normals * along).sum(axis=2) > 0.9).all()
 
 
 @pytest.mark.parametrize("annotated", [False, True])

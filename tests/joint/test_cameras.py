@@ -51,7 +51,7 @@ def fitter(tmp_path_factory) -> Fitter:
     step = np.zeros((CAMERAS, FREEDOMS))
     step[WRONG] = -NEEDED
     wrong = Cameras(observed.rig, observed.depth_bias).moved(step)
-    clouds = list(person_clouds(inputs.frames, observed, 3000, model.device))
+    clouds = person_clouds(inputs.frames, observed, 3000, model.device)
     fitter = Fitter(model, observed, clouds, BodyFitSettings(points_per_frame=3000))
     fitter.evidence.take_cameras(wrong.rig, wrong.depth_bias)
     return fitter

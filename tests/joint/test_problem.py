@@ -22,6 +22,7 @@ from intercap_core.rigid.distance import DistanceField, SurfacePart
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.solve.thread_pool import ThreadPool
 
 FRAMES = 5
 LEFT_HAND = CONTACT_REGIONS.index("left_hand")
@@ -108,10 +109,25 @@ class _Scene:
 def test_how_deep_an_object_is_in_the_body(model, box):
     state = _state(model, 0.05)
     scene = _Scene(model, box, state)
-    assert (scene.geometry.at(state).object_depth() == 0).all()
+    assert (scene.geometry.at(state).object_depth(ThreadPool()) == 0).all()
     chest = scene.geometry.at(state).joints[0][:, JOINT_INDEX["spine2"]]
     within = State(state.body, state.betas, state.expression, state.rotation, chest)
-    assert (scene.geometry.at(within).object_depth() > 0.05).all()
+    assert (scene.geometry.at(within).object_depth(ThreadPool()) > 0.05).all()
+
+
+def test_rows_of_several_threads_are_those_of_one(model, box):
+    one = _state(model, -0.004)
+    of_frame = np.arange(4 * FRAMES)
+    state = State(
+        np.random.default_rng(4).normal(0, 0.01, (len(of_frame), BODY.stop)),
+        one.betas, np.zeros((len(of_frame), 10)), one.rotation[of_frame % FRAMES],
+        one.translation[of_frame % FRAMES],
+    )  # fmt: skip
+    scene = _Scene(model, box, state, touching=[CONTACT_REGIONS.index("left_hand")])
+    alone = scene.problem.equations(state)
+    shared = Problem(scene.problem.terms, ThreadPool(3)).equations(state)
+    assert (shared.bands == alone.bands).all() and (shared.gradient == alone.gradient).all()
+    assert np.abs(alone.bands[2]).max() > 0
 
 
 def _state(model: BodyModel, gap: float) -> State:

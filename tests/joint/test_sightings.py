@@ -53,7 +53,7 @@ def fitted(tmp_path_factory):
     )
     observed = read_observations(inputs.scene, inputs.person)
     settings = BodyFitSettings(points_per_frame=3000)
-    clouds = list(person_clouds(inputs.frames, observed, 3000, model.device))
+    clouds = person_clouds(inputs.frames, observed, 3000, model.device)
     fitter = Fitter(model, observed, clouds, settings)
     settled = Settled(
         torch.zeros(25, 3),

@@ -405,7 +405,7 @@ def test_blend_shapes_compiled_or_plain_end_in_the_same_bodies(tmp_path):
     found = []
     samples = body_samples.choose_samples(model)
     for terms in (CompiledTerms(model, samples), TorchTerms(model, samples)):
-        clouds = list(person_clouds(capture.inputs.frames, seen, 800, model.device))
+        clouds = person_clouds(capture.inputs.frames, seen, 800, model.device)
         vectors = Fitter(model, seen, clouds, SETTINGS, terms=terms).run().vectors
         found.append(model.forward(model.parameters(vectors)).joints.numpy())
     assert 1000 * np.linalg.norm(found[0] - found[1], axis=2).max() < 0.3

@@ -79,7 +79,7 @@ class BodyData(Term):
     ) -> BodyData:
         """Read the observations and what the body fit found to be constant."""
         observations = read_observations(scene, person)
-        clouds = list(person_clouds(frames, observations, settings.points_per_frame, model.device))
+        clouds = person_clouds(frames, observations, settings.points_per_frame, model.device)
         fitter = Fitter(model, observations, clouds, settings, pose_prior)
         settled = Settled(
             *(

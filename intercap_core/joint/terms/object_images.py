@@ -21,7 +21,7 @@ import numpy as np
 
 from intercap_core.camera.transforms import rigid
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, Cameras, Sights
-from intercap_core.joint.constants import IMAGES_OUTLIER, OFFSET_UNCHANGED_S
+from intercap_core.joint.constants import IMAGES_OUTLIER
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.state import OBJECT, State
@@ -55,7 +55,6 @@ class ObjectImagesData(Term):
         self._matrix = tracked.information
         self._gradient = np.zeros((len(tracked.seen), 6))
         self._by_cameras: dict[int, _ByCameras] = {}
-        self._last: State | None = None
         self._noise = 1.0
 
     def take_cameras(self, cameras: Cameras) -> None:
@@ -63,13 +62,11 @@ class ObjectImagesData(Term):
         self._images.take_cameras(cameras)
 
     def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Take the cameras to expose so late (C,), seconds; looks again where that tells."""
-        if self._images.take_offsets(time_offset) > OFFSET_UNCHANGED_S and self._last is not None:
-            self.refresh(self._last)
+        """Take the cameras to expose so late (C,), seconds, from the next look on."""
+        self._images.take_offsets(time_offset)
 
     def refresh(self, state: State) -> None:
         """Look at the images at ``state``."""
-        self._last = state
         poses = rigid(state.rotation, state.translation)
         found = self._look(poses)
         agree = {t: evidence for t, evidence in found.items() if not _contradicts(evidence)}
@@ -95,8 +92,7 @@ class ObjectImagesData(Term):
         tracked = self._tracked
         motion = twists(poses, tracked.seen, tracked.times)
         motion[tracked.resting] = 0
-        frames = np.flatnonzero(tracked.seen).tolist()
-        return {t: self._images.look(t, poses[t], motion[t]) for t in frames}
+        return self._images.look(np.flatnonzero(tracked.seen).tolist(), poses, motion)
 
     def _take(self, t: int, evidence: PoseEvidence) -> None:
         """Hold the frame's quadratic form."""
