@@ -109,53 +109,21 @@ def fit(
     )
 
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
-    steps, refused, settled, camera_change = 0, 0, False, 0.0
-    energy_before: dict[str, float] | None = None
-    energy_after: dict[str, float] = {}
-    held = np.ones(len(state), bool)
-    estimate = estimator.at(state)
+    rounds = _Rounds(problem, body_data, object_data, contact, estimator, prior, state)
     for number, max_steps in enumerate(ROUND_STEPS, 1):
-        contact.take_probability(estimate.probability)
-        body_data.refresh(state)
-        offset_change = body_data.take_offsets(body_data.estimate_offsets(prior).offset)
-        object_data.take_offsets(body_data.time_offset)
-        problem.refresh(state, but=body_data)
-        minimum = minimise(problem.equations, state, max_steps=max_steps)
-        state, steps, refused = minimum.state, steps + minimum.steps, refused + minimum.refused
-        energy_before = energy_before or minimum.energy_before
-        energy_after, held = minimum.equations.energy, held & minimum.held
-        log.info("%d steps, energy %.4g", steps, minimum.equations.total)
-        converged = minimum.converged
-        del minimum  # its equations are most of the memory
-        previous, estimate = estimate, estimator.at(state)
-        contact_change = np.abs(estimate.probability - previous.probability).max()
-        settled = (
-            converged and contact_change < CONTACT_CONVERGED and offset_change < OFFSET_CHANGED_S
-        )
+        rounds.minimise(max_steps)
         if number == len(ROUND_STEPS):
             break
-        if cameras is not None and isinstance(object_data, ObjectImagesData):
-            shown = body_data.sights(state, BODY_SHARE * share), object_data.sights(state)
-            found = cameras.settle(shown)
-            if cameras.take(found):
-                camera_change = found.shift
-                log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
-                state = state.moved(limited(found.along))
-            body_data.take_cameras(cameras.now)
-            object_data.take_cameras(cameras.now)
-            if cameras.refused:
-                # what the cameras were until now was fitted to: at least one more round
-                cameras, camera_change, settled = None, 0.0, False
-                log.warning(
-                    "body and object would move a camera by %.0f mm, far beyond what the scene "
-                    "leaves open: all cameras stay as the scene has them; look at their poses, the "
-                    "body and the object",
-                    1e3 * found.shift,
-                )
-        if settled and camera_change < CAMERAS_CHANGED_M:
+        if (
+            cameras is not None
+            and not cameras.refused
+            and isinstance(object_data, ObjectImagesData)
+        ):
+            rounds.settle(cameras, object_data, share)
+        if rounds.settled:
             break
-    settled = settled and camera_change < CAMERAS_CHANGED_M
-    stuck = steps == 0 and refused > 0 and not settled
+    state, steps, refused = rounds.state, rounds.steps, rounds.refused
+    stuck = steps == 0 and refused > 0 and not rounds.settled
     against_images = np.zeros(len(state), bool)
     if isinstance(object_data, ObjectImagesData):
         against_images = object_data.contradicted(state)
@@ -164,32 +132,107 @@ def fit(
         "%d steps taken, %d refused, %d frames held, %s",
         steps,
         refused,
-        held.sum(),
-        "settled" if settled else "ended before it settled",
+        rounds.held.sum(),
+        "settled" if rounds.settled else "ended before it settled",
     )
     residuals = body_data.residuals(state)
     return JointFit(
         state=state,
-        contact=estimate,
+        contact=rounds.estimate,
         time_offsets=body_data.estimate_offsets(prior),
         residuals=residuals,
-        energy_before=energy_before or {},
-        energy_after=energy_after,
+        energy_before=rounds.energy_before,
+        energy_after=rounds.energy_after,
         steps=steps,
         refused=refused,
-        converged=settled,
+        converged=rounds.settled,
         flag_reasons=_flag_reasons(
             geometry,
             state,
             sequential.flags,
-            estimate,
-            held | stuck,
+            rounds.estimate,
+            rounds.held | stuck,
             against_floor,
             against_images,
             problem.threads,
         ),
-        cameras=cameras is not None,
+        cameras=cameras is not None and not cameras.refused,
     )
+
+
+class _Rounds:
+    """What the alternation has come to: the ``state`` with contact's ``estimate`` there, the energy
+    by term before and after, the numbers of ``steps`` and of ``refused`` ones, and the frames (T,)
+    that were ``held`` in every round."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        body_data: BodyData,
+        object_data: ObjectData | ObjectImagesData,
+        contact: Contact,
+        estimator: ContactEstimator,
+        prior: OffsetPrior,
+        state: State,
+    ) -> None:
+        self._problem, self._body, self._object = problem, body_data, object_data
+        self._contact, self._estimator, self._prior = contact, estimator, prior
+        self.state, self.estimate = state, estimator.at(state)
+        self.steps = self.refused = 0
+        self.held = np.ones(len(state), bool)
+        self.energy_before: dict[str, float] = {}
+        self.energy_after: dict[str, float] = {}
+        self._still = False  # neither state, contact nor time offsets change any more
+        self._camera_change = 0.0
+
+    @property
+    def settled(self) -> bool:
+        """Whether another round would change nothing."""
+        return self._still and self._camera_change < CAMERAS_CHANGED_M
+
+    def minimise(self, max_steps: int) -> None:
+        """One round: time offsets and images at the state, at most so many steps, contact anew."""
+        self._contact.take_probability(self.estimate.probability)
+        self._body.refresh(self.state)
+        offsets = self._body.estimate_offsets(self._prior).offset
+        offset_change = self._body.take_offsets(offsets)
+        self._object.take_offsets(self._body.time_offset)
+        self._problem.refresh(self.state, but=self._body)
+        minimum = minimise(self._problem.equations, self.state, max_steps=max_steps)
+        self.state = minimum.state
+        self.steps, self.refused = self.steps + minimum.steps, self.refused + minimum.refused
+        self.energy_before = self.energy_before or minimum.energy_before
+        self.energy_after = minimum.equations.energy
+        self.held &= minimum.held
+        log.info("%d steps, energy %.4g", self.steps, minimum.equations.total)
+        converged = minimum.converged
+        del minimum  # its equations are most of the memory
+        previous, self.estimate = self.estimate, self._estimator.at(self.state)
+        contact_change = np.abs(self.estimate.probability - previous.probability).max()
+        self._still = bool(
+            converged and contact_change < CONTACT_CONVERGED and offset_change < OFFSET_CHANGED_S
+        )
+
+    def settle(self, cameras: CameraFit, images: ObjectImagesData, share: float) -> None:
+        """Correct the ``cameras`` by body and ``images``; a frame is so large a ``share`` of an
+        independent observation."""
+        shown = self._body.sights(self.state, BODY_SHARE * share), images.sights(self.state)
+        found = cameras.settle(shown)
+        if cameras.take(found):
+            self._camera_change = found.shift
+            log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
+            self.state = self.state.moved(limited(found.along))
+        self._body.take_cameras(cameras.now)
+        images.take_cameras(cameras.now)
+        if cameras.refused:
+            # what the cameras were until now was fitted to: at least one more round
+            self._camera_change, self._still = 0.0, False
+            log.warning(
+                "body and object would move a camera by %.0f mm, far beyond what the scene "
+                "leaves open: all cameras stay as the scene has them; look at their poses, the "
+                "body and the object",
+                1e3 * found.shift,
+            )
 
 
 def _flag_reasons(

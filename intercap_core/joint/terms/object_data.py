@@ -19,7 +19,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.transforms import rigid
-from intercap_core.joint.cameras import Cameras
 from intercap_core.joint.constants import (
     AMBIGUOUS_SHIFT,
     AMBIGUOUS_TURN,
@@ -123,9 +122,6 @@ class ObjectData(Term):
     def take_offsets(self, time_offset: np.ndarray) -> None:
         """Compare with the poses that offsets (C,), seconds, give from now on."""
         self._poses = self._tracked.at(time_offset)
-
-    def take_cameras(self, cameras: Cameras) -> None:
-        """A track says nothing of what other cameras would show."""
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_O at ``state``."""
