@@ -6,6 +6,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -44,6 +45,19 @@ class Candidate:
     def mask(self) -> np.ndarray:
         """The mask decoded to the whole colour image (H, W) bool."""
         return self.runs.decode()
+
+
+class PeopleOfImages(Protocol):
+    """The people of a recording's images, wherever they come from."""
+
+    @property
+    def num_sets(self) -> int:
+        """T."""
+        ...
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """Keypoints (P, 135, 3) of the image's people: x, y, confidence."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""People matched over views by geometry, followed over time, and the subject among them.
+"""PeopleOfImages matched over views by geometry, followed over time, and the subject among them.
 
 The order of people in a detector's file says nothing: each frame set's detections are grouped by
 whether their rays meet, groups are linked over time in space, and the subject is the track that
@@ -15,7 +15,7 @@ import numpy as np
 
 from intercap_core.camera.rig import Rig, ring_centre
 from intercap_core.camera.triangulation import midpoints, pixel_scale, reproject, view_pairs
-from intercap_core.detections.read import Detections
+from intercap_core.detections.read import PeopleOfImages
 from intercap_core.person.constants import (
     CENTRE_RANGE_M,
     LIFTED_SUPPORT,
@@ -60,7 +60,7 @@ class _Track:
 
 
 def find_subject(
-    detections: Detections,
+    detections: PeopleOfImages,
     rig: Rig,
     times: np.ndarray,
     *,
@@ -266,7 +266,7 @@ def _compatible(track: _Track, chosen: dict[int, Group], times: np.ndarray) -> b
 def _add_single_views(
     people: np.ndarray,
     chosen: dict[int, Group],
-    detections: Detections,
+    detections: PeopleOfImages,
     rig: Rig,
     times: np.ndarray,
     min_confidence: float,

@@ -2,6 +2,8 @@
 
 In the order of a run (:mod:`intercap_core.stages.scene`):
 
+0. ``moments`` puts the first steps together. ``start_times``: cameras that started apart, before
+   anything compares views.
 1. ``subject_views``: the subject in every view at the given poses; ``late_views`` adds images that
    are frames late.
 2. ``slips``: images that are whole frames late, found by the body's motion. It rests on

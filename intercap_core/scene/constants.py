@@ -167,6 +167,19 @@ SLIP_GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
 CLEAR_SLIP_GAIN = 10.0  # of an interval over the whole recording's being late
 SLIP_WORTH = 0.2  # of the best interval's gain makes another worth taking at once
 SLIPS_APART_S = 1.0  # nearer in time, one slip may have brought about another
+MAX_START_S = 1.5  # cameras are started by hand or by one command that reaches them in turn
+MAX_START_SHARE = 0.4  # of the recording: less in common tells little; tuned on the studio
+MIN_SHARED_S = 1.0  # that two cameras must both have recorded, to tell when they started
+MAX_PEOPLE = 3  # of an image, the surest
+EPIPOLAR_PX_AT_1080P = (
+    6.0  # what two views of one moment disagree by, over time; tuned on the studio
+)
+# A camera started apart if views agree better so than as they are, and than at any time that is not
+# near: in most blocks of time, by so many standard errors of their mean, and by a share of how much
+# they disagree anyway. Tuned on the studio.
+START_BLOCK_S, START_BLOCKS_SHARE, START_SIGMAS, START_WORSE = 0.3, 0.7, 3.0, 0.2
+CLEAR_SIGMAS, START_PEAK_S, FEWEST_SETS_APART, FEWEST_BLOCKS = 1.0, 0.15, 2, 4
+START_ROUNDS = 5
 MANY_VIEWS = 4  # suffice for the body's motion without those that slip
 
 # --- decision: lenses -----------------------------------------------------------------------------

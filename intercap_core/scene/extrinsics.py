@@ -35,6 +35,7 @@ from intercap_core.scene.registration import (
     PairResiduals,
     Registration,
 )
+from intercap_core.scene.start_times import Starts
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surface import Surface
 
@@ -80,6 +81,7 @@ def refine(
     subject: SubjectViews,
     times: np.ndarray,
     timing: Offsets,
+    starts: Starts,
     *,
     floor: FloorConstraint | None,
     free_poses: bool,
@@ -88,26 +90,27 @@ def refine(
 
     ``static`` and ``moving`` are surfaces as :func:`.surface.background_surfaces` and
     :func:`.moving.moving_surfaces` give; ``subject`` is by moment; ``timing`` is what its keypoints
-    say of the offsets; ``floor`` ties cameras that share no surface with the others. The start's
-    poses are kept where held-out points and keypoints together do
-    not get better, and where not ``free_poses``.
+    say of the offsets beside those of ``starts``; ``floor`` ties cameras that share no surface
+    with the others. The start's poses are kept where held-out points and keypoints together do not
+    get better, and where not ``free_poses``.
     """
     layers = [Layer(static, STATIC), *(Layer(at_once, MOVING) for at_once in moving)]
-    registration = Registration(rig, layers, master)
+    registration = Registration(rig, layers, master, starts.offset_sigma)
+    given = Estimate.start(rig, starts.offset)
     views = body_views(subject, times)
     body = BodyConstraint(views, rig) if len(views.points) >= MIN_BODY_POINTS else None
     known = OffsetInformation(
         timing.information / TIMING_INFLATION**2, timing.vector / TIMING_INFLATION**2
     )
-    overlapping = [registration.residuals(Estimate.start(rig), k).pairs for k in (STATIC, MOVING)]
+    overlapping = [registration.residuals(given, k).pairs for k in (STATIC, MOVING)]
     linked = _linked(np.concatenate(overlapping), master)
     constraints: list[Constraint] = [body] if body else []
     if floor is not None and len(linked) < len(rig):
         constraints.append(floor)  # where cameras overlap, their surfaces tell more
-    held = registration.solve(Estimate.start(rig), (), known, free_poses=False)
+    held = registration.solve(given, (), known, free_poses=False)
     found, improved, ratios = held, False, []
     if free_poses and len(rig) > 1:
-        freed = registration.solve(Estimate.start(rig), constraints, known)
+        freed = registration.solve(given, constraints, known)
         ratios = _ratios(registration, body, held.estimate, freed.estimate)
         if _better(ratios, freed.estimate):
             found, improved = freed, True
@@ -121,7 +124,7 @@ def refine(
         found.estimate.poses,
         found.estimate.bias,
         _stated_covariance(found.covariance, master),
-        np.where(unknown, 0.0, found.estimate.offset),
+        np.where(unknown, given.offset, found.estimate.offset),
         sigma,
         improved,
         converged,

@@ -45,19 +45,34 @@ class Offsets:
 
 
 def keypoint_offsets(
-    keypoints: np.ndarray, slip: np.ndarray, rig: Rig, times: np.ndarray, *, master: int = 0
+    keypoints: np.ndarray,
+    slip: np.ndarray,
+    rig: Rig,
+    times: np.ndarray,
+    *,
+    master: int = 0,
+    start: np.ndarray | None = None,
 ) -> Offsets:
     """Estimate when each camera exposes, seconds after the master.
 
     ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``slip``
-    (T, C) whole sets by which an image is older than its set; ``times`` (T,) s.
+    (T, C) whole sets by which an image is older than its set; ``times`` (T,) s; ``start`` (C,) s,
+    about when they do, where that is not nearly together.
     """
     shown = by_moment(keypoints, slip)
     views = len(rig)
     if len(times) < MIN_TIMING_SETS or views < 2:
         unknown = np.where(np.arange(views) == master, 0.0, np.nan)
         return Offsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
-    return offsets_of(build_motion(shown, rig, times), master)
+    motion = build_motion(shown, rig, times)
+    if start is None or not start.any():
+        return offsets_of(motion, master)
+    found = offsets_of(motion.at_offsets(start), master)
+    return replace(
+        found,
+        offset=found.offset + start,
+        vector=found.vector + found.information @ start,
+    )
 
 
 def offsets_of(motion: Motion, master: int) -> Offsets:

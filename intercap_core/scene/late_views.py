@@ -6,27 +6,19 @@ late somebody who walks is a step behind, and the search takes them for another 
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import pixel_scale, reproject
+from intercap_core.detections.read import PeopleOfImages
 from intercap_core.person.sides import BODY_POINTS, swapped
 from intercap_core.person.subject import MIN_COMMON_POINTS, NOBODY
 from intercap_core.scene.constants import MAX_SLIP, SAME_PERSON_PX_AT_1080P
 
 
-class People(Protocol):
-    """The part of the detections that is used here."""
-
-    def people(self, t: int, c: int) -> np.ndarray:
-        """Keypoints (P, 135, 3) of the image's people."""
-
-
 def with_late_views(
     index: np.ndarray,
-    detections: People,
+    detections: PeopleOfImages,
     joints: np.ndarray,
     rig: Rig,
     times: np.ndarray,

@@ -87,10 +87,11 @@ class Estimate:
     offset: np.ndarray
 
     @classmethod
-    def start(cls, rig: Rig) -> Estimate:
-        """The rig as given."""
+    def start(cls, rig: Rig, offset: np.ndarray | None = None) -> Estimate:
+        """The rig as given, exposing ``offset`` (C,) s late."""
         none = np.zeros(len(rig))
-        return cls(rig.master_from_colour.copy(), none, none.copy())
+        late = none.copy() if offset is None else offset.copy()
+        return cls(rig.master_from_colour.copy(), none, late)
 
 
 @dataclass(frozen=True)
@@ -167,8 +168,19 @@ class Registration:
     ``master`` is the camera that stays, in place and in time.
     """
 
-    def __init__(self, rig: Rig, layers: Sequence[Layer], master: int) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        layers: Sequence[Layer],
+        master: int,
+        offset_sigma: np.ndarray | None = None,
+    ) -> None:
+        """``offset_sigma`` (C,) s is what the start's offsets are off by, None = what synchronised
+        devices are."""
         self.rig = rig
+        self._offset_sigma = (
+            np.full(len(rig), PRIOR_OFFSET_S) if offset_sigma is None else offset_sigma
+        )
         self._master = master
         self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
         for kind in dict.fromkeys(layer.kind for layer in layers):
@@ -323,15 +335,16 @@ class Registration:
             np.full(3, PRIOR_ROTATION_RAD**-2.0),
             np.full(3, PRIOR_TRANSLATION_M**-2.0),
             PRIOR_BIAS_M**-2.0,
-            PRIOR_OFFSET_S**-2.0,
+            0.0,
         ]
         for c in range(len(self.rig)):
+            precision[OFFSET] = self._offset_sigma[c] ** -2.0
             turned = at.poses[c, :3, :3] @ start.poses[c, :3, :3].T
             away = np.r_[
                 Rotation.from_matrix(turned).as_rotvec(),
                 at.poses[c, :3, 3] - start.poses[c, :3, 3],
                 at.bias[c],
-                at.offset[c],
+                at.offset[c] - start.offset[c],
             ]
             matrix[c, :, c] += np.diag(precision)
             gradient[c] += precision * away

@@ -8,7 +8,7 @@ import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
-from intercap_core.detections.read import Detections
+from intercap_core.detections.read import PeopleOfImages
 from intercap_core.person.middles import fill_middles
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import NOBODY, find_subject
@@ -36,7 +36,7 @@ class SubjectViews:
         return triangulated(shown, rig)
 
 
-def subject_views(detections: Detections, rig: Rig, times: np.ndarray) -> SubjectViews:
+def subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
     """Find the subject at the start's poses; all 0 and NaN where no two views agree on anybody."""
     index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE)
     found = triangulated(_keypoints_of(detections, index), rig)
@@ -56,7 +56,7 @@ def subject_views(detections: Detections, rig: Rig, times: np.ndarray) -> Subjec
     return triangulated(_keypoints_of(detections, late), rig)
 
 
-def _keypoints_of(detections: Detections, index: np.ndarray) -> np.ndarray:
+def _keypoints_of(detections: PeopleOfImages, index: np.ndarray) -> np.ndarray:
     keypoints = np.zeros((*index.shape, NUM_KEYPOINTS, 3))
     for t, c in np.argwhere(index != NOBODY):
         keypoints[t, c] = detections.people(t, c)[index[t, c]]

@@ -11,7 +11,6 @@ from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
-from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import SceneSettings, digest
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
@@ -26,11 +25,10 @@ from intercap_core.scene.ground import (
     ground_of_feet,
     zup_from_master,
 )
-from intercap_core.scene.keypoint_timing import keypoint_offsets
 from intercap_core.scene.lens_exchange import Exchange, exchange_lenses
+from intercap_core.scene.moments import Moments, find_moments
 from intercap_core.scene.moving import moving_surfaces
-from intercap_core.scene.slips import Slips, find_slips
-from intercap_core.scene.subject_views import SubjectViews, subject_views, triangulated
+from intercap_core.scene.subject_views import SubjectViews, triangulated
 from intercap_core.scene.surface import Surface, background_surfaces
 from intercap_core.schemas import SCENE
 
@@ -61,12 +59,11 @@ def run(
                 f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
             )
         rig, master = source.rig, source.rig.names.index(source.master)
-        subject = subject_views(people, rig, source.time_s)
-        found = find_slips(subject.keypoints, rig, source.time_s, source.fps, master=master)
-        image_of = images_of_moments(found.slip, source.available)
-        timing = keypoint_offsets(subject.keypoints, found.slip, rig, source.time_s, master=master)
-        subject = subject.showing(image_of, rig)
-        backgrounds = _backgrounds(source, subject, found.slip)
+        moments = find_moments(
+            people, rig, source.time_s, source.fps, source.available, master=master
+        )
+        subject, image_of = moments.subject, moments.image_of
+        backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
         refined = refine(
@@ -76,7 +73,8 @@ def run(
             moving_surfaces(source, rig, image_of, backgrounds),
             subject,
             source.time_s,
-            timing,
+            moments.timing,
+            moments.starts,
             floor=FloorConstraint.of(
                 rig, surfaces, _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
             ),
@@ -87,9 +85,18 @@ def run(
         if not ground.found:
             feet = triangulated(subject.keypoints, rig).joints[:, FEET]
             ground = ground_of_feet(feet, rig, source.gravity)
-        notes = _notes(source, refined, found, exchanges)
+        notes = _notes(source, refined, moments, exchanges)
         _write(
-            output, source, rig, backgrounds, found.slip, image_of, refined, ground, notes, settings
+            output,
+            source,
+            rig,
+            backgrounds,
+            moments.slip,
+            image_of,
+            refined,
+            ground,
+            notes,
+            settings,
         )
 
 
@@ -192,7 +199,10 @@ def _write(
 
 
 def _notes(
-    source: Frames, refined: Refinement, slips: Slips, exchanges: Sequence[Exchange]
+    source: Frames,
+    refined: Refinement,
+    moments: Moments,
+    exchanges: Sequence[Exchange],
 ) -> list[str]:
     """What each camera's lens, pose and time rest on, and where it slips."""
     notes = [[note] if note else [] for note in refined.notes]
@@ -206,7 +216,18 @@ def _notes(
                 f"{what} and those of {source.rig.names[other]} are exchanged in the calibration "
                 f"and were put right ({shown})"
             )
-    for interval in slips.intervals:
+    starts = moments.starts
+    for c in np.flatnonzero(starts.sets).tolist():
+        seconds, when = abs(starts.late[c]), "later" if starts.late[c] > 0 else "earlier"
+        notes[c].append(
+            f"it started {seconds:.3f} s {when} than its times say, and was brought into step"
+        )
+    for c in np.flatnonzero(starts.in_doubt).tolist():
+        notes[c].append(
+            "set aside: the cameras were not started together, and by how much this one is out of "
+            "step could not be told"
+        )
+    for interval in moments.slips.intervals:
         frames = "1 frame" if interval.slip == 1 else f"{interval.slip} frames"
         notes[interval.camera].append(
             f"its images are {frames} late in sets {interval.first} to {interval.last}"

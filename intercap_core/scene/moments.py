@@ -1,0 +1,54 @@
+"""Which moment every image shows: cameras that started apart, images that slipped, offsets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from intercap_core.camera.rig import Rig
+from intercap_core.capture.synchronise import images_of_moments
+from intercap_core.detections.read import PeopleOfImages
+from intercap_core.scene.keypoint_timing import Offsets, keypoint_offsets
+from intercap_core.scene.slips import Slips, find_slips
+from intercap_core.scene.start_times import InStep, Starts, find_starts
+from intercap_core.scene.subject_views import SubjectViews, subject_views
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """``slip`` (T, C) whole sets by which images are older than their set says, by ``starts`` and
+    ``slips`` together; ``image_of`` (T, C) the set whose image shows each set's moment, -1 = none;
+    what the keypoints say of the cameras' ``timing``; the ``subject`` by moment."""
+
+    starts: Starts
+    slips: Slips
+    slip: np.ndarray
+    image_of: np.ndarray
+    timing: Offsets
+    subject: SubjectViews
+
+
+def find_moments(
+    detections: PeopleOfImages,
+    rig: Rig,
+    times: np.ndarray,
+    fps: float,
+    available: np.ndarray,
+    *,
+    master: int,
+) -> Moments:
+    """Bring the views into step: whole recordings first, then images, then parts of a frame.
+
+    ``times`` (T,) s of the sets; ``available`` (T, C): the set has an image of the camera. A camera
+    whose start cannot be told shows no moment.
+    """
+    starts = find_starts(detections, rig, times, available, master=master)
+    subject = subject_views(InStep(detections, starts), rig, times)
+    slips = find_slips(subject.keypoints, rig, times, fps, master=master)
+    slip = starts.with_slips(slips.slip)
+    image_of = images_of_moments(slip, available & ~starts.in_doubt)
+    keypoints = starts.of_images(subject.keypoints)
+    timing = keypoint_offsets(keypoints, slip, rig, times, master=master, start=starts.offset)
+    shown = replace(subject, keypoints=keypoints).showing(image_of, rig)
+    return Moments(starts, slips, slip, image_of, timing, shown)
