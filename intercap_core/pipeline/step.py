@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import inspect
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,9 @@ from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_failure
 from intercap_core.project import Project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+_GIVEN_BACK_BYTES = 4 << 20
 
 
 def run_step(
@@ -30,6 +35,7 @@ def run_step(
     another sequence, and where the stage finds a fault in it.
     """
     annotation = project.annotation(sequence)
+    _give_back_memory()
     _check_inputs(stage, sequence, inputs)
     if STAGES[stage].on_device:
         check_device(project)
@@ -53,6 +59,18 @@ def run_step(
         "contact": annotation.contact,
     }
     run(**{name: known[name] for name in inspect.signature(run).parameters})
+
+
+def _give_back_memory() -> None:
+    """Have glibc give arrays of 4 MB and more back to the system when they are freed.
+
+    It keeps such memory for the process from the first time on that one is freed, up to 32 MB each:
+    a fifth of the joint stage's peak at 1,000 frames. Nothing to do for other C libraries.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _GIVEN_BACK_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _GIVEN_BACK_BYTES)
 
 
 def check_device(project: Project) -> None:
