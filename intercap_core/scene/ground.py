@@ -135,8 +135,9 @@ def ground_of_feet(feet: np.ndarray, rig: Rig, gravity: np.ndarray) -> Ground:
     """The floor that someone stands on: from heels and toes (T, F, 3), NaN = not known.
 
     In each set the lowest of the feet stands, in most of them on the floor. Gravity gives the
-    normal; where none is measured the feet do, if they have been far enough apart. For scenes
-    whose floor no camera measures; its height is as good as the keypoints, a centimetre or two.
+    normal; where none is measured the feet do, as far as they have been apart: who walks along a
+    line shows the tilt along it, and across it the cameras' own up stands. For scenes whose floor
+    no camera measures; its height is as good as the keypoints, a centimetre or two.
     """
     up, _ = up_hint(rig, gravity)
     known = np.isfinite(feet[..., 0]).sum(1) >= 3
@@ -152,9 +153,13 @@ def ground_of_feet(feet: np.ndarray, rig: Rig, gravity: np.ndarray) -> Ground:
     if not np.isfinite(gravity).all(1).any():
         point = standing.mean(0)
         _, spread, axes = np.linalg.svd(standing - point, full_matrices=False)
-        if spread[1] / np.sqrt(len(standing)) < MIN_FOOT_SPREAD_M:
+        along, across = spread[:2] / np.sqrt(len(standing))
+        if along < MIN_FOOT_SPREAD_M:
             return NO_GROUND
         normal = axes[2] * np.sign(axes[2] @ up)
+        if across < MIN_FOOT_SPREAD_M:
+            normal = up - (up @ axes[0]) * axes[0]
+            normal /= np.linalg.norm(normal)
     distance = (standing - point) @ normal
     point = point + (np.median(distance) - FOOT_HEIGHT_M) * normal
     rms = float(np.sqrt(np.mean((distance - np.median(distance)) ** 2)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
@@ -123,6 +124,24 @@ def walking_feet(sets: int = 40) -> np.ndarray:
     feet += rng.normal(0, 0.003, feet.shape)
     feet[::7] = np.nan
     return apply(invert(UP), feet.reshape(-1, 3)).reshape(feet.shape)
+
+
+def test_who_walks_along_a_line_shows_the_tilt_along_it():
+    """The cameras' own up is 2 degrees off along the line and 2 across it."""
+    feet = apply(UP, walking_feet().reshape(-1, 3)).reshape(40, 6, 3)
+    feet[..., 1] = np.repeat([0.1, -0.1], 3)  # no farther than one foot beside the other
+    feet = apply(invert(UP), feet.reshape(-1, 3)).reshape(feet.shape)
+    for axis in (0, 1):
+        turn = Rotation.from_rotvec(np.radians(2) * UP[axis, :3]).as_matrix()
+        about = np.eye(4)
+        about[:3, :3] = turn
+        ground = ground_of_feet(
+            apply(about, feet.reshape(-1, 3)).reshape(feet.shape), RIG, NO_GRAVITY
+        )
+        off = np.degrees(np.arccos(min(1, ground.normal @ turn @ UP[2, :3])))
+        assert ground.source == "feet"
+        # turned about the line the hint stays; about what is across it, the feet tell
+        assert off < (2.5 if axis == 0 else 0.5)
 
 
 def test_a_floor_that_nobody_measures_is_where_the_feet_stand():
