@@ -1,0 +1,164 @@
+"""Results as points: vertices and joints of the body and vertices of the object, at any moment.
+
+    from intercap_core.posed import open_sequence
+
+    sequence = open_sequence("config/demo/config.yaml", "cup_drink_s02")
+    moment = sequence.at(30)
+    moment.body, moment.joints, moment.object_  # (V, 3), (55, 3), (Vo, 3) metres, z up
+
+    seen = open_sequence("config/demo/config.yaml", "cup_drink_s02", stage="body_fit", frame="k3")
+    seen.bodies(slice(0, 45, 5))  # (9, V, 3) and (9, 55, 3), as camera k3 has them
+
+The shapes are the same after both stages that have a body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from intercap_core import artefacts
+from intercap_core.body.artefact import load_model, read_parameters
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.errors import UserError
+from intercap_core.project import Project, load_project
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
+
+Z_UP, MASTER = "z-up", "master"  # frames beside those of the cameras, by name
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """Vertices ``body`` (V, 3), ``joints`` (55, 3) and vertices ``object_`` (Vo, 3), metres;
+    ``trusted``: nothing speaks against this frame."""
+
+    body: np.ndarray
+    joints: np.ndarray
+    object_: np.ndarray
+    trusted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSequence:
+    """T frames in one coordinate frame, ``frame_from_master`` (4, 4).
+
+    ``faces`` (F, 3) of the body, ``mesh`` the object with its own faces, poses master_from_object
+    ``rotation`` (T, 3, 3) and ``translation`` (T, 3), ``times`` (T,) s, ``trusted`` (T,) bool.
+    """
+
+    model: BodyModel
+    parameters: BodyParameters
+    mesh: ObjectMesh
+    rotation: np.ndarray
+    translation: np.ndarray
+    frame_from_master: np.ndarray
+    times: np.ndarray
+    trusted: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    @property
+    def faces(self) -> np.ndarray:
+        """(F, 3) of the body's vertices."""
+        return self.model.faces.cpu().numpy()
+
+    def at(self, frame: int) -> Moment:
+        """One frame; raises IndexError beyond the last."""
+        if not -len(self) <= frame < len(self):
+            raise IndexError(f"frame {frame} of {len(self)}")
+        one = [frame % len(self)]
+        vertices, joints = self.bodies(one)
+        return Moment(vertices[0], joints[0], self.objects(one)[0], bool(self.trusted[frame]))
+
+    def bodies(self, frames: slice | Sequence[int] = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (N, V, 3) and joints (N, 55, 3) of some frames, all by default."""
+        vector = self.parameters.vector()[np.arange(len(self))[frames]]
+        with torch.no_grad():
+            posed = self.model.forward(self.model.parameters(vector))
+        return self._placed(posed.vertices.numpy()), self._placed(posed.joints.numpy())
+
+    def objects(self, frames: slice | Sequence[int] = slice(None)) -> np.ndarray:
+        """Vertices (N, Vo, 3) of the object in some frames, all by default."""
+        at = np.arange(len(self))[frames]
+        turned = self.mesh.vertices @ self.rotation[at].transpose(0, 2, 1)
+        return self._placed(turned + self.translation[at, None])
+
+    def _placed(self, points: np.ndarray) -> np.ndarray:
+        return apply(self.frame_from_master, points.reshape(-1, 3)).reshape(points.shape)
+
+
+def open_sequence(
+    settings: Path | str | Project,
+    sequence: str,
+    *,
+    stage: Literal["joint", "body_fit"] = "joint",
+    frame: str = Z_UP,
+) -> PosedSequence:
+    """Bodies and objects of a sequence of a project, its ``settings`` being ``config.yaml``.
+
+    ``stage``: the final result, or the sequential fits (body_fit with object_track). ``frame``:
+    ``z-up`` with the floor at z = 0, ``master`` (the master colour camera: x right, y down, z
+    forward) or another camera's name, as that stage has it. Raises UserError for a sequence or
+    camera that is not there, and for artefacts that are missing or broken.
+    """
+    project = settings if isinstance(settings, Project) else load_project(Path(settings))
+    if sequence not in project.sequences:
+        raise UserError(
+            f"{project.path}: has no sequence {sequence!r}; it has "
+            f"{', '.join(sorted(project.sequences))}"
+        )
+    mesh = ObjectMesh.load(project.objects[project.sequences[sequence].object])
+    gender = project.subjects[project.sequences[sequence].subject].gender
+    with artefacts.read(project.artefact(sequence, "scene"), SCENE) as scene:
+        names, times = list(scene["camera_names"]), scene["times"]
+        cameras, zup = scene["master_from_colour"], scene["zup_from_master"]
+    fitted = JOINT if stage == "joint" else BODY_FIT
+    with artefacts.read(project.artefact(sequence, stage), fitted) as body:
+        model = load_model(project.config.body_models, gender, body)
+        parameters = read_parameters(body)
+        if stage == "joint":
+            rotation, translation = body["rotation"], body["translation"]
+            trusted, cameras = ~body["flagged"], body["master_from_colour"]
+        else:
+            trusted = ~(body["failed"] | body["uncertain"])
+    if stage != "joint":
+        with artefacts.read(project.artefact(sequence, "object_track"), OBJECT_TRACK) as track:
+            rotation, translation = track["rotation"], track["translation"]
+            trusted &= ~track["lost"]
+    return PosedSequence(
+        model,
+        parameters,
+        mesh,
+        rotation,
+        translation,
+        _from_master(frame, names, cameras, zup, sequence),
+        times,
+        trusted,
+    )
+
+
+def _from_master(
+    frame: str, names: Sequence[str], cameras: np.ndarray, zup: np.ndarray, sequence: str
+) -> np.ndarray:
+    if frame == Z_UP:
+        return zup
+    if frame == MASTER:
+        return np.eye(4)
+    if frame not in names:
+        raise UserError(
+            f"sequence {sequence!r} has no frame {frame!r}; expected {Z_UP}, {MASTER} or one of "
+            f"the cameras {', '.join(names)}"
+        )
+    pose = cameras[names.index(frame)]
+    if not np.isfinite(pose).all():
+        raise UserError(f"sequence {sequence!r}: nothing is known of where camera {frame} was")
+    return invert(pose)
