@@ -25,6 +25,7 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     {
         "tables": "a project's tables for released datasets",
         "pipeline": "runs one stage; decides, by digests of code and settings, what is run again",
+        "posed": "results as vertices and joints, for users of the library",
     },
     {
         "stages": "one thin file a stage: read artefacts, call the room, write one artefact",

@@ -156,9 +156,10 @@ def find_starts(
 
 def _rays(detections: PeopleOfImages, rig: Rig, available: np.ndarray) -> np.ndarray:
     """(T, C, P, K, 2) x and y at z = 1 of the middles of an image's people, NaN = not seen."""
-    pixels = np.full((*available.shape, MAX_PEOPLE, MIDDLES, 2), np.nan)
-    for t, c in np.argwhere(available):
-        people = detections.people(int(t), int(c))
+    images = {(t, c): detections.people(t, c) for t, c in np.argwhere(available).tolist()}
+    most = max((len(people) for people in images.values()), default=0)
+    pixels = np.full((*available.shape, max(1, min(most, MAX_PEOPLE)), MIDDLES, 2), np.nan)
+    for (t, c), people in images.items():
         order = np.argsort(-people[..., 2].sum(1), kind="stable")[:MAX_PEOPLE]
         for place, person in enumerate(people[order]):
             pixels[t, c, place] = middles(person)

@@ -91,13 +91,14 @@ def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
         np.testing.assert_allclose(apply(UP, found["ground_point"][None])[0, 2], 0.005, atol=1e-9)
 
 
-def test_without_depth_the_start_stays_and_there_is_no_floor(tmp_path):
+def test_without_depth_the_start_stays_and_feet_show_the_floor(tmp_path):
     paths = capture(tmp_path, TRUTH)
     write_frames(paths["frames"], TRUTH, num_sets=T)
     scene.run(**paths, settings=SceneSettings(), floor=None)
     with artefacts.read(paths["output"], SCENE) as found:
-        assert not found.attributes["ground_found"]
-        assert np.isnan(found["ground_normal"]).all() and found.keys("cameras/") == []
+        assert found.attributes["ground_source"] == "feet" and found.keys("cameras/") == []
+        assert np.degrees(np.arccos(min(1, found["ground_normal"] @ UP[2, :3]))) < 3
+        assert abs(apply(UP, found["ground_point"][None])[0, 2]) < 0.01
     assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.02
 
 
