@@ -63,10 +63,11 @@ def measured_doubt(confidence: Tensor, error: Tensor) -> float:
 
 class ViewDistances(NamedTuple):
     """Each camera's points by sample of the skin: their mean distance (N,C,S), metres, and
-    effective number (N,C,S), 0 = none; the samples' normals (N,S,3)."""
+    effective number (N,C,S), 0 = none; where the samples were (N,S,3), and their normals."""
 
     distance: Tensor
     points: Tensor
+    where: Tensor
     normal: Tensor
 
 
@@ -379,11 +380,17 @@ class Evidence:
                 )
 
             self._threads.map(matched, seen)
-        self.by_view = ViewDistances(of_views, points, normal)
+        self.by_view = ViewDistances(of_views, points, where, normal)
+        return self.rows(points)
+
+    def rows(self, points: Tensor) -> CloudRows:
+        """What :meth:`match` found, with these numbers of points (N,C,S), 0 = do not count."""
+        found = self.by_view
+        assert found is not None, "match comes first"
         total = points.sum(1)
-        mean = (of_views * points).sum(1) / total.clamp_min(1e-6)
+        mean = (found.distance * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
         share = self.cloud_weight * SAMPLE_SHARE
         weight = share * total / (total + HALF_WEIGHT_POINTS) / noise**2
-        target = mean + (normal * where).sum(2)
-        return CloudRows(target, normal, weight, mean)
+        target = mean + (found.normal * found.where).sum(2)
+        return CloudRows(target, found.normal, weight, mean)

@@ -39,6 +39,13 @@ class NormalEquations:
         self.gradient = np.zeros((frames, ALL.stop))
         self.energies: dict[str, np.ndarray] = {}
 
+    def copy(self) -> NormalEquations:
+        """The same sums, to which more can be added."""
+        made = NormalEquations(0, self._threads)
+        made.bands, made.damped = self.bands.copy(), self.damped.copy()
+        made.gradient, made.energies = self.gradient.copy(), dict(self.energies)
+        return made
+
     def step(self, damping: np.ndarray) -> np.ndarray | None:
         """The Gauss-Newton step (T, n), damped by ``damping`` (T,) of each frame, or None where the
         matrix is not definite.

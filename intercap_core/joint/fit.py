@@ -23,17 +23,16 @@ from intercap_core.joint.constants import (
 from intercap_core.joint.contact_estimate import ContactEstimate, ContactEstimator
 from intercap_core.joint.floor import contradiction
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
-from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.problem import Problem, joint_terms
-from intercap_core.joint.sequential import Flags, SequentialFits
+from intercap_core.joint.sequential import Flags
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData, Residuals
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
-from intercap_core.joint.terms.term import Term
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
 from intercap_core.solve.thread_pool import ThreadPool
 
@@ -59,55 +58,70 @@ class JointFit:
     cameras: bool
 
 
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """The ``problem`` of equation 6, with those of its terms that are told what to hold fixed;
+    ``against_floor`` says why the floor was left out, "" = it was not."""
+
+    problem: Problem
+    body: BodyData
+    object_: ObjectData | ObjectImagesData
+    contact: Contact
+    floor: Ground | None
+    against_floor: str
+    share: float
+
+
+def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
+    """All terms over ``inputs``. Without images the object's track stands for them. A floor that
+    the sequential fits contradict is left out."""
+    sequential, floor = inputs.sequential, inputs.floor
+    against_floor = contradiction(inputs.geometry, sequential, floor) if floor else ""
+    if against_floor:
+        floor = None
+    share = min(1.0, 1 / (inputs.fps * ERROR_LASTING_S))
+    object_data: ObjectData | ObjectImagesData = (
+        ObjectImagesData(sequential.tracked, inputs.images, share)
+        if inputs.images
+        else ObjectData(sequential.tracked)
+    )
+    contact = Contact(inputs.geometry, settings.contact_weight)
+    problem = Problem(
+        joint_terms(
+            inputs.geometry,
+            settings,
+            sequential.state,
+            data=(inputs.body_data, object_data),
+            contact=contact,
+            floor=floor,
+            fps=inputs.fps,
+            trust=sequential.trust,
+            motion=inputs.motion,
+        ),
+        inputs.threads,
+    )
+    return Assembly(problem, inputs.body_data, object_data, contact, floor, against_floor, share)
+
+
 def fit(
-    geometry: Geometry,
-    sequential: SequentialFits,
-    body_data: BodyData,
-    *,
-    floor: Ground | None,
-    fps: float,
-    prior: OffsetPrior,
-    settings: JointSettings,
-    intervals: Sequence[ContactInterval] | None,
-    images: ObjectImages | None = None,
-    cameras: CameraFit | None = None,
-    motion: Term | None = None,
-    threads: ThreadPool | None = None,
+    inputs: JointInputs, settings: JointSettings, intervals: Sequence[ContactInterval] | None
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    ``intervals`` are the annotated contacts, None where contact is to be detected. Without
-    ``images`` the object's track stands for them; without ``cameras`` these stay as they are. A
-    ``floor`` that the sequential fits contradict is left out, which flags every frame. ``motion``
-    is a learned E_S; ``threads`` make rows of the equations, None is one.
+    ``intervals`` are the annotated contacts, None where contact is to be detected. A floor that
+    the sequential fits contradict flags every frame.
     """
+    geometry, sequential, body_data = inputs.geometry, inputs.sequential, inputs.body_data
     state = sequential.state
-    against_floor = contradiction(geometry, sequential, floor) if floor else ""
+    if settings.refine_cameras and not settings.look_again:
+        log.warning("refine_cameras needs look_again: the cameras stay as the scene has them")
+    assembly = assemble(inputs, settings)
+    problem, object_data, contact = assembly.problem, assembly.object_, assembly.contact
+    floor, against_floor, share = assembly.floor, assembly.against_floor, assembly.share
     if against_floor:
         log.warning("%s: every frame is flagged; look at the scene's ground", against_floor)
-        floor = None
-    share = min(1.0, 1 / (fps * ERROR_LASTING_S))
-    object_data: ObjectData | ObjectImagesData = (
-        ObjectImagesData(sequential.tracked, images, share)
-        if images
-        else ObjectData(sequential.tracked)
-    )
-    contact = Contact(geometry, settings.contact_weight)
-    problem = Problem(
-        joint_terms(
-            geometry,
-            settings,
-            state,
-            data=(body_data, object_data),
-            contact=contact,
-            floor=floor,
-            fps=fps,
-            trust=sequential.trust,
-            motion=motion,
-        ),
-        threads or ThreadPool(),
-    )
-
+    cameras = inputs.cameras if inputs.images and settings.refine_cameras else None
+    fps, prior = inputs.fps, inputs.prior
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
     rounds = _Rounds(problem, body_data, object_data, contact, estimator, prior, state)
     for number, max_steps in enumerate(ROUND_STEPS, 1):
@@ -135,7 +149,8 @@ def fit(
         rounds.held.sum(),
         "settled" if rounds.settled else "ended before it settled",
     )
-    residuals = body_data.residuals(state)
+    body_data.refresh(state)
+    residuals = body_data.residuals()
     return JointFit(
         state=state,
         contact=rounds.estimate,

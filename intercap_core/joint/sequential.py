@@ -100,10 +100,16 @@ def _undetermined_hands(body: Artefact) -> np.ndarray:
     return np.asarray(body["undetermined"][:, hands])
 
 
-def _state(body: Artefact, track: Artefact) -> State:
-    """The sequential fits as one state, with the mean shape."""
+def pose_vector(body: Artefact) -> np.ndarray:
+    """Pose and translation (T, 168) of a body_fit or joint artefact."""
     vector = np.concatenate([body[name] for name in _POSE], axis=1).astype(float)
     assert vector.shape[1] == TRANSL.stop
+    return vector
+
+
+def _state(body: Artefact, track: Artefact) -> State:
+    """The sequential fits as one state, with the mean shape."""
+    vector = pose_vector(body)
     betas = body["betas"].astype(float)
     fitted = ~body["failed"]
     shape = betas[fitted].mean(axis=0) if fitted.any() else betas.mean(axis=0)

@@ -34,10 +34,10 @@ from intercap_core import artefacts
 from intercap_core.camera.transforms import rigid
 from intercap_core.errors import UserError
 from intercap_core.joint.cameras import BIAS
+from intercap_core.joint.inputs import read_cameras
 from intercap_core.metrics.extrinsics import displacement
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import SCENE
-from intercap_core.stages.joint import _cameras
 from tests.helpers import fitted_capture as fitted
 
 NAME = "s01_o03"
@@ -104,8 +104,8 @@ def test_cameras_become_the_true_ones_by_their_names(
         for key in set(was.keys()) - changed:
             np.testing.assert_array_equal(three[key], was[key], err_msg=key)
         # what is held has nothing to settle
-        assert len(_cameras(two)._free) == 0
-        np.testing.assert_array_equal(_cameras(one)._free, [6, 13])
+        assert len(read_cameras(two)._free) == 0
+        np.testing.assert_array_equal(read_cameras(one)._free, [6, 13])
 
 
 def test_a_foreign_truth_is_told(capture: fitted.Capture, tmp_path: Path) -> None:

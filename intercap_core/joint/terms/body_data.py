@@ -110,6 +110,21 @@ class BodyData(Term):
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
         equations.add_blocks(self.name, BODY, *self._equations(state))
 
+    def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,) at ``state``, of the last
+        :meth:`refresh`, by the cameras ``used`` (T, C) alone."""
+        problem, evidence = self._problem, self._fitter.evidence
+        counted = torch.as_tensor(used[self._fitter.frames], device=problem.base.device)[..., None]
+        views, rows = problem.views, problem.rows
+        assert views is not None, "refresh comes first"
+        problem.views = replace(views, confidence=views.confidence * counted)
+        if evidence.by_view is not None:
+            problem.rows = evidence.rows(evidence.by_view.points * counted)
+        try:
+            return self._equations(state)
+        finally:
+            problem.views, problem.rows = views, rows
+
     def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,)."""
         assert self._bridged is not None, "refresh comes first"
@@ -153,15 +168,27 @@ class BodyData(Term):
         add_by_cameras(self._fitter.evidence, self._problem, self._trusted, seen)
         return seen
 
-    def residuals(self, state: State) -> Residuals:
-        """How far the images are from ``state``."""
-        self.refresh(state)
+    def residuals(self) -> Residuals:
+        """How far the images are from the state of the last :meth:`refresh`."""
         pixels, metres = self._fitter.residuals(self._problem)
-        keypoint = np.full((len(state), pixels.shape[1]), np.nan)
-        cloud = np.full(len(state), np.nan)
+        total = len(self._fitter.evidence.seen.times)
+        keypoint = np.full((total, pixels.shape[1]), np.nan)
+        cloud = np.full(total, np.nan)
         keypoint[self._fitter.frames] = pixels.cpu().numpy()
         cloud[self._fitter.frames] = metres.cpu().numpy()
         return Residuals(keypoint, cloud)
+
+    def person_by_view(self) -> np.ndarray:
+        """Median distance (T, C) of the person's points from the skin beyond the coverings, metres,
+        in every camera, at the last :meth:`refresh`; NaN = nothing seen."""
+        seen = self._fitter.evidence.seen
+        person = np.full((len(seen.times), len(seen.rig)), np.nan)
+        found = self._fitter.evidence.by_view
+        if found is not None:
+            apart = (found.distance - self._problem.thickness()).abs()
+            apart = torch.where(found.points > 0, apart, torch.nan)
+            person[self._fitter.frames] = apart.nanmedian(2).values.cpu().numpy()
+        return person
 
     @property
     def time_offset(self) -> np.ndarray:

@@ -125,9 +125,20 @@ class ObjectData(Term):
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_O at ``state``."""
+        equations.add_blocks(self.name, OBJECT, *self._equations(self._poses.information, state))
+
+    def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state``, by the share of the
+        evidence that the views ``used`` (T, C) have."""
+        seen = self._poses.share.sum(axis=1) > 0
+        kept = np.where(seen, (self._poses.share * used).sum(axis=1), 1.0)
+        return self._equations(kept[:, None, None] * self._poses.information, state)
+
+    def _equations(
+        self, information: np.ndarray, state: State
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         poses = self._poses
         turn = Rotation.from_matrix(state.rotation @ poses.rotation.transpose(0, 2, 1))
         offset = np.concatenate([turn.as_rotvec(), state.translation - poses.translation], axis=1)
-        gradient = np.einsum("tij,tj->ti", poses.information, offset)
-        energy = 0.5 * (offset * gradient).sum(axis=1)
-        equations.add_blocks(self.name, OBJECT, poses.information, gradient, energy)
+        gradient = np.einsum("tij,tj->ti", information, offset)
+        return information, gradient, 0.5 * (offset * gradient).sum(axis=1)

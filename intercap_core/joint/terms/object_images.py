@@ -15,6 +15,7 @@ little (Geman-McClure). No setting weighs E_O: its strength is the images'.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +30,21 @@ from intercap_core.joint.terms.object_data import TrackedPoses
 from intercap_core.joint.terms.term import Term
 from intercap_core.object_track.constants import CONTRADICTED_LOG_RATIO, UNKNOWN_SIGMA
 from intercap_core.object_track.evidence import PoseEvidence, views_noise
+from intercap_core.object_track.view_report import ViewReport
 from intercap_core.rigid.twist import step_between, twists
 from intercap_core.solve.robust import geman_mcclure_weight
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """A frame's ``matrix`` (6, 6) and ``slope`` (6,), less what the mesh's error takes; the
+    ``weight`` of its evidence, K (``held``, (6, 6)) and the weighted ``gradient`` (6,)."""
+
+    matrix: np.ndarray
+    slope: np.ndarray
+    weight: float
+    held: np.ndarray
+    gradient: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +69,8 @@ class ObjectImagesData(Term):
         self._matrix = tracked.information
         self._gradient = np.zeros((len(tracked.seen), 6))
         self._by_cameras: dict[int, _ByCameras] = {}
+        self._found: dict[int, PoseEvidence] = {}  # at the last look
+        self._agree: dict[int, PoseEvidence] = {}  # of them, those that do not contradict it
         self._noise = 1.0
 
     def take_cameras(self, cameras: Cameras) -> None:
@@ -70,6 +86,7 @@ class ObjectImagesData(Term):
         poses = rigid(state.rotation, state.translation)
         found = self._look(poses)
         agree = {t: evidence for t, evidence in found.items() if not _contradicts(evidence)}
+        self._found, self._agree = found, agree
         self._noise = views_noise(list(agree.values()))
         tracked = self._tracked
         self._looked = rigid(tracked.rotation, tracked.translation)
@@ -96,16 +113,39 @@ class ObjectImagesData(Term):
 
     def _take(self, t: int, evidence: PoseEvidence) -> None:
         """Hold the frame's quadratic form."""
-        information = evidence.information.sum(0) / self._noise
-        gradient = evidence.gradient.sum(0) / self._noise
+        form = self._form(t, evidence.information.sum(0), evidence.gradient.sum(0))
+        self._matrix[t], self._gradient[t] = form.matrix, form.slope
+        self._by_cameras[t] = self._seen_by(
+            t, evidence, form.weight / self._noise, form.held, form.gradient
+        )
+
+    def _form(self, t: int, information: np.ndarray, gradient: np.ndarray) -> _Form:
+        """Of what all views of a frame say, ``information`` (6, 6) and ``gradient`` (6,)."""
+        information, gradient = information / self._noise, gradient / self._noise
         own = -np.linalg.solve(information + np.diag(UNKNOWN_SIGMA**-2), gradient)
         weight = geman_mcclure_weight(own @ information @ own, IMAGES_OUTLIER)
         information, gradient = weight * information, weight * gradient
         held = np.linalg.inv(information + np.diag(1 / self._tracked.spread[t]))  # K
         freed = np.eye(6) - information @ held
-        self._matrix[t] = freed @ information
-        self._gradient[t] = freed @ gradient
-        self._by_cameras[t] = self._seen_by(t, evidence, weight / self._noise, held, gradient)
+        return _Form(freed @ information, freed @ gradient, weight, held, gradient)
+
+    def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state``, of the last look,
+        by the views ``used`` (T, C) alone."""
+        matrix, gradient = self._matrix.copy(), self._gradient.copy()
+        for t, evidence in self._agree.items():
+            views = used[t, list(self._images.cameras)]
+            form = self._form(
+                t, evidence.information[views].sum(0), evidence.gradient[views].sum(0)
+            )
+            matrix[t], gradient[t] = form.matrix, form.slope
+        return _equations(matrix, gradient, self._offset(state))
+
+    def reports(self) -> Iterator[tuple[int, int, ViewReport]]:
+        """Frame, camera, and how its view agreed with the pose of the last look."""
+        for t, evidence in self._found.items():
+            for camera, report in zip(self._images.cameras, evidence.reports, strict=True):
+                yield t, camera, report
 
     def _seen_by(
         self,
@@ -148,13 +188,8 @@ class ObjectImagesData(Term):
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_O at ``state``, as of the last :meth:`refresh`."""
-        offset = self._offset(state)
-        slope = np.einsum("tij,tj->ti", self._matrix, offset)
-        loose = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
-        lowest = np.linalg.solve(loose, self._gradient[..., None])[..., 0]
-        energy = 0.5 * (offset * slope + lowest * self._gradient) + offset * self._gradient
-        gradient = slope + self._gradient
-        equations.add_blocks(self.name, OBJECT, self._matrix, gradient, energy.sum(axis=1))
+        found = _equations(self._matrix, self._gradient, self._offset(state))
+        equations.add_blocks(self.name, OBJECT, *found)
 
     def sights(self, state: State) -> Sights:
         """What the frames that were looked at say of pose and cameras, at ``state``."""
@@ -180,6 +215,17 @@ class ObjectImagesData(Term):
 
     def _offset(self, state: State) -> np.ndarray:
         return step_between(self._looked, rigid(state.rotation, state.translation))
+
+
+def _equations(
+    matrix: np.ndarray, slope: np.ndarray, offset: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrix, gradient and energy (T,), 0 at the lowest, of forms (T, 6, 6) and (T, 6) where poses
+    were looked at, ``offset`` (T, 6) from there."""
+    bent = np.einsum("tij,tj->ti", matrix, offset)
+    lowest = np.linalg.solve(matrix + np.diag(UNKNOWN_SIGMA**-2), slope[..., None])[..., 0]
+    energy = 0.5 * (offset * bent + lowest * slope) + offset * slope
+    return matrix, bent + slope, energy.sum(axis=1)
 
 
 def _contradicts(evidence: PoseEvidence) -> bool:
