@@ -218,6 +218,9 @@ class MetricsSettings(Model):
 
     contact_mm: Positive = 4.5
     """A body vertex this close to the object's surface is in contact."""
+    hold_out: bool = True
+    """Judge the result without truth: fit body and object again without each camera, compare them
+    with what it shows, and state their errors."""
 
 
 class ReportSettings(Model):

@@ -35,7 +35,10 @@ LAYERS: tuple[Mapping[str, str], ...] = (
         "report": "charts, pictures and the page of a dataset",
         "export": "files for other tools: InterCap, AMASS, BOP, glb",
     },
-    {"metrics": "distances, penetration, contact; errors against truth"},
+    {
+        "metrics": "distances, penetration, contact; errors against truth",
+        "verdict": "a result judged without truth, by cameras held out; stated errors",
+    },
     {"joint": "body and object together over all frames, with contact (equation 6)"},
     {
         "body_fit": "SMPL-X parameters in every frame (equation 2)",

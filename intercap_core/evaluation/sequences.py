@@ -12,6 +12,7 @@ from rich.table import Table
 from intercap_core.evaluation.part import SPREAD, Figures, Measured, Part, keyed, number, spread
 from intercap_core.metrics import figures, hold_figures
 from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.metrics.verdict_figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
 
@@ -100,6 +101,7 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
         "vertex_to_cloud_floor": figures.floor_figures(sequences),
         "extrinsics": figures.extrinsics_figures(sequences),
         "flags": figures.flag_figures(sequences),
+        "verdict": verdict_figures(known),
     }
 
 

@@ -47,6 +47,7 @@ def run_step(
         "settings": getattr(project.config, stage),
         "body_settings": project.config.body_fit,
         "track_settings": project.config.object_track,
+        "joint_settings": project.config.joint,
         "sequence": row,
         "object_": project.objects[row.object],
         "subject": project.subjects[row.subject],

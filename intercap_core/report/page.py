@@ -17,7 +17,8 @@ from markupsafe import Markup
 
 from intercap_core.metrics import figures, flags
 from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.report import body, capture, charts, measures
+from intercap_core.metrics.verdict_figures import mean_stated
+from intercap_core.report import body, capture, charts, measures, verdict
 from intercap_core.report import track as tracks
 from intercap_core.report.body import BodyFacts
 from intercap_core.report.capture import CaptureFacts
@@ -111,6 +112,7 @@ def _context(content: Content) -> dict[str, Any]:
         "rows": rows,
         "failed": sorted(content.failed.items()),
         "truth": measures.truth(content.sequences),
+        "verdict": verdict.context(content.sequences, {detail.name for detail in content.details}),
         "penetration": measures.penetration(content.sequences),
         "clouds": measures.clouds(content.dataset, content.sequences),
         "heat": _heat(content),
@@ -163,6 +165,10 @@ def _tiles(content: Content) -> list[dict[str, str]]:
             if key in joint:
                 digits = 2 if unit in ("", "°") else 1
                 tiles.append(_tile(name, joint[key], unit, note, digits))
+    tiles += [
+        _tile(f"{part}, stated", value, "mm", "mean error, without truth")
+        for part, value in mean_stated(content.sequences).items()
+    ]
     tiles += [
         _tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"),
         _tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"),

@@ -10,6 +10,7 @@ import pandas as pd
 
 from intercap_core.metrics import figures
 from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.metrics.verdict_figures import TRUE, stated_errors
 from intercap_core.stage_list import ESTIMATES
 
 _MILLIMETRES = {
@@ -48,6 +49,10 @@ def sequence_table(
             row[f"vertex_to_cloud_floor.{name}"] = value
         for name in sorted(_ACCELERATIONS):
             row[f"{name}_mm"] = 1e3 * _mean(s.values[name])
+        for error in stated_errors(s):
+            row[f"verdict.{error.part}_mm"] = error.stated
+            row[f"verdict.{error.part}_factor"] = error.factor
+            row[f"verdict.{error.part}_silent"] = error.silent
         before, after = residuals.get(s.name, (np.nan, np.nan))
         row["extrinsics_residual_before_mm"] = 1e3 * before
         row["extrinsics_residual_after_mm"] = 1e3 * after
@@ -64,17 +69,23 @@ def sequence_table(
 
 
 def worst_first(table: pd.DataFrame) -> pd.Series:
-    """Rank of each sequence, 1 = worst: by the mean of its ranks in four measures.
+    """Rank of each sequence, 1 = worst: by the mean of its ranks in several measures.
 
-    Share of flagged frames, body and object visible distance to the cloud, and the 98th percentile
-    of penetration. Ranks need no weights between units.
+    Share of flagged frames, body and object visible distance to the cloud, the 98th percentile of
+    penetration, and the stated error of each judged part, worst where nothing can be said. Ranks
+    need no weights between units.
     """
     measures = pd.DataFrame(
         {
             "flagged": table["flagged_frames"] / table["frames"],
-            "body": table["vertex_to_cloud.body_visible_mm"],
-            "object": table["vertex_to_cloud.object_visible_mm"],
+            "body_to_cloud": table["vertex_to_cloud.body_visible_mm"],
+            "object_to_cloud": table["vertex_to_cloud.object_visible_mm"],
             "penetration": table["penetration.p98_mm"],
+            **{
+                part: table[f"verdict.{part}_mm"].fillna(np.inf)
+                for part in TRUE
+                if f"verdict.{part}_mm" in table
+            },
         }
     )
     mean_rank = measures.rank(ascending=False, na_option="bottom").mean(axis=1)
@@ -100,6 +111,8 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
             columns[f"contact_probability.{region}"] = s.values["contact_probability"][:, r]
         for name in sorted(_MILLIMETRES | _ACCELERATIONS):
             columns[f"{name}_mm"] = 1e3 * s.values[name].astype(np.float64)
+        for place, part in enumerate(s.values.get("verdict/part_names", ())):
+            columns[f"verdict.{part}_mm"] = 1e3 * s.values["verdict/error_frame"][place]
         for stage in ESTIMATES:
             for name in ("body_pve", "body_mpjpe", "object_translation"):
                 if f"truth/{stage}/{name}" in s.values:

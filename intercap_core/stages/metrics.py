@@ -11,7 +11,16 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
-from intercap_core.config import BodyModels, MetricsSettings, ObjectEntry, SubjectEntry, digest
+from intercap_core.config import (
+    BodyFitSettings,
+    BodyModels,
+    JointSettings,
+    MetricsSettings,
+    ObjectEntry,
+    ObjectTrackSettings,
+    SubjectEntry,
+    digest,
+)
 from intercap_core.detections.read import Detections
 from intercap_core.metrics import body, motion, object_pose
 from intercap_core.metrics import truth as truths
@@ -30,6 +39,7 @@ from intercap_core.schemas import (
     PERSON,
     SCENE,
 )
+from intercap_core.verdict.judge import Verdict
 
 log = logging.getLogger(__name__)
 
@@ -50,12 +60,33 @@ def run(
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: MetricsSettings,
+    joint_settings: JointSettings,
+    body_settings: BodyFitSettings,
+    track_settings: ObjectTrackSettings,
     truth: Path | None = None,
 ) -> None:
-    """Measure the joint result of one sequence, and every stage against ``truth`` where given.
+    """Measure the joint result of one sequence, judge it by what was held out, and hold every stage
+    to ``truth`` where given.
 
+    The settings of other stages say how their fits were made, which the verdict repeats in part.
     Raises UserError where an input artefact is missing, broken or does not fit the others.
     """
+    verdict = {}
+    if settings.hold_out:
+        verdict = Verdict.reach(
+            frames=frames,
+            scene=scene,
+            detections=detections,
+            person=person,
+            object_track=object_track,
+            body_fit=body_fit,
+            joint=joint,
+            object_=object_,
+            body_models=body_models,
+            settings=joint_settings,
+            body_settings=body_settings,
+            track_settings=track_settings,
+        ).values()
     mesh = ObjectMesh.load(object_)
     fitted_body = read_body(joint, "joint", body_models, subject.gender)
     fitted_object = read_object(joint, "joint")
@@ -106,6 +137,8 @@ def run(
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):
             writer.put(key, values[key])
+        for key in sorted(verdict):
+            writer.put(f"verdict/{key}", verdict[key])
 
 
 def _clouds(

@@ -24,8 +24,16 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.camera import masks
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import rigid
-from intercap_core.config import BodyModels, ObjectEntry, SubjectEntry
+from intercap_core.camera.transforms import apply, rigid
+from intercap_core.config import (
+    BodyFitSettings,
+    BodyModels,
+    JointSettings,
+    ObjectEntry,
+    ObjectTrackSettings,
+    SubjectEntry,
+)
+from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import render_scene
 from intercap_core.rigid.shots import Drawable, Rendering
@@ -48,6 +56,12 @@ BODY_OFFSET_M = 0.010  # the fitted body stands this much beside the true one, d
 OBJECT_OFFSET_M = 0.004  # the tracked ball, down too; the joint result is half as far off
 SUBJECT = SubjectEntry(subject="p01", gender="neutral")
 BODY_MODELS = BodyModels()
+# of the stages whose fits the metrics judge
+OTHER_SETTINGS = {
+    "joint_settings": JointSettings(),
+    "body_settings": BodyFitSettings(),
+    "track_settings": ObjectTrackSettings(),
+}
 
 
 @dataclass
@@ -128,7 +142,8 @@ def make_capture(
     params = model.parameters(params.vector())
     with torch.no_grad():
         posed = model.forward(params)
-        tips = model.keypoints(posed)[:, [29, 33, 37, 41, 45, 50, 54, 58, 62, 66]].numpy()
+        keypoints = model.keypoints(posed).double().numpy()
+    tips = keypoints[:, [29, 33, 37, 41, 45, 50, 54, 58, 62, 66]]
     vertices, joints = posed.vertices.numpy(), posed.joints.numpy()
     palm = vertices[:, model.regions["right_hand"]]
     side = palm[:, :, 0].argmin(1)  # outermost palm vertex, image left
@@ -147,7 +162,7 @@ def make_capture(
     _write_frames(capture, views, name)
     _write_scene(capture, name)
     _write_detections(capture, views, name)
-    _write_person(capture, views, name)
+    _write_person(capture, views, keypoints, name)
     _write_fits(capture, params, name)
     _write_truth(capture, tips, name)
     return capture
@@ -295,7 +310,8 @@ def _write_detections(capture: Capture, views: Any, name: str) -> None:
             writer.put(f"{group}/rle", values)
 
 
-def _write_person(capture: Capture, views: Any, name: str) -> None:
+def _write_person(capture: Capture, views: Any, joints: np.ndarray, name: str) -> None:
+    """With true keypoints, ``joints`` (T, 135, 3) and where each camera sees them."""
     rig, total = capture.rig, len(views)
     count = len(rig)
     rles = [
@@ -306,13 +322,16 @@ def _write_person(capture: Capture, views: Any, name: str) -> None:
     offsets, values = artefacts.pack_ragged(rles)
     missing = np.zeros(total, bool)
     missing[-1] = True
+    seen = np.ones((total, count, 135, 3))
+    for c, camera in enumerate(rig):
+        seen[:, c, :, :2] = camera.colour.project(apply(camera.colour_from_master, joints))
     with artefacts.write(
         capture.paths["person"], PERSON, sequence=name, images_alone=False
     ) as writer:
         writer.put("camera_names", rig.names)
         writer.put("person", np.zeros((total, count), int))
-        writer.put("keypoints", np.zeros((total, count, 135, 3)))
-        writer.put("joints", np.zeros((total, 135, 3)))
+        writer.put("keypoints", seen)
+        writer.put("joints", joints)
         writer.put("joint_views", np.full((total, 135), 3))
         writer.put("joint_error", np.zeros((total, 135)))
         writer.put("inlier", np.ones((total, count, 135), bool))
@@ -363,7 +382,10 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("joint_sigma", np.full((total, 55), 0.01))
         writer.put("failed", np.zeros(total, bool))
         writer.put("bridged", np.zeros(total, bool))
-        _fill(writer, BODY_FIT, T=total, C=count)
+        writer.put("part_names", ["left_hand", "right_hand"])
+        writer.put("keypoint_sigma", np.full(135, 0.01))
+        writer.put("covering_noise", np.full(len(COVERINGS), 0.01))
+        _fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
     with artefacts.write(
         capture.paths["joint"], JOINT, body_model=file_digest(OPEN_BODY),
         object=capture.object_.name, iterations=3, refused=0, converged=True,

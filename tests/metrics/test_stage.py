@@ -33,6 +33,7 @@ def _run(capture: fitted.Capture, output: Path, truth: bool) -> Path:
         subject=fitted.SUBJECT,
         body_models=fitted.BODY_MODELS,
         settings=MetricsSettings(),
+        **fitted.OTHER_SETTINGS,
         truth=capture.paths["truth"] if truth else None,
     )
     return output

@@ -45,6 +45,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
             subject=fitted.SUBJECT,
             body_models=fitted.BODY_MODELS,
             settings=MetricsSettings(),
+            **fitted.OTHER_SETTINGS,
             truth=made[name].paths["truth"] if object_name == "football" else None,
         )
     return made

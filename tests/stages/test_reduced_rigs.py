@@ -244,7 +244,12 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
     common["subject"] = fitted.SUBJECT
     measured = tmp_path / "metrics.h5"
     metrics.run(
-        **paths, **common, output=measured, settings=MetricsSettings(), truth=capture.paths["truth"]
+        **paths,
+        **common,
+        **fitted.OTHER_SETTINGS,
+        output=measured,
+        settings=MetricsSettings(),
+        truth=capture.paths["truth"],
     )
     with artefacts.read(measured, METRICS) as found:
         seen = np.isfinite(found["body_visible_to_cloud"])

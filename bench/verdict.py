@@ -1,0 +1,131 @@
+"""Fit what the verdict states of a result without truth to the true errors of virtual recordings.
+
+    python -m bench.verdict METRICS [METRICS ...]
+
+METRICS are metrics.h5 of sequences with truth, best of many kinds of rigs and noise: stated errors
+can be trusted as far as those reach. Prints the factors for `intercap_core/verdict/constants.py`,
+and how well errors are told of recordings of a kind (the folder above a sequence's) that was left
+out of the fit: the spread that is stated is of these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.optimize import least_squares
+from scipy.stats import spearmanr
+
+from intercap_core.errors import UserError
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.metrics.verdict_figures import WITHIN, stated_errors
+from intercap_core.verdict.constants import Factors
+from intercap_core.verdict.part import Part
+
+SPREAD_SHARE = 0.8  # of the true errors that are within a part's spread
+# Of the jackknife's shift: what a single camera changes is an error, though the studio's stated
+# deviations, which real recordings need not bear out, tell it as well.
+LEAST_SHIFT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Of N sequences of one part: ``features`` (N, F) and the ``true`` errors (N,), metres, and the
+    ``kind`` (N,) of each recording."""
+
+    features: np.ndarray
+    true: np.ndarray
+    kind: np.ndarray
+
+    def chosen(self, rows: np.ndarray) -> Samples:
+        """The sequences ``rows`` (N,) bool alone."""
+        return Samples(self.features[rows], self.true[rows], self.kind[rows])
+
+
+def read(paths: Sequence[Path]) -> dict[Part, Samples]:
+    """The samples of each part; raises UserError where a file has no verdict, or no truth."""
+    rows: dict[Part, list[tuple[np.ndarray, float, str]]] = {part: [] for part in Part}
+    for path in paths:
+        sequence = SequenceMetrics.read(path)
+        if not sequence.has_truth or "verdict/features" not in sequence.values:
+            raise UserError(
+                f"{path}: holds no {'verdict' if sequence.has_truth else 'errors against truth'}; "
+                "name metrics of virtual recordings, made with metrics.hold_out"
+            )
+        for place, error in enumerate(stated_errors(sequence)):
+            if np.isfinite(error.stated) and np.isfinite(error.true):
+                features = sequence.values["verdict/features"][place]
+                rows[Part(error.part)].append(
+                    (features, 1e-3 * error.true, path.parent.parent.name)
+                )
+    return {
+        part: Samples(*(np.array(column) for column in zip(*found, strict=True)))
+        for part, found in rows.items()
+        if found
+    }
+
+
+def fit(samples: Samples) -> Factors:
+    """Factors whose stated errors' logarithms are nearest to the true ones', robustly."""
+    log_true = np.log(samples.true)
+
+    def apart(factors: np.ndarray) -> np.ndarray:
+        return np.log(_stated(samples.features, factors)) - log_true
+
+    start = np.r_[0.5 * samples.true.min(), np.ones(samples.features.shape[1])]
+    least = np.r_[1e-6, LEAST_SHIFT, np.zeros(samples.features.shape[1] - 1)]
+    found = least_squares(apart, start, bounds=(least, np.inf), loss="soft_l1", x_scale=start).x
+    spread = float(np.exp(np.quantile(np.abs(apart(found)), SPREAD_SHARE)))
+    return Factors(float(found[0]), tuple(found[1:].tolist()), spread)
+
+
+def left_out(samples: Samples) -> np.ndarray:
+    """Stated errors (N,), each from factors that were fitted to recordings of other kinds."""
+    stated = np.empty(len(samples.true))
+    for kind in np.unique(samples.kind):
+        own = samples.kind == kind
+        factors = fit(samples.chosen(~own))
+        stated[own] = _stated(samples.features[own], np.r_[factors.rest, factors.of])
+    return stated
+
+
+def _stated(features: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    return np.sqrt(factors[0] ** 2 + ((features * factors[1:]) ** 2).sum(axis=1))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print factors and how well they do."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("metrics", nargs="+", type=Path, help="metrics.h5 of sequences with truth")
+    options = parser.parse_args(arguments)
+    try:
+        parts = read(options.metrics)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    console = Console()
+    columns = ("part", "sequences", "kinds", "rank", f"within {WITHIN:g}", "spread")
+    table = Table(*columns, title="stated against true, of kinds that were left out", box=None)
+    for part, samples in parts.items():
+        factors, kinds = fit(samples), len(np.unique(samples.kind))
+        if kinds > 1:
+            stated = left_out(samples)
+            off = np.exp(np.abs(np.log(stated / samples.true)))
+            factors = factors._replace(spread=float(np.quantile(off, SPREAD_SHARE)))
+            rank = spearmanr(stated, samples.true).statistic
+            cells = (rank, (off < WITHIN).mean(), factors.spread)
+            table.add_row(str(part), str(len(off)), str(kinds), *(f"{cell:.2f}" for cell in cells))
+        of = ", ".join(f"{value:.2f}" for value in factors.of)
+        print(f"    Part.{part.name}: Factors({factors.rest:.4f}, ({of}), {factors.spread:.2f}),")
+    console.print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,165 @@
+"""A result judged by what was kept from it: one camera at a time, every other frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from intercap_core.config import JointSettings
+from intercap_core.joint.fit import Assembly, assemble
+from intercap_core.joint.inputs import JointInputs
+from intercap_core.joint.result import JointResult
+from intercap_core.joint.state import State
+from intercap_core.joint.terms.object_images import ObjectImagesData
+from intercap_core.verdict.constants import HELD_S
+from intercap_core.verdict.part import Part
+from intercap_core.verdict.refits import Refits
+
+JOINTS = {Part.BODY: slice(0, 22), Part.HANDS: slice(25, 55)}
+
+
+@dataclass(frozen=True, eq=False)
+class ViewErrors:
+    """How far the image of each camera is from a state, (T, C); NaN = it shows nothing of it.
+
+    ``keypoint_px`` median over the body's keypoints; ``person_m`` median distance of the person's
+    points from the skin beyond clothes; ``overlap`` IoU of the object's mask and render;
+    ``object_depth_m`` median error of its depth.
+    """
+
+    keypoint_px: np.ndarray
+    person_m: np.ndarray
+    overlap: np.ndarray
+    object_depth_m: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """The judgement.
+
+    ``cameras`` (V,) that were held out, one after another; ``held`` (T,) the one that judges a
+    frame, whose own errors are those of ``without``: of states that it has no part in. ``within``:
+    of the result itself. ``keypoint_m`` (T,): the held camera's error of keypoints at the person's
+    distance, metres. ``shift`` (V, T) metres by which each part moves without a camera,
+    ``repeated`` (T,) by how much it is elsewhere where only the neighbouring frames are seen.
+    """
+
+    cameras: np.ndarray
+    held: np.ndarray
+    within: ViewErrors
+    without: ViewErrors
+    keypoint_m: np.ndarray
+    shift: dict[Part, np.ndarray]
+    repeated: dict[Part, np.ndarray]
+
+
+def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
+    """Refit ``result`` without each camera and from every other frame, and judge it by the rest.
+
+    None where fewer than two cameras show the person: without one of them nothing is left.
+    """
+    assembly = assemble(inputs, settings)
+    state = result.state
+    _hold_fixed(assembly, result)
+    assembly.problem.refresh(state)
+    within = _view_errors(assembly)
+    seen = np.isfinite(within.keypoint_px).any(axis=0)
+    cameras = np.flatnonzero(seen)
+    if len(cameras) < 2:
+        return None
+    refits = Refits(assembly, state)
+    everything = np.ones(within.keypoint_px.shape, bool)
+    without = []
+    for camera in cameras:
+        used = everything.copy()
+        used[:, camera] = False
+        without.append(refits.with_views(used))
+    half = []
+    for first in (0, 1):
+        used = everything.copy()
+        used[first::2] = False
+        half.append(refits.with_views(used))
+    block = np.arange(len(state)) // max(1, round(inputs.fps * HELD_S))
+    turn = block % len(cameras)
+    mixed = _taken(without, turn)
+    assembly.body.refresh(mixed)
+    assembly.object_.refresh(mixed)
+    judged = _view_errors(assembly)
+    held = cameras[turn]
+    points = _points(inputs, state)
+    moved = [_points(inputs, other) for other in without]
+    halves = _points(inputs, _taken(half, np.arange(len(state)) % 2))
+    judged = _of_held(judged, held)
+    return HeldOut(
+        cameras,
+        held,
+        within,
+        judged,
+        _at_person(judged.keypoint_px, result, points[Part.BODY]),
+        {part: np.stack([_rms(other[part] - points[part]) for other in moved]) for part in Part},
+        {part: _rms(halves[part] - points[part]) for part in Part},
+    )
+
+
+def _hold_fixed(assembly: Assembly, result: JointResult) -> None:
+    """Cameras, time offsets and contact as the result has them."""
+    assembly.contact.take_probability(result.probability)
+    assembly.body.refresh(result.state)
+    assembly.body.take_offsets(result.time_offset)
+    assembly.object_.take_offsets(result.time_offset)
+    assembly.body.take_cameras(result.cameras)
+    if isinstance(assembly.object_, ObjectImagesData):
+        assembly.object_.take_cameras(result.cameras)
+
+
+def _view_errors(assembly: Assembly) -> ViewErrors:
+    """At the state at which body and object were refreshed last."""
+    keypoint = assembly.body.residuals().keypoint_px
+    overlap, depth = np.full((2, *keypoint.shape), np.nan)
+    if isinstance(assembly.object_, ObjectImagesData):
+        for t, camera, report in assembly.object_.reports():
+            overlap[t, camera] = report.overlap
+            depth[t, camera] = report.depth_residual_m
+    return ViewErrors(keypoint, assembly.body.person_by_view(), overlap, depth)
+
+
+def _of_held(errors: ViewErrors, held: np.ndarray) -> ViewErrors:
+    """Those of the camera that judges each frame (T,) alone."""
+    mine = np.arange(errors.keypoint_px.shape[1]) == held[:, None]
+    return ViewErrors(*(np.where(mine, values, np.nan) for values in vars(errors).values()))
+
+
+def _at_person(pixels: np.ndarray, result: JointResult, joints: np.ndarray) -> np.ndarray:
+    """Errors (T,), metres, of those in ``pixels`` (T, C), one camera a frame, at the middle of the
+    body's ``joints`` (T, J, 3)."""
+    rig = result.cameras.rig
+    pose = rig.colour_from_master
+    depth = joints.mean(axis=1) @ pose[:, 2, :3].T + pose[:, 2, 3]
+    size = pixels * depth / rig.colour_parameters[:, 0]
+    return np.where(np.isfinite(size).any(axis=1), np.nansum(size, axis=1), np.nan)
+
+
+def _taken(states: list[State], which: np.ndarray) -> State:
+    """Each frame of the state of this number (T,)."""
+    frames, one = np.arange(len(which)), states[0]
+    body, rotation, translation = (
+        np.stack([getattr(state, name) for state in states])[which, frames]
+        for name in ("body", "rotation", "translation")
+    )
+    return State(body, one.betas, one.expression, rotation, translation)
+
+
+def _points(inputs: JointInputs, state: State) -> dict[Part, np.ndarray]:
+    """What is compared of each part (T, K, 3): joints, the object's centre of mass."""
+    with torch.no_grad():
+        posed = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
+    joints = posed.joints.double().cpu().numpy()
+    centre = state.rotation @ inputs.geometry.mesh.centre_of_mass + state.translation
+    return {**{part: joints[:, at] for part, at in JOINTS.items()}, Part.OBJECT: centre[:, None]}
+
+
+def _rms(shift: np.ndarray) -> np.ndarray:
+    """Root mean square length (T,) of (T, K, 3)."""
+    return np.sqrt((shift**2).sum(axis=2).mean(axis=1))
