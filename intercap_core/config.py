@@ -277,8 +277,13 @@ class StudioCapture(Model):
     """Number of frame sets."""
     annotate: bool = False
     """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
-    room: Literal["random", "furnished", "bare"] = "random"
-    """With walls and furniture, or only a floor; by chance one capture in five is bare."""
+    starts_apart: Annotated[float, Field(ge=0, le=1.5)] = 0.0
+    """The cameras are started apart by up to so many seconds, and their times do not tell."""
+    keypoint_bias: Annotated[float, Field(ge=0, le=3)] = 1.0
+    """Scale of what a detector means otherwise by the body's joints, 10 to 20 mm at 1."""
+    room: Literal["random", "furnished", "sparse", "bare"] = "random"
+    """With walls and furniture, a floor with two low pieces, or only a floor; by chance one capture
+    in five is bare."""
     look: Literal["random", "mesh", "plain", "printed"] = "random"
     """Colours of the object: its mesh's, one for all, or printed in a way that no scan knows."""
     layout: LayoutName = "k4a"
@@ -296,8 +301,8 @@ class StudioSettings(Model):
 
     captures: dict[Name, StudioCapture]
     """One entry for each sequence that the studio makes."""
-    fps: Literal[5, 15, 30] = 15
-    """Frame sets a second."""
+    fps: Literal[5, 15, 30, 60] = 15
+    """Frame sets a second; 60 is for layout plain."""
     noise: Annotated[float, Field(ge=0, le=4)] = 1.0
     """Scale of every error; 1 is the headline."""
     noise_family: Literal["a", "b"] = "a"

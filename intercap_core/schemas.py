@@ -347,7 +347,7 @@ TRUTH = Schema(
         "fps": "frame sets a second",
     },
     optional_attributes={
-        "room": "furnished, or bare: a floor and nothing else",
+        "room": "furnished; sparse: a floor and two low pieces; or bare: a floor and nothing else",
         "faults": "what was broken on purpose, camera by camera; empty where nothing was",
     },
     fields={

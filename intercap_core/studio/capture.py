@@ -52,7 +52,7 @@ def make_capture(
     (output / MARK).touch()
     stage = Stage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
-    detector = Detector.build(stage.noise, stage.frames)
+    detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
     segmenter = Segmenter(stage.noise, stage.frames, objects.name)
     recorded = [
         Kinect(stage, index, settings.colour_mode).record(folder, detector, segmenter)

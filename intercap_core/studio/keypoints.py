@@ -49,11 +49,12 @@ class Detector:
     body_bias: np.ndarray
 
     @classmethod
-    def build(cls, noise: NoiseSource, frames: int) -> Detector:
-        """Draw the fixed biases; they are the same in all cameras."""
+    def build(cls, noise: NoiseSource, frames: int, body_bias: float = 1.0) -> Detector:
+        """Draw the fixed biases, the body's times ``body_bias``; they are the same in all
+        cameras."""
         rng = noise.detector_rng("keypoint bias")
         size = np.empty(135)
-        size[BODY] = rng.uniform(*BODY_BIAS_M, 25)
+        size[BODY] = body_bias * rng.uniform(*BODY_BIAS_M, 25)
         size[25:67] = rng.uniform(*HAND_BIAS_M, 42)
         size[67:] = rng.uniform(*FACE_BIAS_M, 68)
         size[[0, 15, 16, 17, 18]] *= 0.35  # nose, eyes, ears are seen, not guessed

@@ -109,6 +109,20 @@ def build_rig(
     )
 
 
+def started_apart(
+    rig: StudioRig, rng: np.random.Generator, seconds: float, fps: float
+) -> StudioRig:
+    """The same rig whose cameras were started by hand: each but the master's images are older or
+    newer by up to ``seconds`` than their times say, one of them by nearly as much."""
+    late = rng.uniform(-seconds, seconds, len(rig.true))
+    if len(late) > 1:
+        most = 1 + int(rng.integers(len(late) - 1))
+        late[most] = np.copysign(seconds * rng.uniform(0.9, 1.0), late[most])
+    late[0] = 0
+    sets = np.round(late * fps).astype(np.int32)
+    return replace(rig, slip=rig.slip + sets, offset_s=rig.offset_s + sets / fps - late)
+
+
 def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
     """stage_from_colour (4, 4) of each camera: x right, y down, z towards the middle."""
     poses = []

@@ -7,8 +7,8 @@ in every camera. Colours are RGB in [0, 1].
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +33,9 @@ class Twin(NamedTuple):
     faces: np.ndarray
 
 
+Furnishing = Literal["furnished", "sparse", "bare"]
+
+
 @dataclass(frozen=True)
 class Room:
     """Static surfaces in the stage frame: vertices (V, 3), faces (F, 3), material (F,) as an index
@@ -50,18 +53,21 @@ def build_room(
     furniture: Sequence[Box],
     eyes: np.ndarray,
     *,
-    bare: bool,
+    furnishing: Furnishing,
     twin: Twin | None = None,
     hidden: np.ndarray | None = None,
 ) -> Room:
-    """Make a room around the stage; ``bare`` leaves only the floor and the script's ``furniture``.
+    """Make a room around the stage with the script's ``furniture``; a bare one has nothing else
+    but a floor, a sparse one two low pieces beside it.
 
     ``eyes`` (C, 2): where the cameras stand; their view of the middle stays free but for a few
     pillars between them and the place ``hidden`` (2,), where given. ``twin`` stands about as well.
     """
     boxes = list(furniture)
     things: list[Twin] = []
-    if not bare:
+    if furnishing == "sparse":
+        boxes += [_lowered(piece) for piece in _pieces(rng, eyes)[1:3]]
+    elif furnishing == "furnished":
         boxes += _walls(rng) + _pieces(rng, eyes)
         if hidden is not None:
             boxes += _pillars(rng, eyes, hidden)
@@ -88,6 +94,11 @@ def build_room(
     looks = tuple(_look(name, rng) for name in names)
     distractor = names.index("distractor") if "distractor" in names else -1
     return Room(np.vstack(vertices), np.vstack(faces), np.concatenate(material), looks, distractor)
+
+
+def _lowered(box: Box) -> Box:
+    """A piece of furniture of half its height."""
+    return replace(box, high=(*box.high[:2], box.high[2] / 2))
 
 
 def _walls(rng: np.random.Generator) -> list[Box]:

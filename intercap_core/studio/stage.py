@@ -22,14 +22,15 @@ from intercap_core.studio.looks import object_colours
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
-from intercap_core.studio.rig import StudioRig, build_rig
-from intercap_core.studio.room import Twin, build_room
+from intercap_core.studio.rig import StudioRig, build_rig, started_apart
+from intercap_core.studio.room import Furnishing, Twin, build_room
 from intercap_core.studio.subjects import Subject, subject_names
 from intercap_core.studio.tissue import press_out
 
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
 OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
 LOOKS = ("mesh", "plain", "printed")  # of the object, as likely as each other
+FASTEST_KINECT = 30  # frames a second of an Azure Kinect, and of the releases made with them
 SMALL_M = 0.35  # a smaller object may be hidden from most cameras
 
 
@@ -74,8 +75,8 @@ class Stage:
         self.puppet = Puppet(self.subject)
         vertices, faces, colours = true_mesh(entry, capture.seed)
         rng = self.noise.rng("look")
-        by_chance = LOOKS[rng.integers(len(LOOKS))]
-        self.look = by_chance if capture.look == "random" else capture.look
+        any_look = LOOKS[rng.integers(len(LOOKS))]
+        self.look = any_look if capture.look == "random" else capture.look
         self.thing = TrueObject(
             entry.name,
             vertices,
@@ -99,6 +100,9 @@ class Stage:
             overlap="no_overlap" not in capture.faults,
             names=camera_names(capture.layout, settings.cameras),
         )
+        if capture.starts_apart:
+            apart = self.noise.rng("starts")
+            self.rig = started_apart(self.rig, apart, capture.starts_apart, settings.fps)
         self.failures = Failures.draw(
             self.noise,
             frames=capture.frames,
@@ -108,17 +112,17 @@ class Stage:
         )
         furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
         is_bare = bool(rng.random() < BARE_ROOM_SHARE)
-        bare = is_bare if capture.room == "random" else capture.room == "bare"
+        by_chance: Furnishing = "bare" if is_bare else "furnished"
+        self.furnishing = by_chance if capture.room == "random" else capture.room
         eyes = invert(self.rig.master_from_stage) @ self.rig.true.master_from_colour
         self.room = build_room(
             rng,
             furniture,
             eyes[:, :2, 3],
-            bare=bare,
+            furnishing=self.furnishing,
             twin=Twin(vertices, faces),
             hidden=self._highlight() if np.ptp(self.bounds, 0).max() < SMALL_M else None,
         )
-        self.bare = bare
 
     def _highlight(self) -> np.ndarray:
         """Where the object is on the floor plan (2,) when most happens to it."""
@@ -187,6 +191,11 @@ def check_capture(capture: StudioCapture, settings: StudioSettings, object_name:
         raise UserError(
             f"studio: interaction {capture.interaction!r} needs object {kind.object_class!r}, "
             f"the sequence has {object_name!r}; correct the sequence's object"
+        )
+    if settings.fps > FASTEST_KINECT and capture.layout != "plain":
+        raise UserError(
+            f"studio: recordings of layout {capture.layout!r} have at most {FASTEST_KINECT} frames "
+            f"a second, 'fps' is {settings.fps}; set layout: plain or another fps"
         )
     if capture.subject not in subject_names():
         raise UserError(

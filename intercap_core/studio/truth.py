@@ -55,7 +55,7 @@ def write_truth(
         object=stage.thing.name,
         ground_offset=float(-normal @ master[:3, 3]),
         fps=float(stage.fps),
-        room="bare" if stage.bare else "furnished",
+        room=stage.furnishing,
         faults=", ".join(_faults(stage, capture)),
     ) as file:
         file.put("times", stage.set_times)

@@ -16,9 +16,11 @@ from intercap_core.errors import UserError
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.failures import Failures, check_faults
+from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.recording import START_US
-from intercap_core.studio.rig import StudioRig, build_rig
+from intercap_core.studio.rig import StudioRig, build_rig, started_apart
+from intercap_core.studio.room import build_room
 from intercap_core.studio.stage import check_capture
 
 FRAMES, FPS = 8, 5
@@ -49,6 +51,17 @@ def test_two_cameras_slip_by_one_to_four_frames(seed: int) -> None:
 def test_some_slips_last_to_the_end_and_some_do_not() -> None:
     lasting = [rig_of(seed, slips="silent").slip[-1].any() for seed in range(30)]
     assert 5 < sum(lasting) < 28
+
+
+@pytest.mark.parametrize("fps", [15, 30, 60])
+def test_cameras_that_start_apart_are_late_by_sets_and_a_rest(fps: int) -> None:
+    rig = rig_of(5)
+    apart = started_apart(rig, np.random.default_rng(8), 0.5, fps)
+    late = (apart.slip - rig.slip) / fps - (apart.offset_s - rig.offset_s)
+    assert (late == late[0]).all()  # all along
+    assert late[0, 0] == 0 and 0.45 <= np.abs(late[0]).max() <= 0.5
+    assert np.abs(apart.offset_s - rig.offset_s).max() <= 0.5 / fps + 1e-12
+    assert len(np.unique(late[0])) == len(late[0])
 
 
 @pytest.mark.parametrize("mode", DEPTH_MODES)
@@ -141,6 +154,30 @@ def test_a_capture_that_cannot_be_made_is_told(capture: dict[str, object], says:
     values = {"interaction": "stool_sit", "subject": "s02", "seed": 1} | capture
     with pytest.raises(UserError, match=says):
         check_capture(StudioCapture(**values), StudioSettings(captures={}), "stool")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("layout", ["k4a", "intercap", "behave"])
+def test_a_kinect_has_no_sixty_frames_a_second(layout: str) -> None:
+    capture = StudioCapture(interaction="stool_sit", subject="s02", seed=1, layout=layout)
+    fast = StudioSettings(captures={}, fps=60)
+    with pytest.raises(UserError, match=f"{layout!r} have at most 30 frames a second"):
+        check_capture(capture, fast, "stool")
+    check_capture(capture.model_copy(update={"layout": "plain"}), fast, "stool")
+
+
+def test_a_detector_may_mean_other_joints() -> None:
+    noise = NoiseSource(3, 1.0, "a", 15.0)
+    usual, other = (Detector.build(noise, 9, scale).body_bias for scale in (1.0, 1.6))
+    np.testing.assert_allclose(other[:25], 1.6 * usual[:25])
+    np.testing.assert_array_equal(other[25:], usual[25:])
+
+
+def test_a_sparse_room_has_a_floor_and_two_low_pieces() -> None:
+    eyes = 2.5 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
+    for furnishing, boxes, top in (("bare", 0, 0.0), ("sparse", 2, 0.4)):
+        room = build_room(np.random.default_rng(4), [], eyes, furnishing=furnishing)
+        assert len(room.vertices) == 4 + 8 * boxes
+        assert room.vertices[:, 2].max() <= top
 
 
 def test_a_single_camera_has_no_faults() -> None:

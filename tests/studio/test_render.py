@@ -42,7 +42,7 @@ def test_moving_things_are_drawn_where_rays_hit_them(
     camera = rig.true[index]
     assert camera.depth is not None
     pose = invert(rig.master_from_stage) @ camera.master_from_depth
-    room = build_room(np.random.default_rng(0), [], np.eye(2), bare=True)
+    room = build_room(np.random.default_rng(0), [], np.eye(2), furnishing="bare")
     view = View(camera.depth, pose, room, coloured=False)
     cast = view.cast(surfaces)
     scene = scene_of(*((apply(s.stage_from_mesh, s.vertices), s.faces) for s in surfaces))
