@@ -48,12 +48,21 @@ class Part(StrEnum):
     captures = "captures"
     objects = "objects"
     bodies = "bodies"
+    field_scenes = "field_scenes"
+    field = "field"
 
 
 DEFAULT_SETTINGS = Path("config/config.yaml")
 SEQUENCE_SETTINGS = [Path("config/evaluation/config.yaml"), Path("config/object/config.yaml")]
 CAPTURE_SETTINGS = [
     Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
+]
+FIELD_SCENE_SETTINGS = [
+    Path(f"config/field/{name}.yaml") for name in ("starts_15", "starts_30", "starts_60", "floor")
+]
+FIELD_SETTINGS = [
+    Path("config/evaluation/config.yaml"),
+    *(Path(f"config/field/{name}.yaml") for name in ("no_depth", "two_views")),
 ]
 OBJECT_SETTINGS = [
     Path(f"config/object/{name}.yaml")
@@ -214,9 +223,26 @@ def evaluate(
         list[Path],
         typer.Option(metavar="SETTINGS", help="Recordings taken to the body's fit; may repeat."),
     ] = BODY_SETTINGS,
+    field_scenes: Annotated[
+        list[Path],
+        typer.Option(
+            metavar="SETTINGS",
+            help="Recordings as outside a studio, taken to the scene; may repeat.",
+        ),
+    ] = FIELD_SCENE_SETTINGS,
+    field: Annotated[
+        list[Path],
+        typer.Option(
+            metavar="SETTINGS",
+            help="Recordings as outside a studio, and usual ones, taken to the end; may repeat.",
+        ),
+    ] = FIELD_SETTINGS,
     only: Annotated[
         Part | None,
-        typer.Option(help="One part: to the end, the scene, the object's track, the body's fit."),
+        typer.Option(
+            help="One part: to the end, the scene, the object's track, the body's fit; recordings "
+            "as outside a studio to the scene, to the end."
+        ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
         "results/evaluation.json"
@@ -255,6 +281,8 @@ def evaluate(
         Part.captures: captures,
         Part.objects: objects,
         Part.bodies: bodies,
+        Part.field_scenes: field_scenes,
+        Part.field: field,
     }
     chosen = {part.value: some for part, some in parts.items() if only in (None, part)}
     raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))

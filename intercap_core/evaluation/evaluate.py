@@ -10,7 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from intercap_core.evaluation import bodies, budget, captures, objects, sequences
+from intercap_core.evaluation import (
+    bodies,
+    budget,
+    captures,
+    field,
+    field_scenes,
+    objects,
+    sequences,
+)
 from intercap_core.evaluation.part import Figures, Part, require_truth
 from intercap_core.evaluation.reference import REFERENCE, compare
 from intercap_core.evaluation.seeds import drawn_anew
@@ -18,7 +26,15 @@ from intercap_core.evaluation.workflows import bring_up_to_date
 from intercap_core.project import load_project
 
 PARTS: dict[str, Part[Any]] = {
-    part.name: part for part in (sequences.PART, captures.PART, objects.PART, bodies.PART)
+    part.name: part
+    for part in (
+        sequences.PART,
+        captures.PART,
+        objects.PART,
+        bodies.PART,
+        field_scenes.PART,
+        field.PART,
+    )
 }
 QUICK_SETTINGS = Path("config/evaluation/quick.yaml")
 QUICK_PARTS = ("sequences", "objects")
@@ -36,13 +52,15 @@ def evaluate(
 
     ``settings``: for each part of ``PARTS`` the settings files of its recordings: ``sequences`` are
     taken to the metrics, ``captures`` to the scene alone, ``objects`` to the object's track,
-    ``bodies`` to the body's fit. ``output`` is flat JSON with keys ``area.measure`` and, where a
+    ``bodies`` to the body's fit, ``field_scenes`` and ``field``, recordings as outside a studio, to
+    the scene and to the metrics. ``output`` is flat JSON with keys ``area.measure`` and, where a
     figure has one, ``area.measure_spread``: areas of annotated recordings end in ``_annotated``,
     those of ``captures`` have their dataset's name, that of ``objects`` is ``object``, that of
-    ``bodies`` is ``body``; ``time`` holds minutes. The figures are compared with those of
-    ``reference`` where one is given. ``seed`` draws all recordings anew (:mod:`.seeds`). Returns 1
-    where a stage failed; recordings that failed are left out of the figures and named. Raises
-    UserError where a project's settings are wrong, or none of its sequences has a result.
+    ``bodies`` is ``body``, those of both parts of the field are ``field`` and ``verdict``; ``time``
+    holds minutes. The figures are compared with those of ``reference`` where one is given.
+    ``seed`` draws all recordings anew (:mod:`.seeds`). Returns 1 where a stage failed; recordings
+    that failed are left out of the figures and named. Raises UserError where a project's settings
+    are wrong, or none of its sequences has a result.
     """
     begin = time.monotonic()
     if seed is not None:

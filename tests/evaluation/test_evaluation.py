@@ -42,6 +42,7 @@ def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
         Path(f"config/{other}/config.yaml") for other in ("demo", "test", "bench", "evaluation")
     ]
     others += [QUICK_SETTINGS, Path("config/evaluation/long.yaml")]
+    others += sorted(Path("config/field").glob("*.yaml"))
     for path in [*others, *objects]:
         studio = load_project(path).config.studio
         assert studio is not None

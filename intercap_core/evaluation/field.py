@@ -1,0 +1,131 @@
+"""The field's part of `intercap evaluate` that ends with the metrics.
+
+No depth and other definitions of joints, few cameras; what the verdict without truth tells of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from intercap_core import artefacts
+from intercap_core.body.artefact import load_model
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.evaluation.part import Figures, Measured, Part, console_of, keyed, number
+from intercap_core.metrics import figures
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.metrics.verdict_figures import stated_errors, verdict_figures
+from intercap_core.project import Project
+from intercap_core.schemas import JOINT, TRUTH
+from intercap_core.studio.subjects import Subject
+
+NO_DEPTH = "field_no_depth"
+_BONES = (
+    ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
+)  # fmt: skip
+_WIDTH = 112
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSequence:
+    """What stage ``metrics`` has measured; the relative errors (B,) of the limbs' lengths, and the
+    error of the person's height, metres."""
+
+    metrics: SequenceMetrics
+    bones: np.ndarray
+    height_m: float
+
+
+FieldSequences = Measured[FieldSequence]
+
+
+def measure(project: Project, sequence: str) -> FieldSequence:
+    """Errors of one recording after ``metrics``."""
+    row = project.sequences[sequence]
+    assert row.truth is not None
+    joint = project.artefact(sequence, "joint")
+    with artefacts.read(joint, JOINT) as fitted, artefacts.read(row.truth, TRUTH) as true:
+        gender = project.subjects[row.subject].gender
+        model = load_model(project.config.body_models, gender, fitted)
+        shape = torch.as_tensor(np.atleast_2d(fitted["betas"]), dtype=model.dtype)
+        rest = model.zeros(1)
+        rest.betas = shape
+        with torch.no_grad():
+            vertices = model.forward(rest).vertices[0].numpy()
+        own, known = (_lengths(a["joints"]) for a in (fitted, true))
+        person = Subject.load(str(true.attributes["subject"]))
+    height = float(np.ptp(vertices[:, 1])) - float(np.ptp(person.rest[:, 1]))
+    metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
+    return FieldSequence(metrics, own / known - 1, height)
+
+
+def _lengths(joints: np.ndarray) -> np.ndarray:
+    """Median lengths (B,) of the limbs' bones over time, of joints (T, 55, 3)."""
+    ends = [
+        [JOINT_INDEX[f"{side}_{name}"] for name in bone]
+        for side in ("left", "right")
+        for bone in _BONES
+    ]
+    a, b = np.array(ends).T
+    return np.median(np.linalg.norm(joints[:, a] - joints[:, b], axis=2), axis=0)
+
+
+def flat(evaluations: Sequence[FieldSequences]) -> Figures:
+    """Keys ``field.<measure>`` and ``verdict.<measure>``."""
+    every = [e.metrics for found in evaluations for e in found.errors]
+    found = keyed("verdict.", verdict_figures(every))
+    flags = figures.flag_figures([m for m in every if m.has_truth])
+    for key, name in (("flag_recall", "bad_recall"), ("flag_precision", "bad_precision")):
+        if key in flags:
+            found[f"field.{name}"] = flags[key]
+    blind = [e for some in evaluations if some.dataset == NO_DEPTH for e in some.errors]
+    if blind:
+        bones = np.abs(np.stack([e.bones for e in blind])).mean(axis=1)  # by person
+        pve = figures.truth_figures([e.metrics for e in blind], "joint")["body_pve_mm"]
+        found |= {
+            "field.no_depth_pve_mm": pve,
+            "field.no_depth_bone_percent": 100 * float(bones.mean()),
+            "field.no_depth_bone_worst_percent": 100 * float(bones.max()),
+            "field.no_depth_height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in blind])),
+        }
+    return found
+
+
+def print_field(evaluations: Sequence[FieldSequences]) -> None:
+    """A row a recording: true and stated errors, limbs, height."""
+    console = console_of(_WIDTH)
+    heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
+             "bones %", "height mm")  # fmt: skip
+    table = Table("recording", *heads, box=None, title="the field, after metrics")
+    for found in evaluations:
+        for e in found.errors:
+            cells = []
+            for error in stated_errors(e.metrics):
+                cells += [number(error.true, 1), number(error.stated, 1) or "silent"]
+            table.add_row(
+                f"{found.dataset}: {e.metrics.name}",
+                *cells,
+                number(100 * float(e.metrics.values["flagged"].mean()), 0),
+                number(100 * float(np.abs(e.bones).mean()), 1),
+                number(1e3 * e.height_m, 0),
+            )
+        for name in found.missing:
+            table.add_row(f"{found.dataset}: {name}", "no metrics")
+    console.print(table)
+    for key, value in flat(evaluations).items():
+        console.print(f"{key}: {value:.3g}", highlight=False)
+
+
+PART = Part(
+    "field",
+    "metrics",
+    ("joint",),
+    "metrics.figures",
+    measure,
+    flat,
+    print_field,
+)

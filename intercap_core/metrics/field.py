@@ -1,0 +1,152 @@
+"""Errors of the scene artefact of recordings as they are made outside a studio.
+
+Cameras out of step, rooms whose measured surface is mostly floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.metrics.capture import MEDIAN_CHI_1
+from intercap_core.metrics.extrinsics import CUBE_SIDE_M, displacement, rig_centre
+from intercap_core.metrics.times import match_times
+from intercap_core.schemas import FRAMES, SCENE, TRUTH
+
+WORSE_M = 0.001  # by more than this a camera ends worse than it was given
+
+
+@dataclass(frozen=True, eq=False)
+class FieldScene:
+    """Of one recording's cameras (N,) but the master, those that have images.
+
+    ``apart_s`` true time by which a camera's images are older than its sets say; ``late_s`` the
+    error of the stated one, the median over images, ``sigma_s`` its stated deviation;
+    ``set_aside``: the scene says that it cannot tell. ``before`` and ``after`` of the extrinsics
+    and their ``stated`` deviation, metres, RMS displacement over a 2 m cube.
+    """
+
+    sequence: str
+    fps: float
+    apart_s: np.ndarray
+    late_s: np.ndarray
+    sigma_s: np.ndarray
+    set_aside: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    stated: np.ndarray
+
+
+def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
+    """Compare one scene with its truth; raises UserError where an artefact cannot be read."""
+    with (
+        artefacts.read(frames, FRAMES) as recorded,
+        artefacts.read(scene, SCENE) as found,
+        artefacts.read(truth, TRUTH) as true,
+    ):
+        fps, names = float(found.attributes["fps"]), found.text("camera_names")
+        at = match_times(truth, true["times"], found["times"], fps)
+        order = [true.text("camera_names").index(name) for name in names]
+        master = names.index(str(found.attributes["master"]))
+        index: np.ndarray = recorded["colour_index"]
+        available = index >= 0
+        late, true_late = (
+            np.where(available, slip / fps - offset, np.nan)
+            for slip, offset in (
+                (found["slip"], found["time_offset"]),
+                (true["slip"][at][:, order], true["time_offset"][order]),
+            )
+        )
+        apart = np.nanmedian(true_late, axis=0)
+        error = np.nanmedian(late - true_late, axis=0)
+        unseen = np.asarray((found["image_of"] < 0).all(axis=0))
+        poses = true["master_from_colour"][order]
+        before, after = (
+            displacement(found[key], poses, master)
+            for key in ("master_from_colour_start", "master_from_colour")
+        )
+        stated = stated_displacement(found["master_from_colour"], found["camera_covariance"])
+        counted = available.any(axis=0) & (np.arange(len(names)) != master)
+        return FieldScene(
+            str(found.attributes["sequence"]),
+            fps,
+            (apart - apart[master])[counted],
+            (error - error[master])[counted],
+            found["time_offset_sigma"][counted],
+            unseen[counted],
+            before[counted],
+            after[counted],
+            stated[counted],
+        )
+
+
+def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """RMS displacement (C,) over the points of a 2 m cube at the rig's centre, metres, that the
+    covariance (C, 7, C, 7) of rotation about the camera's centre, translation and depth bias
+    states."""
+    arms = rig_centre(master_from_camera) - master_from_camera[:, :3, 3]
+    result = np.empty(len(arms))
+    for c, arm in enumerate(arms):
+        own = covariance[c, :6, c, :6]
+        across = np.cross(np.eye(3), arm)  # row i: the shift of the arm by a turn about axis i
+        by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
+        at_centre = np.trace(by_pose @ own @ by_pose.T)
+        turn = np.trace(own[:3, :3])
+        result[c] = np.sqrt(at_centre + CUBE_SIDE_M**2 / 12 * 2 * turn)
+    return result
+
+
+def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Of recordings whose cameras started apart; milliseconds.
+
+    A camera is solved where its images show the right set: the error is below half a set's time.
+    One that is not, and that the scene does not set aside, is ``offset_wrong``.
+    """
+    if not scenes:
+        return {}
+    late, sigma, aside, step = (
+        np.concatenate([values(s) for s in scenes])
+        for values in (
+            lambda s: np.abs(s.late_s),
+            lambda s: s.sigma_s,
+            lambda s: s.set_aside,
+            lambda s: np.full(len(s.late_s), 1 / s.fps),
+        )
+    )
+    solved = ~aside & (late < step / 2)
+    found = {
+        "offset_solved_share": float(solved.mean()),
+        "offset_wrong": float((~solved & ~aside).sum()),
+        "offset_cameras": float(len(late)),
+    }
+    if solved.any():
+        found["offset_error_ms"] = 1e3 * float(late[solved].mean())
+        found["offset_error_worst_ms"] = 1e3 * float(late[solved].max())
+    known = solved & (sigma > 0)
+    if known.any():
+        found["offset_sigma_ms"] = 1e3 * float(np.median(sigma[known]))
+        found["offset_normalised"] = float(np.median(late[known] / sigma[known])) / MEDIAN_CHI_1
+    return found
+
+
+def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Of rooms whose measured surface is mostly floor; millimetres."""
+    if not scenes:
+        return {}
+    before, after, stated = (
+        np.concatenate([getattr(s, name) for s in scenes]) for name in ("before", "after", "stated")
+    )
+    known = stated > 0
+    found = {
+        "extrinsics_floor_heavy_given_mm": 1e3 * float(before.mean()),
+        "extrinsics_floor_heavy_mm": 1e3 * float(after.mean()),
+        "extrinsics_floor_heavy_worst_mm": 1e3 * float(after.max()),
+        "extrinsics_worse_cameras": float((after > before + WORSE_M).sum()),
+    }
+    if known.any():
+        found["extrinsics_normalised"] = float(np.median(after[known] / stated[known]))
+    return found
