@@ -402,7 +402,15 @@ class SequenceEntry(Model):
     """How the recordings are laid out: Azure Kinect files, InterCap's or BEHAVE's release, or plain
     images and videos; see docs/recordings.md."""
     calibration: Path
-    """Camera poses: a rig JSON file, or a folder of Color*.json files as InterCap released."""
+    """Where the cameras are: a file or folder in the form that docs/recordings.md names for the
+    layout, or as Pose2Sim, Anipose, EasyMocap, COLMAP or nerfstudio write it."""
+    calibration_scale: Positive | None = None
+    """Metres for one unit of the calibration, where its form does not fix the unit."""
+    calibration_up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
+    """The axis of the calibration's own world that points up; not stated = it is not relied on."""
+    calibration_floor: Metres | None = None
+    """Metres from the origin of the calibration's world up to the floor, 0 where the floor goes
+    through it; only with calibration_up."""
     keypoints: Path | None = None
     """Folder of people's keypoints: <camera>/<image>_keypoints.json as OpenPose writes them, or
     <camera>.json or <camera>/<image>.json in the manner of COCO-WholeBody; docs/detectors.md."""
@@ -413,6 +421,14 @@ class SequenceEntry(Model):
     annotation: Path | None = None
     """This sequence's annotation file; without one, <sequence>.yaml in the folder of annotations,
     where it is there."""
+
+    @model_validator(mode="after")
+    def _floor_needs_up(self) -> SequenceEntry:
+        if self.calibration_floor is not None and self.calibration_up is None:
+            raise ValueError(
+                "calibration_floor is stated without calibration_up, which it is along"
+            )
+        return self
 
 
 class SubjectEntry(Model):

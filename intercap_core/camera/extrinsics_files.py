@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,14 @@ RELEASE_NAME = re.compile(r"Color(?:_(\d+))?\.json")
 
 @dataclass(frozen=True)
 class Extrinsics:
-    """Poses of the colour cameras: name -> (4, 4), metres; the master's is the identity."""
+    """Poses of the colour cameras: name -> (4, 4), metres; the master's is the identity.
+
+    ``master_from_world`` (4, 4), metres: from the frame that the file itself is written in.
+    """
 
     master: str
     master_from_colour: dict[str, np.ndarray]
+    master_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
 
 
 def read_extrinsics(path: Path) -> Extrinsics:
@@ -132,7 +136,7 @@ def relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrin
     master_from_world = invert(world_from_camera[master])
     poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
     poses[master] = np.eye(4)
-    return Extrinsics(master, poses)
+    return Extrinsics(master, poses, master_from_world)
 
 
 def read_json(path: Path) -> dict[str, Any]:

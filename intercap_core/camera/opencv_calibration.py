@@ -61,9 +61,9 @@ def read_opencv_calibration(path: Path) -> Calibration:
     path = Path(path)
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
-        content: dict[str, Any] = {"cameras": {file.stem: _load(file) for file in files}}
+        content: dict[str, Any] = {"cameras": {file.stem: load_opencv(file) for file in files}}
     else:
-        content = _load(path)
+        content = load_opencv(path)
     entries = content.get("cameras")
     if not isinstance(entries, dict) or not entries:
         raise UserError(
@@ -96,7 +96,7 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
     Its metric radius ends where the distortion turns back, so that nothing outside the view is
     projected into the image. Raises UserError, beginning with ``where``, for what is no lens.
     """
-    k, d = _numbers(matrix, where, "camera_matrix"), _numbers(coefficients, where, "distortion")
+    k, d = numbers_of(matrix, where, "camera_matrix"), numbers_of(coefficients, where, "distortion")
     d = d.ravel()
     if d.size not in COEFFICIENTS:
         more = (
@@ -144,7 +144,7 @@ def turning_radius(distortion: np.ndarray) -> float:
 
 def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
     colour = _lens(entry, where)
-    offset = _numbers(entry.get("time_offset", 0.0), where, "time_offset")
+    offset = numbers_of(entry.get("time_offset", 0.0), where, "time_offset")
     if offset.size != 1:
         raise UserError(f"{where}: time_offset is {offset.tolist()}, expected seconds; correct it")
     depth = entry.get("depth")
@@ -153,7 +153,7 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
         lens, between = colour, np.eye(4)
     elif isinstance(depth, dict):
         lens = _lens(depth, f"{where}, depth")
-        between = _numbers(depth.get("colour_from_depth"), where, "depth.colour_from_depth")
+        between = numbers_of(depth.get("colour_from_depth"), where, "depth.colour_from_depth")
         if not is_rigid(between):
             raise UserError(
                 f"{where}: depth.colour_from_depth is no rigid 4x4 transform (x_colour = R x_depth "
@@ -174,17 +174,21 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
     return CalibratedCamera(colour, lens, between, own or fps, float(offset.ravel()[0]))
 
 
+def image_size_of(size: Any, where: str) -> tuple[int, int]:
+    """Width and height in whole pixels; raises UserError, beginning with ``where``, otherwise."""
+    numbers = numbers_of(size, where, "image_size").ravel()
+    if numbers.size != 2 or (numbers < 1).any() or (numbers != numbers.round()).any():
+        raise UserError(f"{where}: image_size is {size!r:.60}, expected width and height in pixels")
+    return int(numbers[0]), int(numbers[1])
+
+
 def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
     for key in ("camera_matrix", "distortion_coefficients"):
         if key not in entry:
             raise UserError(f"{where}: has no {key}; add it")
     size = entry.get("image_size", [entry.get("image_width"), entry.get("image_height")])
-    numbers = _numbers(size, where, "image_size").ravel()
-    if numbers.size != 2 or (numbers < 1).any() or (numbers != numbers.round()).any():
-        raise UserError(f"{where}: image_size is {size!r:.60}, expected width and height in pixels")
-    width, height = (int(number) for number in numbers)
     return opencv_lens(
-        (width, height), entry["camera_matrix"], entry["distortion_coefficients"], where
+        image_size_of(size, where), entry["camera_matrix"], entry["distortion_coefficients"], where
     )
 
 
@@ -198,17 +202,27 @@ def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> 
             f"{where}: has no pose; add R (3x3, or a rotation vector) and T with x_camera = R "
             "x_world + T, metres"
         )
-    r, t = _numbers(turn, where, "R"), _numbers(shift, where, "T").ravel()
+    camera_from_world = opencv_pose(turn, shift, where)
+    check_distance(path, f"camera {where.rpartition(' ')[2]}", camera_from_world[:3, 3])
+    return invert(camera_from_world)
+
+
+def opencv_pose(turn: Any, shift: Any, where: str) -> np.ndarray:
+    """Camera from world (4, 4) of a rotation, a matrix (3, 3) or vector (3,), and a translation.
+
+    Raises UserError, beginning with ``where``, for what is none.
+    """
+    r, t = numbers_of(turn, where, "R"), numbers_of(shift, where, "T").ravel()
     r = Rotation.from_rotvec(r.ravel()).as_matrix() if r.size == 3 else r
     if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
         raise UserError(
             f"{where}: R is no rotation (3x3, or a vector of 3) or T no vector of 3; correct it"
         )
-    check_distance(path, f"camera {where.rpartition(' ')[2]}", t)
-    return invert(rigid(r, t))
+    return rigid(r, t)
 
 
-def _numbers(value: Any, where: str, field: str) -> np.ndarray:
+def numbers_of(value: Any, where: str, field: str) -> np.ndarray:
+    """Finite numbers as an array; raises UserError, beginning with ``where``, for anything else."""
     try:
         numbers = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -222,7 +236,7 @@ def _positive(entry: dict[str, Any], field: str, where: str) -> float | None:
     value = entry.get(field)
     if value is None:
         return None
-    number = _numbers(value, where, field)
+    number = numbers_of(value, where, field)
     if number.size != 1 or number.ravel()[0] <= 0:
         raise UserError(f"{where}: {field} is {value!r:.60}, expected one positive number")
     return float(number.ravel()[0])
@@ -254,7 +268,11 @@ def _json_object(entry: dict[str, Any]) -> Any:
     return _matrix(entry) if entry.get("type_id") in _MATRIX_TYPES else entry
 
 
-def _load(path: Path) -> dict[str, Any]:
+def load_opencv(path: Path) -> dict[str, Any]:
+    """Read a JSON or YAML file, by hand or of ``cv2.FileStorage``: matrices become nested lists.
+
+    Raises UserError where it is none, or holds no names and values.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

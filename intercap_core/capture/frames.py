@@ -127,6 +127,19 @@ class Frames:
         """(C, 3): the direction down, unit, in each colour camera's frame; NaN = not known."""
         return self._artefact["gravity"]
 
+    @cached_property
+    def stated_up(self) -> np.ndarray:
+        """(3,) unit, up as the user states it, master's frame; NaN = not stated."""
+        return self._stated("stated_up")
+
+    @cached_property
+    def stated_floor(self) -> np.ndarray:
+        """(3,) a point of the floor as the user states it, master's frame; NaN = not stated."""
+        return self._stated("stated_floor")
+
+    def _stated(self, key: str) -> np.ndarray:
+        return self._artefact[key] if key in self._artefact else np.full(3, np.nan)
+
     def depth(self, t: int, c: int) -> np.ndarray | None:
         """Return the depth image (H, W) uint16, millimetres, 0 = invalid; None if there is none."""
         index = int(self._depth_index[t, c])

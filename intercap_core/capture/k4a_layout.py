@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from intercap_core.camera.calibration_files import read_other_calibration, refuse_scale
 from intercap_core.camera.extrinsics_files import read_extrinsics
 from intercap_core.camera.k4a_calibration import COLOUR_MODES
+from intercap_core.camera.other_calibration import Recorded
 from intercap_core.capture.encoded import JPEG_QUALITY, bgr_of_raw, jpeg_of
 from intercap_core.capture.k4a import Recording, imu_samples
 from intercap_core.capture.source import CameraRecording, Image, Layout
@@ -16,12 +18,17 @@ from intercap_core.config import SequenceEntry
 
 
 class KinectLayout(Layout):
-    """``<camera>.mkv`` files, and camera poses as :func:`read_extrinsics` reads them."""
+    """``<camera>.mkv`` files, and camera poses as :func:`read_extrinsics` reads them, or those of
+    another tool's calibration, whose lenses are left aside."""
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
-        self.extrinsics = read_extrinsics(sequence.calibration)
         self.names = sorted(path.stem for path in sequence.recordings.glob("[!.]*.mkv"))
+        path, scale = sequence.calibration, sequence.calibration_scale
+        other = read_other_calibration(path, Recorded(self.names), scale)
+        if other is None:
+            refuse_scale(path, scale)
+        self.extrinsics = read_extrinsics(path) if other is None else other.extrinsics
 
     def open(self, name: str) -> KinectRecording:
         """Open ``<name>.mkv``; raises UserError as :class:`Recording` does."""

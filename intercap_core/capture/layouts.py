@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from intercap_core.camera.calibration_files import refuse_scale
 from intercap_core.capture.source import Layout
 from intercap_core.config import LayoutName, SequenceEntry
 from intercap_core.errors import UserError
@@ -43,6 +44,8 @@ def open_layout(sequence: SequenceEntry) -> Layout:
             f"{sequence.recordings}: sequence {sequence.sequence!r} has no such folder of "
             "recordings; correct 'recordings' in the table of sequences"
         )
+    if sequence.layout in ("intercap", "behave"):
+        refuse_scale(sequence.calibration, sequence.calibration_scale)
     # Imports inside, one a layout: the workflow sees what the stage reaches, each loads its own.
     match sequence.layout:
         case "k4a":

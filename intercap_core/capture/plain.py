@@ -2,7 +2,7 @@
 
 ``recordings`` holds ``<camera>/`` with JPEG or PNG files (or ``<camera>/colour/``), or
 ``<camera>.mp4`` and its like; ``<camera>/depth/`` holds 16-bit PNG files, millimetres, where the
-camera has depth. ``calibration`` is as :mod:`intercap_core.camera.opencv_calibration` says.
+camera has depth. ``calibration`` is as :mod:`intercap_core.camera.calibration_files` says.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from intercap_core.camera.calibration_files import read_calibration
 from intercap_core.camera.extrinsics_files import CAMERA_NAME
-from intercap_core.camera.opencv_calibration import read_opencv_calibration
+from intercap_core.camera.other_calibration import Recorded
 from intercap_core.camera.rig import Camera
+from intercap_core.capture.encoded import encoded_size
 from intercap_core.capture.image_files import FilesRecording
 from intercap_core.capture.source import CameraRecording, Layout
 from intercap_core.capture.timestamps import find_timestamps, rate_of, read_timestamps, shots_of
@@ -30,13 +32,30 @@ class PlainLayout(Layout):
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
-        calibration = read_opencv_calibration(sequence.calibration)
-        self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
         below = sorted(sequence.recordings.iterdir())
         self._folders = {p.name: p for p in below if p.is_dir() and (_colour(p) or _depth(p))}
         self._videos = [p for p in below if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()]
         found = sorted({*self._folders, *(path.stem for path in self._videos)})
         self.names = [name for name in found if CAMERA_NAME.fullmatch(name)]
+        calibration = read_calibration(
+            sequence.calibration,
+            Recorded(self.names, self._size_of),
+            scale=sequence.calibration_scale,
+        )
+        self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
+
+    def _size_of(self, name: str) -> tuple[int, int] | None:
+        """Width and height of the camera's first image; None where there is none to be read."""
+        folder = self._folders.get(name)
+        files = _colour(folder) if folder else []
+        try:
+            if files:
+                return encoded_size(files[0].read_bytes())
+        except OSError:
+            return None
+        from intercap_core.capture.video import video_size
+
+        return next((video_size(path) for path in self._videos if path.stem == name), None)
 
     def open(self, name: str) -> CameraRecording:
         """Open the camera's video or folder.

@@ -21,6 +21,16 @@ from intercap_core.capture.timestamps import Timestamps, shots_of
 from intercap_core.errors import UserError
 
 
+def video_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of a video's images; None where it cannot be opened."""
+    try:
+        with av.open(str(path), metadata_errors="replace") as container:
+            context = container.streams.video[0].codec_context
+            return (context.width, context.height) if context and context.width else None
+    except (av.error.FFmpegError, OSError, IndexError):
+        return None
+
+
 class VideoRecording(CameraRecording):
     """One video file, and perhaps a folder of depth files.
 

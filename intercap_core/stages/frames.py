@@ -79,6 +79,8 @@ def run(
             writer.put(key, values)
         writer.put("master_from_colour", rig.master_from_colour)
         writer.put("gravity", np.stack([view.gravity for view in views]))
+        for key, values in _stated_world(sequence, extrinsics).items():
+            writer.put(key, values)
         writer.put("present", [view.present for view in views])
         writer.put("truncated", [view.truncated for view in views])
         writer.put("note", ["; ".join(view.notes) for view in views])
@@ -90,6 +92,19 @@ def run(
         writer.attributes.update(
             sequence=sequence.sequence, master=extrinsics.master, fps=views[clock].fps
         )
+
+
+def _stated_world(sequence: SequenceEntry, extrinsics: Extrinsics) -> dict[str, np.ndarray]:
+    """What the sequence's row states of the calibration's world: (3,) each, master's frame."""
+    axis = sequence.calibration_up
+    if axis is None:
+        return {}
+    up = np.array([float(axis[-1] == name) for name in "xyz"]) * (-1 if axis[0] == "-" else 1)
+    turn, shift = extrinsics.master_from_world[:3, :3], extrinsics.master_from_world[:3, 3]
+    stated = {"stated_up": turn @ up}
+    if sequence.calibration_floor is not None:
+        stated["stated_floor"] = turn @ (sequence.calibration_floor * up) + shift
+    return stated
 
 
 def _used(names: Sequence[str], settings: FramesSettings, sequence: SequenceEntry) -> set[str]:

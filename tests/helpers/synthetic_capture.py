@@ -5,6 +5,7 @@ Nothing of the studio: rays are cast on boxes and planes analytically.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -185,8 +186,10 @@ def write_frames(
     colour_index: np.ndarray | None = None,
     dropped: np.ndarray | None = None,
     gravity: np.ndarray | None = None,
+    stated: Mapping[str, np.ndarray] | None = None,
 ) -> Path:
-    """Write a frames artefact without colour; ``depths`` has (T, H, W) uint16 for each camera."""
+    """Write a frames artefact without colour; ``depths`` has (T, H, W) uint16 for each camera,
+    ``stated`` what is stated of the calibration's world, by dataset."""
     count = len(rig)
     sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
     none = np.full((num_sets, count), -1)
@@ -200,6 +203,8 @@ def write_frames(
             dropped=dropped,
             gravity=gravity,
         )
+        for key, values in (stated or {}).items():
+            writer.put(key, values)
         for index, name in enumerate(rig.names):
             if depths is not None:
                 writer.put(f"cameras/{name}/depth", depths[index])

@@ -186,8 +186,11 @@ def tracked_subject(wildcards):
 
 
 def layout_of(wildcards):
-    """Param: how the sequence's recordings are laid out; the files themselves are inputs."""
-    return PROJECT.sequences[wildcards.sequence].layout
+    """Param: how the sequence's recordings are laid out, and what its row states of the
+    calibration; the files themselves are inputs."""
+    row = PROJECT.sequences[wildcards.sequence]
+    stated = (row.calibration_scale, row.calibration_up, row.calibration_floor)
+    return row.layout if stated == (None, None, None) else [row.layout, *stated]
 
 
 def capture_of(wildcards):
