@@ -28,6 +28,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
+from intercap_core.export.upright import z_up_frame
 from intercap_core.project import Project, load_project
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
@@ -52,6 +53,7 @@ class PosedSequence:
 
     ``faces`` (F, 3) of the body, ``mesh`` the object with its own faces, poses master_from_object
     ``rotation`` (T, 3, 3) and ``translation`` (T, 3), ``times`` (T,) s, ``trusted`` (T,) bool.
+    ``frame`` says in words which frame it is; for z-up also what turned it upright.
     """
 
     model: BodyModel
@@ -62,6 +64,7 @@ class PosedSequence:
     frame_from_master: np.ndarray
     times: np.ndarray
     trusted: np.ndarray
+    frame: str
 
     def __len__(self) -> int:
         return len(self.rotation)
@@ -121,6 +124,7 @@ def open_sequence(
     with artefacts.read(project.artefact(sequence, "scene"), SCENE) as scene:
         names, times = list(scene["camera_names"]), scene["times"]
         cameras, zup = scene["master_from_colour"], scene["zup_from_master"]
+        upright = z_up_frame(scene)
     fitted = JOINT if stage == "joint" else BODY_FIT
     with artefacts.read(project.artefact(sequence, stage), fitted) as body:
         model = load_model(project.config.body_models, gender, body)
@@ -143,6 +147,7 @@ def open_sequence(
         _from_master(frame, names, cameras, zup, sequence),
         times,
         trusted,
+        upright if frame == Z_UP else f"{frame} colour camera: x right, y down, z forward, metres",
     )
 
 

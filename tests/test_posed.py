@@ -51,6 +51,7 @@ def test_frames_are_those_of_scene_and_cameras(capture, settings):
     upright = seen["z-up"].bodies()[0]
     assert abs(upright[..., 2].min() + fitted.BODY_OFFSET_M) < 0.001  # the fit is so much too low
     assert upright[..., 2].max() > 1.5
+    assert "ground at z = 0" in seen["z-up"].frame and "k2" in seen["k2"].frame
     master = seen["master"].bodies()[0].reshape(-1, 3)
     by_camera = apply(capture.rig[1].colour_from_master, master)
     np.testing.assert_allclose(seen["k2"].bodies()[0].reshape(-1, 3), by_camera, atol=1e-6)

@@ -215,10 +215,14 @@ def _pairs(scene: artefacts.Artefact, names: Sequence[str]) -> list[Pair]:
 def _ground(scene: artefacts.Artefact) -> str:
     told = scene.attributes
     if not told["ground_found"]:
-        return "no floor was seen or annotated"
-    words = f"{told['ground_source']}, {int(told['ground_inliers']):,} points support it"
-    rms = 1e3 * float(told["ground_rms"])
-    return f"{words}, RMS {rms:.1f} mm" if np.isfinite(rms) else words
+        words = f"no floor was seen or annotated, upright by {told.get('up_source', 'a hint')}"
+    elif told["ground_source"] == "stated":
+        words = "as stated with the calibration"
+    else:
+        words = f"{told['ground_source']}, {int(told['ground_inliers']):,} points support it"
+        rms = 1e3 * float(told["ground_rms"])
+        words += f", RMS {rms:.1f} mm" if np.isfinite(rms) else ""
+    return f"{words}; {told['ground_note']}" if "ground_note" in told else words
 
 
 def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:

@@ -48,6 +48,7 @@ OFFSET_SIGMA_S = 0.05  # prior of an offset, told by keypoints alone; tuned on t
 # lenses keypoints alone can judge. Tuned on the studio.
 CALIBRATION_ROTATION_SIGMA = np.radians(0.3)
 CALIBRATION_TRANSLATION_SIGMA_M = 0.006
+STATED_UP_CONE_DEG = 10.0  # of a calibration's axis from the floor's normal: a board laid on it
 CAMERA_UP_CONE_DEG = 40.0  # of the mean of the cameras' own up directions; tuned on the studio
 LEVER_M = 2.5  # from a camera to what it looks at, in a ring: turns a rotation into metres
 
@@ -148,6 +149,16 @@ FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tun
 BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
 BELOW_FLOOR_COST = 3.0  # how many inliers such a point outweighs; tuned on the studio
 MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
+LOWER_FLOOR_DEG = 3.0  # of a lower floor from a platform: both are level
+LEVEL_SHARE = 0.15  # of the sets: feet that make a level of their own; a bound, not tuned
+MAX_SLOPE_DEG = 15.0  # of one tilted plane under all feet; treads of 12 by 40 cm climb by 17
+# How far a measured floor may be from what is stated of the calibration's world before it is said:
+# a board is laid by hand and is a few centimetres thick, feet tell a tilt to about 3 degrees.
+STATED_UP_DEG = 4.0
+STATED_FLOOR_M = 0.06
+FEET_TILT_DEG = 6.0  # twice what feet that have been apart tell a tilt to
+WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; who bends for long leans by less
+MIN_TRUNK_SETS = 5  # that show neck and hips
 MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
 MIN_ANNOTATED_SPREAD_M = 0.02  # annotated points this close to one line give no plane
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,34 +11,31 @@ from intercap_core.errors import UserError
 from intercap_core.scene.constants import (
     BELOW_FLOOR_COST,
     BELOW_FLOOR_M,
-    CAMERA_UP_CONE_DEG,
     FLOOR_COSINE,
     FLOOR_FIRST_GATE_M,
     FLOOR_HYPOTHESES,
     FLOOR_HYPOTHESIS_POINTS,
     FLOOR_HYPOTHESIS_TOLERANCE_M,
     FLOOR_REFINE_STEPS,
-    FOOT_HEIGHT_M,
-    FOOT_TOLERANCE_M,
-    GRAVITY_CONE_DEG,
+    LOWER_FLOOR_DEG,
     MIN_ANNOTATED_SPREAD_M,
     MIN_FLOOR_AREA_M2,
-    MIN_FOOT_SETS,
-    MIN_FOOT_SPREAD_M,
 )
+from intercap_core.scene.up import Up, degrees_between
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
     """``point`` (3,) and unit ``normal`` (3,), up, master frame; ``rms`` metres over the
     ``inliers`` points, or sets in which someone stands, within the tolerance; NaN and 0 where
-    there is no floor."""
+    there is no floor. ``note``: what is odd about it, in words, "" = nothing."""
 
     point: np.ndarray
     normal: np.ndarray
     rms: float
     inliers: int
     source: str
+    note: str = ""
 
     @property
     def found(self) -> bool:
@@ -49,27 +46,11 @@ class Ground:
 NO_GROUND = Ground(np.full(3, np.nan), np.full(3, np.nan), float("nan"), 0, "none")
 
 
-def up_hint(rig: Rig, gravity: np.ndarray) -> tuple[np.ndarray, float]:
-    """Roughly up (3,), master frame, and how far off it may be, degrees.
-
-    ``gravity`` (C, 3) points down in each colour camera, NaN where not known; else the images'
-    upward directions, whose tilts cancel around a ring.
-    """
-    measured = np.isfinite(gravity).all(1)
-    rotations = rig.master_from_colour[:, :3, :3]
-    if measured.any():
-        down = np.einsum("cij,cj->ci", rotations[measured], gravity[measured])
-        up = -np.median(down, axis=0)
-        return up / np.linalg.norm(up), GRAVITY_CONE_DEG
-    up = -rotations[:, :, 1].mean(0)
-    return up / np.linalg.norm(up), CAMERA_UP_CONE_DEG
-
-
 def fit_ground(
     points: np.ndarray,
     normals: np.ndarray,
     rig: Rig,
-    gravity: np.ndarray,
+    up: Up,
     *,
     tolerance_m: float,
     cell_m: float,
@@ -78,19 +59,20 @@ def fit_ground(
     ``cell_m``: the lowest large plane that faces up, below the cameras, with little under it.
 
     Every point with its normal is a hypothesis (so one point gives a plane); the best is refined
-    by iterated weighted least squares.
+    by iterated weighted least squares. A platform may be larger than the floor that is seen
+    around it: the lowest plane parallel to it that is large enough is the floor.
     """
-    up, cone = up_hint(rig, gravity)
-    facing = normals @ up >= np.cos(np.radians(cone) + np.arccos(FLOOR_COSINE))
-    highest = np.median(rig.master_from_colour[:, :3, 3] @ up)
-    candidates = np.flatnonzero(facing & (points @ up < highest))
+    cone = up.cone_deg
+    facing = normals @ up.direction >= np.cos(np.radians(cone) + np.arccos(FLOOR_COSINE))
+    highest = np.median(rig.master_from_colour[:, :3, 3] @ up.direction)
+    candidates = np.flatnonzero(facing & (points @ up.direction < highest))
     if not len(candidates):
         return NO_GROUND
     rng = np.random.default_rng(0)
     judging = min(len(points), FLOOR_HYPOTHESIS_POINTS)
     sample = points[rng.choice(len(points), judging, replace=False)]
     tried = rng.choice(candidates, min(len(candidates), FLOOR_HYPOTHESES), replace=False)
-    near_up = normals[tried] @ up >= np.cos(np.radians(cone))
+    near_up = normals[tried] @ up.direction >= np.cos(np.radians(cone))
     tried = tried[near_up]
     if not len(tried):
         return NO_GROUND
@@ -103,7 +85,36 @@ def fit_ground(
     )
     if fitted.inliers * cell_m**2 < MIN_FLOOR_AREA_M2:
         return NO_GROUND
-    return fitted
+    return _lowest(points[candidates], normals[candidates], fitted, tolerance_m, cell_m)
+
+
+def _lowest(
+    points: np.ndarray, normals: np.ndarray, ground: Ground, tolerance_m: float, cell_m: float
+) -> Ground:
+    """The lowest large plane parallel to ``ground`` among points (N, 3) that face up, or itself."""
+    upper = ground
+    while True:
+        facing = normals @ ground.normal >= FLOOR_COSINE
+        height = (points - ground.point) @ ground.normal
+        under = np.flatnonzero(facing & (height < -BELOW_FLOOR_M))
+        if len(under) * cell_m**2 < MIN_FLOOR_AREA_M2:
+            break
+        order = under[np.argsort(height[under])]
+        reach = height[order] + 2 * FLOOR_HYPOTHESIS_TOLERANCE_M
+        count = np.searchsorted(height[order], reach, side="right") - np.arange(len(order))
+        first = int(np.argmax(count))
+        start = points[order[first : first + count[first]]].mean(0)
+        lower = _refined(points, normals, start, ground.normal, tolerance_m)
+        parallel = degrees_between(lower.normal, ground.normal) <= LOWER_FLOOR_DEG
+        deep = (lower.point - ground.point) @ ground.normal < -BELOW_FLOOR_M
+        if lower.inliers * cell_m**2 < MIN_FLOOR_AREA_M2 or not (parallel and deep):
+            break
+        ground = lower
+    if ground is upper:
+        return ground
+    above = float((upper.point - ground.point) @ ground.normal)
+    note = f"a larger level surface lies {above:.2f} m above the floor (a platform, or a table)"
+    return replace(ground, note=note)
 
 
 def _refined(
@@ -131,43 +142,8 @@ def _refined(
     return Ground(point, normal, rms, int(inlier.sum()), "fitted")
 
 
-def ground_of_feet(feet: np.ndarray, rig: Rig, gravity: np.ndarray) -> Ground:
-    """The floor that someone stands on: from heels and toes (T, F, 3), NaN = not known.
-
-    In each set the lowest of the feet stands, in most of them on the floor. Gravity gives the
-    normal; where none is measured the feet do, as far as they have been apart: who walks along a
-    line shows the tilt along it, and across it the cameras' own up stands. For scenes whose floor
-    no camera measures; its height is as good as the keypoints, a centimetre or two.
-    """
-    up, _ = up_hint(rig, gravity)
-    known = np.isfinite(feet[..., 0]).sum(1) >= 3
-    if known.sum() < MIN_FOOT_SETS:
-        return NO_GROUND
-    height = np.where(np.isfinite(feet[..., 0]), feet @ up, np.inf)[known]
-    standing = feet[known][np.arange(known.sum()), height.argmin(1)]
-    inlier = np.abs(standing @ up - np.median(standing @ up)) < FOOT_TOLERANCE_M
-    standing = standing[inlier]
-    if len(standing) < MIN_FOOT_SETS:
-        return NO_GROUND
-    point, normal = np.median(standing, 0), up
-    if not np.isfinite(gravity).all(1).any():
-        point = standing.mean(0)
-        _, spread, axes = np.linalg.svd(standing - point, full_matrices=False)
-        along, across = spread[:2] / np.sqrt(len(standing))
-        if along < MIN_FOOT_SPREAD_M:
-            return NO_GROUND
-        normal = axes[2] * np.sign(axes[2] @ up)
-        if across < MIN_FOOT_SPREAD_M:
-            normal = up - (up @ axes[0]) * axes[0]
-            normal /= np.linalg.norm(normal)
-    distance = (standing - point) @ normal
-    point = point + (np.median(distance) - FOOT_HEIGHT_M) * normal
-    rms = float(np.sqrt(np.mean((distance - np.median(distance)) ** 2)))
-    return Ground(point, normal, rms, len(standing), "feet")
-
-
 def annotated_ground(
-    floor: np.ndarray, points: np.ndarray, rig: Rig, gravity: np.ndarray, *, tolerance_m: float
+    floor: np.ndarray, points: np.ndarray, up: Up, *, tolerance_m: float
 ) -> Ground:
     """The plane through annotated floor points (M, 3), M >= 3, master frame; ``points`` (N, 3) of
     the background are only counted.
@@ -181,19 +157,24 @@ def annotated_ground(
             f"annotation floor: its {len(floor)} points lie on one line within "
             f"{MIN_ANNOTATED_SPREAD_M * 1000:.0f} mm; pick points that span the floor"
         )
-    normal = axes[2] * np.sign(axes[2] @ up_hint(rig, gravity)[0])
+    normal = axes[2] * np.sign(axes[2] @ up.direction)
     distance = (points - point) @ normal
     inlier = np.abs(distance) < tolerance_m
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2))) if inlier.any() else float("nan")
     return Ground(point, normal, rms, int(inlier.sum()), "annotated")
 
 
-def zup_from_master(ground: Ground, rig: Rig, gravity: np.ndarray) -> np.ndarray:
+def stated_ground(up: np.ndarray, floor: np.ndarray) -> Ground:
+    """The floor as the user states it: ``up`` (3,) unit, and a point of it, master frame."""
+    return Ground(floor, up, float("nan"), 0, "stated")
+
+
+def zup_from_master(ground: Ground, rig: Rig, up_hint: Up) -> np.ndarray:
     """Transform (4, 4) to z up with the floor at z = 0 under the ring's middle; y is where the
-    master looks. Without a floor: up by :func:`up_hint`, and z = 0 at the master camera."""
+    master looks. Without a floor: up by ``up_hint``, and z = 0 at the master camera."""
     up, point = ground.normal, ground.point
     if not ground.found:
-        up, point = up_hint(rig, gravity)[0], np.zeros(3)
+        up, point = up_hint.direction, np.zeros(3)
     ahead = np.array([0.0, 0, 1]) - up[2] * up
     if np.linalg.norm(ahead) < 0.1:  # the master looks straight down: take its image's up
         ahead = np.array([0.0, -1, 0]) + up[1] * up

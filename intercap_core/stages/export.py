@@ -18,11 +18,11 @@ from intercap_core.errors import UserError
 from intercap_core.export import amass, bop, contact, glb, intercap
 from intercap_core.export.motion import Motion, read_motion
 from intercap_core.export.readme import readme
+from intercap_core.export.upright import z_up_frame
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, SCENE
 
 MANIFEST = "export.json"
-Z_UP = "z-up: gravity-aligned, ground at z = 0, metres"
 
 
 def run(
@@ -47,7 +47,7 @@ def run(
     mesh = ObjectMesh.load(object_)
     with artefacts.read(scene, SCENE) as setting:
         given = Rig.from_artefact(setting)
-        zup_from_master = setting["zup_from_master"]
+        zup_from_master, upright = setting["zup_from_master"], z_up_frame(setting)
         image_of, times = setting["image_of"], setting["times"]
         fps = float(setting.attributes["fps"])
     with artefacts.read(joint, JOINT) as fit:
@@ -55,7 +55,7 @@ def run(
         exposures = bop.Exposures(image_of, times, fit["time_offset"])
     motion = read_motion(joint, fps, body_models, subject.gender)
     z_up = settings.frame == "z-up"
-    viewed = motion.moved(zup_from_master, Z_UP) if z_up else motion
+    viewed = motion.moved(zup_from_master, upright) if z_up else motion
     formats = sorted(set(settings.formats))
     with _replaced(output) as folder:
         for name in formats:

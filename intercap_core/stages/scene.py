@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.rig import Rig
+from intercap_core.camera.rig import Rig, ring_centre
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.config import SceneSettings, digest
@@ -17,12 +17,13 @@ from intercap_core.errors import UserError
 from intercap_core.scene.background import Background, background_of
 from intercap_core.scene.constants import BACKGROUND_CELL_M
 from intercap_core.scene.extrinsics import Refinement, refine
+from intercap_core.scene.feet import feet_off_the_floor, ground_of_feet
 from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import (
     Ground,
     annotated_ground,
     fit_ground,
-    ground_of_feet,
+    stated_ground,
     zup_from_master,
 )
 from intercap_core.scene.lens_exchange import Exchange, exchange_lenses
@@ -30,6 +31,13 @@ from intercap_core.scene.moments import Moments, find_moments
 from intercap_core.scene.moving import moving_surfaces
 from intercap_core.scene.subject_views import SubjectViews, triangulated
 from intercap_core.scene.surface import Surface, background_surfaces
+from intercap_core.scene.up import (
+    Up,
+    check_stated_up,
+    compare_with_stated,
+    trunk_direction,
+    up_hint,
+)
 from intercap_core.schemas import SCENE
 
 FEET = slice(19, 25)  # toes and heels among the body's keypoints
@@ -63,6 +71,7 @@ def run(
             people, rig, source.time_s, source.fps, source.available, master=master
         )
         subject, image_of = moments.subject, moments.image_of
+        oddities = _check_stated_up(source, subject)
         backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
@@ -82,9 +91,8 @@ def run(
         )
         rig = rig.moved(refined.poses)
         ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
-        if not ground.found:
-            feet = triangulated(subject.keypoints, rig).joints[:, FEET]
-            ground = ground_of_feet(feet, rig, source.gravity)
+        ground, odd = _with_feet(source, rig, ground, subject)
+        oddities += odd
         notes = _notes(source, refined, moments, exchanges)
         _write(
             output,
@@ -95,6 +103,7 @@ def run(
             image_of,
             refined,
             ground,
+            oddities,
             notes,
             settings,
         )
@@ -107,6 +116,45 @@ def _backgrounds(
     last = source.num_sets - 1
     moment = np.clip(np.arange(source.num_sets)[:, None] - slip, 0, last)
     return [background_of(source, c, subject.joints[moment[:, c]]) for c in range(len(source.rig))]
+
+
+def _up(source: Frames, rig: Rig) -> Up:
+    return up_hint(rig, source.gravity, source.stated_up)
+
+
+def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
+    try:
+        return check_stated_up(
+            source.stated_up, source.rig, source.gravity, trunk_direction(subject.joints)
+        )
+    except UserError as error:
+        raise UserError(f"sequence {source.sequence}: {error}") from None
+
+
+def _with_feet(
+    source: Frames, rig: Rig, ground: Ground, subject: SubjectViews
+) -> tuple[Ground, list[str]]:
+    """The floor, and what is odd about it, in words.
+
+    Without a measured one it is that which is stated where feet do not deny it, else that of feet.
+    """
+    stated = source.stated_up, source.stated_floor
+    middle = ring_centre(rig)
+    if not ground.found:
+        feet = triangulated(subject.keypoints, rig).joints[:, FEET]
+        ground = ground_of_feet(feet, _up(source, rig))
+        if np.isfinite(stated[1]).all():
+            denied = ground.found and compare_with_stated(
+                ground.point, ground.normal, *stated, middle
+            )
+            ground = ground if denied else stated_ground(*stated)
+    odd = [ground.note] if ground.note else []
+    if ground.found and ground.source != "feet":
+        above = feet_off_the_floor(subject.joints[:, FEET], ground)
+        odd += [above] if above else []
+    if ground.found:
+        odd += compare_with_stated(ground.point, ground.normal, *stated, middle)
+    return ground, odd
 
 
 def _ground(
@@ -127,7 +175,7 @@ def _ground(
     if floor is not None:
         try:
             return annotated_ground(
-                np.array(floor, np.float64), everything, rig, source.gravity, tolerance_m=tolerance
+                np.array(floor, np.float64), everything, _up(source, rig), tolerance_m=tolerance
             )
         except UserError as error:
             raise UserError(f"sequence {source.sequence}: {error}") from None
@@ -135,7 +183,7 @@ def _ground(
         everything,
         np.concatenate(normals),
         rig,
-        source.gravity,
+        _up(source, rig),
         tolerance_m=tolerance,
         # Every camera may see the same floor: count the area as if all of them did.
         cell_m=BACKGROUND_CELL_M / np.sqrt(max(1, len(surfaces))),
@@ -151,10 +199,12 @@ def _write(
     image_of: np.ndarray,
     refined: Refinement,
     ground: Ground,
+    oddities: list[str],
     notes: list[str],
     settings: SceneSettings,
 ) -> None:
     pairs = refined.pairs
+    up = _up(source, rig)
     with artefacts.write(
         output,
         SCENE,
@@ -170,6 +220,10 @@ def _write(
         ground_rms=ground.rms,
         ground_inliers=ground.inliers,
     ) as writer:
+        if oddities:
+            writer.attributes["ground_note"] = "; ".join(oddities)
+        if not ground.found:
+            writer.attributes["up_source"] = up.source
         for key, values in rig.datasets().items():
             writer.put(key, values)
         writer.put("present", source.present)
@@ -192,7 +246,7 @@ def _write(
         writer.put("image_of", image_of)
         writer.put("ground_point", ground.point)
         writer.put("ground_normal", ground.normal)
-        writer.put("zup_from_master", zup_from_master(ground, rig, source.gravity))
+        writer.put("zup_from_master", zup_from_master(ground, rig, up))
         for camera, background in zip(rig, backgrounds, strict=True):
             if background is not None:
                 writer.put(f"cameras/{camera.name}/background", background.depth)

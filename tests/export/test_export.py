@@ -7,11 +7,13 @@ import io
 import json
 import pickle
 import pickletools
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -348,6 +350,29 @@ def test_manifest_is_complete_and_names_every_frame(folder: Path) -> None:
     text = (folder / "README.txt").read_text()
     for word in ("master colour camera", "z-up", "millimetres", "x = R v + t", "pelvis"):
         assert word in text
+
+
+@pytest.mark.parametrize(
+    ("hint", "words"),
+    [
+        ("cameras", "mean of the cameras' own up"),
+        ("stated", "as stated with the calibration"),
+        ("gravity", "by the gravity sensors"),
+        (None, "does not name"),  # scenes of earlier versions
+    ],
+)
+def test_without_a_floor_it_is_said_what_turned_the_export_upright(
+    capture: fitted.Capture, tmp_path: Path, hint: str | None, words: str
+) -> None:
+    scene = shutil.copy(capture.paths["scene"], tmp_path / "scene.h5")
+    with h5py.File(scene, "r+") as file:
+        file.attrs["ground_found"] = False
+        if hint:
+            file.attrs["up_source"] = hint
+    out = _run(replace(capture, paths=capture.paths | {"scene": scene}), tmp_path / "out")
+    manifest = json.loads((out / export.MANIFEST).read_text())["frame"]
+    for told in (manifest["amass"], manifest["glb"], (out / "README.txt").read_text()):
+        assert words in told and "no floor is known" in told and "gravity-aligned" not in told
 
 
 def test_same_input_same_bytes_and_old_files_go(

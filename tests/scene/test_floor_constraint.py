@@ -11,6 +11,7 @@ from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
 from intercap_core.scene.surface import Surface, surface_of
+from intercap_core.scene.up import up_hint
 from tests.helpers.synthetic_capture import perturbed, ring, room_depth, to_millimetres
 
 TRUTH, UP = ring()
@@ -37,7 +38,7 @@ def floor_of(rig, patches) -> FloorConstraint:
     points = [apply(rig[c].master_from_depth, s.points) for c, s in patches.items()]
     normals = [s.normals @ rig[c].master_from_depth[:3, :3].T for c, s in patches.items()]
     ground = fit_ground(
-        np.concatenate(points), np.concatenate(normals), rig, NO_GRAVITY,
+        np.concatenate(points), np.concatenate(normals), rig, up_hint(rig, NO_GRAVITY),
         tolerance_m=0.03, cell_m=0.03,
     )  # fmt: skip
     floor = FloorConstraint.of(rig, patches, ground)
@@ -93,6 +94,6 @@ def test_a_floor_that_one_camera_sees_ties_nobody(patches):
     ground = fit_ground(
         apply(TRUTH[0].master_from_depth, patches[0].points),
         patches[0].normals @ TRUTH[0].master_from_depth[:3, :3].T,
-        TRUTH, NO_GRAVITY, tolerance_m=0.03, cell_m=0.03,
+        TRUTH, up_hint(TRUTH, NO_GRAVITY), tolerance_m=0.03, cell_m=0.03,
     )  # fmt: skip
     assert FloorConstraint.of(TRUTH, {0: patches[0]}, ground) is None

@@ -12,6 +12,7 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import SceneSettings
 from intercap_core.errors import UserError
+from intercap_core.export.upright import z_up_frame
 from intercap_core.schemas import SCENE
 from intercap_core.stages import scene
 from tests.helpers.synthetic_capture import (
@@ -100,6 +101,52 @@ def test_without_depth_the_start_stays_and_feet_show_the_floor(tmp_path):
         assert np.degrees(np.arccos(min(1, found["ground_normal"] @ UP[2, :3]))) < 3
         assert abs(apply(UP, found["ground_point"][None])[0, 2]) < 0.01
     assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.02
+
+
+ORIGIN = apply(invert(UP), np.zeros((1, 3)))[0]
+STATED = {"stated_up": UP[2, :3], "stated_floor": ORIGIN}
+
+
+def told(paths: dict[str, Path], depths: list[np.ndarray] | None = None, **stated) -> dict:
+    """The scene's attributes, and its z_up_frame, where a row states these."""
+    write_frames(paths["frames"], TRUTH, num_sets=T, stated=stated, depths=depths)
+    scene.run(**paths, settings=SceneSettings(), floor=None)
+    with artefacts.read(paths["output"], SCENE) as found:
+        height = apply(UP, found["ground_point"][None])[0, 2]
+        return found.attributes | {"height": height, "frame": z_up_frame(found)}
+
+
+def test_a_stated_floor_serves_where_none_is_measured_and_feet_do_not_deny_it(tmp_path):
+    paths = capture(tmp_path, TRUTH)
+    agrees = told(paths, **STATED)
+    assert agrees["ground_source"] == "stated" and abs(agrees["height"]) < 1e-9
+    assert "ground_note" not in agrees and "as stated with the calibration" in agrees["frame"]
+    denied = told(paths, **STATED | {"stated_floor": ORIGIN + 0.4 * UP[2, :3]})
+    assert denied["ground_source"] == "feet" and abs(denied["height"]) < 0.02
+    assert "0.4" in denied["ground_note"] and "below the stated one" in denied["ground_note"]
+    with pytest.raises(UserError, match="sequence test: calibration_up is 90 degrees"):
+        told(paths, stated_up=UP[0, :3])
+
+
+def test_a_measured_floor_stays_and_is_compared_with_the_stated_one(tmp_path):
+    paths = capture(tmp_path, TRUTH)
+    rng = np.random.default_rng(0)
+    depths = []
+    for camera in TRUTH:
+        clean = room_depth(camera, UP, FURNITURE)
+        depths.append(np.stack([to_millimetres(clean, rng) for _ in range(T)]))
+    raised = told(paths, depths, **STATED | {"stated_floor": ORIGIN + 0.2 * UP[2, :3]})
+    assert raised["ground_source"] == "fitted" and abs(raised["height"]) < 0.005
+    assert raised["ground_note"] == "the floor is 0.20 m below the stated one"
+
+
+def test_without_any_floor_it_is_told_what_turned_z_up(tmp_path):
+    paths = capture(tmp_path, TRUTH)
+    write_detections(paths["detections"], TRUTH, [[[] for _ in TRUTH] for _ in range(T)])
+    by_cameras, stated = told(paths), told(paths, stated_up=UP[2, :3])
+    assert by_cameras["up_source"] == "cameras" and stated["up_source"] == "stated"
+    assert "mean of the cameras" in by_cameras["frame"] and "no floor" in by_cameras["frame"]
+    assert "as stated with the calibration; no floor" in stated["frame"]
 
 
 def test_a_recording_without_images_and_a_floor_on_one_line_are_named(tmp_path):
