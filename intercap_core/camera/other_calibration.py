@@ -111,7 +111,7 @@ def fixed_cameras(
     for name, shots in found.items():
         for image, _, pose in shots[1:]:
             apart = float(np.linalg.norm(invert(pose)[:3, 3] - invert(shots[0][2])[:3, 3]))
-            apart *= scale or 1.0
+            apart *= scale or 0.0  # without a scale, which is demanded later, turns alone tell
             turned = np.degrees(
                 Rotation.from_matrix(pose[:3, :3] @ shots[0][2][:3, :3].T).magnitude()
             )

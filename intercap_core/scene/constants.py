@@ -150,6 +150,10 @@ BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tune
 BELOW_FLOOR_COST = 3.0  # how many inliers such a point outweighs; tuned on the studio
 MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
 LOWER_FLOOR_DEG = 3.0  # of a lower floor from a platform: both are level
+COVER_CELL_M = 0.15  # in which a surface above another one hides it
+MAX_COVERED_SHARE = (
+    0.5  # of a lower floor: with more it is the upper one, seen by a misplaced camera
+)
 LEVEL_SHARE = 0.15  # of the sets: feet that make a level of their own; a bound, not tuned
 MAX_SLOPE_DEG = 15.0  # of one tilted plane under all feet; treads of 12 by 40 cm climb by 17
 # How far a measured floor may be from what is stated of the calibration's world before it is said:

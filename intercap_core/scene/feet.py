@@ -87,15 +87,23 @@ def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[
     if max(above.sum(), below.sum()) < need or sloping:
         return inlier, ""
     if below.sum() >= need:
-        order = np.sort(height)
-        ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
-        enough = ends - np.arange(len(order)) >= need
-        lowest = order[int(np.argmax(enough))]
-        level = height[(height >= lowest) & (height <= lowest + 2 * FOOT_TOLERANCE_M)]
-        middle = np.median(level)
+        middle = _lowest_level(height, need)
         inlier = np.abs(height - middle) < FOOT_TOLERANCE_M
         above = height > middle + FOOT_TOLERANCE_M
-    return inlier, _levels(above, height - middle, "above")
+    return inlier, _levels(above, height - middle, "above") if above.sum() >= need else ""
+
+
+def _lowest_level(height: np.ndarray, need: int) -> float:
+    """The lowest of the heights (S,) about which ``need`` of them lie and above which few do; their
+    median where there is none such: noise about one level has no gap below it."""
+    order, middle = np.sort(height), float(np.median(height))
+    ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
+    first = int(np.argmax(ends - np.arange(len(order)) >= need))
+    level = float(np.median(order[first : ends[first]]))
+    between = np.arange(level, middle, 0.2 * FOOT_TOLERANCE_M)
+    near = np.abs(height[:, None] - between) < 0.5 * FOOT_TOLERANCE_M
+    count = near.sum(0)
+    return level if len(count) and count.min() < 0.5 * count[0] else middle
 
 
 def _levels(off: np.ndarray, height: np.ndarray, side: str) -> str:

@@ -11,6 +11,7 @@ from intercap_core.errors import UserError
 from intercap_core.scene.constants import (
     BELOW_FLOOR_COST,
     BELOW_FLOOR_M,
+    COVER_CELL_M,
     FLOOR_COSINE,
     FLOOR_FIRST_GATE_M,
     FLOOR_HYPOTHESES,
@@ -18,6 +19,7 @@ from intercap_core.scene.constants import (
     FLOOR_HYPOTHESIS_TOLERANCE_M,
     FLOOR_REFINE_STEPS,
     LOWER_FLOOR_DEG,
+    MAX_COVERED_SHARE,
     MIN_ANNOTATED_SPREAD_M,
     MIN_FLOOR_AREA_M2,
 )
@@ -109,12 +111,28 @@ def _lowest(
         deep = (lower.point - ground.point) @ ground.normal < -BELOW_FLOOR_M
         if lower.inliers * cell_m**2 < MIN_FLOOR_AREA_M2 or not (parallel and deep):
             break
+        if _covered(points, lower, ground, tolerance_m) > MAX_COVERED_SHARE:
+            break
         ground = lower
     if ground is upper:
         return ground
     above = float((upper.point - ground.point) @ ground.normal)
     note = f"a larger level surface lies {above:.2f} m above the floor (a platform, or a table)"
     return replace(ground, note=note)
+
+
+def _covered(points: np.ndarray, lower: Ground, upper: Ground, tolerance_m: float) -> float:
+    """Share of the lower plane, by cells, over which the upper one was seen: no camera looks
+    through a platform, but one that is misplaced shows the same floor a second time."""
+    across = np.linalg.svd(upper.normal[None])[2][1:]
+
+    def cells(plane: Ground) -> set[tuple[int, ...]]:
+        on = np.abs((points - plane.point) @ plane.normal) < tolerance_m
+        flat = np.floor(points[on] @ across.T / COVER_CELL_M).astype(int)
+        return set(map(tuple, flat.tolist()))
+
+    below = cells(lower)
+    return len(below & cells(upper)) / max(1, len(below))
 
 
 def _refined(

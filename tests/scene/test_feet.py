@@ -76,6 +76,12 @@ def test_a_hint_that_is_tilted_is_no_staircase():
     assert ground.found and ground.note == ""
 
 
+def test_noise_about_one_level_does_not_lower_the_floor():
+    height = np.random.default_rng(5).normal(0, 0.06, 120)
+    ground = ground_of_feet(feet_at(walk(height)), BY_GRAVITY)
+    assert abs(ground_height(ground)) < 0.02
+
+
 def test_who_stands_off_a_measured_floor_is_told():
     floor = stated_ground(MASTER_UP, ORIGIN)
     assert feet_off_the_floor(feet_at(walk(np.zeros(60))), floor) == ""

@@ -195,3 +195,13 @@ def test_a_beam_does_not_bend_the_floor(height_m):
     ground = fit_ground(points, normals, RIG, BY_CAMERAS, tolerance_m=0.015, cell_m=CELL_M)
     angle, offset = errors(ground)
     assert angle < 0.05 and offset < 0.0005
+
+
+def test_a_floor_that_a_misplaced_camera_shows_again_is_no_lower_one():
+    points, normals = room(0, table=False)
+    rng = np.random.default_rng(4)
+    again = np.column_stack([rng.uniform(-1.2, 1.2, (1200, 2)), np.full(1200, -0.2)])
+    points = np.concatenate([points, apply(invert(UP), again)])
+    normals = np.concatenate([normals, np.tile(UP[2, :3], (1200, 1))])
+    ground = fit_ground(points, normals, RIG, BY_GRAVITY, tolerance_m=0.015, cell_m=CELL_M)
+    assert errors(ground)[1] < 0.001 and ground.note == ""
