@@ -1,4 +1,4 @@
-"""What an artefact holds, printed for a person."""
+"""What an artefact holds, printed for a person: numbers as a table, texts as they are."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from rich.table import Table
 
 from intercap_core import artefacts, schemas
 from intercap_core.errors import UserError
+from intercap_core.metrics.flags import ranges
+
+TEXTS_TOLD = 30  # lines of one dataset
 
 
 def print_summary(path: Path, *, verify: bool = False) -> None:
@@ -43,5 +46,31 @@ def print_summary(path: Path, *, verify: bool = False) -> None:
             cells = (key, " x ".join(map(str, shape)), dtype, unit, frame, count, doc)
             table.add_row(*map(escape, cells))
         console.print(table)
+        for key in source.keys():  # noqa: SIM118
+            _print_texts(source, key, console)
         if verify:
             console.print("every dataset was read and its checksum is right")
+
+
+def _print_texts(source: artefacts.Artefact, key: str, console: Console) -> None:
+    """The dataset's texts that are not empty, equal neighbours together; nothing for numbers and
+    for names alone."""
+    shape, dtype, _, _ = source.describe(key)
+    if dtype != "text" or len(shape) != 1 or key.endswith("_names"):
+        return
+    texts = source.text(key)
+    cameras = source.text("camera_names") if "camera_names" in source else []
+    by_camera = len(cameras) == len(texts) and key.rpartition("/")[2] == "note"
+    lines = [f"{_span(first, last)}: {text}" for first, last, text in ranges(texts)]
+    if by_camera:
+        lines = [f"{name}: {text}" for name, text in zip(cameras, texts, strict=True) if text]
+    if lines:
+        console.print(f"[bold]{escape(key)}[/bold]", highlight=False)
+    for line in lines[:TEXTS_TOLD]:
+        console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
+    if len(lines) > TEXTS_TOLD:
+        console.print(f"  ... and {len(lines) - TEXTS_TOLD} more", highlight=False)
+
+
+def _span(first: int, last: int) -> str:
+    return str(first) if first == last else f"{first} to {last}"

@@ -18,6 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from intercap_core.commands.check import check_bodies
+from intercap_core.commands.closing import print_remarks
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import read_state
 from intercap_core.project import Project, load_project
@@ -68,6 +69,7 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
             settings, cores=cores, arguments=[*targets, "--config", f"exclude=[{excluded}]"]
         )
         run_watched(command, Watcher(project, console), console)
+    print_remarks(project, console)
     report = project.results / "report.html"
     if report.is_file():
         words = f"report: {report.resolve()}"

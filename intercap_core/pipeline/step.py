@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import inspect
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,9 +13,12 @@ from typing import Any
 
 from intercap_core import artefacts, schemas
 from intercap_core.errors import UserError
+from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import last_failure
 from intercap_core.project import Project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+
+log = logging.getLogger(__name__)
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _GIVEN_BACK_BYTES = 4 << 20
@@ -60,6 +64,10 @@ def run_step(
         "contact": annotation.contact,
     }
     run(**{name: known[name] for name in inspect.signature(run).parameters})
+    if not STAGES[stage].writes_folder:
+        for note in outcome.notes(stage, output):
+            log.warning("sequence %s: %s", sequence, note)
+        log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output))
 
 
 def _give_back_memory() -> None:

@@ -1,0 +1,171 @@
+"""What a stage has come to, in one line that a person understands, and what it could not do well.
+
+Both are read back from the artefact, so that what is said of kept results and of new ones is the
+same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core import artefacts, schemas
+from intercap_core.artefacts import Artefact
+
+_SURE = 0.5  # contact that is likelier than not
+
+
+def line(stage: str, path: Path) -> str:
+    """One line on what ``stage`` wrote; raises UserError where the artefact cannot be read."""
+    with artefacts.read(path, getattr(schemas, stage.upper())) as artefact:
+        return _LINES[stage](artefact)
+
+
+def notes(stage: str, path: Path) -> list[str]:
+    """What of the artefact is degraded, in words, each once; raises UserError as :func:`line`."""
+    with artefacts.read(path, getattr(schemas, stage.upper())) as artefact:
+        found = []
+        if "note" in artefact:
+            names = artefact.text("camera_names")
+            found += [
+                f"camera {name}: {text}"
+                for name, text in zip(names, artefact.text("note"), strict=True)
+                if text
+            ]
+        for name in ("ground_note", "doubts"):
+            text = str(artefact.attributes.get(name, ""))
+            found += [text] if text else []
+        if stage == "scene" and not artefact.attributes["ground_found"]:
+            found.append("no floor was found")
+        if stage == "joint" and not artefact.attributes["converged"]:
+            found.append("the joint fit ended before it settled")
+        if "verdict/silent" in artefact:
+            parts = zip(
+                artefact.text("verdict/part_names"), artefact.text("verdict/silent"), strict=True
+            )
+            found += [f"no error of the {part} is stated: {text}" for part, text in parts if text]
+        return list(dict.fromkeys(found))
+
+
+def flagged_frames(metrics: Path) -> tuple[int, int, list[tuple[str, int]]]:
+    """Of a metrics artefact: frames that are flagged, all frames, and the reasons with the number
+    of frames of each, the most frequent first."""
+    with artefacts.read(metrics, schemas.METRICS) as artefact:
+        flagged, reasons = artefact["flagged"], artefact.text("flag_reason")
+    counts: dict[str, int] = {}
+    for text in reasons:
+        for reason in dict.fromkeys(part.strip() for part in text.split(";") if part.strip()):
+            counts[reason] = counts.get(reason, 0) + 1
+    ordered = sorted(counts.items(), key=lambda item: -item[1])
+    return int(flagged.sum()), len(flagged), ordered
+
+
+def _frames(a: Artefact) -> str:
+    times, index = a["times"], a["colour_index"]
+    seconds = float(times[-1] - times[0]) if len(times) else 0.0
+    depth = int((a["depth_index"] >= 0).any(axis=0).sum())
+    return (
+        f"{_share(a['present'])} cameras used, {depth} with depth; {len(times)} sets over "
+        f"{seconds:.1f} s at {float(a.attributes['fps']):g} a second, "
+        f"{100 * float((index >= 0).mean()):.0f} % of their images there"
+    )
+
+
+def _detections(a: Artefact) -> str:
+    keypoints, candidates = a["keypoints_found"], a["candidates_found"]
+    return (
+        f"keypoints of {100 * float(keypoints.mean()):.0f} %, candidates of "
+        f"{100 * float(candidates.mean()):.0f} % of {keypoints.size} images"
+    )
+
+
+def _scene(a: Artefact) -> str:
+    shown = (a["image_of"] >= 0).any(axis=0)
+    slipped = int((a["slip"] != 0).any(axis=0).sum())
+    before, after = a["pair_residual_before"], a["pair_residual_after"]
+    known = np.isfinite(before) & np.isfinite(after)
+    poses = "no pair of cameras shares a surface"
+    if known.any():
+        poses = (
+            f"backgrounds {1e3 * float(np.median(before[known])):.1f} to "
+            f"{1e3 * float(np.median(after[known])):.1f} mm apart"
+        )
+    floor = {"fitted": "floor from depth", "feet": "floor from the feet", "none": "no floor"}
+    source = str(a.attributes["ground_source"])
+    return (
+        f"{_share(shown)} cameras in step, {slipped} of them moved in time; {poses}; "
+        f"{floor.get(source, f'floor {source}')}"
+    )
+
+
+def _person(a: Artefact) -> str:
+    seen, missing = a["person"] >= 0, a["missing"]
+    return (
+        f"the subject in {_share(~missing)} frames, by {float(seen.sum(axis=1).mean()):.1f} views "
+        f"on average; a mask in {100 * float((a['mask_source'] > 0).mean()):.0f} % of images"
+    )
+
+
+def _object_track(a: Artefact) -> str:
+    source = str(a.attributes["seed_source"])
+    return (
+        f"tracked in {_share(~a['lost'])} frames, {int(a['ambiguous'].sum())} of them ambiguous, "
+        f"{int(a['resting'].sum())} at rest; found at frame {a.attributes['seed_frame']} ({source})"
+    )
+
+
+def _body_fit(a: Artefact) -> str:
+    bridged = a["bridged"] | a["failed"]
+    return (
+        f"fitted in {_share(~bridged)} frames, the others filled in; {int(a['uncertain'].sum())} "
+        f"not determined by what was seen; keypoints {_median(a['keypoint_residual']):.1f} px"
+    )
+
+
+def _joint(a: Artefact) -> str:
+    settled = "settled" if a.attributes["converged"] else "ended before it settled"
+    touching = int((a["contact_probability"] > _SURE).any(axis=1).sum())
+    return (
+        f"{a.attributes['iterations']} steps, {a.attributes['refused']} refused, {settled}; "
+        f"contact in {touching} of {len(a['flagged'])} frames, "
+        f"{int(a['flagged'].sum())} not trusted"
+    )
+
+
+def _metrics(a: Artefact) -> str:
+    parts = []
+    if "verdict/error" in a:
+        stated = zip(
+            a.text("verdict/part_names"), a["verdict/error"], a["verdict/error_factor"], strict=True
+        )
+        parts = [
+            f"{part} {1e3 * e:.1f} mm ({1e3 * e / factor:.1f} to {1e3 * e * factor:.1f})"
+            for part, e, factor in stated
+            if np.isfinite(e)
+        ]
+    said = f"stated errors: {', '.join(parts)}; " if parts else ""
+    return f"{said}{_share(a['flagged'])} frames flagged"
+
+
+_LINES: dict[str, Callable[[Artefact], str]] = {
+    "frames": _frames,
+    "detections": _detections,
+    "scene": _scene,
+    "person": _person,
+    "object_track": _object_track,
+    "body_fit": _body_fit,
+    "joint": _joint,
+    "metrics": _metrics,
+}
+
+
+def _share(which: Any) -> str:
+    return f"{int(which.sum())} of {which.size}"
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
