@@ -24,6 +24,7 @@ from intercap_core.config import (
 from intercap_core.detections.read import Detections
 from intercap_core.metrics import body, motion, object_pose
 from intercap_core.metrics import truth as truths
+from intercap_core.metrics.exchanged import exchanged
 from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.flags import merge_reasons
 from intercap_core.metrics.measurement import Measurement, Values
@@ -188,6 +189,7 @@ def _stated(
         uncertain = artefact["uncertain"]
     with artefacts.read(joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
+        joints = artefact["joints"]
         probability = artefact["contact_probability"]
     unseen = np.asarray(~images.available.any(1))
     alone = ~joint_flags  # the joint stage repeats, in its words, what it was told of a frame
@@ -200,6 +202,10 @@ def _stated(
             (failed & alone, "body fit failed"),
             (bridged & ~failed & alone, "body filled in from neighbouring frames"),
             (uncertain & alone, "body not determined by what was seen"),
+            *(
+                (frames, f"left and right of the {limb} may be exchanged: they jump there and back")
+                for limb, frames in exchanged(joints).items()
+            ),
         ]
     )
     for t in np.flatnonzero(joint_flags):
