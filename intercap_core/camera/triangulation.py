@@ -20,6 +20,9 @@ REFINE_STEPS = 4
 HUBER_PX_AT_1080P = 4.0  # typical standard deviation of good 2D detectors
 PARTNERS = 5  # of each camera, whose rays are crossed with its own before those of others
 BEST_PARALLAX_DEG = 70.0
+# Rays closer in direction than this, or opposite, agree by chance: at worst as much as two views of
+# full confidence are worth. Six views alternately high and low hardly ever have such pairs.
+CHANCE_PARALLAX_DEG, CHANCE_COST = 25.0, 2.0
 _BLOCK = 20_000  # points at once: bounds memory at some 100 MB with six views
 
 
@@ -182,9 +185,18 @@ def _best_proposal(
             proposal, _ = midpoints(rays[a, rows], rays[b, rows], centres[a], centres[b])
             error = _errors(proposal, pixels[rows], weights[rows], rig)
             cost = (weights[rows] * np.minimum(error / limit, 1.0) ** 2).sum(1)
+            cost += _agreed_by_chance(rays[a, rows], rays[b, rows])
             better = np.isfinite(proposal[:, 0]) & (cost < best_cost[rows])
             best[rows[better]], best_cost[rows[better]] = proposal[better], cost[better]
     return best
+
+
+def _agreed_by_chance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Cost (N,) of a proposal by rays (N, 3) that run nearly along each other: whatever is near the
+    line between two cameras that face each other, they agree on some point of it."""
+    sine = np.linalg.norm(np.cross(first, second), axis=1)
+    sine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    return CHANCE_COST * np.maximum(0, 1 - sine / np.sin(np.radians(CHANCE_PARALLAX_DEG)))
 
 
 def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:

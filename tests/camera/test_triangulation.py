@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.camera.triangulation import midpoints, reproject, triangulate
 from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swapped
@@ -53,6 +54,23 @@ def test_views_that_lie_are_left_out(wrong):
     error = np.linalg.norm(found.points - points, axis=1)
     assert np.median(error) < 0.008 and (error < 0.05).mean() > 0.98
     assert found.inlier[rows, liars].mean() < 0.02
+
+
+def test_cameras_that_face_each_other_agree_by_chance():
+    """Two views show points near the line between two cameras; the camera opposite lies, of points
+    farther along the first one's rays."""
+    facing = Rig(tuple(RIG[c] for c in (0, 3, 1)))
+    first, opposite = (camera.master_from_colour[:3, 3] for camera in (facing[0], facing[1]))
+    along = (0.5 + np.linspace(-0.05, 0.05, 20))[:, None]
+    points = first + along * (opposite - first) + np.array([0, 0.2, 0.0])
+    lie = first + 1.25 * (points - first)
+    pixels = reproject(points, facing)
+    pixels[:, 1] = reproject(lie, facing)[:, 1]
+    weights = np.tile([0.9, 0.9, 0.4], (20, 1))  # and it is surer than the view from the side
+    found = triangulate(pixels, weights, facing, max_error_px=20)
+    # without a cost of chance the two that face each other win, and the point is anywhere between
+    np.testing.assert_allclose(found.points, points, atol=0.05)
+    assert found.inlier[:, 2].all()
 
 
 def test_too_few_views_give_no_point():
