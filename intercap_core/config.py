@@ -394,8 +394,8 @@ class SequenceEntry(Model):
     """Name of the sequence; letters, digits, _ and - only."""
     subject: Name
     """Row of subjects.tsv."""
-    object: Name
-    """Key of objects.yaml."""
+    object: Name | None = None
+    """Key of objects.yaml; empty = a person alone, and no object is looked for."""
     recordings: Path
     """Folder of the recordings, one file or folder for each camera."""
     layout: LayoutName = "k4a"
@@ -551,6 +551,14 @@ class Annotation(Model):
         if self.floor is not None and _width(self.floor) < MIN_FLOOR_WIDTH_M:
             raise ValueError("the floor points lie on one line; a plane needs one beside it")
         return self
+
+    def check_object(self, name: str | None) -> str | None:
+        """Say which section speaks of an object where the sequence's ``name`` of one is None."""
+        if name is None:
+            for section in ("contact", "object_pose"):
+                if getattr(self, section):
+                    return f"{section} is annotated, and the sequence names no object"
+        return None
 
     def check_frames(self, count: int) -> str | None:
         """Say which entry lies past the recording's ``count`` frame sets, or None."""

@@ -38,8 +38,8 @@ Z_UP, MASTER = "z-up", "master"  # frames beside those of the cameras, by name
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """Vertices ``body`` (V, 3), ``joints`` (55, 3) and vertices ``object_`` (Vo, 3), metres;
-    ``trusted``: nothing speaks against this frame."""
+    """Vertices ``body`` (V, 3), ``joints`` (55, 3) and vertices ``object_`` (Vo, 3), metres, (0, 3)
+    of a person alone; ``trusted``: nothing speaks against this frame."""
 
     body: np.ndarray
     joints: np.ndarray
@@ -51,14 +51,15 @@ class Moment:
 class PosedSequence:
     """T frames in one coordinate frame, ``frame_from_master`` (4, 4).
 
-    ``faces`` (F, 3) of the body, ``mesh`` the object with its own faces, poses master_from_object
-    ``rotation`` (T, 3, 3) and ``translation`` (T, 3), ``times`` (T,) s, ``trusted`` (T,) bool.
-    ``frame`` says in words which frame it is; for z-up also what turned it upright.
+    ``faces`` (F, 3) of the body, ``mesh`` the object with its own faces, None where the sequence
+    names none; poses master_from_object ``rotation`` (T, 3, 3) and ``translation`` (T, 3), NaN of an
+    object that was found in no frame; ``times`` (T,) s, ``trusted`` (T,) bool. ``frame`` says in
+    words which frame it is; for z-up also what turned it upright.
     """
 
     model: BodyModel
     parameters: BodyParameters
-    mesh: ObjectMesh
+    mesh: ObjectMesh | None
     rotation: np.ndarray
     translation: np.ndarray
     frame_from_master: np.ndarray
@@ -90,8 +91,11 @@ class PosedSequence:
         return self._placed(posed.vertices.numpy()), self._placed(posed.joints.numpy())
 
     def objects(self, frames: slice | Sequence[int] = slice(None)) -> np.ndarray:
-        """Vertices (N, Vo, 3) of the object in some frames, all by default."""
+        """Vertices (N, Vo, 3) of the object in some frames, all by default; Vo = 0 of a person
+        alone."""
         at = np.arange(len(self))[frames]
+        if self.mesh is None:
+            return np.zeros((len(at), 0, 3))
         turned = self.mesh.vertices @ self.rotation[at].transpose(0, 2, 1)
         return self._placed(turned + self.translation[at, None])
 
@@ -119,7 +123,8 @@ def open_sequence(
             f"{project.path}: has no sequence {sequence!r}; it has "
             f"{', '.join(sorted(project.sequences))}"
         )
-    mesh = ObjectMesh.load(project.objects[project.sequences[sequence].object])
+    entry = project.object_of(sequence)
+    mesh = None if entry is None else ObjectMesh.load(entry)
     gender = project.subjects[project.sequences[sequence].subject].gender
     with artefacts.read(project.artefact(sequence, "scene"), SCENE) as scene:
         names, times = list(scene["camera_names"]), scene["times"]
@@ -137,7 +142,8 @@ def open_sequence(
     if stage != "joint":
         with artefacts.read(project.artefact(sequence, "object_track"), OBJECT_TRACK) as track:
             rotation, translation = track["rotation"], track["translation"]
-            trusted &= ~track["lost"]
+            if mesh is not None:
+                trusted &= ~track["lost"]
     return PosedSequence(
         model,
         parameters,

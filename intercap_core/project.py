@@ -42,6 +42,15 @@ class Project:
         """Folder of this dataset's logs."""
         return Path("logs") / self.config.dataset
 
+    def object_of(self, sequence: str) -> ObjectEntry | None:
+        """The sequence's object; None where its row names none: a person alone."""
+        name = self.sequences[sequence].object
+        return None if name is None else self.objects[name]
+
+    def objects_named(self) -> list[str]:
+        """Names of the objects that sequences have, sorted."""
+        return sorted({row.object for row in self.sequences.values() if row.object is not None})
+
     def annotation_path(self, sequence: str) -> Path:
         """Where this sequence's annotation file is, or would be."""
         if self.annotation_made(sequence):
@@ -71,6 +80,12 @@ class Project:
                 )
             return Annotation()
         annotation = _parse(Annotation, _or_empty(read_yaml(path)), str(path), "annotation")
+        problem = annotation.check_object(self.sequences[sequence].object)
+        if problem:
+            raise UserError(
+                f"{path}: {problem}; remove the section, or name the object of sequence "
+                f"{sequence!r} in the table"
+            )
         with contextlib.suppress(artefacts.Unreadable):
             with artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source:
                 count = len(source["times"])
@@ -122,7 +137,7 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     for row in rows.values():
         for field, known in (("subject", subjects), ("object", objects)):
             value = getattr(row, field)
-            if value not in known:
+            if value is not None and value not in known:
                 raise UserError(
                     f"{table}: sequence {row.sequence!r} has {field} {value!r}, which is not in "
                     f"the table of {field}s ({', '.join(sorted(known)) or 'empty'}); correct the "
@@ -162,8 +177,7 @@ def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str
 
 def _check_files(project: Project) -> None:
     """Meshes and body files are shared by sequences: what is missing stops the run."""
-    used = sorted({row.object for row in project.sequences.values()})
-    for name in used:
+    for name in project.objects_named():
         entry = project.objects[name]
         for field in ("mesh", "contact_vertices"):
             file = getattr(entry, field)

@@ -75,7 +75,7 @@ def check_detector(project: Project) -> list[Fault]:
             f"({', '.join(project.objects[name].labels)}); add the label to objects.yaml, or name "
             "the model's classes in detections.segmentation_labels",
         )
-        for name in sorted({row.object for row in project.sequences.values()})
+        for name in project.objects_named()
         if project.objects[name].labels and not {*project.objects[name].labels} & {*classes}
     ]
 
@@ -91,17 +91,14 @@ def faults_of_sequences(project: Project) -> list[Fault]:
     Recordings that the studio is to make are not missed, but it must be able to make them; images
     are not read.
     """
-    meshes = {
-        name: _fault_of_mesh(project, name)
-        for name in {row.object for row in project.sequences.values()}
-    }
+    meshes = {name: _fault_of_mesh(project, name) for name in project.objects_named()}
     faults = _annotations_without_sequence(project)
     for name, row in project.sequences.items():
         try:
             project.annotation(name)
         except UserError as error:
             faults.append(Fault(name, str(error)))
-        mesh = meshes[row.object]
+        mesh = None if row.object is None else meshes[row.object]
         if mesh is not None:
             faults.append(Fault(name, mesh))
         if project.recordings_made(name) is not None:
@@ -224,7 +221,8 @@ def _notes_of_candidates(
         )
         notes += seen.notes
         labels |= seen.labels
-    expected = project.objects[row.object].labels
+    entry = project.object_of(row.sequence)
+    expected = () if entry is None else entry.labels
     if labels and expected and not labels & {*expected}:
         found = sorted(label or "no label" for label in labels)
         notes.append(

@@ -31,10 +31,13 @@ def draw_closeups(
         )
     written, empty = [], []
     for name in sequences or project.sequences:
-        row = project.sequences[name]
+        row, entry = project.sequences[name], project.object_of(name)
+        if entry is None:
+            empty.append(name)
+            continue
         handling = read_handling(
             {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES},
-            entry=project.objects[row.object],
+            entry=entry,
             body_models=project.config.body_models,
             gender=project.subjects[row.subject].gender,
             truth=row.truth,

@@ -43,7 +43,9 @@ def measure(project: Project, sequence: str) -> ObjectErrors:
     """Errors of one recording's object after ``object_track``."""
     truth = project.sequences[sequence].truth
     assert truth is not None
-    mesh = ObjectMesh.load(project.objects[project.sequences[sequence].object])
+    entry = project.object_of(sequence)
+    assert entry is not None
+    mesh = ObjectMesh.load(entry)
     scene, track = (project.artefact(sequence, stage) for stage in ("scene", "object_track"))
     return object_errors.measure(scene, track, truth, mesh)
 
@@ -117,6 +119,11 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
         console.print(table)
 
 
+def has_object(project: Project, sequence: str) -> bool:
+    """Whether a recording is of a person with an object."""
+    return project.object_of(sequence) is not None
+
+
 PART = Part(
     "objects",
     "object_track",
@@ -126,4 +133,5 @@ PART = Part(
     flat,
     print_objects,
     kept=ObjectErrors,
+    has=has_object,
 )

@@ -55,7 +55,8 @@ class Part(Generic[Errors]):
     artefacts ``reads`` beside it, and ``code`` is the module (below ``intercap_core``) whose digest
     stands for what it computes. ``kept`` is the dataclass of errors that are stored because
     measuring takes long; None where they are read at once. ``flat`` gives the keys ``area.measure``
-    of all projects, ``print_tables`` prints them, ``rig`` describes a project's settings.
+    of all projects, ``print_tables`` prints them, ``rig`` describes a project's settings;
+    ``has`` (project, sequence) says whether a recording has what is measured.
     """
 
     name: str
@@ -67,15 +68,17 @@ class Part(Generic[Errors]):
     print_tables: Callable[[Sequence[Measured[Errors]]], None]
     rig: Callable[[Project], str] = lambda _: ""
     kept: type[Errors] | None = None
+    has: Callable[[Project, str], bool] = lambda _project, _sequence: True
 
     def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
         """Measure every recording whose artefact is there, several at a time.
 
         Raises UserError where no sequence of a project has come to the stage.
         """
+        counted = [[n for n in project.sequences if self.has(project, n)] for project in projects]
         there = [
-            [name for name in project.sequences if project.artefact(name, self.stage).is_file()]
-            for project in projects
+            [name for name in names if project.artefact(name, self.stage).is_file()]
+            for project, names in zip(projects, counted, strict=True)
         ]
         for project, names in zip(projects, there, strict=True):
             if not names:
@@ -95,10 +98,10 @@ class Part(Generic[Errors]):
             Measured(
                 project.config.dataset,
                 [next(errors) for _ in names],
-                [name for name in project.sequences if name not in names],
+                [name for name in wanted if name not in names],
                 self.rig(project),
             )
-            for project, names in zip(projects, there, strict=True)
+            for project, wanted, names in zip(projects, counted, there, strict=True)
         ]
 
 
@@ -125,11 +128,11 @@ def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors
     state = hashlib.sha256(code_digest(part.code).encode())
     state.update(code_digest(f"evaluation.{part.name}").encode())
     row = project.sequences[sequence]
-    entry, subject = project.objects[row.object], project.subjects[row.subject]
-    for told in (entry, subject, project.config.body_models):
+    entry, subject = project.object_of(sequence), project.subjects[row.subject]
+    for told in (*filter(None, [entry]), subject, project.config.body_models):
         state.update(told.model_dump_json().encode())
     files = [project.artefact(sequence, stage) for stage in (*part.reads, part.stage)]
-    for path in (*files, truth, entry.mesh):
+    for path in (*files, truth, *([entry.mesh] if entry else [])):
         with open(path, "rb") as file:
             state.update(hashlib.file_digest(file, "sha256").digest())
     folder = project.results / sequence / "evaluation"

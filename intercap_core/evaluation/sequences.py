@@ -109,7 +109,7 @@ def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Fi
     """What the joint stage is held to: the sequential fits' figures, and objects that got worse."""
     first = found["body_fit"]
     beside = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
-    if sequences:
+    if any(s.object_ for s in sequences):
         worse = hold_figures.worse_objects(sequences)
         beside |= {"object_worse_count": float(len(worse))}
     cameras = figures.extrinsics_figures(sequences)
@@ -131,7 +131,7 @@ def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Fi
 
 
 def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceMetrics]]:
-    names = sorted({s.object_ for s in sequences})
+    names = sorted({s.object_ for s in sequences if s.object_})
     return {name: [s for s in sequences if s.object_ == name] for name in names}
 
 

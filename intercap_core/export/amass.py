@@ -42,7 +42,9 @@ def object_arrays(motion: Motion) -> dict[str, np.ndarray]:
 
 
 def write(folder: Path, motion: Motion) -> None:
-    """Write ``body.npz`` and ``object.npz``; numpy dates their entries 1980, so bytes repeat."""
+    """Write ``body.npz`` and, where there is one, ``object.npz``; numpy dates their entries 1980,
+    so bytes repeat."""
     folder.mkdir()
     np.savez(folder / "body.npz", allow_pickle=False, **body_arrays(motion))
-    np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion))
+    if motion.has_object:
+        np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion))

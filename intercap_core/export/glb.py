@@ -1,4 +1,5 @@
-"""An animated glTF 2.0 file: the body as a skinned mesh with 55 joints, the object as a node.
+"""An animated glTF 2.0 file: the body as a skinned mesh with 55 joints, the object, where there is
+one, as a node.
 
 glTF is y up: a root node turns the motion's z-up frame. Skinning takes each vertex's four largest
 weights, as every viewer does, and the first frame's shape and expression; pose correctives of a
@@ -105,14 +106,17 @@ class _Document:
         )
 
 
-def write(path: Path, motion: Motion, mesh: ObjectMesh, *, z_up: bool) -> None:
-    """Write body and object; ``z_up`` says whether the motion's frame is z-up or a camera's."""
+def write(path: Path, motion: Motion, mesh: ObjectMesh | None, *, z_up: bool) -> None:
+    """Write the body, and the object unless ``mesh`` is None; ``z_up`` says whether the motion's
+    frame is z-up or a camera's."""
     document = _Document()
     times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
     root = _YUP_FROM_ZUP if z_up else _YUP_FROM_CAMERA
     animation: dict[str, Any] = {"name": motion.sequence, "samplers": [], "channels": []}
     skeleton, body = _body(document, motion, animation, times)
-    children = [skeleton, _object(document, motion, mesh, animation, times)]
+    children = [skeleton]
+    if mesh is not None:
+        children.append(_object(document, motion, mesh, animation, times))
     world = {"name": "world", "rotation": _listed(root.as_quat()), "children": children}
     # A skinned mesh's own place means nothing to the format, so it stays at the top.
     document.json["scenes"][0]["nodes"] = [document.add("nodes", world), body]

@@ -17,9 +17,17 @@ NUM_HAND_COMPONENTS = 12  # of the release; SMPLify-X's number, with flat_hand_m
 def result(motion: Motion) -> dict[str, Any]:
     """The release's keys and shapes for T frames, and the full hand poses beside its 12 components.
 
-    ``body_pose`` is (1, 63 T), as released. ``pose_embedding`` is VPoser's and left out.
+    ``body_pose`` is (1, 63 T), as released. Without an object its keys are left out.
+    ``pose_embedding`` is VPoser's and left out.
     """
     params, total = motion.parameters, len(motion)
+    of_object = {}
+    if motion.has_object:
+        turns = Rotation.from_matrix(motion.rotation).as_rotvec()
+        of_object = {
+            "ob_pose": list(turns.astype(np.float32)),
+            "ob_trans": list(motion.translation.astype(np.float32)),
+        }
     hands = {
         f"{side}_hand_pose": hand_components(motion, index)
         for index, side in enumerate(("left", "right"))
@@ -36,8 +44,7 @@ def result(motion: Motion) -> dict[str, Any]:
         "jaw_pose": _single(params.jaw_pose),
         "leye_pose": _single(params.leye_pose),
         "reye_pose": _single(params.reye_pose),
-        "ob_pose": list(Rotation.from_matrix(motion.rotation).as_rotvec().astype(np.float32)),
-        "ob_trans": list(motion.translation.astype(np.float32)),
+        **of_object,
     }
 
 

@@ -19,7 +19,7 @@ from intercap_core.schemas import JOINT
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A joint result, float64.
+    """A joint result, float64; ``object_`` is "" and its poses are NaN where there is none.
 
     ``parameters`` are those of the body, ``pelvis`` (3,) its pelvis joint in the shaped rest pose;
     ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are frame_from_object. ``frame`` says in words
@@ -40,6 +40,11 @@ class Motion:
 
     def __len__(self) -> int:
         return len(self.rotation)
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there is an object in any frame."""
+        return bool(np.isfinite(self.translation).any())
 
     def moved(self, new_from_old: np.ndarray, frame: str) -> Motion:
         """The same motion seen from another frame; ``new_from_old`` (4, 4) is rigid.

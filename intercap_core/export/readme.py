@@ -57,10 +57,43 @@ contact/annotation_draft.yaml the same as intervals, in the format of an annotat
 """
 
 
-def readme(motion: Motion, viewed: Motion, mesh: ObjectMesh, formats: Sequence[str]) -> str:
-    """README.txt for these formats; ``viewed`` is the motion in the frame of amass and glb."""
+# Of the text above, what is said instead where there is no object.
+_WITHOUT_OBJECT = {
+    "object {object}, ": "{no_object}, ",
+    "An object pose maps the mesh as it is stored: x = R v + t, R 3x3 applied on the left.\n": "",
+    "Object mesh: {mesh_vertices} vertices, metres.\n": "",
+    """\
+  ob_pose, ob_trans: lists of T (3,) rotation vectors (radians) and translations (metres),
+    master camera from object
+""": "  ob_pose, ob_trans are left out: there is no object\n",
+    """\
+amass/object.npz    rotation (T,3,3), translation (T,3): frame from object, metres
+""": "",
+    "(55 joints) and object, animated": "(55 joints), animated",
+}
+
+_LEFT_OUT = """
+{name} is left out, though export.formats names it: it holds {holds}, and there is no object.
+"""
+_HOLDS = {"bop": "poses of an object", "contact": "what touches an object"}
+
+
+def needs_object(name: str) -> bool:
+    """Whether a format is of an object and says nothing without one."""
+    return name in _HOLDS
+
+
+def readme(motion: Motion, viewed: Motion, mesh: ObjectMesh | None, formats: Sequence[str]) -> str:
+    """README.txt for these formats; ``viewed`` is the motion in the frame of amass and glb.
+
+    Without a ``mesh`` there is no object, and the formats that need one are left out.
+    """
     parts = {"intercap": _INTERCAP, "amass": _AMASS, "bop": _BOP, "glb": _GLB, "contact": _CONTACT}
+    if mesh is None:
+        parts |= {n: _LEFT_OUT.format(name=n, holds=holds) for n, holds in _HOLDS.items()}
     text = _HEAD + "".join(parts[name] for name in formats)
+    for said, instead in _WITHOUT_OBJECT.items() if mesh is None else ():
+        text = text.replace(said, instead)
     return text.format(
         sequence=motion.sequence,
         subject=motion.subject,
@@ -69,7 +102,8 @@ def readme(motion: Motion, viewed: Motion, mesh: ObjectMesh, formats: Sequence[s
         frames=len(motion),
         fps=motion.fps,
         body=motion.model.path.name,
-        mesh_vertices=len(mesh.vertices),
+        no_object=f"object {motion.object_} found in no frame" if motion.object_ else "alone",
+        mesh_vertices=0 if mesh is None else len(mesh.vertices),
         master=motion.frame,
         viewed=viewed.frame,
     )

@@ -22,12 +22,16 @@ from intercap_core.schemas import CONTACT_REGIONS
 
 @dataclass(frozen=True)
 class ContactEstimate:
-    """``probability`` (T, R), the ``labels`` (T, R) of the annotation, -1 where none, and what is
-    odd about the annotation."""
+    """``probability`` (T, R), NaN without an object, the ``labels`` (T, R) of the annotation, -1
+    where none, and what is odd about the annotation."""
 
     probability: np.ndarray
     labels: np.ndarray
     oddities: Sequence[Oddity] = ()
+
+    def change(self, other: ContactEstimate) -> float:
+        """The largest difference of probabilities; 0 without an object."""
+        return float(np.nanmax(np.abs(self.probability - other.probability), initial=0.0))
 
     def distrust(self) -> list[tuple[np.ndarray, str]]:
         """Frames (T,) that an annotation makes doubtful, each with the reason in words."""
@@ -59,6 +63,8 @@ class ContactEstimator:
     def at(self, state: State) -> ContactEstimate:
         """Contact by region at ``state``."""
         shape = (len(state), len(CONTACT_REGIONS))
+        if not self._geometry.has_object:
+            return ContactEstimate(np.full(shape, np.nan), np.full(shape, -1, np.int8))
         if self._intervals is None and not self._settings.detect_contact:
             return ContactEstimate(np.zeros(shape), np.full(shape, -1, np.int8))
         motion, held_in = self._observe(state), self._held(state)

@@ -75,6 +75,11 @@ class NormalEquations:
         """Energy (T,) of all terms."""
         return np.sum(list(self.energies.values()), axis=0)
 
+    def hold(self, columns: slice) -> None:
+        """Keep ``columns``, of which no term knows anything, where they are."""
+        own = self.bands[0][:, columns, columns]
+        own += np.eye(own.shape[-1])
+
     def add_blocks(
         self,
         term: str,

@@ -31,6 +31,7 @@ from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData, Residuals
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.ground import Ground
+from intercap_core.joint.terms.no_object import NoObject
 from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
@@ -58,6 +59,9 @@ class JointFit:
     cameras: bool
 
 
+ObjectTerm = ObjectData | ObjectImagesData | NoObject  # what stands for E_O
+
+
 @dataclass(frozen=True, eq=False)
 class Assembly:
     """The ``problem`` of equation 6, with those of its terms that are told what to hold fixed;
@@ -65,27 +69,31 @@ class Assembly:
 
     problem: Problem
     body: BodyData
-    object_: ObjectData | ObjectImagesData
-    contact: Contact
+    object_: ObjectTerm
+    contact: Contact | None
     floor: Ground | None
     against_floor: str
     share: float
 
 
 def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
-    """All terms over ``inputs``. Without images the object's track stands for them. A floor that
-    the sequential fits contradict is left out."""
+    """All terms over ``inputs``. Without images the object's track stands for them; without an
+    object only the body's terms are left. A floor that the sequential fits contradict is left
+    out."""
     sequential, floor = inputs.sequential, inputs.floor
     against_floor = contradiction(inputs.geometry, sequential, floor) if floor else ""
     if against_floor:
         floor = None
     share = min(1.0, 1 / (inputs.fps * ERROR_LASTING_S))
-    object_data: ObjectData | ObjectImagesData = (
-        ObjectImagesData(sequential.tracked, inputs.images, share)
-        if inputs.images
-        else ObjectData(sequential.tracked)
-    )
-    contact = Contact(inputs.geometry, settings.contact_weight)
+    object_data: ObjectTerm = NoObject()
+    contact = None
+    if sequential.tracked is not None:
+        contact = Contact(inputs.geometry, settings.contact_weight)
+        object_data = (
+            ObjectImagesData(sequential.tracked, inputs.images, share)
+            if inputs.images
+            else ObjectData(sequential.tracked)
+        )
     problem = Problem(
         joint_terms(
             inputs.geometry,
@@ -113,14 +121,15 @@ def fit(
     """
     geometry, sequential, body_data = inputs.geometry, inputs.sequential, inputs.body_data
     state = sequential.state
-    if settings.refine_cameras and not settings.look_again:
+    alone = not geometry.has_object
+    if settings.refine_cameras and not (settings.look_again or alone):
         log.warning("refine_cameras needs look_again: the cameras stay as the scene has them")
     assembly = assemble(inputs, settings)
     problem, object_data, contact = assembly.problem, assembly.object_, assembly.contact
     floor, against_floor, share = assembly.floor, assembly.against_floor, assembly.share
     if against_floor:
         log.warning("%s: every frame is flagged; look at the scene's ground", against_floor)
-    cameras = inputs.cameras if inputs.images and settings.refine_cameras else None
+    cameras = inputs.cameras if (inputs.images or alone) and settings.refine_cameras else None
     fps, prior = inputs.fps, inputs.prior
     estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
     rounds = _Rounds(problem, body_data, object_data, contact, estimator, prior, state)
@@ -128,11 +137,7 @@ def fit(
         rounds.minimise(max_steps)
         if number == len(ROUND_STEPS):
             break
-        if (
-            cameras is not None
-            and not cameras.refused
-            and isinstance(object_data, ObjectImagesData)
-        ):
+        if cameras is not None and not cameras.refused and not isinstance(object_data, ObjectData):
             rounds.settle(cameras, object_data, share)
         if rounds.settled:
             break
@@ -184,8 +189,8 @@ class _Rounds:
         self,
         problem: Problem,
         body_data: BodyData,
-        object_data: ObjectData | ObjectImagesData,
-        contact: Contact,
+        object_data: ObjectTerm,
+        contact: Contact | None,
         estimator: ContactEstimator,
         prior: OffsetPrior,
         state: State,
@@ -207,7 +212,8 @@ class _Rounds:
 
     def minimise(self, max_steps: int) -> None:
         """One round: time offsets and images at the state, at most so many steps, contact anew."""
-        self._contact.take_probability(self.estimate.probability)
+        if self._contact is not None:
+            self._contact.take_probability(self.estimate.probability)
         self._body.refresh(self.state)
         offsets = self._body.estimate_offsets(self._prior).offset
         offset_change = self._body.take_offsets(offsets)
@@ -223,22 +229,25 @@ class _Rounds:
         converged = minimum.converged
         del minimum  # its equations are most of the memory
         previous, self.estimate = self.estimate, self._estimator.at(self.state)
-        contact_change = np.abs(self.estimate.probability - previous.probability).max()
+        contact_change = self.estimate.change(previous)
         self._still = bool(
             converged and contact_change < CONTACT_CONVERGED and offset_change < OFFSET_CHANGED_S
         )
 
-    def settle(self, cameras: CameraFit, images: ObjectImagesData, share: float) -> None:
-        """Correct the ``cameras`` by body and ``images``; a frame is so large a ``share`` of an
-        independent observation."""
-        shown = self._body.sights(self.state, BODY_SHARE * share), images.sights(self.state)
+    def settle(self, cameras: CameraFit, images: ObjectImagesData | NoObject, share: float) -> None:
+        """Correct the ``cameras`` by body and, where there is an object, ``images``; a frame is so
+        large a ``share`` of an independent observation."""
+        shown = [self._body.sights(self.state, BODY_SHARE * share)]
+        if isinstance(images, ObjectImagesData):
+            shown.append(images.sights(self.state))
         found = cameras.settle(shown)
         if cameras.take(found):
             self._camera_change = found.shift
             log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
             self.state = self.state.moved(limited(found.along))
         self._body.take_cameras(cameras.now)
-        images.take_cameras(cameras.now)
+        if isinstance(images, ObjectImagesData):
+            images.take_cameras(cameras.now)
         if cameras.refused:
             # what the cameras were until now was fitted to: at least one more round
             self._camera_change, self._still = 0.0, False
@@ -262,15 +271,21 @@ def _flag_reasons(
 ) -> list[str]:
     """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
     lowered its energy; ``against_images`` (T,): they contradict the object's final pose."""
-    posed = geometry.at(state)
-    deep = posed.proximity.distance.min(axis=1) < -FLAGGED_DEPTH
+    nowhere = np.zeros(len(state), bool)
+    deep = sunk = nowhere
+    lost = "object found in no frame"
+    if geometry.has_object:
+        posed = geometry.at(state)
+        deep = posed.proximity.distance.min(axis=1) < -FLAGGED_DEPTH
+        sunk = posed.object_depth(threads) > FLAGGED_DEPTH
+        lost = "object lost, filled in"
     causes = (
         (flags.filled, "body not seen well enough, filled in"),
         (flags.uncertain, "body not determined by what was seen"),
-        (flags.lost, "object lost, filled in"),
+        (flags.lost, lost),
         (flags.ambiguous, "object pose ambiguous"),
         (deep, "body deep inside the object"),
-        (posed.object_depth(threads) > FLAGGED_DEPTH, "object deep inside the body"),
+        (sunk, "object deep inside the body"),
         *estimate.distrust(),
         (stuck, "no step of the joint fit lowered its energy"),
         (against_images, "the images contradict the object's pose"),

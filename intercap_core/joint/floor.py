@@ -33,8 +33,11 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground)
     sunk = float(np.median(lowest[known]))
     if sunk < -FLOOR_CONTRADICTED:
         return f"floor {-sunk:.2f} m above the feet, not used"
-    objects = _height(posed.object_vertices, floor).min(axis=1)
-    reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))[known]
+    reach = lowest
+    if geometry.has_object:
+        objects = _height(posed.object_vertices, floor).min(axis=1)
+        reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
+    reach = reach[known]
     nearest = float(np.quantile(reach, REACHED_SHARE))
     if nearest > FLOOR_CONTRADICTED:
         return f"floor {nearest:.2f} m below feet and object, not used"

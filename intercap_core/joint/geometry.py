@@ -30,17 +30,39 @@ class Geometry:
     def __init__(
         self,
         model: BodyModel,
-        mesh: ObjectMesh,
-        field: DistanceField,
+        mesh: ObjectMesh | None,
+        field: DistanceField | None,
         patches: Patches,
         touched: Surface | None = None,
     ) -> None:
-        """``touched`` is what contact draws skin to, None = the whole surface."""
-        self.model, self.mesh, self.field, self.patches = model, mesh, field, patches
+        """``mesh`` and its ``field`` are None where there is no object; ``touched`` is what contact
+        draws skin to, None = the whole surface."""
+        self.model, self._mesh, self._field, self.patches = model, mesh, field, patches
         self.touched = touched
         self.skin = Skin.select(model, patches)
-        self.moments = smoothness.moment_points(mesh.vertices, OBJECT_ARM)
         self._last: PosedGeometry | None = None
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there is an object; what else is asked of it needs one."""
+        return self._mesh is not None
+
+    @property
+    def mesh(self) -> ObjectMesh:
+        """The object's."""
+        assert self._mesh is not None, "there is no object"
+        return self._mesh
+
+    @property
+    def field(self) -> DistanceField:
+        """Distances to the object's surface."""
+        assert self._field is not None, "there is no object"
+        return self._field
+
+    @cached_property
+    def moments(self) -> np.ndarray:
+        """Points (6, 3) with the object's moments, its frame."""
+        return smoothness.moment_points(self.mesh.vertices, OBJECT_ARM)
 
     def at(self, state: State) -> PosedGeometry:
         """The geometry at ``state``; the last state's is kept, since all terms ask for the same.

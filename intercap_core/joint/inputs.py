@@ -48,9 +48,9 @@ from intercap_core.solve.thread_pool import ThreadPool
 class JointInputs:
     """The sequential fits with what they were fitted to.
 
-    ``images`` is None where the settings do not look again, ``floor`` where none was seen,
-    ``motion`` without a learned E_S. ``cameras`` are the scene's, with what is known of them.
-    ``attributes``: sequence, gender and body model of the body's fit.
+    ``images`` is None where the settings do not look again or there is no object, ``floor`` where
+    none was seen, ``motion`` without a learned E_S. ``cameras`` are the scene's, with what is known
+    of them. ``attributes``: sequence, gender and body model of the body's fit.
     """
 
     geometry: Geometry
@@ -80,7 +80,7 @@ def open_inputs(
     person: Path,
     object_track: Path,
     body_fit: Path,
-    object_: ObjectEntry,
+    object_: ObjectEntry | None,
     body_models: BodyModels,
     settings: JointSettings,
     body_settings: BodyFitSettings,
@@ -90,12 +90,10 @@ def open_inputs(
     """Open for a ``with`` block, in which images are read.
 
     ``body_settings`` say what the body fit had fitted, ``track_settings`` how the tracker compares
-    images. Raises UserError where an artefact or the mesh cannot be used.
+    images; ``object_`` is None for a person alone. An object whose track is lost in all frames is
+    taken as none. Raises UserError where an artefact or the mesh cannot be used.
     """
-    problem = settings.check_object(object_)
-    if problem:
-        raise UserError(problem)
-    mesh = ObjectMesh.load(object_)
+    mesh = _mesh(object_, settings)
     with (
         artefacts.read(body_fit, BODY_FIT) as body,
         artefacts.read(object_track, OBJECT_TRACK) as track,
@@ -120,8 +118,9 @@ def open_inputs(
         floor, prior = _floor(source), _offset_prior(source)
         cameras = read_cameras(source)
         up = source["ground_normal"]
-    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-    geometry = Geometry(model, mesh, field, contact_patches(model), _touched(mesh, field, settings))
+    if sequential.tracked is None:
+        mesh = None
+    geometry = _geometry(model, mesh, settings)
     motion = None
     if encoder is not None:
         motion = LearnedMotion(geometry, encoder, up, settings.body_smoothness)
@@ -130,7 +129,7 @@ def open_inputs(
     # two threads would wait for each other
     with Frames.open(frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
-        if settings.look_again:
+        if settings.look_again and object_ is not None and mesh is not None:
             seen = ObjectRecording(
                 recording, Detections.load(detections), scene, person, mesh.diameter
             )
@@ -148,6 +147,24 @@ def open_inputs(
             threads,
             attributes,
         )
+
+
+def _mesh(entry: ObjectEntry | None, settings: JointSettings) -> ObjectMesh | None:
+    """The object's, None for a person alone; raises UserError where it cannot be used."""
+    if entry is None:
+        return None
+    problem = settings.check_object(entry)
+    if problem:
+        raise UserError(problem)
+    return ObjectMesh.load(entry)
+
+
+def _geometry(model: BodyModel, mesh: ObjectMesh | None, settings: JointSettings) -> Geometry:
+    patches = contact_patches(model)
+    if mesh is None:
+        return Geometry(model, None, None, patches)
+    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+    return Geometry(model, mesh, field, patches, _touched(mesh, field, settings))
 
 
 def _motion_encoder(

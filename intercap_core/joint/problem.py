@@ -51,7 +51,7 @@ def joint_terms(
     sequential: State,
     *,
     data: Sequence[Term],
-    contact: Contact,
+    contact: Contact | None,
     floor: Ground | None,
     fps: float,
     trust: Trust,
@@ -61,21 +61,32 @@ def joint_terms(
 
     ``sequential`` is the state of the sequential fits; ``data`` are E_B and E_O; ``floor`` is None
     where none was seen: then nothing keeps body or object above it. ``motion`` takes the place of
-    the joints' small accelerations.
+    the joints' small accelerations. Without ``contact`` there is no object: the body's own terms.
     """
+    handling: tuple[Term, ...] = ()
+    of_object: tuple[Term, ...] = ()
+    if contact is not None:
+        handling = (
+            contact,
+            Stick(geometry, contact, fps, settings.stick_weight),
+            Penetration(geometry, settings.penetration_weight),
+            ObjectInBody(geometry, settings.penetration_weight),
+        )
+        of_object = (
+            ObjectMotion(geometry, fps, settings.object_smoothness),
+            ObjectDrift(
+                geometry, sequential, fps, trust.object_, trust.still, settings.drift_weight
+            ),
+            *((ObjectGround(geometry, floor, settings.ground_weight),) if floor else ()),
+        )
     return (
         *data,
-        contact,
-        Stick(geometry, contact, fps, settings.stick_weight),
-        Penetration(geometry, settings.penetration_weight),
-        ObjectInBody(geometry, settings.penetration_weight),
+        *handling,
         *((BodyGround(geometry, floor, settings.ground_weight),) if floor else ()),
         Plant(geometry, floor, fps, settings.plant_weight),
         motion or BodyMotion(geometry, fps, settings.body_smoothness),
         BodyDrift(geometry, sequential, fps, trust.body, settings.drift_weight),
-        ObjectMotion(geometry, fps, settings.object_smoothness),
-        ObjectDrift(geometry, sequential, fps, trust.object_, trust.still, settings.drift_weight),
-        *((ObjectGround(geometry, floor, settings.ground_weight),) if floor else ()),
+        *of_object,
     )
 
 

@@ -31,8 +31,9 @@ class Flags:
     """Frames (T,) that a sequential fit has flagged.
 
     ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
-    was seen; ``lost`` and ``ambiguous``: the object track's. ``hands`` (T, 2), left and right: the
-    hand is not determined by what was seen, or not fitted at all; no reason to flag the frame.
+    was seen; ``lost`` and ``ambiguous``: the object track's, where an object is named. ``hands``
+    (T, 2), left and right: the hand is not determined by what was seen, or not fitted at all; no
+    reason to flag the frame.
     """
 
     filled: np.ndarray
@@ -46,12 +47,13 @@ class Flags:
 class SequentialFits:
     """One state of body and object, and how far it is to be trusted.
 
-    ``state`` has the mean shape. ``joint_sigma`` (T, 55) and ``object_sigma`` (T,) are stated
-    standard deviations of positions, metres.
+    ``state`` has the mean shape. ``tracked`` is None where there is no object: the track is lost in
+    every frame, and the state's poses of the object are NaN. ``joint_sigma`` (T, 55) and
+    ``object_sigma`` (T,) are stated standard deviations of positions, metres.
     """
 
     state: State
-    tracked: TrackedPoses
+    tracked: TrackedPoses | None
     trust: Trust
     flags: Flags
     joint_sigma: np.ndarray
@@ -62,26 +64,31 @@ class SequentialFits:
         """Read body_fit.h5, object_track.h5 and, for the cameras' times, scene.h5."""
         state = _state(body, track)
         failed, lost = body["failed"], track["lost"]
+        named = bool(track.attributes["object"])
         filled = failed | body["bridged"]
         flags = Flags(
             filled=filled,
             uncertain=body["uncertain"],
-            lost=lost,
+            lost=lost & named,
             ambiguous=track["ambiguous"],
             hands=_undetermined_hands(body) | filled[:, None],
         )
         resting = track["resting"]
-        tracked = TrackedPoses.from_track(
-            state.rotation,
-            state.translation,
-            track["covariance"] - track["spread"],
-            lost,
-            flags.ambiguous,
-            resting,
-            visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
-            times=scene["times"],
-            time_offset=scene["time_offset"],
-        )
+        tracked = None
+        if lost.all():
+            state = state.without_object()
+        else:
+            tracked = TrackedPoses.from_track(
+                state.rotation,
+                state.translation,
+                track["covariance"] - track["spread"],
+                lost,
+                flags.ambiguous,
+                resting,
+                visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
+                times=scene["times"],
+                time_offset=scene["time_offset"],
+            )
         sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
         return cls(
             state=state,

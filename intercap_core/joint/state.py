@@ -24,7 +24,7 @@ ALL = slice(0, OBJECT.stop)
 class State:
     """``body`` (T, 168) pose and translation in ``BodyParameters``' order; ``betas`` (S,) and
     ``expression`` (T, X), which stay as they are; ``rotation`` (T, 3, 3) and ``translation``
-    (T, 3), master_from_object."""
+    (T, 3), master_from_object, all NaN where there is no object."""
 
     body: np.ndarray
     betas: np.ndarray
@@ -34,6 +34,11 @@ class State:
 
     def __len__(self) -> int:
         return len(self.body)
+
+    def without_object(self) -> State:
+        """The body alone."""
+        nowhere = np.full_like(self.rotation, np.nan), np.full_like(self.translation, np.nan)
+        return State(self.body, self.betas, self.expression, *nowhere)
 
     def parameters(self, model: BodyModel) -> BodyParameters:
         """The body as the model takes it."""

@@ -58,6 +58,12 @@ class SequenceMetrics:
     def __len__(self) -> int:
         return len(self.values["flagged"])
 
+    @property
+    def has_object(self) -> bool:
+        """Whether there are figures of an object: not of a person alone, nor where none was
+        found."""
+        return "contact_frame" in self.values
+
 
 def pooled(sequences: Sequence[SequenceMetrics], key: str) -> np.ndarray | None:
     """The frames of all sequences that have dataset ``key``, end to end; None if none has."""
@@ -132,7 +138,9 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     for s in sequences:
         if not s.has_truth:
             continue
-        wrong = _object_errors(s, "joint").lost
+        wrong = np.zeros(len(s), bool)
+        if "truth/joint/object_translation" in s.values:
+            wrong = _object_errors(s, "joint").lost
         if "truth/joint/body_pve" in s.values:
             wrong = wrong | (s.values["truth/joint/body_pve"] > BAD_BODY_M)
         flagged.append(s.values["flagged"])
@@ -194,8 +202,9 @@ def _over(
 
 def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
     """Hand error over the frames in which that hand truly touches the object."""
-    errors = pooled(sequences, f"truth/{stage}/hand_mpjpe")
-    touching = pooled(sequences, "truth/contact_region")
+    handling = [s for s in sequences if "truth/contact_region" in s.values]
+    errors = pooled(handling, f"truth/{stage}/hand_mpjpe")
+    touching = pooled(handling, "truth/contact_region")
     if errors is None or touching is None:
         return float("nan")
     held = errors[touching[:, :2]]  # METRIC_REGIONS starts with the left and the right hand

@@ -35,8 +35,8 @@ class Heatmaps:
 def collect(paths: Sequence[Path]) -> Heatmaps:
     """Add up the metrics artefacts at 4.5 mm; raises UserError as reading does.
 
-    Bodies of another vertex count than the first one's are left out of the body's map, which lies
-    on one topology.
+    Sequences without an object count in none of the maps. Bodies of another vertex count than the
+    first one's are left out of the body's map, which lies on one topology.
     """
     body = np.zeros(0)
     body_frames = 0
@@ -45,6 +45,8 @@ def collect(paths: Sequence[Path]) -> Heatmaps:
     frames: dict[str, int] = {}
     for path in paths:
         with artefacts.read(path, METRICS) as artefact:
+            if "body_to_object" not in artefact:
+                continue
             name = str(artefact.attributes["object"])
             distance = artefact["body_to_object"]
             if body_frames == 0:

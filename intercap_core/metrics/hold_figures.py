@@ -27,10 +27,11 @@ def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
     if not have:
         return {}
     figures: Figures = _joint_figures(have, key)
-    tips, touching = pooled(have, f"{key}fingertips"), pooled(have, "truth/contact_region")
-    assert tips is not None and touching is not None
-    # METRIC_REGIONS starts with the left and the right hand
-    figures["fingertip_touching_mm"] = 1e3 * _mean(tips[touching[:, :2]])
+    handling = [s for s in have if "truth/contact_region" in s.values]
+    tips, touching = pooled(handling, f"{key}fingertips"), pooled(handling, "truth/contact_region")
+    if tips is not None and touching is not None:
+        # METRIC_REGIONS starts with the left and the right hand
+        figures["fingertip_touching_mm"] = 1e3 * _mean(tips[touching[:, :2]])
     figures["acceleration_feet_mm"] = 1e3 * _mean(pooled(have, f"{key}acceleration_feet"))
     slips = slip_by_object(have, stage)
     figures["slip_mm_s"] = _mean(np.array(list(slips.values())))
@@ -71,7 +72,8 @@ def _stated_and_true(
     sequences: Sequence[SequenceMetrics],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Stated probability, true contact and true distance (N, 12) over all sequences' frames."""
-    have = [s for s in sequences if "truth/region_distance" in s.values]
+    stated = [s for s in sequences if "contact_probability" in s.values]
+    have = [s for s in stated if "truth/region_distance" in s.values]
     probability, true = pooled(have, "contact_probability"), pooled(have, "truth/contact_region")
     distance = pooled(have, "truth/region_distance")
     if probability is None or true is None or distance is None:

@@ -61,7 +61,8 @@ class ObjectErrors:
 def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> ObjectErrors:
     """Compare the artefact of stage ``object_track`` with the truth of its recording.
 
-    Raises UserError where an artefact is broken, or the truth is of another recording.
+    Of an object that was found in no frame the errors are infinite. Raises UserError where an
+    artefact is broken, or the truth is of another recording.
     """
     track = read_object(object_track, "object_track")
     with artefacts.read(object_track, OBJECT_TRACK) as found:
@@ -75,6 +76,24 @@ def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> O
         object_pose.posed_point(r, t, mesh.centre_of_mass)
         for r, t in ((track.rotation, track.translation), (rotation, translation))
     )
+    moves = motion.moving(rotation, true_centre, fps)
+    if not track.known:
+        beyond, unknown = np.full(len(at), np.inf), np.full(len(at), np.nan)
+        return ObjectErrors(
+            sequence=sequence,
+            object_=mesh.name,
+            fps=fps,
+            translation=beyond,
+            rotation=beyond,
+            turn=unknown,
+            centre=centre,
+            true_centre=true_centre,
+            views=views,
+            moves=moves,
+            flagged=track.flagged,
+            add_s=beyond,
+            mssd=beyond,
+        )
     points = mesh.vertices[:: -(-len(mesh.vertices) // SURFACE_POINTS)]
     poses = (track.rotation, track.translation, rotation, translation)
     normalised = normalised_turn = None
@@ -95,7 +114,7 @@ def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> O
         centre=centre,
         true_centre=true_centre,
         views=views,
-        moves=motion.moving(rotation, true_centre, fps),
+        moves=moves,
         flagged=track.flagged,
         add_s=add_s(points, *poses) / mesh.diameter,
         mssd=mssd(points, *poses, mesh) / mesh.diameter,
@@ -168,7 +187,8 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
         values = scale * np.concatenate(errors)[seen]
         if len(values):
             found[f"{key}_median_{unit}"] = float(np.median(values))
-            found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
+            with np.errstate(invalid="ignore"):  # infinite errors of what was found nowhere
+                found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
     add, worst = _pooled([r.add_s for r in recordings]), _pooled([r.mssd for r in recordings])
     if len(add):
         found["add_s_recall"] = float((add < ADD_S_SHARE).mean())

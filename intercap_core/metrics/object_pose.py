@@ -39,7 +39,8 @@ def rotation_error_deg(
 
 
 def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
-    """Which poses are truly lost (...): off by more than 50 mm or 20 degrees."""
+    """Which poses are truly lost (...): off by more than 50 mm or 20 degrees, infinite where the
+    object is there and was not found."""
     return (translation_error_m > LOST_TRANSLATION_M) | (rotation_error_degrees > LOST_ROTATION_DEG)
 
 

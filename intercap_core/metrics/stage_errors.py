@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,24 +22,45 @@ from intercap_core.schemas import METRIC_REGIONS
 _FEET = ("left_foot", "right_foot")  # regions of the soles
 
 
+@dataclass(frozen=True, eq=False)
+class _Both:
+    """The tracked object's ``mesh`` and ``surface``, and the ``true_surface``."""
+
+    mesh: ObjectMesh
+    surface: PosedObject
+    true_surface: DistanceField
+
+    def true_normals(self, points: np.ndarray) -> np.ndarray:
+        """Normals (N, 3) of the true surface nearest to points (N, 3), its frame."""
+        return self.true_surface.closest(points).normals
+
+
 class StageErrors:
-    """Errors of each stage by dataset name; what a stage does not estimate is left out."""
+    """Errors of each stage by dataset name; what a stage does not estimate is left out.
+
+    ``mesh`` is the tracked object's; without one, or where there truly is none, the errors are the
+    body's alone.
+    """
 
     def __init__(
         self,
         truth: truths.Truth,
         true_distance: np.ndarray | None,
-        mesh: ObjectMesh,
+        mesh: ObjectMesh | None,
         threshold_m: float,
         fps: float,
     ) -> None:
         self._truth = truth
         self._true_distance = true_distance
-        self._mesh = mesh
         self._threshold = threshold_m
         self._fps = fps
-        self._surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-        self._true_surface = DistanceField(truth.object_vertices, truth.object_faces)
+        self._both: _Both | None = None
+        if mesh is not None and truth.has_object:
+            self._both = _Both(
+                mesh,
+                PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight),
+                DistanceField(truth.object_vertices, truth.object_faces),
+            )
         self._touched = np.zeros(0, int)  # vertices that truly touch in some frame
         self._true_local = np.zeros((0, 0, 3))  # of them, in the true object's frame
         if truth.vertices is not None and true_distance is not None:
@@ -49,35 +71,45 @@ class StageErrors:
             )
 
     def of_object(self, stage: str, track: ObjectTrack) -> Values:
-        errors = truths.object_errors(self._truth, track, self._mesh, self._fps)
+        if self._both is None:
+            return {}
+        errors = truths.object_errors(self._truth, track, self._both.mesh, self._fps)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
     def of_body(self, stage: str, body_track: BodyTrack, track: ObjectTrack) -> Values:
         """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets."""
         errors = truths.body_errors(self._truth, body_track, self._fps)
-        if self._truth.vertices is not None and self._true_distance is not None:
+        if self._truth.vertices is not None:
             errors |= self._vertices(body_track, track)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
     def _vertices(self, body_track: BodyTrack, track: ObjectTrack) -> Values:
         """Errors of skin, contact, hold and stand, frame by frame."""
         pve, counts, touching, held, soles = [], [], [], [], []
-        assert self._truth.vertices is not None and self._true_distance is not None
+        assert self._truth.vertices is not None
         regions = body_track.model.regions
         for t, vertices in enumerate(body_track.vertices()):
             held.append(vertices[self._touched])
             soles.append([vertices[regions[foot]] for foot in _FEET])
             pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
-            distance = self._surface.signed_distance(
-                vertices.astype(np.float64), track.rotation[t], track.translation[t]
-            )
+            if self._both is None or self._true_distance is None:
+                continue
+            distance = np.full(len(vertices), np.inf)  # of an object that was not found
+            if track.known:
+                distance = self._both.surface.signed_distance(
+                    vertices.astype(np.float64), track.rotation[t], track.translation[t]
+                )
             counts.append(truths.contact_counts(distance, self._true_distance[t]))
             touching.append(contact.vertex_contact(distance, self._threshold))
-        touched = np.stack(touching)
-        return {
-            **self._slip(np.stack(held), track),
+        of_body = {
             **self._feet([np.stack(sole) for sole in zip(*soles, strict=True)], regions),
             "body_pve": pve,
+        }
+        if not touching:
+            return of_body
+        touched = np.stack(touching)
+        return of_body | {
+            **self._slip(np.stack(held), track),
             "vertex_contact_counts": np.stack(counts),
             "contact_frame": touched.any(1),
             "region_contact": contact.region_contact(touched, regions, METRIC_REGIONS),
@@ -85,9 +117,11 @@ class StageErrors:
 
     def _slip(self, held: np.ndarray, track: ObjectTrack) -> Values:
         """Of the skin vertices (T, N, 3) that truly touch at some time, on the tracked object."""
-        assert self._true_distance is not None
+        assert self._true_distance is not None and self._both is not None
+        if not track.known:
+            return {"slip": np.full(len(held), np.nan)}
         pose, true = (Pose(of.rotation, of.translation).matrix for of in (track, self._truth))
-        symmetry = self._mesh.symmetry  # a spin that nothing shows is no slip
+        symmetry = self._both.mesh.symmetry  # a spin that nothing shows is no slip
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
         )
@@ -96,7 +130,7 @@ class StageErrors:
             _local(held, pose[:, :3, :3], pose[:, :3, 3]),
             self._true_local,
             touching,
-            lambda points: self._true_surface.closest(points).normals,
+            self._both.true_normals,
             self._fps,
         )
         return {"slip": speed}
@@ -119,8 +153,10 @@ class StageErrors:
     def about_truth(self, regions: Mapping[str, np.ndarray]) -> Values:
         """What is true, of a body whose parts have these vertices."""
         truth = self._truth
+        if self._both is None:
+            return self._true_skin(regions)
         centre = object_pose.posed_point(
-            truth.rotation, truth.translation, self._mesh.centre_of_mass
+            truth.rotation, truth.translation, self._both.mesh.centre_of_mass
         )
         return {
             "truth/sweep": contact.SWEEP_M,
@@ -133,13 +169,15 @@ class StageErrors:
 
     def _true_skin(self, regions: Mapping[str, np.ndarray]) -> Values:
         truth = self._truth
-        if truth.vertices is None or self._true_distance is None:
+        if truth.vertices is None:
             return {}
         soles = [truth.vertices[:, regions[foot]].astype(np.float64) for foot in _FEET]
         carried = [np.any(support(sole, truth.floor, self._fps), axis=1) for sole in soles]
-        nearest = [self._true_distance[:, regions[name]].min(1) for name in METRIC_REGIONS]
-        return {
-            "truth/region_distance": np.stack(nearest, 1),
+        near = {}
+        if self._both is not None and self._true_distance is not None:
+            nearest = [self._true_distance[:, regions[name]].min(1) for name in METRIC_REGIONS]
+            near = {"truth/region_distance": np.stack(nearest, 1)}
+        return near | {
             "truth/standing": _since_before(carried) > 0,
             "truth/foot_centre": np.stack([sole.mean(1) for sole in soles], 1),
         }

@@ -52,13 +52,18 @@ class BodyTrack:
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """T poses master_from_object; ``flagged`` (T,): the stage itself does not trust the frame;
-    ``covariance`` (T, 6, 6) or None."""
+    """T poses master_from_object, all NaN where there is no object; ``flagged`` (T,): the stage
+    itself does not trust the frame; ``covariance`` (T, 6, 6) or None."""
 
     rotation: np.ndarray
     translation: np.ndarray
     flagged: np.ndarray
     covariance: np.ndarray | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an object in any frame."""
+        return bool(np.isfinite(self.translation).any())
 
 
 def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> BodyTrack:

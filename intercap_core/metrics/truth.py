@@ -26,8 +26,9 @@ class Truth:
     fitted body has another topology than the one the truth was matched to; ``visible`` (T, V) of
     them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
     (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
-    ``translation`` (T, 3); ``contact_region`` (T, 12) in the order of METRIC_REGIONS; the
-    ``floor``; ``master_from_colour`` (C, 4, 4) and ``camera_names``.
+    ``translation`` (T, 3), of a person alone NaN, and the mesh empty; ``contact_region`` (T, 12) in
+    the order of METRIC_REGIONS; the ``floor``; ``master_from_colour`` (C, 4, 4) and
+    ``camera_names``.
     """
 
     vertices: np.ndarray | None
@@ -44,6 +45,11 @@ class Truth:
     floor: Floor
     camera_names: tuple[str, ...]
     master_from_colour: np.ndarray
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there truly is an object."""
+        return len(self.object_faces) > 0
 
     @classmethod
     def load(cls, path: Path, times: np.ndarray, fps: float, num_vertices: int) -> Truth:
@@ -64,17 +70,18 @@ class Truth:
                 visible = body.corresponding_vertices(seen, faces, face, weights)[..., 0] > 0.5
             names = file.text("region_names")
             columns = [names.index(name) for name in METRIC_REGIONS]
+            thing = _TrueThing.read(file, at)
             return cls(
                 vertices=vertices,
                 visible=visible,
                 joints=file["joints"][at],
                 tips=file["fingertips"][at],
-                object_vertices=file["object_vertices"].astype(np.float64),
-                object_faces=file["object_faces"],
-                object_visible=file["object_visible"][at],
-                rotation=file["rotation"][at],
-                translation=file["translation"][at],
-                object_views=file["object_views"][at],
+                object_vertices=thing.vertices,
+                object_faces=thing.faces,
+                object_visible=thing.visible,
+                rotation=thing.rotation,
+                translation=thing.translation,
+                object_views=thing.views,
                 contact_region=file["region_contact"][at][:, columns],
                 floor=Floor(file["ground_normal"], float(file.attributes["ground_offset"])),
                 camera_names=tuple(file.text("camera_names")),
@@ -93,6 +100,40 @@ class Truth:
         points = samples.of(mesh.vertices, mesh.faces)
         nearest = cKDTree(self.object_vertices).query(points)[1]
         return self.object_vertices[nearest], self.object_visible[:, nearest]
+
+
+@dataclass(frozen=True, eq=False)
+class _TrueThing:
+    """The object's part of the file at T moments: an empty mesh without poses where there is
+    none."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    visible: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    views: np.ndarray
+
+    @classmethod
+    def read(cls, file: artefacts.Artefact, at: np.ndarray) -> _TrueThing:
+        if not file.attributes["object"]:
+            count = len(at)
+            return cls(
+                np.zeros((0, 3)),
+                np.zeros((0, 3), np.int32),
+                np.zeros((count, 0), bool),
+                np.full((count, 3, 3), np.nan),
+                np.full((count, 3), np.nan),
+                np.zeros(count, np.int8),
+            )
+        return cls(
+            file["object_vertices"].astype(np.float64),
+            file["object_faces"],
+            file["object_visible"][at],
+            file["rotation"][at],
+            file["translation"][at],
+            file["object_views"][at],
+        )
 
 
 def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
@@ -126,6 +167,8 @@ def object_errors(
     fps: float,
 ) -> dict[str, np.ndarray]:
     """Errors of T object poses by key of the metrics artefact."""
+    if not track.known:
+        return _missed(len(truth.rotation))
     centre = mesh.centre_of_mass
     fitted = object_pose.posed_point(track.rotation, track.translation, centre)
     true = object_pose.posed_point(truth.rotation, truth.translation, centre)
@@ -146,6 +189,19 @@ def object_errors(
             track.translation, truth.translation, track.covariance
         )
     return result
+
+
+def _missed(frames: int) -> dict[str, np.ndarray]:
+    """Errors of an object that is there and that was found in no frame: beyond any bound."""
+    unknown = np.full(frames, np.nan)
+    return {
+        "object_translation": np.full(frames, np.inf),
+        "object_rotation": np.full(frames, np.inf),
+        "object_centre": np.full((frames, 3), np.nan),
+        "object_turn": unknown,
+        "object_flagged": np.ones(frames, bool),
+        "acceleration_object": unknown,
+    }
 
 
 def contact_counts(distance: np.ndarray, true_distance: np.ndarray) -> np.ndarray:

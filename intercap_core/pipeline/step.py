@@ -53,7 +53,7 @@ def run_step(
         "track_settings": project.config.object_track,
         "joint_settings": project.config.joint,
         "sequence": row,
-        "object_": project.objects[row.object],
+        "object_": project.object_of(sequence),
         "subject": project.subjects[row.subject],
         "body_models": project.config.body_models,
         "device": project.config.device,
@@ -122,7 +122,7 @@ def run_studio(project: Project, sequence: str) -> Path:
         project.config.studio.captures[sequence],
         project.config.studio,
         sequence=sequence,
-        objects=project.objects[project.sequences[sequence].object],
+        objects=project.object_of(sequence),
         output=folder,
     )
     return folder

@@ -125,10 +125,12 @@ def _reliability(known: Sequence[SequenceMetrics]) -> str:
     )
 
 
-def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any]:
-    """Histogram, cumulative curve and figures over contact frames."""
+def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
+    """Histogram, cumulative curve and figures over contact frames; None where no sequence has an
+    object."""
     touching = figures.pooled(sequences, "contact_frame")
-    assert touching is not None
+    if touching is None:
+        return None
     edges = np.arange(0, _HISTOGRAM_MM + _BIN_MM / 2, _BIN_MM)
     lines, shares, tallest = [], [], 1.0
     for name, colour in (("max", "c2"), ("mean", "c1"), ("median", "c3")):

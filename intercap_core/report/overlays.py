@@ -50,13 +50,14 @@ class Fit:
         parameters: BodyParameters,
         rotation: np.ndarray,
         translation: np.ndarray,
-        mesh: ObjectMesh,
+        mesh: ObjectMesh | None,
     ) -> None:
+        """``mesh`` is None where there is no object."""
         self._model = model
         self._parameters = parameters
         self._rotation = rotation
         self._translation = translation
-        self.mesh = mesh
+        self._mesh = mesh
         self.faces = model.faces.numpy()
 
     def body(self, t: int) -> np.ndarray:
@@ -65,13 +66,20 @@ class Fit:
             posed = self._model.forward(self._parameters.frames(slice(t, t + 1)))
         return posed.vertices[0].numpy().astype(np.float64)
 
+    @property
+    def objects(self) -> tuple[ObjectMesh, ...]:
+        """The object's mesh, where there is one."""
+        return () if self._mesh is None else (self._mesh,)
+
     def object_pose(self, t: int) -> np.ndarray:
         """master_from_object (4, 4)."""
         return rigid(self._rotation[t], self._translation[t])
 
     def object_vertices(self, t: int) -> np.ndarray:
-        """Vertices (Vo, 3), master frame."""
-        return self.mesh.vertices @ self._rotation[t].T + self._translation[t]
+        """Vertices (Vo, 3), master frame; none where there is no object."""
+        if self._mesh is None:
+            return np.zeros((0, 3))
+        return self._mesh.vertices @ self._rotation[t].T + self._translation[t]
 
 
 def choose_frames(residual: np.ndarray, count: int) -> list[int]:
@@ -102,13 +110,17 @@ def choose_cameras(fit: Fit, rig: Rig, frames: Sequence[int], count: int) -> lis
             rendering = render_scene(
                 [
                     Drawable(fit.body(t), fit.faces, camera.colour_from_master),
-                    Drawable(
-                        fit.mesh.vertices, fit.mesh.faces,
-                        camera.colour_from_master @ fit.object_pose(t),
+                    *(
+                        Drawable(
+                            mesh.vertices,
+                            mesh.faces,
+                            camera.colour_from_master @ fit.object_pose(t),
+                        )
+                        for mesh in fit.objects
                     ),
                 ],
                 lens,
-            )  # fmt: skip
+            )
             seen[c] += np.count_nonzero(rendering.body == 1)
             seen[c] += 1e-3 * np.count_nonzero(rendering.body == 0)
     axes = rig.master_from_colour[:, :3, 2]
@@ -154,13 +166,18 @@ def overlays(
             picture = draw(
                 [
                     _painted(bodies[t], fit.faces, BODY_COLOUR, camera.colour_from_master),
-                    _painted(
-                        fit.mesh.vertices, fit.mesh.faces, OBJECT_COLOUR,
-                        camera.colour_from_master @ fit.object_pose(t),
+                    *(
+                        _painted(
+                            mesh.vertices,
+                            mesh.faces,
+                            OBJECT_COLOUR,
+                            camera.colour_from_master @ fit.object_pose(t),
+                        )
+                        for mesh in fit.objects
                     ),
                 ],
                 lens,
-            )  # fmt: skip
+            )
             laid = picture.over(crop[..., ::-1] / np.float32(255), _OPACITY)
             result.append(Overlay(camera.name, t, encode_jpeg(laid), lens.width, lens.height))
     return result

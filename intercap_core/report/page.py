@@ -136,13 +136,13 @@ def _headline(content: Content) -> str:
     frames = sum(len(s) for s in content.sequences)
     seconds = sum(len(s) / s.fps for s in content.sequences)
     subjects = len({s.subject for s in content.sequences})
-    objects = len({s.object_ for s in content.sequences})
+    objects = len({s.object_ for s in content.sequences if s.object_})
     parts = [
         _counted(len(content.sequences), "sequence"),
         _counted(frames, "frame"),
         f"{seconds / 60:.1f} minutes" if seconds >= 120 else f"{seconds:.0f} seconds",
         _counted(subjects, "subject"),
-        _counted(objects, "object"),
+        _counted(objects, "object") if objects else "people alone",
     ]
     if content.failed:
         parts.append(f"{len(content.failed)} failed")
@@ -169,13 +169,14 @@ def _tiles(content: Content) -> list[dict[str, str]]:
         _tile(f"{part}, stated", value, "mm", "mean error, without truth")
         for part, value in mean_stated(content.sequences).items()
     ]
-    tiles += [
-        _tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"),
-        _tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"),
-        _tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"),
-        _tile("flagged", 100 * float(flagged.mean()), "%", f"{int(flagged.sum())} not trusted"),
-    ]
-    return tiles
+    handling = any(s.has_object for s in content.sequences)
+    if handling:
+        tiles.append(_tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"))
+    tiles.append(_tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
+    if handling:
+        tiles.append(_tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"))
+    share, count = 100 * float(flagged.mean()), int(flagged.sum())
+    return [*tiles, _tile("flagged", share, "%", f"{count} not trusted")]
 
 
 def _tile(name: str, value: float | None, unit: str, note: str, digits: int = 1) -> dict[str, str]:
@@ -262,8 +263,26 @@ def _detail(content: Content, detail: Detail) -> dict[str, Any]:
             "flag",
             [(a, b, f"{_span(a, b)}: {why}") for a, b, why in flags.ranges(reasons)],
         ),
-        charts.Band("in contact", "any", _runs(s.values["contact_frame"])),
+        *(_contact_bands(s) if s.has_object else ()),
     ]
+    return {
+        "name": s.name,
+        "subject": s.subject,
+        "object": s.object_,
+        "contact": s.has_object,
+        "frames": len(s),
+        "fps": s.fps,
+        "cameras": list(cameras.values()),
+        "note": detail.note,
+        "joint": detail.joint,
+        "closeups": [_embedded(picture, picture.hold.caption) for picture in detail.closeups],
+        "timeline": charts.timeline(bands, len(s)),
+    }
+
+
+def _contact_bands(s: SequenceMetrics) -> list[charts.Band]:
+    """Frames in contact, and of each region that touches, as stated and as the meshes have it."""
+    bands = [charts.Band("in contact", "any", _runs(s.values["contact_frame"]))]
     names = list(s.values["region_names"])
     for region in METRIC_REGIONS:
         says = region.replace("_", " ")
@@ -273,18 +292,7 @@ def _detail(content: Content, detail: Detail) -> dict[str, Any]:
         touching = s.values["region_contact"][:, names.index(region)]
         if touching.any():
             bands.append(charts.Band(f"{says}, meshes", "any", _runs(touching)))
-    return {
-        "name": s.name,
-        "subject": s.subject,
-        "object": s.object_,
-        "frames": len(s),
-        "fps": s.fps,
-        "cameras": list(cameras.values()),
-        "note": detail.note,
-        "joint": detail.joint,
-        "closeups": [_embedded(picture, picture.hold.caption) for picture in detail.closeups],
-        "timeline": charts.timeline(bands, len(s)),
-    }
+    return bands
 
 
 def _versions(content: Content) -> list[tuple[str, str]]:

@@ -18,6 +18,11 @@ _MILLIMETRES = {
     "ground_penetration", "body_to_cloud", "object_to_cloud", "body_visible_to_cloud",
     "object_visible_to_cloud", "cloud_to_body",
 }  # fmt: skip
+_RANKED = {  # columns of the table of sequences and what they are a measure of
+    "vertex_to_cloud.body_visible_mm": "body_to_cloud",
+    "vertex_to_cloud.object_visible_mm": "object_to_cloud",
+    "penetration.p98_mm": "penetration",
+}
 _ACCELERATIONS = {"acceleration_body", "acceleration_object"}
 
 
@@ -28,7 +33,7 @@ def sequence_table(
 
     ``residuals``: median point-to-plane distance between cameras before and after refinement, by
     sequence, metres. Columns ``<stage>.<figure>`` are errors against truth. ``rank`` orders the
-    sequences by :func:`worst_first`, 1 = worst.
+    sequences by :func:`worst_first`, 1 = worst. What a sequence does not have is NaN.
     """
     rows = []
     for s in sequences:
@@ -39,7 +44,7 @@ def sequence_table(
             "frames": len(s),
             "fps": s.fps,
             "flagged_frames": int(s.values["flagged"].sum()),
-            "contact_frames": int(s.values["contact_frame"].sum()),
+            "contact_frames": int(s.values["contact_frame"].sum()) if s.has_object else np.nan,
         }
         for name, value in figures.penetration_figures([s]).items():
             row[f"penetration.{name}"] = value
@@ -48,7 +53,8 @@ def sequence_table(
         for name, value in figures.floor_figures([s]).items():
             row[f"vertex_to_cloud_floor.{name}"] = value
         for name in sorted(_ACCELERATIONS):
-            row[f"{name}_mm"] = 1e3 * _mean(s.values[name])
+            if name in s.values:
+                row[f"{name}_mm"] = 1e3 * _mean(s.values[name])
         for error in stated_errors(s):
             row[f"verdict.{error.part}_mm"] = error.stated
             row[f"verdict.{error.part}_factor"] = error.factor
@@ -64,6 +70,9 @@ def sequence_table(
                 row[f"extrinsics_error.{name}"] = value
         rows.append(row)
     table = pd.DataFrame(rows)
+    for name in _RANKED:
+        if name not in table:  # of no sequence, where nobody handles an object
+            table[name] = np.nan
     table.insert(1, "rank", worst_first(table))
     return table
 
@@ -72,15 +81,13 @@ def worst_first(table: pd.DataFrame) -> pd.Series:
     """Rank of each sequence, 1 = worst: by the mean of its ranks in several measures.
 
     Share of flagged frames, body and object visible distance to the cloud, the 98th percentile of
-    penetration, and the stated error of each judged part, worst where nothing can be said. Ranks
-    need no weights between units.
+    penetration, and the stated error of each judged part, worst where nothing can be said. Without
+    an object there are no measures of it. Ranks need no weights between units.
     """
     measures = pd.DataFrame(
         {
             "flagged": table["flagged_frames"] / table["frames"],
-            "body_to_cloud": table["vertex_to_cloud.body_visible_mm"],
-            "object_to_cloud": table["vertex_to_cloud.object_visible_mm"],
-            "penetration": table["penetration.p98_mm"],
+            **{name: table[column] for column, name in _RANKED.items()},
             **{
                 part: table[f"verdict.{part}_mm"].fillna(np.inf)
                 for part in TRUE
@@ -88,7 +95,10 @@ def worst_first(table: pd.DataFrame) -> pd.Series:
             },
         }
     )
-    mean_rank = measures.rank(ascending=False, na_option="bottom").mean(axis=1)
+    ranks = measures.rank(ascending=False, na_option="bottom")
+    of_object = ranks.columns.intersection(["object_to_cloud", "penetration", "object"])
+    ranks.loc[table["contact_frames"].isna(), of_object] = np.nan
+    mean_rank = ranks.mean(axis=1)
     return mean_rank.rank(method="first").astype(int)
 
 
@@ -96,7 +106,6 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
     """One row a frame; millimetres, degrees, mm/frame^2 at 30 fps."""
     parts = []
     for s in sequences:
-        names = s.values["region_names"]
         total = len(s)
         columns: dict[str, object] = {
             "sequence": np.repeat(s.name, total),
@@ -104,12 +113,16 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
             "time_s": np.arange(total) / s.fps,
             "flagged": s.values["flagged"],
             "flag_reason": s.values["flag_reason"].astype(str),
-            "contact": s.values["contact_frame"],
-            "contact_regions": [";".join(names[row]) for row in s.values["region_contact"]],
         }
-        for r, region in enumerate(names):
-            columns[f"contact_probability.{region}"] = s.values["contact_probability"][:, r]
-        for name in sorted(_MILLIMETRES | _ACCELERATIONS):
+        if s.has_object:
+            names = s.values["region_names"]
+            columns["contact"] = s.values["contact_frame"]
+            columns["contact_regions"] = [
+                ";".join(names[row]) for row in s.values["region_contact"]
+            ]
+            for r, region in enumerate(names):
+                columns[f"contact_probability.{region}"] = s.values["contact_probability"][:, r]
+        for name in sorted((_MILLIMETRES | _ACCELERATIONS) & s.values.keys()):
             columns[f"{name}_mm"] = 1e3 * s.values[name].astype(np.float64)
         for place, part in enumerate(s.values.get("verdict/part_names", ())):
             columns[f"verdict.{part}_mm"] = 1e3 * s.values["verdict/error_frame"][place]

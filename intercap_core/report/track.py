@@ -14,6 +14,7 @@ from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
 from intercap_core.errors import UserError
+from intercap_core.object_track.absent import SOURCE as NO_TRACK
 from intercap_core.report import charts
 from intercap_core.report.overlays import choose_frames
 from intercap_core.report.sheets import Sheet
@@ -75,20 +76,26 @@ def read_track(
 ) -> TrackFacts:
     """Read and draw one track; ``kept(t, c)`` gives the RLE of the candidate that it kept.
 
-    What cannot be drawn is left out, with its reason in ``note``. Raises UserError as
+    What cannot be drawn is left out, with its reason in ``note``; of an object that was found in no
+    frame, that is why. Raises UserError as
     :func:`artefacts.read` does.
     """
     with artefacts.read(object_track, OBJECT_TRACK) as track:
         poses = np.array(
             [rigid(r, t) for r, t in zip(track["rotation"], track["translation"], strict=True)]
         )
-        sheet, note = _sheet(frames, scene, mesh, poses, kept, track["overlap"])
+        source = track.attributes["seed_source"]
+        sheet, note = None, str(track.attributes["doubts"])
+        seed = "nowhere: it was found in no frame"
+        if source != NO_TRACK:
+            sheet, note = _sheet(frames, scene, mesh, poses, kept, track["overlap"])
+            found = "annotated" if source == "annotated" else "found by search"
+            seed = f"frame {track.attributes['seed_frame']}, {found}"
         covariance = track["covariance"]
-        found = "annotated" if track.attributes["seed_source"] == "annotated" else "found by search"
         return TrackFacts(
             name=str(track.attributes["sequence"]),
             object_=str(track.attributes["object"]),
-            seed=f"frame {track.attributes['seed_frame']}, {found}",
+            seed=seed,
             cameras=track.text("camera_names"),
             overlap=track["overlap"],
             depth=track["depth_residual"],
@@ -144,8 +151,12 @@ def context(facts: TrackFacts) -> dict[str, Any]:
         "note": facts.note,
         "timeline": charts.state_timeline(rows, total, marks),
         "charts": [
-            _chart(facts.sigma_mm, "deviation of place, mm", _LEAST_MM, np.inf),
-            _chart(facts.sigma_deg, "deviation of turn, degrees", _LEAST_DEG, _MOST_DEG),
+            _chart(values, label, least, most)
+            for values, label, least, most in (
+                (facts.sigma_mm, "deviation of place, mm", _LEAST_MM, np.inf),
+                (facts.sigma_deg, "deviation of turn, degrees", _LEAST_DEG, _MOST_DEG),
+            )
+            if np.isfinite(values).any()
         ],
         "track_states": list(TRACK_STATES.items()),
         "view_states": list(VIEW_STATES.items()),

@@ -84,7 +84,9 @@ def run(
     details = [
         replace(
             _detail(name, sequences[name], s, objects, subjects, body_models, settings),
-            closeups=_closeups(
+            closeups=[]
+            if not s.has_object
+            else _closeups(
                 sequences[name],
                 objects[s.object_],
                 body_models,
@@ -101,7 +103,7 @@ def run(
     tracks = [
         _track(sequences[name], s.object_, objects)
         for name, s in zip(sequences, measured, strict=True)
-        if name in shown
+        if name in shown and s.object_
     ]
     bodies = [
         read_fit(
@@ -128,7 +130,7 @@ def run(
         captures=captures,
         tracks=tracks,
         bodies=bodies,
-        body_heat=body_pictures(model, heat.body, body_top),
+        body_heat=body_pictures(model, heat.body, body_top) if heat.body_frames else [],
         body_top=body_top,
         body_frames=heat.body_frames,
         object_heat=[_object_heat(name, heat, objects) for name in sorted(drawn)],
@@ -150,7 +152,7 @@ def _detail(
     body_models: BodyModels,
     settings: ReportSettings,
 ) -> Detail:
-    mesh = ObjectMesh.load(objects[measured.object_])
+    mesh = ObjectMesh.load(objects[measured.object_]) if measured.has_object else None
     with artefacts.read(paths["joint"], JOINT) as joint:
         parameters = read_parameters(joint)
         model = load_model(body_models, subjects[measured.subject].gender, joint)
@@ -161,7 +163,8 @@ def _detail(
             master = rig.names.index(str(scene.attributes["master"]))
         said = _of_joint(joint, rig, master)
     rig = rig.moved(settled)
-    chosen = choose_frames(measured.values["object_visible_to_cloud"], settings.frames)
+    worst = "object_visible_to_cloud" if measured.has_object else "body_visible_to_cloud"
+    chosen = choose_frames(measured.values[worst], settings.frames)
     cameras = choose_cameras(fit, rig, chosen, settings.cameras)
     try:
         with Frames.open(paths["frames"]) as images:
@@ -288,18 +291,17 @@ def _trace(paths: SequenceArtefacts) -> dict[str, str]:
 
 
 def _write_heatmaps(path: Path, dataset: str, heat: Heatmaps) -> None:
-    counts = [len(found.likelihood) for found in heat.objects.values()]
+    found = list(heat.objects.values())
+    ends = np.cumsum([len(one.likelihood) for one in found], dtype=np.int64)
     with artefacts.write(
         path, HEATMAPS, dataset=dataset, contact_m=CONTACT_M, body_frames=heat.body_frames
     ) as writer:
         writer.put("body_likelihood", heat.body)
         writer.put("object_names", list(heat.objects))
-        writer.put("object_frames", [found.frames for found in heat.objects.values()])
-        writer.put("object_offsets", np.concatenate([[0], np.cumsum(counts)]))
-        writer.put("object_points", np.concatenate([f.points for f in heat.objects.values()]))
-        writer.put(
-            "object_likelihood", np.concatenate([f.likelihood for f in heat.objects.values()])
-        )
+        writer.put("object_frames", np.array([one.frames for one in found], np.int64))
+        writer.put("object_offsets", np.concatenate([np.zeros(1, np.int64), ends]))
+        writer.put("object_points", np.concatenate([np.zeros((0, 3)), *(f.points for f in found)]))
+        writer.put("object_likelihood", np.concatenate([[], *(f.likelihood for f in found)]))
 
 
 def _replace(path: Path, text: str) -> None:

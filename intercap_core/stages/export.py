@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -17,10 +18,12 @@ from intercap_core.config import BodyModels, ExportSettings, ObjectEntry, Subjec
 from intercap_core.errors import UserError
 from intercap_core.export import amass, bop, contact, glb, intercap
 from intercap_core.export.motion import Motion, read_motion
-from intercap_core.export.readme import readme
+from intercap_core.export.readme import needs_object, readme
 from intercap_core.export.upright import z_up_frame
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, SCENE
+
+log = logging.getLogger(__name__)
 
 MANIFEST = "export.json"
 
@@ -29,7 +32,7 @@ def run(
     *,
     joint: Path,
     scene: Path,
-    object_: ObjectEntry,
+    object_: ObjectEntry | None,
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: ExportSettings,
@@ -37,14 +40,15 @@ def run(
 ) -> None:
     """Write the chosen formats into the folder ``output``, replacing an earlier export there.
 
-    The folder appears whole or not at all: it is filled under a temporary name beside its own,
-    and an earlier export goes only when the new one is complete. Raises UserError where an
-    artefact or the object's mesh is missing or broken, and where ``output`` holds anything but an
-    export.
+    The folder appears whole or not at all: it is filled under a temporary name beside its own, and
+    an earlier export goes only when the new one is complete. Without an object (``object_`` is
+    None, or it was found in no frame) its files are left out, which README.txt says. Raises
+    UserError where an artefact or the object's mesh is missing or broken, and where ``output``
+    holds anything but an export.
     """
     output = Path(output)
     _check_replaceable(output)
-    mesh = ObjectMesh.load(object_)
+    mesh = None if object_ is None else ObjectMesh.load(object_)
     with artefacts.read(scene, SCENE) as setting:
         given = Rig.from_artefact(setting)
         zup_from_master, upright = setting["zup_from_master"], z_up_frame(setting)
@@ -54,9 +58,14 @@ def run(
         rig = given.moved(fit["master_from_colour"])
         exposures = bop.Exposures(image_of, times, fit["time_offset"])
     motion = read_motion(joint, fps, body_models, subject.gender)
+    if not motion.has_object:
+        mesh = None
     z_up = settings.frame == "z-up"
     viewed = motion.moved(zup_from_master, upright) if z_up else motion
-    formats = sorted(set(settings.formats))
+    named = sorted(set(settings.formats))
+    formats = [name for name in named if mesh is not None or not needs_object(name)]
+    for name in set(named) - set(formats):
+        log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
     with _replaced(output) as folder:
         for name in formats:
             if name == "intercap":
@@ -64,7 +73,7 @@ def run(
                 intercap.write(folder / "intercap" / "res.pkl", motion)
             elif name == "amass":
                 amass.write(folder / "amass", viewed)
-            elif name == "bop":
+            elif name == "bop" and object_ is not None and mesh is not None:
                 number = bop.object_id(object_.mesh)
                 bop.write(folder / "bop", motion, rig, mesh, number, exposures)
             elif name == "contact":
@@ -72,7 +81,7 @@ def run(
             else:
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, z_up=z_up)
-        (folder / "README.txt").write_text(readme(motion, viewed, mesh, formats), encoding="utf-8")
+        (folder / "README.txt").write_text(readme(motion, viewed, mesh, named), encoding="utf-8")
         _write_manifest(folder, motion, viewed, formats)
 
 

@@ -57,7 +57,7 @@ def run(
     object_track: Path,
     body_fit: Path,
     output: Path,
-    object_: ObjectEntry,
+    object_: ObjectEntry | None,
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: JointSettings,
@@ -69,9 +69,9 @@ def run(
     """Write joint.h5 from the sequential fits.
 
     ``body_settings`` say what the body fit had fitted, ``track_settings`` how the tracker compares
-    images. ``contact`` are the annotated intervals,
-    None where contact is to be detected from the geometry. Raises UserError where an artefact or
-    the mesh cannot be used.
+    images. ``contact`` are the annotated intervals, None where contact is to be detected from the
+    geometry. Where ``object_`` is None, or its track is lost in all frames, the body's terms are
+    minimised alone. Raises UserError where an artefact or the mesh cannot be used.
     """
     with open_inputs(
         frames=frames,
@@ -102,7 +102,7 @@ def run(
         JOINT,
         settings_digest=digest(settings),
         subject=subject.subject,
-        object=object_.name,
+        object=object_.name if object_ else "",
         iterations=fitted.steps,
         refused=fitted.refused,
         converged=fitted.converged,

@@ -27,10 +27,10 @@ from intercap_core.metrics import truth as truths
 from intercap_core.metrics.exchanged import exchanged
 from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.flags import merge_reasons
-from intercap_core.metrics.measurement import Measurement, Values
+from intercap_core.metrics.measurement import Handled, Measurement, Values
 from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
 from intercap_core.metrics.stage_errors import StageErrors
-from intercap_core.metrics.tracks import BodyTrack, ObjectTrack, read_body, read_object
+from intercap_core.metrics.tracks import BodyTrack, read_body, read_object
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import (
     BODY_FIT,
@@ -57,7 +57,7 @@ def run(
     body_fit: Path,
     joint: Path,
     output: Path,
-    object_: ObjectEntry,
+    object_: ObjectEntry | None,
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: MetricsSettings,
@@ -70,7 +70,9 @@ def run(
     to ``truth`` where given.
 
     The settings of other stages say how their fits were made, which the verdict repeats in part.
-    Raises UserError where an input artefact is missing, broken or does not fit the others.
+    Where ``object_`` is None, or it was found in no frame, what would be of an object and of
+    contact is left out; of one that is truly there, the errors are infinite. Raises UserError where
+    an input artefact is missing, broken or does not fit the others.
     """
     verdict = {}
     if settings.hold_out:
@@ -88,7 +90,7 @@ def run(
             body_settings=body_settings,
             track_settings=track_settings,
         ).values()
-    mesh = ObjectMesh.load(object_)
+    mesh = None if object_ is None else ObjectMesh.load(object_)
     fitted_body = read_body(joint, "joint", body_models, subject.gender)
     fitted_object = read_object(joint, "joint")
     with contextlib.ExitStack() as stack:
@@ -104,10 +106,12 @@ def run(
         if truth is not None:
             vertices = fitted_body.model.num_vertices
             known = truths.Truth.load(truth, images.time_s, images.fps, vertices)
+        handled = None
+        if mesh is not None and fitted_object.known:
+            handled = Handled(mesh, fitted_object)
         measured = Measurement(
-            mesh,
+            handled,
             fitted_body,
-            fitted_object,
             clouds,
             rig,
             settings.contact_mm * 1e-3,
@@ -115,8 +119,10 @@ def run(
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
         true_distance = values.pop("true_distance", None)
         _warn_of_foreign_truth(truth, values)
-        values |= _motion(fitted_body, fitted_object, mesh, images.fps)
+        values |= _motion(fitted_body, handled, images.fps)
         values |= _stated(images, person, object_track, body_fit, joint)
+        if handled is not None:
+            values["contact_probability"] = fitted["contact_probability"]
         if known is not None:
             tracked = read_object(object_track, "object_track")
             first_body = read_body(body_fit, "body_fit", body_models, subject.gender)
@@ -131,7 +137,7 @@ def run(
         attributes = {
             "sequence": images.sequence,
             "subject": subject.subject,
-            "object": object_.name,
+            "object": object_.name if object_ else "",
             "fps": images.fps,
             "has_truth": known is not None,
         }
@@ -168,29 +174,31 @@ def _clouds(
     )
 
 
-def _motion(body_track: BodyTrack, track: ObjectTrack, mesh: ObjectMesh, fps: float) -> Values:
-    centre = object_pose.posed_point(track.rotation, track.translation, mesh.centre_of_mass)
-    return {
-        "acceleration_body": motion.acceleration(body_track.joints[:, body.BODY_JOINTS], fps),
-        "acceleration_object": motion.acceleration(centre[:, None], fps),
-    }
+def _motion(body_track: BodyTrack, handled: Handled | None, fps: float) -> Values:
+    joints = body_track.joints[:, body.BODY_JOINTS]
+    values: Values = {"acceleration_body": motion.acceleration(joints, fps)}
+    if handled is not None:
+        track, point = handled.track, handled.mesh.centre_of_mass
+        centre = object_pose.posed_point(track.rotation, track.translation, point)
+        values["acceleration_object"] = motion.acceleration(centre[:, None], fps)
+    return values
 
 
 def _stated(
     images: Frames, person: Path, object_track: Path, body_fit: Path, joint: Path
 ) -> Values:
-    """Frames that some stage does not trust, with every reason, and contact as joint states it."""
+    """Frames that some stage does not trust, with every reason."""
     with artefacts.read(person, PERSON) as artefact:
         missing = artefact["missing"]
     with artefacts.read(object_track, OBJECT_TRACK) as artefact:
-        lost, ambiguous = artefact["lost"], artefact["ambiguous"]
+        named = bool(artefact.attributes["object"])
+        lost, ambiguous = artefact["lost"] & named, artefact["ambiguous"]
     with artefacts.read(body_fit, BODY_FIT) as artefact:
         failed, bridged = artefact["failed"], artefact["bridged"]
         uncertain = artefact["uncertain"]
     with artefacts.read(joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
         joints = artefact["joints"]
-        probability = artefact["contact_probability"]
     unseen = np.asarray(~images.available.any(1))
     alone = ~joint_flags  # the joint stage repeats, in its words, what it was told of a frame
     reasons = merge_reasons(
@@ -214,7 +222,6 @@ def _stated(
     return {
         "flagged": np.array([bool(r) for r in reasons]),
         "flag_reason": reasons,
-        "contact_probability": probability,
     }
 
 

@@ -14,6 +14,7 @@ from intercap_core.capture.frames import Frames
 from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings, digest
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.object_track.absent import NOT_NAMED, SOURCE, absent_track
 from intercap_core.object_track.constants import TOLD_SHARE, TRACKING_FACES
 from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.object_track.proposals import NotFound
@@ -33,15 +34,20 @@ def run(
     detections: Path,
     person: Path,
     output: Path,
-    object_: ObjectEntry,
+    object_: ObjectEntry | None,
     settings: ObjectTrackSettings,
     initial: InitialObjectPose | None = None,
 ) -> None:
     """Track the object through the recording and write the object_track artefact.
 
-    The start is ``initial`` where annotated, else searched for. Raises UserError where the mesh
+    Where ``object_`` is None, a person alone, it says so: lost in every frame, without a pose. The
+    start is ``initial`` where annotated, else searched for. Raises UserError where the mesh
     or an input artefact is unusable, or no frame shows anything that could be the object.
     """
+    if object_ is None:
+        with Frames.open(frames) as recording:
+            _write_absent(output, recording, "", [NOT_NAMED], settings)
+        return
     mesh = ObjectMesh.load(object_)
     simple = mesh.simplified(TRACKING_FACES)
     with Frames.open(frames) as recording:
@@ -77,8 +83,9 @@ def run(
             raise UserError(
                 f"sequence {sequence}: object {object_.name!r} was found in no frame (no "
                 "segmentation candidate, with depth or in two views, fits its size; labels "
-                f"expected: {', '.join(object_.labels) or 'any'}); check the candidates, or "
-                f"annotate 'object_pose'{'. Note: '.join(['', *filter(None, doubts)])}"
+                f"expected: {', '.join(object_.labels) or 'any'}); check the candidates, "
+                "annotate 'object_pose', or clear the column 'object' where there is none"
+                f"{'. Note: '.join(['', *filter(None, doubts)])}"
             ) from None
         names = list(recording.rig.names)
     told = [*(doubt for doubt in doubts if doubt), *track.doubts]
@@ -96,6 +103,30 @@ def run(
         doubts="; ".join(told),
     ) as writer:
         for key, values in _datasets(track, source.cameras, len(names)).items():
+            writer.put(key, values)
+        writer.put("camera_names", names)
+
+
+def _write_absent(
+    output: Path,
+    recording: Frames,
+    name: str,
+    doubts: list[str],
+    settings: ObjectTrackSettings,
+) -> None:
+    """Write that there is no object, with the reasons."""
+    names = list(recording.rig.names)
+    with artefacts.write(
+        output,
+        OBJECT_TRACK,
+        settings_digest=digest(settings),
+        sequence=recording.sequence,
+        object=name,
+        seed_frame=-1,
+        seed_source=SOURCE,
+        doubts="; ".join(doubts),
+    ) as writer:
+        for key, values in absent_track(recording.num_sets, len(names)).items():
             writer.put(key, values)
         writer.put("camera_names", names)
 

@@ -27,7 +27,7 @@ def make_capture(
     settings: StudioSettings,
     *,
     sequence: str,
-    objects: ObjectEntry,
+    objects: ObjectEntry | None,
     output: Path,
 ) -> None:
     """Write the folder of one capture.
@@ -35,9 +35,9 @@ def make_capture(
     Holds the recordings and calibration in the layout of ``capture``,
     keypoints/<camera>/<image>_keypoints.json, candidates/<camera>.json, truth.h5, annotation.yaml
     if ``capture.annotate``, and last capture.json, the sorted list of the files with their SHA-256.
-    ``objects`` is the tracked object's entry. The same arguments give the same bytes. Raises
-    UserError for a subject, interaction, object or fault that the studio does not have, and for an
-    ``output`` that holds something else.
+    ``objects`` is the tracked object's entry, None of a person alone. The same arguments give the
+    same bytes. Raises UserError for a subject, interaction, object or fault that the studio does
+    not have, and for an ``output`` that holds something else.
     """
     output = Path(output)
     if output.exists():
@@ -53,7 +53,7 @@ def make_capture(
     stage = Stage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
     detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
-    segmenter = Segmenter(stage.noise, stage.frames, objects.name)
+    segmenter = Segmenter(stage.noise, stage.frames, stage.thing.name)
     recorded = [
         Kinect(stage, index, settings.colour_mode).record(folder, detector, segmenter)
         for index in range(len(stage.rig.true))

@@ -122,10 +122,11 @@ class Kinect:
                 files.write(Shot(t, self.device_time_us(t), jpeg, recorded_depth, inertial))
                 hidden[t] = _hidden(cast, colour_view, points[t])
                 seen[t] = int((cast.identity == OBJECT).sum())
-                same = order and np.array_equal(
-                    surfaces[1].stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
-                )
-                whole[t] = whole[self.sets[order - 1]] if same else colour_view.count(surfaces[1])
+                for thing in surfaces[1:]:
+                    same = order and np.array_equal(
+                        thing.stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
+                    )
+                    whole[t] = whole[self.sets[order - 1]] if same else colour_view.count(thing)
                 truth = Labels(
                     cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1), blur[t]
                 )
@@ -189,17 +190,17 @@ def surfaces_at(
     moment: Moment,
     t: int,
     colours: np.ndarray,
-) -> tuple[Surface, Surface]:
-    """The clothed body and the object at one moment."""
+) -> list[Surface]:
+    """The clothed body and the object, where there is one, at one moment."""
     clothed, thing, subject = moment.clothed[t], stage.thing, stage.subject
     normals = subject.normals(clothed[None])[0]
-    return (
-        Surface(clothed, subject.faces.astype(np.int32), normals, colours, np.eye(4)),
-        Surface(
-            thing.vertices, thing.faces, stage.thing_normals, thing.colours,
-            moment.stage_from_object[t],
-        ),
-    )  # fmt: skip
+    surfaces = [Surface(clothed, subject.faces.astype(np.int32), normals, colours, np.eye(4))]
+    if thing:
+        pose = moment.stage_from_object[t]
+        surfaces.append(
+            Surface(thing.vertices, thing.faces, stage.thing_normals, thing.colours, pose)
+        )
+    return surfaces
 
 
 def _blur_px(view: View, times: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -12,7 +12,6 @@ from intercap_core.body.model import BodyModel
 from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
-from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.normals import vertex_normals
 from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.interactions import interaction_named
@@ -38,7 +37,7 @@ SMALL_M = 0.35  # a smaller object may be hidden from most cameras
 class Moment:
     """N moments in the stage frame, metres: ``body`` and ``clothed`` (N, V, 3), ``joints``
     (N, 55, 3), ``tips`` (N, 10, 3) thumb to little finger, left then right, ``pelvis`` (N, 3, 3)
-    stage_from_rest rotations, ``stage_from_object`` (N, 4, 4)."""
+    stage_from_rest rotations, ``stage_from_object`` (N, 4, 4), NaN where there is no object."""
 
     body: np.ndarray
     clothed: np.ndarray
@@ -58,9 +57,9 @@ class Stage:
         self,
         capture: StudioCapture,
         settings: StudioSettings,
-        entry: ObjectEntry,
+        entry: ObjectEntry | None,
     ) -> None:
-        check_capture(capture, settings, entry.name)
+        check_capture(capture, settings, None if entry is None else entry.name)
         self.depth_mode, self.has_depth = settings.depth_mode, capture.depth
         self.frames, self.fps = capture.frames, settings.fps
         self.duration = capture.frames / settings.fps
@@ -73,18 +72,10 @@ class Stage:
         )
         self.subject = Subject.load(capture.subject)
         self.puppet = Puppet(self.subject)
-        vertices, faces, colours = true_mesh(entry, capture.seed)
-        rng = self.noise.rng("look")
-        any_look = LOOKS[rng.integers(len(LOOKS))]
-        self.look = any_look if capture.look == "random" else capture.look
-        self.thing = TrueObject(
-            entry.name,
-            vertices,
-            faces,
-            object_colours(self.look, vertices, colours / 255.0, rng),
-            DistanceField(vertices, faces, threads=1),
-        )
-        self.bounds = np.stack([vertices.min(0), vertices.max(0)])
+        self.thing = TrueObject.nothing() if entry is None else self._thing(entry, capture)
+        corners = self.thing.vertices
+        self.bounds = np.stack([corners.min(0, initial=np.inf), corners.max(0, initial=-np.inf)])
+        size = float(np.ptp(self.bounds, 0).max())
         kind = interaction_named(capture.interaction)
         self.interaction = kind(self.puppet, self.thing, self.noise.rng("script"))
         rng = self.noise.rng("room")
@@ -120,8 +111,21 @@ class Stage:
             furniture,
             eyes[:, :2, 3],
             furnishing=self.furnishing,
-            twin=Twin(vertices, faces),
-            hidden=self._highlight() if np.ptp(self.bounds, 0).max() < SMALL_M else None,
+            twin=Twin(corners, self.thing.faces) if self.thing else None,
+            hidden=self._highlight() if self.thing and size < SMALL_M else None,
+        )
+
+    def _thing(self, entry: ObjectEntry, capture: StudioCapture) -> TrueObject:
+        """The object as it truly is in this capture."""
+        vertices, faces, colours = true_mesh(entry, capture.seed)
+        rng = self.noise.rng("look")
+        by_chance = LOOKS[rng.integers(len(LOOKS))]
+        look = by_chance if capture.look == "random" else capture.look
+        return TrueObject(
+            entry.name,
+            vertices,
+            faces,
+            object_colours(look, vertices, colours / 255.0, rng),
         )
 
     def _highlight(self) -> np.ndarray:
@@ -154,7 +158,7 @@ class Stage:
         stage_from_object = place @ played.stage_from_object
         posed = self.puppet.skin(world, pelvis)
         body, clothed = posed.vertices.copy(), posed.clothed.copy()
-        for n in range(len(times)):
+        for n in range(len(times) if self.thing else 0):
             for points in (body, clothed):
                 points[n] = press_out(
                     points[n], self.thing.surface, stage_from_object[n], self.bounds
@@ -184,13 +188,17 @@ class Stage:
         return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-def check_capture(capture: StudioCapture, settings: StudioSettings, object_name: str) -> None:
+def check_capture(
+    capture: StudioCapture, settings: StudioSettings, object_name: str | None
+) -> None:
     """Raise UserError for a subject, interaction, object or fault that the studio cannot play."""
     kind = interaction_named(capture.interaction)
-    if object_name != kind.object_class:
+    if (object_name or "") != kind.object_class:
+        needed = f"object {kind.object_class!r}" if kind.object_class else "no object"
+        found = "none" if object_name is None else repr(object_name)
         raise UserError(
-            f"studio: interaction {capture.interaction!r} needs object {kind.object_class!r}, "
-            f"the sequence has {object_name!r}; correct the sequence's object"
+            f"studio: interaction {capture.interaction!r} needs {needed}, the sequence has "
+            f"{found}; correct the sequence's object"
         )
     if settings.fps > FASTEST_KINECT and capture.layout != "plain":
         raise UserError(

@@ -65,11 +65,12 @@ def write_truth(
         file.put("correspondence_weights", stage.subject.fitted_bary)
         file.put("joints", stage.to_master(moment.joints))
         file.put("fingertips", stage.to_master(moment.tips))
-        file.put("object_vertices", stage.thing.vertices)
-        file.put("object_faces", stage.thing.faces)
-        file.put("rotation", pose[:, :3, :3])
-        file.put("translation", pose[:, :3, 3])
-        file.put("object_views", views.sum(1))
+        if stage.thing:
+            file.put("object_vertices", stage.thing.vertices)
+            file.put("object_faces", stage.thing.faces)
+            file.put("rotation", pose[:, :3, :3])
+            file.put("translation", pose[:, :3, 3])
+            file.put("object_views", views.sum(1))
         file.put("region_names", CONTACT_REGIONS)
         file.put("region_contact", contact)
         file.put("camera_names", rig.true.names)
@@ -81,7 +82,8 @@ def write_truth(
         file.put("depth_recorded", np.stack([camera.depth for camera in recorded], 1))
         file.put("ground_normal", normal)
         file.put("body_visible", body_visible)
-        file.put("object_visible", object_visible)
+        if stage.thing:
+            file.put("object_visible", object_visible)
     return contact
 
 
@@ -95,6 +97,8 @@ def region_contact(stage: Stage, moment: Moment) -> np.ndarray:
     """(T, R): some point of the region is within ``CONTACT_M`` of the object."""
     regions = stage.fitted.regions
     result = np.zeros((len(moment.body), len(CONTACT_REGIONS)), bool)
+    if not stage.thing:
+        return result
     for t, pose in enumerate(moment.stage_from_object):
         points = stage.subject.on_fitted_topology(moment.body[t : t + 1])[0]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -113,14 +117,14 @@ def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
     stage_from_master = np.linalg.inv(stage.rig.master_from_stage)
     for t, pose in enumerate(moment.stage_from_object):
         moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
+        drawn = [(moved, thing.faces)] if thing else []
         points = np.concatenate([moment.clothed[t], moved])
         normals = np.concatenate(
             [stage.subject.normals(moment.clothed[t][None])[0],
              stage.thing_normals @ pose[:3, :3].T]
         )  # fmt: skip
         room = stage.room
-        scene = scene_of((moment.clothed[t], faces), (moved, thing.faces),
-                         (room.vertices, room.faces))  # fmt: skip
+        scene = scene_of((moment.clothed[t], faces), *drawn, (room.vertices, room.faces))
         for camera in stage.rig.true:
             place = stage_from_master @ camera.master_from_colour
             to_eye = place[:3, 3] - points
@@ -157,6 +161,8 @@ def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict
     for angle in np.arange(4) * np.pi / 2 + rng.uniform(0, 1):
         point = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0])
         floor.append((stage.to_master(point) + off(ANNOTATION_ERROR_M)).round(5).tolist())
+    if not stage.thing:
+        return {"floor": floor}
     return {
         "contact": intervals,
         "object_pose": {

@@ -98,14 +98,18 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
         within,
         judged,
         _at_person(judged.keypoint_px, result, points[Part.BODY]),
-        {part: np.stack([_rms(other[part] - points[part]) for other in moved]) for part in Part},
-        {part: _rms(halves[part] - points[part]) for part in Part},
+        {
+            part: np.stack([_rms(other[part] - at) for other in moved])
+            for part, at in points.items()
+        },
+        {part: _rms(halves[part] - at) for part, at in points.items()},
     )
 
 
 def _hold_fixed(assembly: Assembly, result: JointResult) -> None:
     """Cameras, time offsets and contact as the result has them."""
-    assembly.contact.take_probability(result.probability)
+    if assembly.contact is not None:
+        assembly.contact.take_probability(result.probability)
     assembly.body.refresh(result.state)
     assembly.body.take_offsets(result.time_offset)
     assembly.object_.take_offsets(result.time_offset)
@@ -152,12 +156,16 @@ def _taken(states: list[State], which: np.ndarray) -> State:
 
 
 def _points(inputs: JointInputs, state: State) -> dict[Part, np.ndarray]:
-    """What is compared of each part (T, K, 3): joints, the object's centre of mass."""
+    """What is compared of each part (T, K, 3): joints and, where there is one, the object's centre
+    of mass."""
     with torch.no_grad():
         posed = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
     joints = posed.joints.double().cpu().numpy()
-    centre = state.rotation @ inputs.geometry.mesh.centre_of_mass + state.translation
-    return {**{part: joints[:, at] for part, at in JOINTS.items()}, Part.OBJECT: centre[:, None]}
+    found = {part: joints[:, at] for part, at in JOINTS.items()}
+    if inputs.geometry.has_object:
+        centre = state.rotation @ inputs.geometry.mesh.centre_of_mass + state.translation
+        found[Part.OBJECT] = centre[:, None]
+    return found
 
 
 def _rms(shift: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ Values = dict[str, np.ndarray | list[str]]
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """Of T frames and C cameras: what was held out, None where nothing could be, and what is stated
-    of each part."""
+    of each part: not of an object where there is none."""
 
     cameras: tuple[str, ...]
     frames: int
@@ -50,7 +50,7 @@ class Verdict:
         object_track: Path,
         body_fit: Path,
         joint: Path,
-        object_: ObjectEntry,
+        object_: ObjectEntry | None,
         body_models: BodyModels,
         settings: JointSettings,
         body_settings: BodyFitSettings,
@@ -78,9 +78,10 @@ class Verdict:
         ) as inputs:
             held = hold_out(inputs, settings, result)
             sequential = inputs.sequential
+            parts = [part for part in Part if part != Part.OBJECT or inputs.geometry.has_object]
         stated = {
             part: state(held, part, _sigma(sequential, part), _known(sequential, part))
-            for part in Part
+            for part in parts
         }
         for part, said in stated.items():
             if said.silent:
@@ -94,7 +95,7 @@ class Verdict:
 
     def values(self) -> Values:
         """As the metrics artefact holds them, without their prefix."""
-        parts = list(Part)
+        parts = list(self.stated)
         said = [self.stated[part] for part in parts]
         values: Values = {
             "part_names": [str(part) for part in parts],

@@ -20,16 +20,25 @@ from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.fit import Assembly
 from intercap_core.joint.minimise import limited
 from intercap_core.joint.state import BODY, OBJECT, State
+from intercap_core.joint.terms.body_data import BodyData
+from intercap_core.joint.terms.no_object import NoObject
+from intercap_core.joint.terms.object_data import ObjectData
+from intercap_core.joint.terms.object_images import ObjectImagesData
 
 
 class Refits:
     """Refits around one ``state``, at which the ``assembly``'s terms were refreshed."""
 
     def __init__(self, assembly: Assembly, state: State) -> None:
-        self._body, self._object, self.state = assembly.body, assembly.object_, state
+        self.state = state
+        self._seen: list[tuple[slice, BodyData | ObjectData | ObjectImagesData]] = [
+            (BODY, assembly.body)
+        ]
+        if not isinstance(assembly.object_, NoObject):
+            self._seen.append((OBJECT, assembly.object_))
         self._rest = NormalEquations(len(state), assembly.problem.threads)
         for term in assembly.problem.terms:
-            if term is not self._body and term is not self._object:
+            if not any(term is seen for _, seen in self._seen):
                 term.add(state, self._rest)
         every = np.ones((len(state), len(assembly.body.time_offset)), bool)
         self._descent = self._step(every)
@@ -40,7 +49,7 @@ class Refits:
 
     def _step(self, used: np.ndarray) -> np.ndarray:
         equations = self._rest.copy()
-        for columns, term in ((BODY, self._body), (OBJECT, self._object)):
+        for columns, term in self._seen:
             equations.add_blocks(term.name, columns, *term.of_views(used, self.state))
         step = equations.step(np.full(len(self.state), MIN_DAMPING))
         if step is None:  # nothing holds some parameter: no step tells anything

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import torch
 import yaml
@@ -34,6 +35,7 @@ from intercap_core.config import (
     SubjectEntry,
 )
 from intercap_core.energy.body_samples import COVERINGS
+from intercap_core.object_track.absent import SOURCE, absent_track
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import render_scene
 from intercap_core.rigid.shots import Drawable, Rendering
@@ -166,6 +168,27 @@ def make_capture(
     _write_fits(capture, params, name)
     _write_truth(capture, tips, name)
     return capture
+
+
+def take_object_away(capture: Capture) -> None:
+    """Make the capture one of a person alone: artefacts up to joint, and the truth."""
+    total, count = len(capture.vertices), len(capture.rig)
+    with h5py.File(capture.paths["object_track"], "r+") as file:
+        file.attrs["object"], file.attrs["seed_source"] = "", SOURCE
+        for key, values in absent_track(total, count).items():
+            file[key][...] = values
+    with h5py.File(capture.paths["joint"], "r+") as file:
+        file.attrs["object"] = ""
+        for key in ("rotation", "translation", "contact_probability"):
+            file[key][...] = np.nan
+    with h5py.File(capture.paths["truth"], "r+") as file:
+        file.attrs["object"] = ""
+        file["region_contact"][...] = False
+        for key in (
+            "object_vertices", "object_faces", "object_views", "object_visible", "rotation",
+            "translation",
+        ):  # fmt: skip
+            del file[key]
 
 
 def write_project(folder: Path, capture: Capture, name: str) -> Path:

@@ -45,9 +45,9 @@ def existing(*paths):
 
 
 def of_sequence(wildcards):
-    """The sequence's row, its object and its subject."""
+    """The sequence's row, its object (None = a person alone) and its subject."""
     row = PROJECT.sequences[wildcards.sequence]
-    return row, PROJECT.objects[row.object], PROJECT.subjects[row.subject]
+    return row, PROJECT.object_of(wildcards.sequence), PROJECT.subjects[row.subject]
 
 
 def made_by_studio(wildcards, name):
@@ -118,7 +118,7 @@ def artefacts_read(stage):
 def object_files(wildcards):
     """Input function: the object's mesh and contact vertices."""
     _, tracked, _ = of_sequence(wildcards)
-    return existing(tracked.mesh, tracked.contact_vertices)
+    return [] if tracked is None else existing(tracked.mesh, tracked.contact_vertices)
 
 
 def body_file(wildcards):
@@ -161,7 +161,9 @@ def annotation_of(*sections):
 
 
 def entry_of_object(name):
-    """An object's entry without its files, which are inputs."""
+    """An object's entry without its files, which are inputs; None of no object."""
+    if name is None:
+        return None
     entry = PROJECT.objects[name]
     return entry.model_dump(mode="json", exclude={"mesh", "contact_vertices"})
 
@@ -173,10 +175,9 @@ def tracked_object(wildcards):
 
 def all_entries():
     """Param: digest of every object's and subject's entry that the sequences use."""
-    objects = {PROJECT.sequences[name].object for name in SEQUENCES}
     subjects = {PROJECT.sequences[name].subject for name in SEQUENCES}
     return digest(
-        [[entry_of_object(name) for name in sorted(objects)], sorted(subjects)]
+        [[entry_of_object(name) for name in PROJECT.objects_named()], sorted(subjects)]
     )
 
 

@@ -49,12 +49,15 @@ def release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
 class BehaveFiles:
     """Keypoints and masks beside BEHAVE's images, by the time of the image, microseconds.
 
-    The masks are of one person and of the sequence's object, which is given ``object_label``.
+    The masks are of one person and of the sequence's object, which is given ``object_label``; None
+    leaves them out.
     """
 
-    def __init__(self, recordings: Path, object_label: str) -> None:
+    def __init__(self, recordings: Path, object_label: str | None) -> None:
         self._folders = frame_folders(recordings) if recordings.is_dir() else {}
-        self._labels = {BEHAVE_PERSON: PERSON_LABEL, BEHAVE_OBJECT: object_label}
+        self._labels = {BEHAVE_PERSON: PERSON_LABEL}
+        if object_label is not None:
+            self._labels[BEHAVE_OBJECT] = object_label
 
     def keypoints(self, time_us: int, camera: str) -> Path | None:
         """The keypoint file of one image, None = there is none."""

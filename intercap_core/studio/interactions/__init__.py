@@ -16,6 +16,7 @@ from intercap_core.studio.interactions.stool_sit import StoolSit
 from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
 from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
 from intercap_core.studio.interactions.toolbox_carry import ToolboxCarry
+from intercap_core.studio.interactions.walk_and_wave import WalkAndWave
 
 INTERACTIONS: dict[str, type[Interaction]] = {
     "suitcase_carry": SuitcaseCarry,
@@ -37,6 +38,7 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "stool_sit": StoolSit,
     "chair_sit": ChairSit,
     "toolbox_carry": ToolboxCarry,
+    "walk_and_wave": WalkAndWave,
 }
 
 

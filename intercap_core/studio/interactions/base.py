@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -23,7 +24,21 @@ class TrueObject:
     vertices: np.ndarray
     faces: np.ndarray
     colours: np.ndarray
-    surface: DistanceField
+
+    @classmethod
+    def nothing(cls) -> TrueObject:
+        """What a person alone handles: a mesh without a face."""
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+        return cls("", vertices, faces, vertices)
+
+    def __bool__(self) -> bool:
+        """Whether there is an object."""
+        return len(self.faces) > 0
+
+    @cached_property
+    def surface(self) -> DistanceField:
+        """Distances to it."""
+        return DistanceField(self.vertices, self.faces, threads=1)
 
     @property
     def standing_height(self) -> float:
@@ -52,7 +67,8 @@ class Box:
 
 @dataclass(frozen=True)
 class Performance:
-    """N moments: joint rotations (N, 55, 3, 3), pelvis (N, 3), stage_from_object (N, 4, 4)."""
+    """N moments: joint rotations (N, 55, 3, 3), pelvis (N, 3), stage_from_object (N, 4, 4), NaN
+    where there is no object."""
 
     world: np.ndarray
     pelvis: np.ndarray
@@ -61,7 +77,7 @@ class Performance:
 
 @dataclass
 class Interaction(ABC):
-    """One script for one person and one object.
+    """One script for one person and one object, or none where ``object_class`` is "".
 
     Script time runs from 0 to ``SCRIPT_S``. ``centre`` is the middle of the action on the floor,
     in the script's frame: z up, the floor at z = 0. ``highlight`` is the script time around which a

@@ -1,0 +1,168 @@
+"""A virtual recording of a person alone, taken from the studio through every stage."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core.commands.check import faults_of_sequences
+from intercap_core.commands.closeups import draw_closeups
+from intercap_core.commands.inspect import print_summary
+from intercap_core.errors import UserError
+from intercap_core.pipeline.step import run_dataset, run_step, run_studio
+from intercap_core.posed import open_sequence
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+
+NAME = "alone"
+ROW = (
+    "alone\ts04\t\tresults/trial/recordings/alone\tresults/trial/recordings/alone/calibration.json"
+    "\tresults/trial/recordings/alone/keypoints\tresults/trial/recordings/alone/candidates"
+    "\tresults/trial/recordings/alone/truth.h5\n"
+)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """Every stage has run."""
+    folder = tmp_path_factory.mktemp("alone")
+    (folder / "config.yaml").write_text(
+        "dataset: trial\n"
+        f"results: {folder / 'results'}\n"
+        "body_fit: {points_per_frame: 300}\n"
+        "report: {cameras: 1, frames: 1}\n"
+        "studio: {colour_mode: 720P, cameras: 2, captures: {alone: "
+        "{interaction: walk_and_wave, subject: s04, seed: 31, frames: 6, annotate: true}}}\n"
+    )
+    (folder / "objects.yaml").write_text("")
+    (folder / "subjects.tsv").write_text("subject\tgender\ns04\tmale\n")
+    (folder / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\tkeypoints\tcandidates\ttruth\n" + ROW
+    )
+    project = load_project(folder / "config.yaml")
+    assert not faults_of_sequences(project)
+    run_studio(project, NAME)
+    for stage in STAGES:
+        inputs = {name: project.artefact(NAME, name) for name in STAGES[stage].reads}
+        run_step(stage, project, NAME, inputs=inputs, output=project.artefact(NAME, stage))
+    run_dataset(project)
+    return project
+
+
+def _open(project: Project, stage: str) -> h5py.File:
+    return h5py.File(project.artefact(NAME, stage))
+
+
+def test_no_stage_says_anything_of_an_object(project: Project) -> None:
+    with _open(project, "object_track") as track, _open(project, "joint") as joint:
+        assert (track.attrs["object"], track.attrs["seed_source"]) == ("", "none")
+        assert "names no object" in track.attrs["doubts"]
+        assert track["lost"][()].all() and (track["candidate"][()] == -1).all()
+        for file in (track, joint):
+            assert np.isnan(file["rotation"]).all() and np.isnan(file["translation"]).all()
+        assert joint.attrs["object"] == "" and np.isnan(joint["contact_probability"]).all()
+    with _open(project, "metrics") as metrics:
+        told = {*metrics, *metrics["truth"], *metrics["truth/joint"]}
+        told.discard("ground_penetration")
+        of_object = ("object", "contact", "penetration", "slip")
+        assert not [key for key in told if any(word in key for word in of_object)]
+
+
+def test_the_body_is_fitted_with_its_own_terms(project: Project) -> None:
+    with _open(project, "joint") as joint:
+        terms = {name.decode() for name in joint["energy_names"]}
+        assert terms == {"body_data", "body_drift", "body_motion", "ground", "plant"}
+        before, after = (joint[f"energy_{when}"][()].sum() for when in ("before", "after"))
+        assert joint.attrs["iterations"] > 0 and after < before
+        assert not joint["flagged"][()].all()
+    with _open(project, "metrics") as metrics:
+        first, last = (metrics[f"truth/{s}/body_pve"][()].mean() for s in ("body_fit", "joint"))
+        assert last < min(0.030, first + 0.001)
+        assert "no images" not in {reason.decode() for reason in metrics["flag_reason"]}
+
+
+def test_files_for_other_tools_hold_the_body(project: Project) -> None:
+    folder = project.artefact(NAME, "export")
+    kinds = {path.name for path in folder.iterdir() if path.is_dir()}
+    assert kinds == {"amass", "glb", "intercap"}
+    assert [path.name for path in (folder / "amass").iterdir()] == ["body.npz"]
+    result = pickle.loads((folder / "intercap" / "res.pkl").read_bytes())
+    assert len(result["transl"]) == 6 and not {"ob_pose", "ob_trans"} & result.keys()
+    text = (folder / "README.txt").read_text()
+    assert "bop is left out" in text and "contact is left out" in text and "mesh" not in text
+    told = json.loads((folder / "export.json").read_text())
+    assert (told["object"], told["formats"]) == ("", ["amass", "glb", "intercap"])
+    data = (folder / "glb" / f"{NAME}.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    assert [mesh["name"] for mesh in json.loads(data[20 : 20 + length])["meshes"]] == ["body"]
+
+
+def test_the_report_leaves_objects_and_contact_out(project: Project) -> None:
+    page = (project.results / "report.html").read_text()
+    for part in ('id="penetration"', 'id="heatmaps"', 'id="tracks"', "in contact</text>", ">nan"):
+        assert part not in page
+    assert "people alone" in page and 'id="bodies"' in page
+    summary = json.loads((project.results / "summary.json").read_text())
+    assert summary["vertex_to_cloud"]["object_mm"] is None
+    assert summary["penetration"]["share_le_5mm"] is None
+    assert "object_track" not in summary["truth"] or not summary["truth"]["object_track"]
+    row = (project.results / "tables" / "sequences.csv").read_text().splitlines()
+    values = dict(zip(row[0].split(","), row[1].split(","), strict=True))
+    assert values["contact_frames"] == values["vertex_to_cloud.object_mm"] == ""
+    assert float(values["joint.body_pve_mm"]) > 0
+
+
+def test_results_are_points_and_pictures_of_the_body(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for stage in ("joint", "body_fit"):
+        found = open_sequence(project, NAME, stage=stage)
+        moment = found.at(2)
+        assert moment.object_.shape == (0, 3) and found.objects().shape == (6, 0, 3)
+        assert moment.body.shape[1] == 3 and abs(moment.body[:, 2].min()) < 0.05
+        assert found.trusted.any()
+    assert draw_closeups(project.path, []) == ([], [NAME])
+    for stage in SEQUENCE_STAGES:
+        print_summary(project.artefact(NAME, stage), verify=True)
+    assert "a person alone" in capsys.readouterr().out
+
+
+def test_the_truth_has_no_object(project: Project) -> None:
+    recordings = project.recordings_made(NAME)
+    assert recordings is not None
+    with h5py.File(recordings / "truth.h5") as truth:
+        assert truth.attrs["object"] == "" and not truth["region_contact"][()].any()
+        assert "rotation" not in truth and "object_vertices" not in truth
+        steps = np.linalg.norm(np.diff(truth["joints"][()], axis=0), axis=-1) * 15
+        assert steps.max() < 4.5  # m/s
+    annotation = project.annotation(NAME)
+    assert annotation.floor and annotation.contact is None and annotation.object_pose is None
+
+
+def test_an_annotation_of_an_object_is_refused(project: Project) -> None:
+    path = project.annotation_path(NAME)
+    kept = path.read_text()
+    try:
+        path.write_text("contact:\n  - {part: left_hand, start: 0, end: 2}\n")
+        with pytest.raises(UserError, match=r"contact is annotated.*names no object.*'alone'"):
+            project.annotation(NAME)
+    finally:
+        path.write_text(kept)
+
+
+def test_a_script_and_an_object_must_fit(project: Project, tmp_path: Path) -> None:
+    text = (project.path.parent / "sequences.tsv").read_text()
+    mesh = Path(__file__).resolve().parents[2] / "config" / "objects" / "09_cup.ply"
+    for name in ("config.yaml", "subjects.tsv"):
+        (tmp_path / name).write_text((project.path.parent / name).read_text())
+    (tmp_path / "objects.yaml").write_text(f"cup: {{mesh: {mesh}}}\n")
+    root = project.path.parent
+    text = text.replace("s04\t\t", "s04\tcup\t").replace("results/trial", f"{root}/results/trial")
+    (tmp_path / "sequences.tsv").write_text(text)
+    told = [str(fault) for fault in faults_of_sequences(load_project(tmp_path / "config.yaml"))]
+    assert any("needs no object, the sequence has 'cup'" in line for line in told)
