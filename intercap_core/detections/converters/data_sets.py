@@ -55,7 +55,7 @@ class BehaveFiles:
 
     def __init__(self, recordings: Path, object_label: str | None) -> None:
         self._folders = frame_folders(recordings) if recordings.is_dir() else {}
-        self._labels = {BEHAVE_PERSON: PERSON_LABEL}
+        self._labels: dict[tuple[str, ...], str] = {BEHAVE_PERSON: PERSON_LABEL}
         if object_label is not None:
             self._labels[BEHAVE_OBJECT] = object_label
 
