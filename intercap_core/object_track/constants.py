@@ -368,6 +368,10 @@ LABELS_TOLD = 8  # labels named in a warning
 # more: of so small an object it is not told. Those that are so much worse at the track's own poses
 # are not fitted.
 CHECK_FRAMES, CHECK_SCALES, CHECK_GAIN, CHECK_HOPELESS = 6, (0.9, 1.1), 8.0, 10.0
+# Nats of all believed frames together, as so many independent looks as they are, below which the
+# track is of nothing: what a detector takes for the object now and then reaches 8, the least of
+# objects that are there, a cup behind a hand without depth, some 25. Tuned on the studio.
+NOTHING_LOG_RATIO = 12.0
 # Nats of half of the frames, below which the mesh is hardly that object: wrong meshes of like size
 # have 5 to 19, right ones 40 to 100, a cup at twice the noise 14. Tuned on the studio.
 LIKENESS_LOG_RATIO = 10.0

@@ -24,6 +24,7 @@ from intercap_core.object_track.constants import (
     GONE_PROBABILITY,
     LOST_PROBABILITY,
     MOTION_ROUNDS,
+    NOTHING_LOG_RATIO,
     ROUNDS,
     SEEN_LOG_RATIO,
 )
@@ -48,14 +49,22 @@ from intercap_core.rigid.twist import step_between
 @dataclass(frozen=True)
 class Track:
     """All frames (T), the frame that the track started from and how its pose was found:
-    ``borne_out``, whether the images support the annotation. ``doubts`` say in words what speaks
+    ``borne_out``, whether the images support the annotation. ``evidence``: nats that the images of
+    all believed frames say for it, as independent looks. ``doubts`` say in words what speaks
     against the mesh."""
 
     frames: list[FrameResult]
     seed_frame: int
     annotated: bool
+    evidence: float
     borne_out: bool = True
     doubts: tuple[str, ...] = ()
+
+    @property
+    def of_nothing(self) -> bool:
+        """Whether the images say too little for there to be an object at all, which nobody who has
+        annotated its pose is asked."""
+        return not self.annotated and self.evidence < NOTHING_LOG_RATIO
 
 
 class Tracker:
@@ -124,8 +133,9 @@ class Tracker:
         )
         refined = WholeTrack(self._observer, self._times, self._share).refine(frames)
         final = flagged(self._mesh, refined)
+        evidence = self._share * sum(frame.fit.log_ratio for frame in final if not frame.lost)
         doubts = mesh_doubts(self._observer, final)
-        return Track(final, seed, initial is not None, borne_out, tuple(doubts))
+        return Track(final, seed, initial is not None, evidence, borne_out, tuple(doubts))
 
     def _look(self, decoded: Decoded) -> Decoded:
         """Decide anew until nothing more is found in the frames in doubt."""

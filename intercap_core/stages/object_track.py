@@ -15,7 +15,7 @@ from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSett
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.object_track.absent import NOT_NAMED, SOURCE, absent_track
-from intercap_core.object_track.constants import TOLD_SHARE, TRACKING_FACES
+from intercap_core.object_track.constants import NOTHING_LOG_RATIO, TOLD_SHARE, TRACKING_FACES
 from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.recording import ObjectRecording
@@ -40,9 +40,9 @@ def run(
 ) -> None:
     """Track the object through the recording and write the object_track artefact.
 
-    Where ``object_`` is None, a person alone, it says so: lost in every frame, without a pose. The
-    start is ``initial`` where annotated, else searched for. Raises UserError where the mesh
-    or an input artefact is unusable, or no frame shows anything that could be the object.
+    Where ``object_`` is None, a person alone, or the images show nothing of it, it says so: lost in
+    every frame, without a pose. The start is ``initial`` where annotated, else searched for. Raises
+    UserError where the mesh or an input artefact is unusable.
     """
     if object_ is None:
         with Frames.open(frames) as recording:
@@ -79,14 +79,21 @@ def run(
         )
         try:
             track = tracker.run(_start(initial, recording.num_sets, sequence))
+            nothing = _nothing(track)
         except NotFound:
-            raise UserError(
-                f"sequence {sequence}: object {object_.name!r} was found in no frame (no "
-                "segmentation candidate, with depth or in two views, fits its size; labels "
-                f"expected: {', '.join(object_.labels) or 'any'}); check the candidates, "
-                "annotate 'object_pose', or clear the column 'object' where there is none"
-                f"{'. Note: '.join(['', *filter(None, doubts)])}"
-            ) from None
+            nothing = (
+                "it was found in no frame (no segmentation candidate, with depth or in two views, "
+                f"fits its size; labels expected: {', '.join(object_.labels) or 'any'})"
+            )
+        if nothing:
+            nothing += (
+                ": no frame has a pose of it; check the candidates, annotate 'object_pose', or "
+                "clear the column 'object' where there is none"
+            )
+            log.warning("sequence %s: object %r: %s", sequence, object_.name, nothing)
+            told = [nothing, *filter(None, doubts)]
+            _write_absent(output, recording, object_.name, told, settings)
+            return
         names = list(recording.rig.names)
     told = [*(doubt for doubt in doubts if doubt), *track.doubts]
     for doubt in track.doubts:
@@ -105,6 +112,20 @@ def run(
         for key, values in _datasets(track, source.cameras, len(names)).items():
             writer.put(key, values)
         writer.put("camera_names", names)
+
+
+def _nothing(track: Track) -> str:
+    """Why the track is not believed in any frame, "" = it is in some."""
+    believed = sum(not frame.lost for frame in track.frames)
+    if believed == 0:
+        return "its track is lost in every frame"
+    if track.of_nothing:
+        return (
+            f"what was tracked in {believed} of {len(track.frames)} frames is not believed, as all "
+            f"images together hardly show it ({track.evidence:.0f} nats, expected "
+            f"{NOTHING_LOG_RATIO:.0f} and more)"
+        )
+    return ""
 
 
 def _write_absent(

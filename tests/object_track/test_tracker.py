@@ -319,8 +319,34 @@ def test_stage_says_what_is_wrong(written, tmp_path):
             **written, output=tmp_path / "x.h5", object_=entry, settings=SETTINGS,
             initial=InitialObjectPose(frame=99, rotation_vector=(0, 0, 0), translation=(0, 0, 2)),
         )  # fmt: skip
-    with pytest.raises(UserError, match="'cup' was found in no frame"):
-        object_track.run(
-            **written, output=tmp_path / "x.h5", object_=entry, settings=SETTINGS, initial=None
-        )
     assert not (tmp_path / "x.h5").exists()
+
+
+def test_an_object_that_nothing_shows_is_absent(written, tmp_path, caplog):
+    """A cup looked for where there is a suitcase: no pose, every frame lost, the reason told."""
+    output = tmp_path / "x.h5"
+    object_track.run(**written, output=output, object_=catalogue()["cup"], settings=SETTINGS)
+    with artefacts.read(output, OBJECT_TRACK) as track:
+        told = track.attributes
+        assert (told["object"], told["seed_source"], told["seed_frame"]) == ("cup", "none", -1)
+        assert "it was found in no frame" in told["doubts"] and "annotate" in told["doubts"]
+        assert track["lost"].all() and (track["candidate"] == -1).all()
+        assert np.isnan(track["rotation"]).all() and np.isnan(track["translation"]).all()
+    assert "object 'cup': it was found in no frame" in caplog.text
+
+
+def test_a_track_that_hardly_any_image_shows_is_not_believed(
+    written, tmp_path, caplog, monkeypatch
+):
+    """The suitcase's own track, once more evidence is asked for than its few frames hold."""
+    monkeypatch.setattr("intercap_core.object_track.tracker.NOTHING_LOG_RATIO", 1e4)
+    entry, output = catalogue()["suitcase"], tmp_path / "x.h5"
+    object_track.run(**written, output=output, object_=entry, settings=SETTINGS)
+    with artefacts.read(output, OBJECT_TRACK) as track:
+        assert track["lost"].all() and track.attributes["object"] == "suitcase"
+        assert "is not believed" in track.attributes["doubts"]
+    assert "hardly show it" in caplog.text
+    given = InitialObjectPose(frame=0, rotation_vector=(0, 0, 0), translation=(0, 0, 2))
+    object_track.run(**written, output=output, object_=entry, settings=SETTINGS, initial=given)
+    with artefacts.read(output, OBJECT_TRACK) as track:  # who annotates it knows that it is there
+        assert not track["lost"].all()

@@ -212,8 +212,11 @@ def test_object_that_nothing_can_place_is_told(objects, tmp_path):
         ("none", Reduction(candidates=[])),
     ):
         paths = reduction.apply(objects["suitcase"].paths, tmp_path / name)
-        with pytest.raises(UserError, match=r"found in no frame .* with depth or in two views"):
-            tracked(paths, tmp_path / name / "object_track.h5")
+        path = tracked(paths, tmp_path / name / "object_track.h5")
+        with artefacts.read(path, OBJECT_TRACK) as track:
+            assert track["lost"].all() and np.isnan(track["translation"]).all()
+            why = str(track.attributes["doubts"])
+            assert "found in no frame" in why and "with depth or in two views" in why
 
 
 def test_object_in_sixteen_views(tmp_path):
