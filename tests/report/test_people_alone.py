@@ -55,6 +55,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
             subject=fitted.SUBJECT,
             body_models=fitted.BODY_MODELS,
             settings=MetricsSettings(),
+            **fitted.OTHER_SETTINGS,
             truth=capture.paths["truth"],
         )
     return made
@@ -90,7 +91,11 @@ def test_the_body_is_measured_alike(measured: dict[str, SequenceMetrics]) -> Non
     assert [s.has_object for s in (held, alone, missed)] == [True, False, False]
     for key in ("body_to_cloud", "truth/joint/body_pve", "truth/joint/planted_speed"):
         np.testing.assert_allclose(alone.values[key], held.values[key], rtol=1e-4)
-    about = {key.rpartition("/")[2].partition("_")[0] for key in alone.values}
+    assert list(held.values["verdict/part_names"]) == ["body", "hands", "object"]
+    for nothing in (alone, missed):
+        assert list(nothing.values["verdict/part_names"]) == ["body", "hands"]
+    judged = {key for key in alone.values if key.startswith("verdict/")}
+    about = {key.rpartition("/")[2].partition("_")[0] for key in alone.values.keys() - judged}
     assert not about & {"object", "contact", "region", "penetration", "vertex"}
 
 
