@@ -52,8 +52,8 @@ class PosedSequence:
     """T frames in one coordinate frame, ``frame_from_master`` (4, 4).
 
     ``faces`` (F, 3) of the body, ``mesh`` the object with its own faces, None where the sequence
-    names none; poses master_from_object ``rotation`` (T, 3, 3) and ``translation`` (T, 3), NaN of an
-    object that was found in no frame; ``times`` (T,) s, ``trusted`` (T,) bool. ``frame`` says in
+    names none; poses master_from_object ``rotation`` (T, 3, 3) and ``translation`` (T, 3), NaN of
+    an object that was found in no frame; ``times`` (T,) s, ``trusted`` (T,) bool. ``frame`` says in
     words which frame it is; for z-up also what turned it upright.
     """
 

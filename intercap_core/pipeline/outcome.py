@@ -14,6 +14,7 @@ import numpy as np
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
+from intercap_core.object_track.absent import SOURCE as NO_TRACK
 
 _SURE = 0.5  # contact that is likelier than not
 
@@ -37,7 +38,8 @@ def notes(stage: str, path: Path) -> list[str]:
             ]
         for name in ("ground_note", "doubts"):
             text = str(artefact.attributes.get(name, ""))
-            found += [text] if text else []
+            alone = name == "doubts" and not artefact.attributes.get("object", name)
+            found += [text] if text and not alone else []
         if stage == "scene" and not artefact.attributes["ground_found"]:
             found.append("no floor was found")
         if stage == "joint" and not artefact.attributes["converged"]:
@@ -111,6 +113,8 @@ def _person(a: Artefact) -> str:
 
 def _object_track(a: Artefact) -> str:
     source = str(a.attributes["seed_source"])
+    if source == NO_TRACK:
+        return f"no object: {a.attributes['doubts']}"
     return (
         f"tracked in {_share(~a['lost'])} frames, {int(a['ambiguous'].sum())} of them ambiguous, "
         f"{int(a['resting'].sum())} at rest; found at frame {a.attributes['seed_frame']} ({source})"
@@ -128,9 +132,12 @@ def _body_fit(a: Artefact) -> str:
 def _joint(a: Artefact) -> str:
     settled = "settled" if a.attributes["converged"] else "ended before it settled"
     touching = int((a["contact_probability"] > _SURE).any(axis=1).sum())
+    contact = f"contact in {touching} of {len(a['flagged'])} frames"
+    if np.isnan(a["contact_probability"]).all():
+        contact = "the body alone, without an object"
     return (
         f"{a.attributes['iterations']} steps, {a.attributes['refused']} refused, {settled}; "
-        f"contact in {touching} of {len(a['flagged'])} frames, "
+        f"{contact}, "
         f"{int(a['flagged'].sum())} not trusted"
     )
 

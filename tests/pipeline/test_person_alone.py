@@ -14,6 +14,7 @@ from intercap_core.commands.check import faults_of_sequences
 from intercap_core.commands.closeups import draw_closeups
 from intercap_core.commands.inspect import print_summary
 from intercap_core.errors import UserError
+from intercap_core.pipeline.outcome import line, notes
 from intercap_core.pipeline.step import run_dataset, run_step, run_studio
 from intercap_core.posed import open_sequence
 from intercap_core.project import Project, load_project
@@ -84,6 +85,13 @@ def test_the_body_is_fitted_with_its_own_terms(project: Project) -> None:
         first, last = (metrics[f"truth/{s}/body_pve"][()].mean() for s in ("body_fit", "joint"))
         assert last < min(0.030, first + 0.001)
         assert "no images" not in {reason.decode() for reason in metrics["flag_reason"]}
+
+
+def test_what_is_said_of_the_stages(project: Project) -> None:
+    said = {stage: line(stage, project.artefact(NAME, stage)) for stage in SEQUENCE_STAGES}
+    assert said["object_track"].startswith("no object: the sequence names no object")
+    assert "the body alone, without an object" in said["joint"] and "contact" not in said["joint"]
+    assert not notes("object_track", project.artefact(NAME, "object_track"))  # as was asked for
 
 
 def test_files_for_other_tools_hold_the_body(project: Project) -> None:
