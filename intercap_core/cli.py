@@ -62,7 +62,7 @@ FIELD_SCENE_SETTINGS = [
 ]
 FIELD_SETTINGS = [
     Path("config/evaluation/config.yaml"),
-    *(Path(f"config/field/{name}.yaml") for name in ("no_depth", "two_views")),
+    *(Path(f"config/field/{name}.yaml") for name in ("no_depth", "two_views", "alone")),
 ]
 OBJECT_SETTINGS = [
     Path(f"config/object/{name}.yaml")

@@ -71,7 +71,7 @@ STAGES: dict[str, Stage] = {
         Stage(
             "export",
             "Files for other tools: InterCap, AMASS, BOP, glb.",
-            ("joint", "scene"),
+            ("joint", "scene", "metrics"),
             writes_folder=True,
         ),
     )

@@ -23,7 +23,7 @@ from intercap_core.project import Project
 from intercap_core.schemas import JOINT, TRUTH
 from intercap_core.studio.subjects import Subject
 
-NO_DEPTH = "field_no_depth"
+NO_DEPTH, ALONE = "field_no_depth", "field_alone"
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
 )  # fmt: skip
@@ -92,7 +92,18 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
             "field.no_depth_bone_worst_percent": 100 * float(bones.max()),
             "field.no_depth_height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in blind])),
         }
+    alone = [found for found in evaluations if found.dataset == ALONE]
+    if alone:
+        whole = [_of_a_person_alone(e.metrics) for some in alone for e in some.errors]
+        count = len(whole) + sum(len(some.missing) for some in alone)
+        found["field.people_alone_share"] = sum(whole) / count
     return found
+
+
+def _of_a_person_alone(metrics: SequenceMetrics) -> bool:
+    """Whether there are figures of the body, and none of an object that is not there."""
+    has = figures.truth_figures([metrics], "joint")
+    return "body_pve_mm" in has and not any(name.startswith("object") for name in has)
 
 
 def print_field(evaluations: Sequence[FieldSequences]) -> None:

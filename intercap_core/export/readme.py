@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from intercap_core.export.motion import Motion
+from intercap_core.metrics.verdict_figures import StatedError
 from intercap_core.rigid.mesh import ObjectMesh
 
 _HEAD = """\
@@ -78,20 +79,41 @@ _LEFT_OUT = """
 _HOLDS = {"bop": "poses of an object", "contact": "what touches an object"}
 
 
+def _stated(errors: Sequence[StatedError]) -> str:
+    """What is known of the errors without truth, in words; empty where nobody asked."""
+    if not errors:
+        return ""
+    said = [
+        f"{e.part} {e.stated:.1f} mm ({e.stated / e.factor:.1f} to {e.stated * e.factor:.1f})"
+        for e in errors
+        if not e.silent
+    ]
+    silent = [f"of the {e.part} nothing is stated: {e.silent}" for e in errors if e.silent]
+    words = [f"mean {', '.join(said)}"] if said else []
+    return f"Stated errors, by cameras held out: {'; '.join([*words, *silent])}.\n"
+
+
 def needs_object(name: str) -> bool:
     """Whether a format is of an object and says nothing without one."""
     return name in _HOLDS
 
 
-def readme(motion: Motion, viewed: Motion, mesh: ObjectMesh | None, formats: Sequence[str]) -> str:
-    """README.txt for these formats; ``viewed`` is the motion in the frame of amass and glb.
+def readme(
+    motion: Motion,
+    viewed: Motion,
+    mesh: ObjectMesh | None,
+    formats: Sequence[str],
+    stated: Sequence[StatedError] = (),
+) -> str:
+    """README.txt for these formats; ``viewed`` is the motion in the frame of amass and glb,
+    ``stated`` the errors of the parts of the result.
 
     Without a ``mesh`` there is no object, and the formats that need one are left out.
     """
     parts = {"intercap": _INTERCAP, "amass": _AMASS, "bop": _BOP, "glb": _GLB, "contact": _CONTACT}
     if mesh is None:
         parts |= {n: _LEFT_OUT.format(name=n, holds=holds) for n, holds in _HOLDS.items()}
-    text = _HEAD + "".join(parts[name] for name in formats)
+    text = _HEAD + _stated(stated) + "".join(parts[name] for name in formats)
     for said, instead in _WITHOUT_OBJECT.items() if mesh is None else ():
         text = text.replace(said, instead)
     return text.format(

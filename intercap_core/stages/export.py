@@ -20,6 +20,8 @@ from intercap_core.export import amass, bop, contact, glb, intercap
 from intercap_core.export.motion import Motion, read_motion
 from intercap_core.export.readme import needs_object, readme
 from intercap_core.export.upright import z_up_frame
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.metrics.verdict_figures import StatedError, stated_errors
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, SCENE
 
@@ -32,6 +34,7 @@ def run(
     *,
     joint: Path,
     scene: Path,
+    metrics: Path,
     object_: ObjectEntry | None,
     subject: SubjectEntry,
     body_models: BodyModels,
@@ -41,10 +44,10 @@ def run(
     """Write the chosen formats into the folder ``output``, replacing an earlier export there.
 
     The folder appears whole or not at all: it is filled under a temporary name beside its own, and
-    an earlier export goes only when the new one is complete. Without an object (``object_`` is
-    None, or it was found in no frame) its files are left out, which README.txt says. Raises
-    UserError where an artefact or the object's mesh is missing or broken, and where ``output``
-    holds anything but an export.
+    an earlier export goes only when the new one is complete. README.txt says what ``metrics``
+    state of the errors, and what is left out without an object (``object_`` is None, or it was
+    found in no frame). Raises UserError where an artefact or the object's mesh is missing or
+    broken, and where ``output`` holds anything but an export.
     """
     output = Path(output)
     _check_replaceable(output)
@@ -81,8 +84,10 @@ def run(
             else:
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, z_up=z_up)
-        (folder / "README.txt").write_text(readme(motion, viewed, mesh, named), encoding="utf-8")
-        _write_manifest(folder, motion, viewed, formats)
+        stated = stated_errors(SequenceMetrics.read(metrics))
+        text = readme(motion, viewed, mesh, named, stated)
+        (folder / "README.txt").write_text(text, encoding="utf-8")
+        _write_manifest(folder, motion, viewed, formats, stated)
 
 
 def _check_replaceable(output: Path) -> None:
@@ -119,7 +124,13 @@ def _replaced(output: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _write_manifest(output: Path, motion: Motion, viewed: Motion, formats: Sequence[str]) -> None:
+def _write_manifest(
+    output: Path,
+    motion: Motion,
+    viewed: Motion,
+    formats: Sequence[str],
+    stated: Sequence[StatedError],
+) -> None:
     files = sorted(path for path in output.rglob("*") if path.is_file())
     content: dict[str, Any] = {
         "sequence": motion.sequence,
@@ -131,6 +142,11 @@ def _write_manifest(output: Path, motion: Motion, viewed: Motion, formats: Seque
         "formats": list(formats),
         "frame": {"intercap": motion.frame, "bop": motion.frame, "amass": viewed.frame,
                   "glb": "y-up, turned by the root node from: " + viewed.frame},
+        "stated_error_mm": {
+            error.part: {"mean": round(error.stated, 2), "factor": error.factor}
+            for error in stated
+            if not error.silent
+        },
         "files": {
             path.relative_to(output).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in files

@@ -23,13 +23,14 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts, safe_pickle
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.capture.synchronise import images_of_moments
-from intercap_core.config import ExportSettings, Symmetry
+from intercap_core.config import ExportSettings, MetricsSettings, Symmetry
 from intercap_core.errors import UserError
 from intercap_core.export import bop
 from intercap_core.export.motion import read_motion
 from intercap_core.rigid.symmetry import SymmetryGroup
-from intercap_core.schemas import SCENE
-from intercap_core.stages import export
+from intercap_core.schemas import METRICS, SCENE
+from intercap_core.stage_list import SEQUENCE_STAGES
+from intercap_core.stages import export, metrics
 from tests.helpers import fitted_capture as fitted
 
 OFFSET = np.array([0, fitted.BODY_OFFSET_M, 0])
@@ -38,12 +39,22 @@ OBJECT_OFFSET = np.array([0, fitted.OBJECT_OFFSET_M / 2, 0])
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"), object_name="cup")
+    made = fitted.make_capture(tmp_path_factory.mktemp("capture"), object_name="cup")
+    metrics.run(
+        **made.inputs(*SEQUENCE_STAGES[:-1]),
+        output=made.paths["metrics"],
+        object_=made.object_,
+        subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS,
+        settings=MetricsSettings(),
+        **fitted.OTHER_SETTINGS,
+    )
+    return made
 
 
 def _run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
     export.run(
-        **capture.inputs("joint", "scene"),
+        **capture.inputs("joint", "scene", "metrics"),
         object_=capture.object_,
         subject=fitted.SUBJECT,
         body_models=fitted.BODY_MODELS,
@@ -350,6 +361,16 @@ def test_manifest_is_complete_and_names_every_frame(folder: Path) -> None:
     text = (folder / "README.txt").read_text()
     for word in ("master colour camera", "z-up", "millimetres", "x = R v + t", "pelvis"):
         assert word in text
+
+
+def test_stated_errors_go_with_the_files(capture: fitted.Capture, folder: Path) -> None:
+    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
+        body = 1e3 * measured["verdict/error"][0]
+        factor = measured["verdict/error_factor"][0]
+    said = json.loads((folder / "export.json").read_text())["stated_error_mm"]
+    assert said["body"] == {"mean": round(body, 2), "factor": factor}
+    text = (folder / "README.txt").read_text()
+    assert f"mean body {body:.1f} mm ({body / factor:.1f} to {body * factor:.1f})" in text
 
 
 @pytest.mark.parametrize(
