@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,10 @@ from intercap_core.body_fit.start import between, place_trunk, turned_around
 from intercap_core.body_fit.terms import Targets, Terms
 from intercap_core.config import BodyFitSettings
 from intercap_core.energy.body_samples import COVERINGS
+from intercap_core.progress import Progress
 from intercap_core.solve.levenberg_marquardt import Solution, minimise
+
+log = logging.getLogger(__name__)
 
 _WRISTS = ("left_wrist", "right_wrist")
 
@@ -108,6 +112,7 @@ class Fitter:
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
         self._terms = terms
+        self._progress = Progress(log, "body: minimised", None, "rounds")
         self.evidence = Evidence(model, seen, clouds, settings.cloud_weight)
         self.frames = self.evidence.frames
         self.one_shape = settings.shape == "shared"
@@ -240,6 +245,7 @@ class Fitter:
             keep_normal=keep_normal,
         )
         problem.accept(solution.own, solution.shared)
+        self._progress.step()
         return solution
 
     def _expect_pose(self, problem: BodyProblem) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,9 @@ from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import encoded_size
 from intercap_core.capture.source import CameraRecording, Image, Layout
 from intercap_core.errors import UserError
+from intercap_core.progress import Progress
+
+log = logging.getLogger(__name__)
 
 COLOUR_BUFFER_BYTES = 4 << 20
 FINGERPRINT_BYTES = 256  # of each image's end: entropy-coded, so that no two images share them
@@ -114,9 +118,11 @@ class _Copy:
         Raises UserError where no image at all has the size that the calibration is for.
         """
         view, recording = self.view, self.recording
+        progress = Progress(log, f"{view.name}: read", None, "images")
         try:
             for image in recording.images():
                 (self._take_colour if image.kind == "colour" else self._take_depth)(image)
+                progress.step()
         except UserError as error:
             if not self.colour_times:
                 raise

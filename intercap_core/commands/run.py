@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,14 +21,16 @@ from rich.table import Table
 from intercap_core.commands.check import check_bodies
 from intercap_core.commands.closing import print_remarks
 from intercap_core.errors import UserError
-from intercap_core.pipeline.job import read_state
+from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
 POLL_SECONDS = 0.5
+SAID_EVERY_S = 30.0  # between two lines of progress where no terminal redraws a table
 COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
 LAST_LINES = 15
+STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # how Snakemake says how far it is
 AGGREGATES = ("report.html", "summary.json")
 
 
@@ -37,6 +40,7 @@ class JobState:
 
     state: str
     words: str
+    log: Path
 
 
 def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = ()) -> int:
@@ -111,6 +115,7 @@ class Watcher:
         self._console = console
         self._start = time.time() - 1.0  # file systems keep whole seconds at worst
         self._told: set[str] = set()
+        self._said = time.monotonic()
         self._logs = project.logs
         self.transcript = self._logs / "snakemake.log"
 
@@ -121,7 +126,7 @@ class Watcher:
             try:
                 if path == self.transcript or path.stat().st_mtime < self._start:
                     continue
-                state = JobState(*read_state(path))
+                state = JobState(*read_state(path), path)
             except FileNotFoundError:  # the workflow removes an old log before it runs a job anew
                 continue
             sequence = path.parent.name if path.parent != self._logs else ""
@@ -162,12 +167,30 @@ class Watcher:
         )
 
     def tell(self) -> None:
-        """Print each job once, when it has ended; for terminals that cannot redraw."""
-        for name, job in self.jobs().items():
+        """Print each job once, when it has ended, and now and then how far those are that run.
+
+        For terminals that cannot redraw.
+        """
+        jobs = self.jobs()
+        for name, job in jobs.items():
             if job.state != "running" and name not in self._told:
                 self._told.add(name)
                 words = f"{name}: {job.state} {job.words}"
                 self._console.print(words, highlight=False, markup=False)
+        if time.monotonic() - self._said >= SAID_EVERY_S:
+            self._said = time.monotonic()
+            self._console.print(self.progress(), highlight=False, markup=False, soft_wrap=True)
+
+    def progress(self) -> str:
+        """How many jobs are done of how many, and the last words of those that run."""
+        said = self.transcript.read_text(encoding="utf-8", errors="replace")
+        done, of = (STEPS.findall(said) or [("0", "?")])[-1]
+        running = [
+            f"{name} ({last_words(job.log)})"
+            for name, job in self.jobs().items()
+            if job.state == "running"
+        ]
+        return f"{done} of {of} jobs done; {len(running)} run: {', '.join(running) or 'none'}"
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:

@@ -41,7 +41,6 @@ SEGMENTATION_BATCH = 4  # images at once where the model takes any number
 POSE_BATCH = 8  # people at once where the model takes any number
 MAX_BOXES = 3000  # of one image that take part in the suppression
 MAX_PEOPLE = 10  # of one image
-IMAGES_PER_LINE = 100  # seen by a model between two lines of the log
 
 # --- decision: people found without boxes; tuned on the studio
 # Where no detector gave a box, the whole image is looked through. A person counts with this many

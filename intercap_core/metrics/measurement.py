@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,12 @@ from intercap_core.metrics.proximity import PosedObject, Sight, distance_to_body
 from intercap_core.metrics.segmented import SegmentedClouds
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
 from intercap_core.metrics.truth import Truth
+from intercap_core.progress import Progress
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.surface_samples import sample_surface
 from intercap_core.schemas import CONTACT_REGIONS
+
+log = logging.getLogger(__name__)
 
 BODY_SAMPLES = 4000  # points of the body compared with the cloud, area-sampled
 VISIBILITY_SAMPLES = 2000  # the same of the object
@@ -86,6 +90,7 @@ class Measurement:
             if handled is not None:
                 true_points, seen = truth.object_samples_visible(handled.samples, handled.mesh)
             true_surface = PosedObject(truth.object_vertices, truth.object_faces)
+        progress = Progress(log, "measured", len(self.body.joints))
         for t, vertices in enumerate(self.body.vertices()):
             vertices = vertices.astype(np.float64)
             row: Values = {"ground_penetration": penetration.ground_penetration(vertices, *floor)}
@@ -106,6 +111,7 @@ class Measurement:
                     t, truth, true_surface, true_points, clouds[1], seen_object
                 )
             rows.append(row)
+            progress.step()
         values = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
         if handled is None:
             return values

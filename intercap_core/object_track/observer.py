@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -27,6 +28,7 @@ from intercap_core.object_track.places import Places
 from intercap_core.object_track.search import rank_frames, search
 from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.progress import Progress
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.paint import Paint
@@ -34,6 +36,8 @@ from intercap_core.rigid.render import Renderer, open_renderer
 
 Pictures = Callable[[int], list[np.ndarray | None]]
 """Of frame t the views' images (h, w, 3) uint8 BGR, reduced; None where there is none."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
@@ -61,6 +65,7 @@ class Observer:
 
     def __post_init__(self) -> None:
         self.views = ViewCache(self.load)
+        self._progress = Progress(log, f"{self.mesh.name}: fitted", None, "poses")
         self.renderer = open_renderer(self.settings.render_on)
 
     @property
@@ -138,6 +143,7 @@ class Observer:
     ) -> Fit:
         """The pose (4, 4) of frame t fitted from one that is nearly right, of an object that moves
         by ``twist`` (6,); ``mesh`` instead of the object's own."""
+        self._progress.step()
         return fit_pose(
             mesh or self.mesh,
             self.views(t),

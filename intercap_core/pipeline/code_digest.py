@@ -18,7 +18,8 @@ from pathlib import Path
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1]
 DECLARATIONS = frozenset({f"{PACKAGE}.{name}" for name in ("config", "schemas", "project")})
-NEUTRAL = frozenset({f"{PACKAGE}.kernel_cache"})  # where compiled code lies changes no result
+# Where compiled code lies, and what is said meanwhile, changes no result.
+NEUTRAL = frozenset({f"{PACKAGE}.kernel_cache", f"{PACKAGE}.progress"})
 CONSTANTS = (".constants", "_constants")  # ends of modules that hold a room's numbers
 DATA_FOLDERS = ("data", "templates")
 

@@ -68,6 +68,12 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
         handler.close()
 
 
+def last_words(log: Path) -> str:
+    """The last line of a log without its time of day; empty where there is none."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    return lines[-1].partition(" ")[2] if lines else ""
+
+
 def _tell(line: str) -> None:
     """Write to standard error, on a line of its own.
 
@@ -89,9 +95,7 @@ def last_failure(folder: Path) -> str | None:
 
 def read_state(log: Path) -> tuple[str, str]:
     """Whether the job that wrote ``log`` runs, finished or failed; and how long, or why."""
-    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    # After the time of day, which every line starts with
-    last = lines[-1].partition(" ")[2] if lines else ""
+    last = last_words(log)
     for state, mark in (("finished", FINISHED), ("failed", FAILED)):
         if last.startswith(mark):
             return state, last.removeprefix(mark).strip()

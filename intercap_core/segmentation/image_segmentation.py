@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.capture.frames import Frames
+from intercap_core.progress import Progress
 from intercap_core.segmentation.colour_candidates import ColourSegmenter
 from intercap_core.segmentation.depth_candidates import DepthSegmenter
 from intercap_core.segmentation.image_segments import ViewSegments
+
+log = logging.getLogger(__name__)
 
 
 def segment_images(
@@ -25,14 +30,19 @@ def segment_images(
     depth = wanted & frames.depth_available
     if depth.any() and np.isfinite(joints).any():
         segmenter = DepthSegmenter(frames, scene, joints, np.flatnonzero(depth.any(0)).tolist())
-        for t in np.flatnonzero(depth.any(1)).tolist():
+        moments = np.flatnonzero(depth.any(1)).tolist()
+        progress = Progress(log, "segmented", len(moments), "frames by depth")
+        for t in moments:
             segments = segmenter.segment(t, np.flatnonzero(depth[t]).tolist())
             found.update({(t, c): view for c, view in segments.items()})
+            progress.step()
     colour = wanted & ~depth & frames.colour_available
     if colour.any() and np.isfinite(joints).any():
         by_colour = ColourSegmenter(frames, scene, joints)
+        progress = Progress(log, "segmented", int(colour.sum()), "images by colour")
         for t, c in np.argwhere(colour).tolist():
             view = by_colour.segment(t, c)
             if view is not None:
                 found[t, c] = view
+            progress.step()
     return found

@@ -14,7 +14,6 @@ from intercap_core import artefacts
 from intercap_core.config import DetectionsSettings, SequenceEntry, digest
 from intercap_core.detections import candidate_files, keypoint_files
 from intercap_core.detections.candidate_files import Candidates
-from intercap_core.detections.constants import IMAGES_PER_LINE
 from intercap_core.detections.converters.data_sets import BehaveFiles
 from intercap_core.detections.converters.label_maps import class_names
 from intercap_core.detections.image_numbers import CameraImages, camera_images
@@ -22,6 +21,7 @@ from intercap_core.detections.instance import Instance, boxes_of
 from intercap_core.detections.keypoint_files import People
 from intercap_core.detections.keypoint_values import NOBODY, Values
 from intercap_core.errors import UserError
+from intercap_core.progress import Progress
 from intercap_core.schemas import DETECTIONS, FRAMES
 
 log = logging.getLogger(__name__)
@@ -206,10 +206,11 @@ def _segment(
     segmenter = Segmenter.load(settings)
     damaged = [0] * len(images)
     pictures = _pictures(frames, wanted, damaged)
-    for number, ((t, c), instances) in enumerate(segmenter.segment(pictures), start=1):
+    progress = Progress(log, "segmented", len(wanted), "images")
+    for (t, c), instances in segmenter.segment(pictures):
         found[c].instances[t] = instances
         found[c].candidates_found[t] = True
-        _tell("segmented", number, len(wanted))
+        progress.step()
     for detections, count in zip(found, damaged, strict=True):
         if count:
             detections.notes.append(f"{count} damaged images not segmented")
@@ -230,10 +231,11 @@ def _find_people(
     model = PoseModel.load(settings)
     damaged = [0] * len(images)
     values = [Values(camera.size, settings.keypoint_full_confidence) for camera in images]
-    for number, ((t, c), picture) in enumerate(_pictures(frames, wanted, damaged), start=1):
+    progress = Progress(log, "found people in", len(wanted), "images")
+    for (t, c), picture in _pictures(frames, wanted, damaged):
         found[c].people[t] = values[c].clean(model.find(picture, found[c].instances[t]))
         found[c].keypoints_found[t] = True
-        _tell("found people in", number, len(wanted))
+        progress.step()
     for detections, count, counted in zip(found, damaged, values, strict=True):
         detections.notes += counted.notes()
         if count:
@@ -266,8 +268,3 @@ def _pictures(
                 damaged[c] += 1
             else:
                 yield (t, c), picture
-
-
-def _tell(done: str, number: int, count: int) -> None:
-    if number % IMAGES_PER_LINE == 0 or number == count:
-        log.info("%s %d of %d images", done, number, count)

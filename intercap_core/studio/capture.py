@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -11,12 +12,15 @@ import yaml
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
+from intercap_core.progress import Progress
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.masks import Segmenter
 from intercap_core.studio.recording import Kinect
 from intercap_core.studio.stage import Stage
 from intercap_core.studio.truth import erring_annotation, write_truth
+
+log = logging.getLogger(__name__)
 
 MANIFEST = "capture.json"
 MARK = ".virtual"  # there from the first file on: the studio may delete what lies beside it
@@ -54,10 +58,12 @@ def make_capture(
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
     detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
     segmenter = Segmenter(stage.noise, stage.frames, stage.thing.name)
-    recorded = [
-        Kinect(stage, index, settings.colour_mode).record(folder, detector, segmenter)
-        for index in range(len(stage.rig.true))
-    ]
+    recorded = []
+    progress = Progress(log, "recorded", len(stage.rig.true), "cameras")
+    for index in range(len(stage.rig.true)):
+        kinect = Kinect(stage, index, settings.colour_mode)
+        recorded.append(kinect.record(folder, detector, segmenter))
+        progress.step()
     folder.write_calibration(stage.rig.claimed, settings.fps)
     moment = stage.at(stage.set_times)
     contact = write_truth(

@@ -460,3 +460,18 @@ def test_real_recordings_below_the_results_are_never_made(small_project: Path) -
     assert done.returncode == 0, done.stdout + done.stderr
     assert "good: reading and synchronising" in done.stdout
     assert "virtual recording" not in done.stdout
+
+
+def test_a_run_without_a_terminal_says_how_far_it_is(small_project: Path) -> None:
+    project = load_project(small_project / "config.yaml")
+    watcher = Watcher(project, Console(file=io.StringIO()))
+    watcher.transcript.parent.mkdir(parents=True)
+    watcher.transcript.write_text("1 of 9 steps (11%) done\n3 of 9 steps (33%) done\n")
+    logs = {"frames": "finished in 2.0 s", "person": "segmented 20 of 90 frames by depth"}
+    for stage, last in logs.items():
+        path = project.logs / "good" / f"{stage}.log"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(f"12:00:00 started\n12:00:09 {last}\n")
+    assert watcher.progress() == (
+        "3 of 9 jobs done; 1 run: good: person (segmented 20 of 90 frames by depth)"
+    )
