@@ -6,6 +6,7 @@ Nothing heavy is imported before a command needs it, so that help answers at onc
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
@@ -95,12 +96,15 @@ Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all
 def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     """Check settings, tables, annotations and recordings, and say all that is wrong.
 
+    Each recording is opened: its size beside the calibration, its length beside the other cameras'
+    and what its head states, its images beside its detections. A fraction of a second a sequence.
+
     Example: intercap check config/demo/config.yaml
     """
     from intercap_core.commands.check import (
         check_bodies,
         check_detector,
-        faults_of_sequences,
+        check_sequences,
         notes_of_sequences,
     )
     from intercap_core.pipeline.step import check_device
@@ -109,11 +113,19 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     project = load_project(settings)
     check_device(project)
     check_bodies(project)
-    for note in [*check_detector(project), *notes_of_sequences(project)]:
+    notes = [*check_detector(project), *notes_of_sequences(project)]
+    start = time.monotonic()
+    found = check_sequences(project)
+    elapsed, faults = time.monotonic() - start, found.faults
+    for summary in found.summaries:
+        typer.echo(summary)
+    for note in [*notes, *found.notes]:
         typer.echo(f"note: {note}")
-    faults = faults_of_sequences(project)
     for fault in faults:
         typer.echo(f"problem: {fault}", err=True)
+    if found.summaries:
+        count = len(found.summaries)
+        typer.echo(f"the recordings of {count} sequences were looked into in {elapsed:.1f} s")
     good = len(project.sequences) - len({fault.sequence for fault in faults} - {""})
     typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
     if faults:

@@ -17,9 +17,11 @@ import numpy as np
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import PNG_END, PNG_START, encoded_size
+from intercap_core.capture.glance import Glance
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.errors import UserError
 
+LOOKED_AT = 5  # files of each kind that a glance opens, spread over the recording
 GREY_TYPE = 0  # PNG colour type of one channel
 
 
@@ -107,9 +109,53 @@ class FilesRecording(CameraRecording):
         """Device time, microseconds, and path of every colour file, also of damaged ones."""
         return [(shot.time_us, shot.colour) for shot in self._shots if shot.colour is not None]
 
+    def glance(self) -> Glance:
+        """The sizes of all files, and some of the images."""
+        files, size = self.colour_files, None
+        for _, path in files:
+            with contextlib.suppress(DamagedImage):
+                size = encoded_size(read_colour(path))
+                break
+        times = [time_us for time_us, _ in files]
+        seconds = (times[-1] - times[0]) * 1e-6 if times else None
+        faults = faults_of_files(self._shots, self.camera.depth)
+        return Glance(size, len(files), seconds, faults=tuple(faults))
+
     def images(self) -> Iterator[Image]:
         """Images in the order of the shots; damaged ones are left out and counted."""
         return read_shots(self, self._shots)
+
+
+def faults_of_files(shots: list[Shot], lens: Intrinsics | None) -> list[str]:
+    """What is wrong with a camera's image files, by their sizes and a look into some of them.
+
+    ``lens`` of the depth camera, None = its depth is not used.
+    """
+    faults = []
+    for kind, paths in (
+        ("colour", [shot.colour for shot in shots if shot.colour is not None]),
+        ("depth", [shot.depth for shot in shots if shot.depth is not None and lens is not None]),
+    ):
+        empty = [path for path in paths if path.stat().st_size == 0]
+        if empty:
+            told = f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
+            faults.append(told)
+        bad = []
+        looked = np.unique(np.linspace(0, len(paths) - 1, LOOKED_AT).round().astype(int))
+        looked = looked[: len(paths)].tolist()
+        for index in looked:
+            try:
+                if kind == "colour":
+                    read_colour(paths[index])
+                elif lens is not None:
+                    read_depth(paths[index], (lens.width, lens.height))
+            except DamagedImage as error:
+                if paths[index] not in empty:
+                    bad.append(f"{paths[index].name} {error}")
+        if bad:
+            told = f"{len(bad)} of {len(looked)} {kind} files looked at are damaged"
+            faults.append(f"{told} (first: {bad[0]})")
+    return faults
 
 
 def read_shots(recording: CameraRecording, shots: list[Shot]) -> Iterator[Image]:

@@ -28,6 +28,7 @@ from intercap_core.camera.k4a_calibration import (
 )
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import RAW_FORMATS, encoded_size
+from intercap_core.capture.glance import Glance, glance_at_video, segment_end
 from intercap_core.errors import UserError
 
 TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
@@ -35,7 +36,6 @@ CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"
 IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
 PASSIVE_INFRARED = "PASSIVE_IR"  # the depth camera as an infrared one: it measures no depth
 _EBML_MAGIC = b"\x1a\x45\xdf\xa3"
-_SEGMENT_ID = b"\x18\x53\x80\x67"
 
 Kind = Literal["colour", "depth", "imu"]
 _KINDS: dict[str, Kind] = {"COLOR": "colour", "DEPTH": "depth", "IMU": "imu"}
@@ -153,6 +153,14 @@ class Recording:
             width, height = DEPTH_MODES[self.info.depth_mode].size
             return len(content) == 2 * width * height
         return kind == "imu"
+
+    def glance(self) -> Glance:
+        """A look at the colour track, without reading the others."""
+        index = next(index for index, kind in self._streams.items() if kind == "colour")
+        seen = glance_at_video(self.path, index, self.info.fps)
+        if self.info.colour_format != "MJPG":
+            return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size)
+        return seen
 
     def depth_image(self, content: bytes) -> np.ndarray:
         """Turn a depth packet into (H, W) uint16, millimetres, 0 = invalid, lossless."""
@@ -295,11 +303,5 @@ def _is_truncated(path: Path) -> bool:
             f"{path}: is not a Matroska file (it starts with {head[:4]!r}); give the .mkv that "
             "k4arecorder wrote"
         )
-    at = head.find(_SEGMENT_ID)
-    if at < 0 or at + 5 > len(head):
-        return True
-    width = 9 - head[at + 4].bit_length()  # of the length that follows the id
-    field = head[at + 4 : at + 4 + width]
-    length = int.from_bytes(field, "big") & ((1 << 7 * width) - 1)
-    unfinished = length == (1 << 7 * width) - 1
-    return unfinished or size < at + 4 + width + length
+    end = segment_end(head)
+    return end is None or size < end

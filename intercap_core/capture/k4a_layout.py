@@ -12,6 +12,7 @@ from intercap_core.camera.extrinsics_files import read_extrinsics
 from intercap_core.camera.k4a_calibration import COLOUR_MODES
 from intercap_core.camera.other_calibration import Recorded
 from intercap_core.capture.encoded import JPEG_QUALITY, bgr_of_raw, jpeg_of
+from intercap_core.capture.glance import Glance
 from intercap_core.capture.k4a import Recording, imu_samples
 from intercap_core.capture.source import CameraRecording, Image, Layout
 from intercap_core.config import SequenceEntry
@@ -55,6 +56,10 @@ class KinectRecording(CameraRecording):
     def close(self) -> None:
         """Close the file."""
         self._recording.close()
+
+    def glance(self) -> Glance:
+        """The head, the first image and the file's length."""
+        return self._recording.glance()
 
     def images(self) -> Iterator[Image]:
         """Colour packets as recorded, depth without loss; gravity from the accelerometer.

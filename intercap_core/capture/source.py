@@ -17,6 +17,7 @@ import numpy as np
 
 from intercap_core.camera.extrinsics_files import Extrinsics
 from intercap_core.camera.rig import Camera
+from intercap_core.capture.glance import Glance
 from intercap_core.config import SequenceEntry
 
 
@@ -73,6 +74,10 @@ class CameraRecording(ABC):
         Images that are damaged are left out and counted in a note. No depth image is given where
         ``camera.depth`` is None.
         """
+
+    @abstractmethod
+    def glance(self) -> Glance:
+        """Look at what can be told without reading all images, in milliseconds."""
 
     def close(self) -> None:  # noqa: B027 (a folder has nothing to close)
         """Release the file."""

@@ -15,10 +15,13 @@ import numpy as np
 
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import JPEG_QUALITY, jpeg_of
-from intercap_core.capture.image_files import read_shots
+from intercap_core.capture.glance import Glance, glance_at_video
+from intercap_core.capture.image_files import faults_of_files, read_shots
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.capture.timestamps import Timestamps, shots_of
 from intercap_core.errors import UserError
+
+FEW_IMAGES = 0.02  # by which a count from duration and rate may be wrong
 
 
 def video_size(path: Path) -> tuple[int, int] | None:
@@ -76,6 +79,16 @@ class VideoRecording(CameraRecording):
     def close(self) -> None:
         """Close the file."""
         self._container.close()
+
+    def glance(self) -> Glance:
+        """The head, the first image, the index or the last image; beside it the depth files."""
+        seen = glance_at_video(self.source, self._stream.index, self.fps)
+        faults = faults_of_files(self._shots, self.camera.depth)
+        if self._times is not None and seen.images is not None:
+            stated = len(self._times)
+            if abs(stated - seen.images) > max(1, FEW_IMAGES * stated):
+                faults.append(f"has {stated} timestamps for about {seen.images} images")
+        return seen._replace(faults=tuple(faults))
 
     def images(self) -> Iterator[Image]:
         """Images in the order in which they are shown, then depth."""

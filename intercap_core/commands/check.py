@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from intercap_core.config import DetectionsSettings, SequenceEntry
+from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
 if TYPE_CHECKING:
     from intercap_core.capture.source import Layout
+    from intercap_core.commands.check_recordings import Looked
 
 LABELS_TOLD = 8  # labels that a note names
 
@@ -85,14 +87,30 @@ def _told(labels: list[str]) -> str:
     return ", ".join(labels[:LABELS_TOLD]) + more
 
 
-def faults_of_sequences(project: Project) -> list[Fault]:
-    """Check what every sequence needs: annotation, files, mesh, poses, the heads of recordings.
+@dataclass
+class Findings:
+    """Faults of all sequences, what a run survives, and each good recording in one line."""
 
-    Recordings that the studio is to make are not missed, but it must be able to make them; images
-    are not read.
+    faults: list[Fault] = field(default_factory=list)
+    notes: list[Fault] = field(default_factory=list)
+    summaries: list[Fault] = field(default_factory=list)
+
+
+def faults_of_sequences(project: Project) -> list[Fault]:
+    """The faults alone of :func:`check_sequences`."""
+    return check_sequences(project).faults
+
+
+def check_sequences(project: Project) -> Findings:
+    """Check what every sequence needs: annotation, files, mesh, poses, a look at its recordings.
+
+    Recordings that the studio is to make are not missed, but it must be able to make them. Of
+    images a few are read.
     """
-    meshes = {name: _fault_of_mesh(project, name) for name in project.objects_named()}
-    faults = _annotations_without_sequence(project)
+    found = Findings()
+    meshes = {name: _look_at_mesh(project, name, found) for name in project.objects_named()}
+    faults = found.faults
+    faults += _annotations_without_sequence(project)
     for name, row in project.sequences.items():
         try:
             project.annotation(name)
@@ -104,9 +122,11 @@ def faults_of_sequences(project: Project) -> list[Fault]:
         if project.recordings_made(name) is not None:
             faults += [Fault(name, message) for message in _faults_of_capture(project, name)]
             continue
-        cameras = project.config.frames.cameras
-        faults += [Fault(name, message) for message in _faults_of_files(row, cameras)]
-    return faults
+        looked = _look_at_files(row, project.config.frames)
+        faults += [Fault(name, message) for message in looked.faults]
+        found.notes += [Fault(name, message) for message in looked.notes]
+        found.summaries += [Fault(name, looked.summary)] if looked.summary else []
+    return found
 
 
 def notes_of_sequences(project: Project) -> list[Fault]:
@@ -244,14 +264,34 @@ def _annotations_without_sequence(project: Project) -> list[Fault]:
     ]
 
 
-def _fault_of_mesh(project: Project, name: str) -> str | None:
-    from intercap_core.rigid.mesh import ObjectMesh
+def _look_at_mesh(project: Project, name: str, found: Findings) -> str | None:
+    """Why an object's mesh cannot be used; what is said of one that can is noted."""
+    from intercap_core.rigid import mesh
 
+    said = _Kept()
+    mesh.log.addHandler(said)
+    mesh.log.propagate = False
     try:
-        ObjectMesh.load(project.objects[name])
+        mesh.ObjectMesh.load(project.objects[name])
     except UserError as error:
         return str(error)
+    finally:
+        mesh.log.removeHandler(said)
+        mesh.log.propagate = True
+    found.notes += [Fault("", text) for text in said.texts]
     return None
+
+
+class _Kept(logging.Handler):
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the record's words."""
+        self.texts.append(record.getMessage())
 
 
 def _faults_of_capture(project: Project, name: str) -> list[str]:
@@ -266,44 +306,47 @@ def _faults_of_capture(project: Project, name: str) -> list[str]:
     return []
 
 
-def _faults_of_files(row: SequenceEntry, cameras: tuple[str, ...]) -> list[str]:
+def _look_at_files(row: SequenceEntry, settings: FramesSettings) -> Looked:
+    from intercap_core.commands.check_recordings import Looked
+
     faults = []
     for column in ("calibration", "keypoints", "candidates", "truth"):
         path = getattr(row, column)
         if path is not None and not path.exists():
             faults.append(f"column {column} says {path}, which is not there")
     if not row.recordings.is_dir():
-        return [f"there is no folder {row.recordings} of recordings", *faults]
-    return faults + (_faults_of_recordings(row, cameras) if row.calibration.exists() else [])
+        return Looked(faults=[f"there is no folder {row.recordings} of recordings", *faults])
+    looked = _look_at_recordings(row, settings) if row.calibration.exists() else Looked()
+    looked.faults[:0] = faults
+    return looked
 
 
-def _faults_of_recordings(row: SequenceEntry, cameras: tuple[str, ...]) -> list[str]:
+def _look_at_recordings(row: SequenceEntry, settings: FramesSettings) -> Looked:
     from intercap_core.capture.layouts import open_layout
+    from intercap_core.commands.check_recordings import Looked, look_at_recordings
 
     try:
         layout = open_layout(row)
     except UserError as error:
-        return [str(error)]
+        return Looked(faults=[str(error)])
     if not layout.names:
-        return [f"{row.recordings} holds no camera's recording in the layout {row.layout}"]
+        return Looked(
+            faults=[f"{row.recordings} holds no camera's recording in the layout {row.layout}"]
+        )
+    cameras = settings.cameras
     known = list(layout.extrinsics.master_from_colour)
     faults = [
         f"the setting frames.cameras names {name!r}, {row.recordings} has {', '.join(layout.names)}"
         for name in cameras
         if name not in known and name not in layout.names
     ]
-    for name in layout.names:
-        if cameras and name not in cameras:
-            continue
-        if name not in known:
-            faults.append(
-                f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add "
-                "the camera"
-            )
-            continue
-        try:
-            with layout.open(name):
-                pass
-        except UserError as error:
-            faults.append(str(error))
-    return faults
+    used = [name for name in layout.names if not cameras or name in cameras]
+    faults += [
+        f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add the camera"
+        for name in used
+        if name not in known
+    ]
+    posed = [name for name in used if name in known]
+    looked = look_at_recordings(row, layout, posed, without_depth=not settings.depth)
+    looked.faults[:0] = faults
+    return looked
