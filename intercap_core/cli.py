@@ -53,6 +53,7 @@ class Part(StrEnum):
     field = "field"
 
 
+WIDEST_HOLE = 0.1  # of the object's length: a hole that a flat cover closes without a guess
 DEFAULT_SETTINGS = Path("config/config.yaml")
 SEQUENCE_SETTINGS = [Path("config/evaluation/config.yaml"), Path("config/object/config.yaml")]
 CAPTURE_SETTINGS = [
@@ -382,6 +383,37 @@ def inspect(
     from intercap_core.commands.inspect import print_summary
 
     print_summary(artefact, verify=verify)
+
+
+@app.command(name="close-mesh", rich_help_panel=LOOK)
+def close_mesh(
+    mesh: Annotated[Path, typer.Argument(metavar="IN", help="The mesh with holes.")],
+    output: Annotated[Path, typer.Argument(metavar="OUT", help="A new .ply or .obj.")],
+    widest_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="Widest hole to close, mm; else a tenth of the object's length."
+        ),
+    ] = None,
+) -> None:
+    """Close the small holes of an object's mesh by flat covers, and say what was closed.
+
+    A hole that is wider is refused: what surface was there cannot be known. The input stays as it
+    is, vertices keep their numbers, textures become colours of vertices.
+
+    Example: intercap close-mesh scan.ply scan_closed.ply --widest-mm 30
+    """
+    from intercap_core.rigid.closing import close_mesh as close
+
+    widest = None if widest_mm is None else 1e-3 * widest_mm
+    done = close(mesh, output, widest_m=widest, share=WIDEST_HOLE)
+    for hole in done.closed:
+        typer.echo(f"closed: {hole}")
+    left = f"; {done.strays} open edges form no loop and are left" if done.strays else ""
+    state = "watertight" if done.watertight else "still open"
+    typer.echo(
+        f"{output}: {len(done.closed)} holes closed with {done.faces_added} faces, {state}{left}"
+    )
 
 
 @app.command(rich_help_panel=LOOK)

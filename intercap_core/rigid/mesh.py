@@ -57,7 +57,7 @@ class ObjectMesh:
         metres, loose faces without an inside, contact vertices that are not its vertices.
         """
         path = Path(entry.mesh)
-        mesh = _read(path)
+        mesh = read_mesh(path)
         in_file = np.asarray(mesh.vertices)
         _check_size(path, mesh)
         mesh, place = _without_loose_vertices(path, mesh)
@@ -78,7 +78,7 @@ class ObjectMesh:
             np.asarray(mesh.faces, np.int32),
             ids.astype(np.int64),
             symmetry,
-            _colours(mesh)[:, :3].copy(),
+            colours_of(mesh)[:, :3].copy(),
             bool(mesh.is_watertight),
         )
 
@@ -148,7 +148,8 @@ class ObjectMesh:
         return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
 
 
-def _read(path: Path) -> trimesh.Trimesh:
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """The mesh of a file as it is; raises UserError, naming the file, where it is no mesh."""
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
     try:
@@ -180,7 +181,7 @@ def _read(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _colours(mesh: trimesh.Trimesh) -> np.ndarray:
+def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
     """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
     visual: Any = mesh.visual
     try:
@@ -243,7 +244,7 @@ def _without_loose_vertices(
     kept = trimesh.Trimesh(
         np.asarray(mesh.vertices)[used],
         place[np.asarray(mesh.faces)],
-        vertex_colors=_colours(mesh)[used],
+        vertex_colors=colours_of(mesh)[used],
         process=False,
         validate=False,
     )
@@ -255,7 +256,7 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
     new_id = np.arange(len(mesh.vertices))
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
         return mesh, new_id
-    colours = _colours(mesh)
+    colours = colours_of(mesh)
     vertices, first, new_id = np.unique(
         np.asarray(mesh.vertices).round(7), axis=0, return_index=True, return_inverse=True
     )
@@ -292,8 +293,9 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
                 "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
             )
         log.warning(
-            "%s: not watertight, %.1f %% of its edges are open; inside is what its surface winds "
-            "around, so that penetration near the holes is uncertain",
+            "%s: not watertight, %.1f %% of its edges are open: object_track draws it from both "
+            "sides, in joint and metrics inside is what its surface winds around, so that contact "
+            "and penetration near the holes are uncertain; `intercap close-mesh` closes small ones",
             path, 100 * open_share,
         )  # fmt: skip
     return mesh, new_id.reshape(-1)
