@@ -282,9 +282,10 @@ def _notes(
             "step could not be told"
         )
     for interval in moments.slips.intervals:
-        frames = "1 frame" if interval.slip == 1 else f"{interval.slip} frames"
+        count, when = abs(interval.slip), "late" if interval.slip > 0 else "early"
+        frames = "1 frame" if count == 1 else f"{count} frames"
         notes[interval.camera].append(
-            f"its images are {frames} late in sets {interval.first} to {interval.last}"
+            f"its images are {frames} {when} in sets {interval.first} to {interval.last}"
         )
     for c, present in enumerate(source.present):
         if present and np.isnan(refined.offset_sigma[c]):
