@@ -40,6 +40,7 @@ differences from the paper are in ``docs/equations.md``.
 | 6 | E_B | joint/terms/body_data.py | BodyData | - |
 | 6 | E_O, looked at anew | joint/terms/object_images.py | ObjectImagesData | joint.look_again |
 | 6 | E_O, the track for them | joint/terms/object_data.py | ObjectData | joint.look_again |
+| beyond | no object in place of E_O | joint/terms/no_object.py | NoObject | - |
 | 6, A.4 | E_C: residuals | energy/contact.py | term | joint.contact_weight |
 | 6, A.4 | E_C with Q_t | joint/terms/contact.py | Contact | joint.contact_weight |
 | 6, A.4 | E_C: to any or annotated points | energy/proximity.py | proximity | joint.contact_to |

@@ -133,7 +133,9 @@ class Tracker:
         )
         refined = WholeTrack(self._observer, self._times, self._share).refine(frames)
         final = flagged(self._mesh, refined)
-        evidence = self._share * sum(frame.fit.log_ratio for frame in final if not frame.lost)
+        # a recording that is shorter than one independent look is one all the same
+        share = max(self._share, 1 / max(len(final), 1))
+        evidence = share * sum(frame.fit.log_ratio for frame in final if not frame.lost)
         doubts = mesh_doubts(self._observer, final)
         return Track(final, seed, initial is not None, evidence, borne_out, tuple(doubts))
 
