@@ -18,7 +18,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.evaluation.part import Figures, Measured, Part, console_of, keyed, number
 from intercap_core.metrics import figures
 from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.metrics.verdict_figures import stated_errors, verdict_figures
+from intercap_core.metrics.verdict_figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
 from intercap_core.schemas import JOINT, TRUTH
 from intercap_core.studio.subjects import Subject
@@ -115,8 +115,11 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
     for found in evaluations:
         for e in found.errors:
             cells = []
-            for error in stated_errors(e.metrics):
-                cells += [number(error.true, 1), number(error.stated, 1) or "silent"]
+            by_part = {error.part: error for error in stated_errors(e.metrics)}
+            for part in TRUE:  # a person alone has no object
+                error = by_part.get(part)
+                told = error and [number(error.true, 1), number(error.stated, 1) or "silent"]
+                cells += told or ["", ""]
             table.add_row(
                 f"{found.dataset}: {e.metrics.name}",
                 *cells,
