@@ -284,6 +284,8 @@ class StudioCapture(Model):
     room: Literal["random", "furnished", "sparse", "bare"] = "random"
     """With walls and furniture, a floor with two low pieces, or only a floor; by chance one capture
     in five is bare."""
+    shoes: Literal["plain", "heavy"] = "plain"
+    """Shoes as thin as skin, or heavy ones: soles of 22 mm, 10 to 15 mm round the feet."""
     look: Literal["random", "mesh", "plain", "printed"] = "random"
     """Colours of the object: its mesh's, one for all, or printed in a way that no scan knows."""
     layout: LayoutName = "k4a"

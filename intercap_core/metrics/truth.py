@@ -27,8 +27,8 @@ class Truth:
     them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
     (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
     ``translation`` (T, 3), of a person alone NaN, and the mesh empty; ``contact_region`` (T, 12) in
-    the order of METRIC_REGIONS; the ``floor``; ``master_from_colour`` (C, 4, 4) and
-    ``camera_names``.
+    the order of METRIC_REGIONS; the ``floor`` that bare soles are on; ``master_from_colour``
+    (C, 4, 4) and ``camera_names``.
     """
 
     vertices: np.ndarray | None
@@ -69,6 +69,9 @@ class Truth:
                 seen = file["body_visible"][at].astype(np.float32)[..., None]
                 visible = body.corresponding_vertices(seen, faces, face, weights)[..., 0] > 0.5
             names = file.text("region_names")
+            # bare feet in shoes stand as high as the soles are thick
+            soles = float(file.attributes.get("sole_m", 0.0))
+            offset = float(file.attributes["ground_offset"]) - soles
             columns = [names.index(name) for name in METRIC_REGIONS]
             thing = _TrueThing.read(file, at)
             return cls(
@@ -83,7 +86,7 @@ class Truth:
                 translation=thing.translation,
                 object_views=thing.views,
                 contact_region=file["region_contact"][at][:, columns],
-                floor=Floor(file["ground_normal"], float(file.attributes["ground_offset"])),
+                floor=Floor(file["ground_normal"], offset),
                 camera_names=tuple(file.text("camera_names")),
                 master_from_colour=file["master_from_colour"],
             )

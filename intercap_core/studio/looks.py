@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.studio.shoes import shoe_area
 from intercap_core.studio.subjects import Subject
 
 SKIN = ((0.87, 0.68, 0.56), (0.72, 0.52, 0.40), (0.50, 0.34, 0.25), (0.93, 0.76, 0.66))
@@ -55,9 +56,7 @@ def body_colours(subject: Subject, rng: np.random.Generator) -> np.ndarray:
     legs = of("left_hip", "right_hip", "left_knee", "right_knee") + of("pelvis")
     colours[dressed] = pick(SHIRTS)
     colours[dressed & (legs > 0.5)] = pick(TROUSERS)
-    feet = of("left_ankle", "right_ankle", "left_foot", "right_foot") > 0.5
-    low = rest[:, 1] < joints[[7, 8], 1].mean() + 0.01
-    colours[feet & low] = pick(SHOES)
+    colours[shoe_area(subject)] = pick(SHOES)
     eyes = joints[[JOINT_INDEX["left_eye_smplhf"], JOINT_INDEX["right_eye_smplhf"]]].mean(0)
     head = of("head") > 0.5
     scalp = rest[:, 1] > eyes[1] + 0.045

@@ -74,9 +74,9 @@ class Trunk:
 
 
 def _sole_depth(subject: Subject, side: int) -> float:
-    """How far the ankle is above the sole of a level foot, metres."""
+    """How far the ankle is above the sole of a level foot, in its shoe, metres."""
     share = np.asarray(subject.weights[:, [7 + side, 10 + side]].sum(1)).ravel()
-    return float(subject.rest_joints[7 + side, 1] - subject.rest[share > 0.5, 1].min())
+    return float(subject.rest_joints[7 + side, 1] - subject.rest_clothed[share > 0.5, 1].min())
 
 
 def _girth(subject: Subject) -> float:

@@ -23,6 +23,7 @@ from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
 from intercap_core.studio.rig import StudioRig, build_rig, started_apart
 from intercap_core.studio.room import Furnishing, Twin, build_room
+from intercap_core.studio.shoes import in_heavy_shoes
 from intercap_core.studio.subjects import Subject, subject_names
 from intercap_core.studio.tissue import press_out
 
@@ -71,6 +72,8 @@ class Stage:
             capture.redrawn_detections,
         )
         self.subject = Subject.load(capture.subject)
+        if capture.shoes == "heavy":
+            self.subject = in_heavy_shoes(self.subject, self.noise.rng("shoes"))
         self.puppet = Puppet(self.subject)
         self.thing = TrueObject.nothing() if entry is None else self._thing(entry, capture)
         corners = self.thing.vertices
@@ -199,6 +202,11 @@ def check_capture(
         raise UserError(
             f"studio: interaction {capture.interaction!r} needs {needed}, the sequence has "
             f"{found}; correct the sequence's object"
+        )
+    if capture.shoes != "plain" and kind.feet_meet_object:
+        raise UserError(
+            f"studio: in interaction {capture.interaction!r} bare soles meet the object, "
+            f"'shoes' is {capture.shoes!r}; set shoes: plain or another interaction"
         )
     if settings.fps > FASTEST_KINECT and capture.layout != "plain":
         raise UserError(

@@ -51,7 +51,8 @@ class Subject:
 
     rest (V,3), faces (F,3), rest_joints (55,3), rest_tips (10,3) in metres, weights (V,55), bulges
     (8,V,3) metres at a right angle, clothing (V,) metres, height_m; fitted_face (N,) and
-    fitted_bary (N,3): where on this mesh the vertices of the open body are.
+    fitted_bary (N,3): where on this mesh the vertices of the open body are; sole_m: how far soles
+    of shoes are below the lowest skin.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Subject:
     clothing: np.ndarray
     fitted_face: np.ndarray
     fitted_bary: np.ndarray
+    sole_m: float = 0.0
 
     @classmethod
     def load(cls, name: str) -> Subject:
@@ -116,6 +118,11 @@ class Subject:
     def normals(self, vertices: np.ndarray) -> np.ndarray:
         """(B,V,3) -> unit normals (B,V,3), each face counted by its area."""
         return _normals(np.asarray(vertices, np.float64), self.faces)
+
+    @property
+    def rest_clothed(self) -> np.ndarray:
+        """The clothed surface (V,3) in the T-pose."""
+        return self.rest + self.normals(self.rest[None])[0] * self.clothing[:, None]
 
     def _chain(self, local: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         world = np.empty_like(local)

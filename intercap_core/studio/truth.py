@@ -58,6 +58,8 @@ def write_truth(
         room=stage.furnishing,
         faults=", ".join(_faults(stage, capture)),
     ) as file:
+        if stage.subject.sole_m:
+            file.attributes["sole_m"] = stage.subject.sole_m
         file.put("times", stage.set_times)
         file.put("body_vertices", stage.to_master(moment.body))
         file.put("body_faces", stage.subject.faces)

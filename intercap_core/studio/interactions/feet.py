@@ -21,12 +21,12 @@ class Foot:
         self._part = part_of(self.subject, np.flatnonzero(share > 0.5))
 
     def skin(self, places: np.ndarray) -> np.ndarray:
-        """(N, 5) -> skin (N, n, 3) of the stage."""
+        """(N, 5) -> skin, or the shoe round it, (N, n, 3) of the stage."""
         foot = foot_rotations(places[:, [4, 4]], places[:, [3, 3]])[:, self.side]
         local = np.broadcast_to(np.eye(3), (len(places), 55, 3, 3)).copy()
         local[:, self.ankle] = foot[:, 0]
         local[:, self.toes] = np.swapaxes(foot[:, 0], 1, 2) @ foot[:, 1]
-        posed = self._part.skin(local, np.zeros((len(places), 3))).vertices
+        posed = self._part.skin(local, np.zeros((len(places), 3))).clothed
         return posed - self.subject.rest_joints[self.ankle] + places[:, None, :3]
 
     def backed_off(

@@ -30,6 +30,7 @@ class FootballKick(Interaction):
     """The ball lies before the right foot and leaves about ahead."""
 
     object_class = "football"
+    feet_meet_object = True
     highlight = 1.7
     centre = (0.50, -0.05)
 

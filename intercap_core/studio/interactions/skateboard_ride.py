@@ -27,6 +27,7 @@ class SkateboardRide(Interaction):
     """The board rolls along x, to either side; the person stands behind its long side."""
 
     object_class = "skateboard"
+    feet_meet_object = True
     highlight = 1.5
 
     def plan(self) -> None:
