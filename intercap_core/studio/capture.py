@@ -57,7 +57,7 @@ def make_capture(
     stage = Stage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
     detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
-    segmenter = Segmenter(stage.noise, stage.frames, stage.thing.name)
+    segmenter = Segmenter(stage.noise, stage.frames, stage.thing.name, capture.passer_by)
     recorded = []
     progress = Progress(log, "recorded", len(stage.rig.true), "cameras")
     for index in range(len(stage.rig.true)):

@@ -26,6 +26,7 @@ HIDDEN_SHIFT_M, HIDDEN_HAND_SHIFT_M = 0.045, 0.030
 SWAP_PROBABILITY, SWAP_S = 0.015, 0.3
 MISS_PROBABILITY, MISS_S = 0.012, 0.25
 BYSTANDER_PROBABILITY, BYSTANDER_S = 0.08, 1.0
+FEWEST_SEEN = 8  # of a passer-by's 25 body joints, or nobody is found
 BLIND = 0.35  # how little the confidence knows about the true error, 0 all to 1 nothing
 
 _SWAPPED = np.arange(135)
@@ -68,14 +69,15 @@ class Detector:
         points: np.ndarray,
         axes: np.ndarray,
         hidden: np.ndarray,
+        *who: str,
     ) -> np.ndarray:
-        """Keypoints (T, 135, 3) x, y, confidence of the subject in one camera.
+        """Keypoints (T, 135, 3) x, y, confidence of the subject, or of ``who``, in one camera.
 
         ``points`` (T, 135, 3) true points and ``axes`` (T, 3, 3) the pelvis's rotation, both in
         the master frame; ``hidden`` (T, 135) bool: something is in the way.
         """
         noise, scale = self.noise, self.noise.scale
-        rng = noise.detector_rng("keypoints", camera.name)
+        rng = noise.detector_rng("keypoints", camera.name, *who)
         per_metre = self._pixels_per_metre(camera, points)
         biased = points + np.einsum("tij,kj->tki", axes, self.body_bias)
         pose = camera.colour_from_master
@@ -176,6 +178,27 @@ class Detector:
                 ghost[:, 2] *= rng.uniform(0.3, 0.8)
                 people.insert(int(rng.integers(len(people) + 1)), ghost)
             result.append(people)
+        return result
+
+    def with_passer_by(
+        self,
+        camera: Camera,
+        people: list[list[np.ndarray]],
+        passer_by: np.ndarray,
+        hidden: np.ndarray,
+    ) -> list[list[np.ndarray]]:
+        """The people of each frame's file, and among them, at any place, somebody who walks past:
+        keypoints (T, 135, 3), ``hidden`` (T, 135), where enough of the body is seen."""
+        noise = self.noise
+        rng = noise.detector_rng("passer-by", camera.name)
+        one, common = np.ones((self.frames, 1)), np.zeros(self.frames)
+        missed = noise.episodes(rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.0)[:, 0]
+        seen = (passer_by[:, BODY, 2] > 0) & ~hidden[:, BODY]
+        found = (seen.sum(1) >= FEWEST_SEEN) & ~missed
+        result = []
+        for t, have in enumerate(people):
+            place = int(rng.integers(len(have) + 1))
+            result.append([*have[:place], passer_by[t], *have[place:]] if found[t] else have)
         return result
 
 

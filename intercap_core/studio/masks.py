@@ -15,7 +15,7 @@ import numpy as np
 from pycocotools import mask as coco
 
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.render import BODY, OBJECT
+from intercap_core.studio.render import BODY, OBJECT, PASSER_BY
 
 LABELS = {
     "suitcase": "suitcase", "skateboard": "skateboard", "football": "sports ball",
@@ -67,8 +67,10 @@ class Labels:
 class Segmenter:
     """The network over one recording; every camera's errors partly agree."""
 
-    def __init__(self, noise: NoiseSource, frames: int, object_name: str) -> None:
-        self.noise, self.frames = noise, frames
+    def __init__(
+        self, noise: NoiseSource, frames: int, object_name: str, passer_by: bool = False
+    ) -> None:
+        self.noise, self.frames, self.passer_by = noise, frames, passer_by
         self.label = LABELS.get(object_name, object_name)
         shared = noise.detector_rng("masks")
         self._shared = {
@@ -120,6 +122,20 @@ class CameraMasks:
             [noise.episodes(rng, frames, one * chance, miss, 0.7, 0.0)[:, 0] for chance in often], 1
         )
         self._score = noise.process(rng, frames, 4 + len(often), 0.3)
+        if network.passer_by:
+            self._expect_passer_by(noise.detector_rng("masks", name, "passer-by"))
+
+    def _expect_passer_by(self, rng: np.random.Generator) -> None:
+        """Waves, misses and scores of one more person, drawn apart from all else."""
+        noise, frames = self.noise, self.network.frames
+        waves = noise.process(rng, frames, 12, rng.uniform(*EPISODE_S))[:, None]
+        self._waves = np.concatenate([self._waves, waves], 1)
+        self._directions = np.concatenate([self._directions, rng.normal(size=(1, 12, 2))])
+        self._phases = np.concatenate([self._phases, rng.uniform(0, 2 * np.pi, (1, 12))])
+        chance, common = np.full((frames, 1), PERSON_MISSED), np.zeros(frames)
+        seconds = rng.uniform(*EPISODE_S)
+        self._other_missed = noise.episodes(rng, frames, chance, common, seconds, 0.0)[:, 0]
+        self._other_score = noise.process(rng, frames, 1, 0.3)[:, 0]
 
     def _things(self) -> list[tuple[str, dict[str, Any]]]:
         """False instances of this view that stand still: label and RLE."""
@@ -147,6 +163,12 @@ class CameraMasks:
                 thing = None
         if person is not None and not self._person_missed[t]:
             found.append(("person", self._rle(person, truth), score[0] + 0.15))
+        if self.network.passer_by and not self._other_missed[t]:
+            other = self._bordered(truth, PASSER_BY, t)
+            if other is not None:
+                found.append(
+                    ("person", self._rle(other, truth), 0.87 + 0.12 * self._other_score[t])
+                )
         missed = MISS_FREE + (MISS_HIDDEN - MISS_FREE) * (1 - truth.visible) ** 2
         blur = truth.blur_px / (BLUR_PX * self.size[0] / 1920)
         missed = 1 - (1 - missed) * (1 - MISS_BLURRED * (1 - np.exp(-(blur**2))))

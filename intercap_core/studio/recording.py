@@ -16,7 +16,8 @@ from intercap_core.studio.failures import CLOCK_FALLS_BACK_SETS
 from intercap_core.studio.keypoints import Detector, to_json
 from intercap_core.studio.looks import body_colours
 from intercap_core.studio.masks import Labels, Segmenter
-from intercap_core.studio.render import OBJECT, Cast, Photographer, Surface, View
+from intercap_core.studio.passer_by import Passing
+from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, Cast, Photographer, Surface, View
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.sensor import DepthSensor
 from intercap_core.studio.stage import Moment, Stage
@@ -98,8 +99,11 @@ class Kinect:
         masks = segmenter.camera(name, clutter, size)
         colours = body_colours(stage.subject, stage.noise.rng("looks"))
 
+        passing = stage.passer_by.at(self.exposures) if stage.passer_by else None
         points = stage.keypoints(moment)
         hidden = np.zeros(points.shape[:2], bool)
+        others = stage.keypoints(passing) if passing else points[:0]
+        others_hidden = np.ones(others.shape[:2], bool)
         seen, whole = np.zeros(stage.frames, int), np.zeros(stage.frames, int)
         blur = _blur_px(colour_view, self.exposures, moment.stage_from_object[:, :3, 3])
         empty = stage.failures.depth_empty[:, self.index]
@@ -111,7 +115,7 @@ class Kinect:
         )  # fmt: skip
         with folder.open(device) as files:
             for order, t in enumerate(self.sets):
-                surfaces = surfaces_at(stage, moment, t, colours)
+                surfaces = surfaces_at(stage, moment, t, colours, passing)
                 cast = colour_view.cast(surfaces)
                 inertial = self._inertial(t, rng, depth_pose)
                 jpeg = photographer.jpeg(photographer.photograph(cast))
@@ -121,8 +125,10 @@ class Kinect:
                 recorded_depth = depth if has_depth[t] else None
                 files.write(Shot(t, self.device_time_us(t), jpeg, recorded_depth, inertial))
                 hidden[t] = _hidden(cast, colour_view, points[t])
+                if passing and passing.present[t]:
+                    others_hidden[t] = _hidden(cast, colour_view, others[t])
                 seen[t] = int((cast.identity == OBJECT).sum())
-                for thing in surfaces[1:]:
+                for thing in [surface for surface in surfaces if surface.kind == OBJECT]:
                     same = order and np.array_equal(
                         thing.stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
                     )
@@ -135,7 +141,12 @@ class Kinect:
                 image = folder.image_number(t, order, stage.fps)
                 candidates += [{"image_id": image, **result} for result in found]
         self._write_candidates(folder.path, candidates)
-        self._write_keypoints(folder, detector, moment, points, hidden)
+        shown = self._detected(detector, moment, points, hidden)
+        people = detector.people(self.true, shown)
+        if passing:
+            walker = self._detected(detector, passing, others, others_hidden, "passer-by")
+            people = detector.with_passer_by(self.true, people, walker, others_hidden)
+        self._write_keypoints(folder, people)
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
         return Recorded(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
@@ -164,19 +175,20 @@ class Kinect:
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
 
-    def _write_keypoints(
+    def _detected(
         self,
-        folder: CaptureFolder,
         detector: Detector,
-        moment: Moment,
+        moment: Moment | Passing,
         points: np.ndarray,
         hidden: np.ndarray,
-    ) -> None:
+        *who: str,
+    ) -> np.ndarray:
+        """Keypoints (T, 135, 3) in the image of a person with true points (T, 135, 3)."""
         master = self.stage.rig.master_from_stage[:3, :3]
-        subject = detector.detect(
-            self.true, self.stage.to_master(points), master @ moment.pelvis, hidden
-        )
-        people = detector.people(self.true, subject)
+        axes = master @ moment.pelvis
+        return detector.detect(self.true, self.stage.to_master(points), axes, hidden, *who)
+
+    def _write_keypoints(self, folder: CaptureFolder, people: list[list[np.ndarray]]) -> None:
         target = folder.path / "keypoints" / self.true.name
         target.mkdir(parents=True)
         for order, t in enumerate(self.sets):
@@ -190,16 +202,24 @@ def surfaces_at(
     moment: Moment,
     t: int,
     colours: np.ndarray,
+    passing: Passing | None = None,
 ) -> list[Surface]:
-    """The clothed body and the object, where there is one, at one moment."""
-    clothed, thing, subject = moment.clothed[t], stage.thing, stage.subject
-    normals = subject.normals(clothed[None])[0]
-    surfaces = [Surface(clothed, subject.faces.astype(np.int32), normals, colours, np.eye(4))]
+    """The clothed body, the object and a passer-by, those that are there at one moment."""
+    thing, subject = stage.thing, stage.subject
+    faces = subject.faces.astype(np.int32)
+
+    def person(kind: int, clothed: np.ndarray, colours: np.ndarray) -> Surface:
+        normals = subject.normals(clothed[None])[0]
+        return Surface(kind, clothed, faces, normals, colours, np.eye(4))
+
+    surfaces = [person(BODY, moment.clothed[t], colours)]
     if thing:
         pose = moment.stage_from_object[t]
         surfaces.append(
-            Surface(thing.vertices, thing.faces, stage.thing_normals, thing.colours, pose)
+            Surface(OBJECT, thing.vertices, thing.faces, stage.thing_normals, thing.colours, pose)
         )
+    if stage.passer_by and passing and passing.present[t]:
+        surfaces.append(person(PASSER_BY, passing.clothed[t], stage.passer_by.colours))
     return surfaces
 
 

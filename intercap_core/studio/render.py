@@ -21,7 +21,7 @@ from intercap_core.rigid.shots import Drawable
 from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 
-BODY, OBJECT = 1, 2  # what an identity image holds; 0 is the room
+BODY, OBJECT, PASSER_BY = 1, 2, 3  # what an identity image holds; 0 is the room
 BOX_MARGIN_PX = 1
 AMBIENT = 0.42
 VOID = 0.04  # grey of what lies beyond the room
@@ -35,9 +35,10 @@ JPEG_QUALITY = 85
 
 @dataclass(frozen=True)
 class Surface:
-    """A closed moving mesh in its own frame: vertices (V, 3), faces (F, 3), unit normals (V, 3),
-    colours (V, 3) RGB in [0, 1], and where it is, stage_from_mesh (4, 4)."""
+    """A closed moving mesh, BODY, OBJECT or PASSER_BY, in its own frame: vertices (V, 3), faces
+    (F, 3), unit normals (V, 3), colours (V, 3) RGB in [0, 1], and where it is, stage_from_mesh."""
 
+    kind: int
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
@@ -49,9 +50,9 @@ class Surface:
 class Cast:
     """What moving things look like in a window whose first pixel is (x0, y0).
 
-    ``identity`` (h, w) uint8 BODY, OBJECT or 0 where the room is nearer. Of the n pixels that are
-    not 0: ``pixels`` (n,) flat index in the window, ``depth`` (n,) z in metres, ``normal`` (n, 3)
-    stage frame and ``colour`` (n, 3), float32.
+    ``identity`` (h, w) uint8 BODY, OBJECT, PASSER_BY or 0 where the room is nearer. Of the n pixels
+    that are not 0: ``pixels`` (n,) flat index in the window, ``depth`` (n,) z in metres, ``normal``
+    (n, 3) stage frame and ``colour`` (n, 3), float32.
     """
 
     x0: int
@@ -154,18 +155,19 @@ class View:
         return Drawable(surface.vertices, surface.faces, pose)
 
     def cast(self, surfaces: Sequence[Surface]) -> Cast:
-        """Draw ``surfaces`` (body, object) over the room."""
+        """Draw ``surfaces`` over the room."""
         drawn = render_scene(
             [self._drawable(s) for s in surfaces], self.lens, margin_px=BOX_MARGIN_PX
         )
         nearer = drawn.mask & (drawn.depth < self.depth[drawn.window])
-        identity = np.where(nearer, drawn.body + 1, 0).astype(np.uint8)
+        kinds = np.array([surface.kind for surface in surfaces], np.uint8)
+        identity = np.where(nearer, kinds[drawn.body], 0).astype(np.uint8)
         pixels = np.flatnonzero(nearer)
         depth = drawn.depth.ravel()[pixels]
         normal, colour = np.empty((2, len(pixels), 3), np.float32)
         rays = self.lens.rays[drawn.window].reshape(-1, 2)
-        for number, surface in enumerate(surfaces):
-            here = np.flatnonzero(identity.ravel()[pixels] == number + 1)
+        for surface in surfaces:
+            here = np.flatnonzero(identity.ravel()[pixels] == surface.kind)
             _interpolate(
                 here, pixels, drawn.face.ravel(), rays, self._drawable(surface).camera_from_mesh,
                 surface.vertices, surface.faces, surface.normals, surface.colours,

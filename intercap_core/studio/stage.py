@@ -21,6 +21,7 @@ from intercap_core.studio.looks import object_colours
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
+from intercap_core.studio.passer_by import PasserBy, Passing
 from intercap_core.studio.rig import StudioRig, build_rig, started_apart
 from intercap_core.studio.room import Furnishing, Twin, build_room
 from intercap_core.studio.shoes import in_heavy_shoes
@@ -131,6 +132,19 @@ class Stage:
             object_colours(look, vertices, colours / 255.0, rng),
         )
 
+        self.passer_by = self._passer_by(eyes[:, :2, 3]) if capture.passer_by else None
+
+    def _passer_by(self, eyes: np.ndarray) -> PasserBy:
+        played = self.interaction.perform(
+            self.interaction.script_times(self.set_times, self.duration)
+        )
+        place = self.stage_from_script
+        pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
+        thing = (place @ played.stage_from_object)[:, :2, 3]
+        return PasserBy(
+            self.noise, self.subject, self.room, eyes, self.set_times, pelvis[:, :2], thing
+        )
+
     def _highlight(self) -> np.ndarray:
         """Where the object is on the floor plan (2,) when most happens to it."""
         played = self.interaction.perform(np.array([self.interaction.highlight]))
@@ -177,8 +191,8 @@ class Stage:
             stage_from_object,
         )
 
-    def keypoints(self, moment: Moment) -> np.ndarray:
-        """The 135 true keypoints (N, 135, 3) in the stage."""
+    def keypoints(self, moment: Moment | Passing) -> np.ndarray:
+        """The 135 true keypoints (N, 135, 3) in the stage; all people share one mesh."""
         chart = self.fitted.keypoint_map
         corners = self.subject.faces[self.subject.fitted_face[chart.vertex_ids]]
         weights = self.subject.fitted_bary[chart.vertex_ids]

@@ -58,6 +58,8 @@ def write_truth(
         room=stage.furnishing,
         faults=", ".join(_faults(stage, capture)),
     ) as file:
+        if stage.passer_by:
+            file.attributes["passer_by"] = stage.passer_by.subject.name
         if stage.subject.sole_m:
             file.attributes["sole_m"] = stage.subject.sole_m
         file.put("times", stage.set_times)
@@ -117,6 +119,7 @@ def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
     count = moment.clothed.shape[1]
     result = np.zeros((len(moment.clothed), count + len(thing.vertices)), bool)
     stage_from_master = np.linalg.inv(stage.rig.master_from_stage)
+    passing = stage.passer_by.at(stage.set_times) if stage.passer_by else None
     for t, pose in enumerate(moment.stage_from_object):
         moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
         drawn = [(moved, thing.faces)] if thing else []
@@ -126,6 +129,8 @@ def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
              stage.thing_normals @ pose[:3, :3].T]
         )  # fmt: skip
         room = stage.room
+        if passing and passing.present[t]:
+            drawn.append((passing.clothed[t], faces))
         scene = scene_of((moment.clothed[t], faces), *drawn, (room.vertices, room.faces))
         for camera in stage.rig.true:
             place = stage_from_master @ camera.master_from_colour

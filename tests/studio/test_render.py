@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from intercap_core.camera.transforms import apply, invert, rigid
-from intercap_core.studio.render import BODY, CAMERA_GAMMA, OBJECT, Surface, View, scene_of, shade
+from intercap_core.studio.render import BODY, OBJECT, BODY, CAMERA_GAMMA, OBJECT, Surface, View, scene_of, shade
 from intercap_core.studio.rig import build_rig
 from intercap_core.studio.room import build_room
 from intercap_core.studio.skeleton import turn
@@ -26,9 +26,9 @@ def surfaces() -> tuple[Surface, Surface]:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.15)
     place = rigid(turn(np.array([0.3, 0.2, 0.1])), np.array([0.25, 0.3, 1.2]))
     return (
-        Surface(posed, subject.faces, normals, 0.5 + 0.2 * posed, np.eye(4)),
+        Surface(BODY, posed, subject.faces, normals, 0.5 + 0.2 * posed, np.eye(4)),
         Surface(
-            np.array(ball.vertices), np.array(ball.faces), ball.vertices / 0.15,
+            OBJECT, np.array(ball.vertices), np.array(ball.faces), ball.vertices / 0.15,
             0.5 + 0.2 * ball.vertices, place,
         ),
     )  # fmt: skip

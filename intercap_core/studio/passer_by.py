@@ -1,0 +1,201 @@
+"""Another person who walks straight through the room, past the subject, and touches nothing.
+
+The way is drawn until one fits: 0.8 to 1.6 m from the subject where the two are nearest, clear of
+the object, of furniture and of the cameras. Walls have no doors: where one is in the way, the
+person comes out of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.errors import UserError
+from intercap_core.studio.controls import Footwork, Step
+from intercap_core.studio.hands import RELAXED
+from intercap_core.studio.looks import body_colours
+from intercap_core.studio.motion import LEG_REACH, Puppet, Trunk
+from intercap_core.studio.noise import NoiseSource
+from intercap_core.studio.room import FLOOR_HALF_M, Room
+from intercap_core.studio.subjects import Subject, subject_names
+
+PASSES_M = (0.8, 1.6)  # from the subject's pelvis, where nearest
+# Of the walker's middle: half the shoulders are 0.23 m
+CLEAR_OF_OBJECT_M, CLEAR_OF_THINGS_M, CLEAR_OF_CAMERAS_M = 0.65, 0.33, 0.45
+PASSES_WITHIN = (0.3, 0.7)  # of the recording
+TRIES = 3000
+STEP_S = (0.46, 0.54)
+STRIDE = (0.72, 0.84)  # of a leg's length, from one foot to the other
+SWINGS = 0.94  # of a step's time in which the foot is in the air
+ARM_SWING_M, LEAN, COUNTER_TURN = 0.16, 0.05, 0.08  # metres; rad of the trunk
+CELL_M = 0.05  # of the floor plan
+FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is a thing that one walks around
+OTHER_COLOURS = 0.25  # at least this far from the subject's, mean of the clothed surface, RGB
+_CORNERS = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
+
+
+@dataclass(frozen=True)
+class Passing:
+    """N moments: ``present`` (N,) bool, and where it is, in the stage, metres: ``body`` and
+    ``clothed`` (N, V, 3), ``joints`` (N, 55, 3), ``pelvis`` (N, 3, 3) stage_from_rest."""
+
+    present: np.ndarray
+    body: np.ndarray
+    clothed: np.ndarray
+    joints: np.ndarray
+    pelvis: np.ndarray
+
+
+@dataclass(frozen=True)
+class Way:
+    """A straight way, ``heading`` rad; at ``when`` s of the recording one is at ``place`` (2,)."""
+
+    place: np.ndarray
+    heading: float
+    when: float
+
+    def at(self, times: np.ndarray, speed: float) -> np.ndarray:
+        """Places (N, 2) at recording times (N,), where one walks with ``speed`` m/s."""
+        ahead = np.array([np.cos(self.heading), np.sin(self.heading)])
+        return self.place + speed * (times - self.when)[:, None] * ahead
+
+
+class PasserBy:
+    """The other person of one recording.
+
+    ``times`` (N,) s over the recording, at which ``pelvis`` (N, 2) and ``thing`` (N, 2) are the
+    places of subject and object on the floor, in the stage; ``eyes`` (C, 2) those of the cameras.
+    """
+
+    def __init__(
+        self,
+        noise: NoiseSource,
+        subject: Subject,
+        room: Room,
+        eyes: np.ndarray,
+        times: np.ndarray,
+        pelvis: np.ndarray,
+        thing: np.ndarray,
+    ) -> None:
+        rng = noise.rng("passer-by")
+        others = [name for name in subject_names() if name != subject.name]
+        self.subject = Subject.load(others[rng.integers(len(others))])
+        self.puppet = Puppet(self.subject)
+        self.colours = _other_colours(noise, self.subject, subject)
+        self.step_s, stride = rng.uniform(*STEP_S), rng.uniform(*STRIDE) * self.puppet.leg
+        self.speed = stride / self.step_s
+        self.way = self._way(rng, _things(room), eyes, times, pelvis, thing)
+        self._walk(stride)
+
+    def _way(
+        self,
+        rng: np.random.Generator,
+        things: np.ndarray,
+        eyes: np.ndarray,
+        times: np.ndarray,
+        pelvis: np.ndarray,
+        thing: np.ndarray,
+    ) -> Way:
+        """A way that fits; raises UserError where none does."""
+        whole = np.arange(-FLOOR_HALF_M, FLOOR_HALF_M, 0.05) / self.speed
+        for _ in range(TRIES):
+            heading, far = rng.uniform(0, 2 * np.pi), rng.uniform(*PASSES_M)
+            moment = round(rng.uniform(*PASSES_WITHIN) * (len(times) - 1))
+            left = np.array([-np.sin(heading), np.cos(heading)])
+            way = Way(pelvis[moment] + far * left, heading, float(times[moment]))
+            path, places = way.at(times, self.speed), way.at(way.when + whole, self.speed)
+            nearest = np.linalg.norm(path - pelvis, axis=1).min()
+            if (
+                PASSES_M[0] <= nearest <= PASSES_M[1]
+                and np.linalg.norm(path - thing, axis=1).min() > CLEAR_OF_OBJECT_M
+                and _gap(places, things) > CLEAR_OF_THINGS_M
+                and _gap(places, eyes) > CLEAR_OF_CAMERAS_M
+            ):
+                return way
+        raise UserError(
+            "studio: nobody finds a way past the subject through this room; set passer_by: false, "
+            "another seed or room: bare"
+        )
+
+    def _walk(self, stride: float) -> None:
+        """Footsteps along x of the walker's own frame, from x = 0 at the time 0."""
+        puppet, across = self.puppet, 0.7 * self.puppet.hip_width
+        count = int(np.ceil(2 * (FLOOR_HALF_M + 1) / stride))
+        start = np.array([[-0.5 * stride, across], [0.5 * stride, -across]])
+        steps = []
+        for k in range(count):
+            begin, foot = k * self.step_s, k % 2
+            place = ((k + 1.5) * stride, (across, -across)[foot])
+            steps.append(Step(foot, begin, begin + SWINGS * self.step_s, place))
+        self.seconds = count * self.step_s
+        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, self.seconds)
+        self.track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, across, puppet.hip_drop, puppet.stand
+        )
+
+    def at(self, times: np.ndarray) -> Passing:
+        """The person at recording times (N,); present while on the floor of the room."""
+        count, points = len(times), len(self.subject.rest)
+        present = (np.abs(self.way.at(times, self.speed)) < FLOOR_HALF_M - 0.3).all(1)
+        body, clothed = np.zeros((2, count, points, 3))
+        joints, pelvis = np.zeros((count, 55, 3)), np.zeros((count, 3, 3))
+        if present.any():
+            world, root = self._pose(times[present])
+            posed = self.puppet.skin(world, root)
+            body[present], clothed[present] = posed.vertices, posed.clothed
+            joints[present], pelvis[present] = posed.joints, world[:, 0]
+        return Passing(present, body, clothed, joints, pelvis)
+
+    def _pose(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joint rotations (N, 55, 3, 3) and pelvis (N, 3) in the stage."""
+        puppet = self.puppet
+        # the middle of the walk is where the way is given
+        own = times - self.way.when + self.seconds / 2
+        track, feet = self.track(own), self.footwork.feet(own)
+        phase = np.pi * own / self.step_s  # a half turn is a step, the left foot's first
+        bend, head = np.zeros((2, len(own), 3))
+        bend[:, 0], bend[:, 1] = LEAN, COUNTER_TURN * np.sin(phase - np.pi / 2)
+        trunk = puppet.settled(Trunk(track[:, :3], track[:, 3], bend, head), feet[0])
+        world = puppet.trunk(trunk)
+        puppet.legs(world, trunk.pelvis, *feet)
+        # an arm is ahead while the foot of its side is behind
+        for side, sign in enumerate((1.0, -1.0)):
+            swing = sign * ARM_SWING_M * np.cos(phase)
+            puppet.arm_to(
+                world, trunk.pelvis, side, puppet.idle_wrist(world, trunk.pelvis, side, swing)
+            )
+            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+        middle = self.speed * self.seconds / 2
+        cos, sin = np.cos(self.way.heading), np.sin(self.way.heading)
+        turned = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        place = np.array([*self.way.place, 0.0])
+        return turned @ world, (trunk.pelvis - [middle, 0, 0]) @ turned.T + place
+
+
+def _things(room: Room) -> np.ndarray:
+    """Points (N, 2) of what stands about, on the floor plan."""
+    corners = room.vertices[room.faces]
+    points = np.einsum("sk,fkc->fsc", _CORNERS, corners).reshape(-1, 3)
+    standing = points[:, 2] > FLOOR_UP_M
+    inside = np.linalg.norm(points[:, :2], axis=1) < WALLS_BEYOND_M
+    cells = np.round(points[standing & inside, :2] / CELL_M).astype(int)
+    return CELL_M * np.unique(cells, axis=0)
+
+
+def _gap(path: np.ndarray, things: np.ndarray) -> float:
+    """How near a path (N, 2) comes to things (M, 2), metres."""
+    if not len(things):
+        return np.inf
+    return float(np.linalg.norm(path[:, None] - things, axis=2).min())
+
+
+def _other_colours(noise: NoiseSource, passer_by: Subject, subject: Subject) -> np.ndarray:
+    """Colours (V, 3) of somebody whose clothes are not the subject's."""
+    worn = body_colours(subject, noise.rng("looks"))[subject.clothing > 0.001].mean(0)
+    rng = noise.rng("passer-by looks")
+    dressed = passer_by.clothing > 0.001
+    drawn = [body_colours(passer_by, rng) for _ in range(8)]
+    away = [float(np.linalg.norm(colours[dressed].mean(0) - worn)) for colours in drawn]
+    far = next((k for k, distance in enumerate(away) if distance > OTHER_COLOURS), None)
+    return drawn[int(np.argmax(away)) if far is None else far]

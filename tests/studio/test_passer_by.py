@@ -1,0 +1,131 @@
+"""Another person who walks past: apart from all, seen by the cameras, no part of the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.camera.transforms import invert
+from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.schemas import TRUTH
+from intercap_core.studio.capture import make_capture
+from intercap_core.studio.keypoints import Detector
+from intercap_core.studio.looks import body_colours
+from intercap_core.studio.noise import NoiseSource
+from intercap_core.studio.passer_by import PASSES_M, PasserBy
+from intercap_core.studio.recording import surfaces_at
+from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, View, scene_of
+from intercap_core.studio.stage import Stage
+
+Entry = Callable[[str], ObjectEntry]
+CAPTURE = StudioCapture(
+    interaction="stool_sit", subject="s06", seed=5, frames=10, layout="plain", passer_by=True
+)
+SETTINGS = StudioSettings(captures={}, cameras=3, colour_mode="720P", fps=5)
+
+
+@pytest.fixture(scope="module")
+def stage(object_entry: Entry) -> Stage:
+    return Stage(CAPTURE, SETTINGS, object_entry("stool"))
+
+
+@pytest.fixture(scope="module")
+def walker(stage: Stage) -> PasserBy:
+    assert stage.passer_by is not None
+    return stage.passer_by
+
+
+def test_somebody_else_walks_past_and_touches_nothing(stage: Stage, walker: PasserBy) -> None:
+    times = np.arange(0, stage.duration, 1 / 30)
+    moment, passing = stage.at(times), walker.at(times)
+    assert walker.subject.name != stage.subject.name and passing.present.all()
+    apart = np.linalg.norm((passing.joints - moment.joints)[:, 0, :2], axis=1)
+    assert PASSES_M[0] - 0.05 < apart.min() < PASSES_M[1] + 0.05
+    things = stage.thing.vertices[::50]
+    for t in range(0, len(times), 5):
+        pose = moment.stage_from_object[t]
+        at = things @ pose[:3, :3].T + pose[:3, 3]
+        gap = np.linalg.norm(at[:, None] - passing.clothed[t][None, ::40], axis=2).min()
+        assert gap > 0.1
+    assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
+    pace = np.linalg.norm(np.diff(passing.joints[:, 0], axis=0), axis=1) * 30
+    assert pace.min() > 0.8 and pace.max() < 2.2
+
+
+def test_the_walker_comes_from_the_edge_and_leaves(walker: PasserBy) -> None:
+    times = walker.way.when + np.array([-20.0, -2.0, 0.0, 2.0, 20.0])
+    present = walker.at(times).present
+    assert present.tolist() == [False, True, True, True, False]
+
+
+def test_nothing_else_of_the_recording_changes(stage: Stage, object_entry: Entry) -> None:
+    alone = Stage(CAPTURE.model_copy(update={"passer_by": False}), SETTINGS, object_entry("stool"))
+    ours, theirs = (s.at(s.set_times[::4]) for s in (stage, alone))
+    np.testing.assert_array_equal(ours.body, theirs.body)
+    np.testing.assert_array_equal(ours.stage_from_object, theirs.stage_from_object)
+    np.testing.assert_array_equal(stage.room.vertices, alone.room.vertices)
+    np.testing.assert_array_equal(stage.rig.offset_s, alone.rig.offset_s)
+
+
+def test_each_hides_what_is_behind(stage: Stage, walker: PasserBy) -> None:
+    """Against rays that are cast through all surfaces at once."""
+    times = np.array([0.0, walker.way.when, 1.8])
+    moment, passing = stage.at(times), walker.at(times)
+    colours = body_colours(stage.subject, stage.noise.rng("looks"))
+    stage_from_master = invert(stage.rig.master_from_stage)
+    drawn_of_walker = 0
+    for camera in stage.rig.true:
+        pose = stage_from_master @ camera.master_from_colour
+        view = View(camera.colour.scaled(0.2), pose, stage.room, coloured=True)
+        for t in range(len(times)):
+            surfaces = surfaces_at(stage, moment, t, colours, passing)
+            cast = view.cast(surfaces)
+            drawn = np.zeros(view.depth.shape, int)
+            drawn[cast.window] = cast.identity
+            meshes = [
+                (s.vertices @ s.stage_from_mesh[:3, :3].T + s.stage_from_mesh[:3, 3], s.faces)
+                for s in surfaces
+            ]
+            scene = scene_of(*meshes, (stage.room.vertices, stage.room.faces))
+            rays = np.empty((*view.depth.shape, 6), np.float32)
+            rays[..., :3], rays[..., 3:] = view.eye, view.directions()
+            hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["geometry_ids"].numpy()
+            for number, kind in enumerate((BODY, OBJECT, PASSER_BY)):
+                assert ((hit == number) != (drawn == kind)).mean() < 1e-4
+            drawn_of_walker += int((drawn == PASSER_BY).sum())
+    assert drawn_of_walker > 1000
+
+
+def test_detectors_find_both_people_in_any_order(tmp_path: Path, object_entry: Entry) -> None:
+    folder = tmp_path / "passed"
+    make_capture(CAPTURE, SETTINGS, sequence="passed", objects=object_entry("stool"), output=folder)
+    with artefacts.read(folder / "truth.h5", TRUTH) as truth:
+        assert truth.attributes["passer_by"] != truth.attributes["subject"]
+        names = truth.text("camera_names")
+    several, persons = 0, 0
+    for name in names:
+        for path in sorted((folder / "keypoints" / name).iterdir()):
+            several += len(json.loads(path.read_text())["people"]) > 1
+        found = json.loads((folder / "candidates" / f"{name}.json").read_text())
+        images = [c["image_id"] for c in found if c["category"] == "person"]
+        persons += sum(images.count(image) > 1 for image in set(images))
+    assert several > CAPTURE.frames and persons > CAPTURE.frames
+
+
+def test_a_walker_is_anywhere_in_a_file_and_only_where_seen(stage: Stage) -> None:
+    detector = Detector.build(NoiseSource(3, 1.0, "a", 5.0), 60)
+    subject, walker = np.zeros((135, 3)), np.ones((60, 135, 3))
+    hidden = np.zeros((60, 135), bool)
+    hidden[40:] = True
+    camera = stage.rig.true[0]
+    people = detector.with_passer_by(camera, [[subject] for _ in range(60)], walker, hidden)
+    places = [[person is not subject for person in found].index(True) for found in people[:40]
+              if len(found) == 2]  # fmt: skip
+    assert len(places) > 30 and 5 < sum(places) < len(places) - 5
+    assert all(len(found) == 1 for found in people[40:])
