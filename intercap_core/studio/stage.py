@@ -25,7 +25,7 @@ from intercap_core.studio.passer_by import PasserBy, Passing
 from intercap_core.studio.rig import StudioRig, build_rig, started_apart
 from intercap_core.studio.room import Furnishing, Twin, build_room
 from intercap_core.studio.shoes import in_heavy_shoes
-from intercap_core.studio.subjects import Subject, subject_names
+from intercap_core.studio.subjects import Subject, build_names, subject_names
 from intercap_core.studio.tissue import press_out
 
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
@@ -227,9 +227,10 @@ def check_capture(
             f"studio: recordings of layout {capture.layout!r} have at most {FASTEST_KINECT} frames "
             f"a second, 'fps' is {settings.fps}; set layout: plain or another fps"
         )
-    if capture.subject not in subject_names():
+    people = (*subject_names(), *build_names())
+    if capture.subject not in people:
         raise UserError(
-            f"studio: no subject {capture.subject!r}, there are {', '.join(subject_names())}; "
+            f"studio: no subject {capture.subject!r}, there are {', '.join(people)}; "
             "correct 'subject' of the capture"
         )
     if capture.video and capture.layout != "plain":

@@ -19,7 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS, PARENTS
 
+# The usual dozen, and people of other builds on the same mesh: their file holds what is their own
 SUBJECTS_FILE = Path(__file__).parent / "data" / "subjects.npz"
+BUILDS_FILE = SUBJECTS_FILE.with_name("builds.npz")
 # Each driver's angle thickens and creases what hangs on it (the file's `bulges`, at 90 degrees)
 _DRIVERS = tuple(
     JOINT_INDEX[f"{side}_{joint}"]
@@ -71,12 +73,14 @@ class Subject:
 
     @classmethod
     def load(cls, name: str) -> Subject:
-        """One of `subject_names()`; another name raises KeyError."""
-        data = _file()
-        names = data["names"].tolist()
+        """One of `subject_names()` or `build_names()`; another name raises KeyError."""
+        names = (*subject_names(), *build_names())
         if name not in names:
             raise KeyError(f"no subject {name!r}; there are {', '.join(names)}")
-        i = names.index(name)
+        data = _file(SUBJECTS_FILE)
+        if name in build_names():
+            data = data | _file(BUILDS_FILE)
+        i = data["names"].tolist().index(name)
         weights = data["weights"].astype(np.float64)
         return cls(
             name=name,
@@ -155,13 +159,18 @@ class Subject:
 
 
 def subject_names() -> tuple[str, ...]:
-    """The people there are, in a fixed order."""
-    return tuple(_file()["names"].tolist())
+    """The usual people, in a fixed order."""
+    return tuple(_file(SUBJECTS_FILE)["names"].tolist())
+
+
+def build_names() -> tuple[str, ...]:
+    """The people of other builds: small and tall, slight and strong."""
+    return tuple(_file(BUILDS_FILE)["names"].tolist())
 
 
 @cache
-def _file() -> dict[str, np.ndarray]:
-    with np.load(SUBJECTS_FILE, allow_pickle=False) as file:
+def _file(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as file:
         return {name: file[name] for name in file.files}
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from intercap_core.body.model import BodyModel
-from intercap_core.studio.subjects import Subject, subject_names
+from intercap_core.studio.subjects import Subject, build_names, subject_names
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +25,41 @@ def test_a_dozen_people_of_both_genders() -> None:
     assert 1.45 < min(heights) < 1.6 and 1.8 < max(heights) < 2.0
     with pytest.raises(KeyError, match="s99"):
         Subject.load("s99")
+
+
+def test_other_builds_are_small_and_tall_slight_and_strong() -> None:
+    people = [Subject.load(n) for n in build_names()]
+    assert len(people) == 6
+    heights = np.array([p.height_m for p in people])
+    np.testing.assert_allclose(heights, [np.ptp(p.rest[:, 1]) for p in people], atol=0.004)
+    assert abs(heights.min() - 1.50) < 0.005 and abs(heights.max() - 1.95) < 0.005
+    girths = []
+    for p in people:
+        forearm = np.asarray(p.weights[:, [18]].sum(1)).ravel() > 0.9
+        around = p.rest[forearm] - p.rest_joints[18]
+        bone = p.rest_joints[20] - p.rest_joints[18]
+        along = around @ bone / (bone @ bone)
+        ring = around[(along > 0.2) & (along < 0.5)]
+        off = ring - np.outer(ring @ bone / (bone @ bone), bone)
+        girths.append(np.linalg.norm(off - off.mean(0), axis=1).mean() / np.linalg.norm(bone))
+    slight, strong = np.array(girths)[[0, 2, 4]], np.array(girths)[[1, 3, 5]]
+    assert strong.min() > 1.1 * slight.max()
+
+
+@pytest.mark.parametrize("name", build_names())
+def test_other_builds_stand_on_the_same_mesh(name: str) -> None:
+    person, usual = Subject.load(name), Subject.load("s04")
+    assert np.array_equal(person.faces, usual.faces)
+    ours, theirs = (
+        np.sort(np.linalg.norm(np.diff(p.rest[p.faces], axis=1), axis=2).ravel())
+        for p in (person, usual)
+    )
+    assert 0.5 < np.median(ours / theirs) < 2  # no triangle is torn
+    assert ours.max() < 2 * theirs.max()
+    out = person.skin(_random_pose(1), np.zeros((1, 3)))
+    assert np.isfinite(out.clothed).all()
+    worn = person.clothing[person.clothing > 0]
+    assert 0.003 < np.median(worn) and worn.max() < 0.021
 
 
 def test_the_rest_pose_leaves_the_body_where_it_is(person: Subject) -> None:

@@ -34,7 +34,8 @@ def at(vertices: np.ndarray, faces: np.ndarray, face: np.ndarray, bary: np.ndarr
     return np.einsum("nk,nkc->nc", bary, vertices[faces[face]])
 
 
-def _enlarged(template: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
+def enlarged(template: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """The mesh with hands, feet and head blown up, so that neighbours are far apart."""
     out = template.copy()
     fingers = {s: [i for i, n in enumerate(JOINT_NAMES) if n.startswith(s) and n[-1] in "123"]
                for s in ("left", "right")}  # fmt: skip
@@ -51,7 +52,7 @@ def _enlarged(template: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> 
     return out
 
 
-def _closest(
+def closest(
     points: np.ndarray,
     normals: np.ndarray,
     vertices: np.ndarray,
@@ -92,7 +93,7 @@ def remesh(source: Source, template: np.ndarray, joints: np.ndarray, faces: int)
     import open3d as o3d
     import trimesh
 
-    big = _enlarged(template, source.weights, joints)
+    big = enlarged(template, source.weights, joints)
     is_eye = source.weights[:, [23, 24]].sum(1) > 0.5
     eye_face = is_eye[source.faces].all(1)
     skin = trimesh.Trimesh(big, source.faces[~eye_face], process=False)
@@ -105,7 +106,7 @@ def remesh(source: Source, template: np.ndarray, joints: np.ndarray, faces: int)
     new_id[eye_ids] = len(small.vertices) + np.arange(len(eye_ids))
     vertices = np.concatenate([np.asarray(small.vertices), big[eye_ids]])
     triangles = np.concatenate([np.asarray(small.triangles), new_id[source.faces[eye_face]]])
-    face, bary = _closest(vertices, vertex_normals(vertices, triangles), big, source.faces)
+    face, bary = closest(vertices, vertex_normals(vertices, triangles), big, source.faces)
     on_source = at(big, source.faces, face, bary)
-    back_face, back_bary = _closest(big, vertex_normals(big, source.faces), on_source, triangles)
+    back_face, back_bary = closest(big, vertex_normals(big, source.faces), on_source, triangles)
     return Retopology(triangles, face, bary, back_face, back_bary)

@@ -52,13 +52,37 @@ def _phenotypes(rng: np.random.Generator) -> dict[str, np.ndarray]:
     }
 
 
-def _local_changes(source: Source, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def used_changes(source: Source) -> list[str]:
+    """The names of the local changes that people get."""
     labels = source.model.local_change_labels  # type: ignore[attr-defined]
-    used = [n for n in labels if not any(s in n for s in _SKIPPED)]
-    return {n: np.clip(rng.normal(0, 0.25, _COUNT), -0.8, 0.8) for n in used}
+    return [n for n in labels if not any(s in n for s in _SKIPPED)]
 
 
-def _residual_mm(space: shape_space.ShapeSpace, vertices: np.ndarray, area: np.ndarray) -> float:
+def _local_changes(source: Source, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    return {n: np.clip(rng.normal(0, 0.25, _COUNT), -0.8, 0.8) for n in used_changes(source)}
+
+
+def with_local_changes(
+    source: Source,
+    space: shape_space.ShapeSpace,
+    area: np.ndarray,
+    person: dict[str, np.ndarray],
+    local: dict[str, np.ndarray],
+    wanted_mm: float,
+) -> tuple[tuple[np.ndarray, ...], float]:
+    """A T-posed body, local changes bisected until it is ``wanted_mm`` outside the fitted model's
+    shape space, and their strength; ``person`` and ``local`` hold values (1,)."""
+    low, high = 0.0, 3.0
+    for _ in range(9):
+        strength = (low + high) / 2
+        change = {k: np.clip(strength * v, -1, 1) for k, v in local.items()}
+        body = shape_space.t_posed(source, source.coefficients(person, change))
+        rms = residual_mm(space, body[0][0], area)
+        low, high = (strength, high) if rms < wanted_mm else (low, strength)
+    return body, strength
+
+
+def residual_mm(space: shape_space.ShapeSpace, vertices: np.ndarray, area: np.ndarray) -> float:
     """RMS distance (mm) of a body from the fitted model's ten shape directions."""
     basis = space.directions[:, :, :10].reshape(-1, 10)
     weight = np.repeat(area, 3)
@@ -77,15 +101,10 @@ def _identities(source: Source, space: shape_space.ShapeSpace, rng: np.random.Ge
     bodies, measured = [], []
     for i in range(_COUNT):
         person = {k: v[i : i + 1] for k, v in people.items()}
-        low, high = 0.0, 3.0
-        for _ in range(9):  # bisect the strength of the local changes
-            strength = (low + high) / 2
-            change = {k: np.clip(strength * v[i : i + 1], -1, 1) for k, v in local.items()}
-            body = shape_space.t_posed(source, source.coefficients(person, change))
-            rms = _residual_mm(space, body[0][0], area)
-            low, high = (strength, high) if rms < wanted[i] else (low, strength)
+        own = {k: v[i : i + 1] for k, v in local.items()}
+        body, _ = with_local_changes(source, space, area, person, own, wanted[i])
         bodies.append(tuple(x[0] for x in body))
-        measured.append(rms)
+        measured.append(residual_mm(space, body[0][0], area))
     vertices, joints, tips = (np.stack(x) for x in zip(*bodies, strict=True))
     return vertices, joints, tips, people, np.array(measured)
 
@@ -159,7 +178,7 @@ def _bulges(vertices: np.ndarray, joints: np.ndarray, faces: np.ndarray) -> np.n
     return out
 
 
-def _clothing(vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, faces: np.ndarray,
+def clothing_of(vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, faces: np.ndarray,
               long_sleeves: bool, rng: np.random.Generator,) -> np.ndarray:  # fmt: skip
     """(V,) thickness in metres: 5 to 20 mm with folds; 0 on hands, face and feet."""
     mean = _neighbour_mean(faces, len(vertices))
@@ -201,7 +220,7 @@ def bake(source: Source, path: Path) -> None:
     weights = _smoothed_weights(weights, mesh.faces)
     template, mean_joints = on_mesh.mean(0), joints.mean(0)
     clothing = np.stack([
-        _clothing(on_mesh[i], weights, joints[i], mesh.faces, i % 3 != 1, rng)
+        clothing_of(on_mesh[i], weights, joints[i], mesh.faces, i % 3 != 1, rng)
         for i in range(_COUNT)
     ])  # fmt: skip
     back = np.stack([retopology.at(on_mesh[i], mesh.faces, mesh.back_face, mesh.back_bary)
