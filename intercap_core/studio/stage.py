@@ -118,6 +118,7 @@ class Stage:
             twin=Twin(corners, self.thing.faces) if self.thing else None,
             hidden=self._highlight() if self.thing and size < SMALL_M else None,
         )
+        self.passer_by = self._passer_by(eyes[:, :2, 3]) if capture.passer_by else None
 
     def _thing(self, entry: ObjectEntry, capture: StudioCapture) -> TrueObject:
         """The object as it truly is in this capture."""
@@ -132,15 +133,15 @@ class Stage:
             object_colours(look, vertices, colours / 255.0, rng),
         )
 
-        self.passer_by = self._passer_by(eyes[:, :2, 3]) if capture.passer_by else None
-
     def _passer_by(self, eyes: np.ndarray) -> PasserBy:
         played = self.interaction.perform(
             self.interaction.script_times(self.set_times, self.duration)
         )
         place = self.stage_from_script
         pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
-        thing = (place @ played.stage_from_object)[:, :2, 3]
+        thing = (
+            (place @ played.stage_from_object)[:, :2, 3] if self.thing else np.full((1, 2), np.inf)
+        )
         return PasserBy(
             self.noise, self.subject, self.room, eyes, self.set_times, pelvis[:, :2], thing
         )

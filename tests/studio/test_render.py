@@ -8,7 +8,15 @@ import pytest
 import trimesh
 
 from intercap_core.camera.transforms import apply, invert, rigid
-from intercap_core.studio.render import BODY, OBJECT, BODY, CAMERA_GAMMA, OBJECT, Surface, View, scene_of, shade
+from intercap_core.studio.render import (
+    BODY,
+    CAMERA_GAMMA,
+    OBJECT,
+    Surface,
+    View,
+    scene_of,
+    shade,
+)
 from intercap_core.studio.rig import build_rig
 from intercap_core.studio.room import build_room
 from intercap_core.studio.skeleton import turn
