@@ -65,6 +65,17 @@ FREE_SPACE_NEAREST_M = 0.3
 FREE_SPACE_REACH_M = 0.05  # largest way in along the normal; tuned on the studio
 FREE_SPACE_STEP_M = 0.01  # step of that search; tuned on the studio
 
+# --- sensor: masks ----------------------------------------------------------------------------
+
+OUTLINE_POINTS = 400  # of a rim, a third of its pixels where a person fills 720 lines: speed
+OUTLINE_BLUR_PX = 3.0  # over which the rim's direction is measured; tuned on the studio
+SHORTEST_OUTLINE_PX = 40  # rims of smaller spots and holes are the network's; tuned on the studio
+OUTLINE_TRUST = 1.0  # of a point of the rim, a measured point's; tuned on the studio
+# Largest cosine between the line of sight and the normal of what may be on the rim: two thirds of a
+# limb's spacing of samples. Tuned on the studio.
+OUTLINE_FACING = 0.6
+OUTLINE_COSINE = 0.8  # least, of the normals of a rim's plane and its vertex; tuned on the studio
+
 # --- human motion -----------------------------------------------------------------------------
 
 MAX_SPEED = 6.0  # m/s; hands and feet reach some 5 in everyday tasks; tuned on the studio

@@ -16,12 +16,10 @@ from torch import Tensor
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.constants import (
-    CLOUD_HUBER_M,
     CONFIDENCE_BINS,
     FEWEST_IN_BIN,
     FRAMES_KEPT,
     FRAMES_POSED,
-    FREE_SPACE_TRUST,
     HALF_WEIGHT_POINTS,
     KEYPOINT_SIGMA_M,
     LARGEST_CONFIDENCE_EXPONENT,
@@ -33,13 +31,13 @@ from intercap_core.body_fit.constants import (
     SIGMA_RANGE,
     SMALLEST_SIGMA_PX,
 )
-from intercap_core.body_fit.free_space import seen_through
+from intercap_core.body_fit.matching import Matcher, Skin
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.terms import Views
 from intercap_core.camera.rig import Rig
 from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
-from intercap_core.energy.body_cloud import CloudRows, Matches
+from intercap_core.energy.body_cloud import CloudRows
 from intercap_core.energy.body_keypoints import KeypointSet
 from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.energy.body_self import SelfContact
@@ -77,7 +75,8 @@ class Evidence:
     frames (N,) their ids. keypoint_sigma (135,) m and cloud_noise (G,) m start from what is usual
     and are refined from residuals; the first is of keypoints of usual confidence, others have
     (confidence / usual)^-keypoint_doubt of it. cloud_residual (N,): median distance of points at
-    the last matching, metres, NaN = none. by_view: what each camera's points said then, or None.
+    the last matching, metres, NaN = none; measured (N,S): which samples had some. by_view: what
+    each camera's points and masks said then, or None.
     """
 
     def __init__(
@@ -99,6 +98,7 @@ class Evidence:
         )
         contact = SelfContact.of(model, self.samples)
         self.self_contact = replace(contact, vertex=sample, patch=patch)  # places in the surface
+        self._matcher = Matcher.of(self.samples, self.surface, model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
         self.group = torch.as_tensor(self.samples.group, device=model.device)
         carrier = model.skinning_weights.argmax(1).cpu().numpy()
@@ -108,6 +108,9 @@ class Evidence:
         self._threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
+        self.measured = torch.zeros(
+            len(self.frames), len(self.samples.vertex), dtype=torch.bool, device=model.device
+        )
         self.by_view: ViewDistances | None = None
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
@@ -257,73 +260,6 @@ class Evidence:
                 low, high = (covering.noise * factor for factor in NOISE_RANGE)
                 self.cloud_noise[g] = min(max(found, low), high)
 
-    def _matched(
-        self,
-        t: int,
-        vertices: Tensor,
-        normals: Tensor,
-        where: Tensor,
-        shift: Tensor | None,
-        expected: Tensor,
-        reach: float,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Matches of the t-th frame's cloud by sample of the skin: mean distance and effective
-        number of points by camera (C,S), and the median distance, metres.
-
-        vertices and normals (R,3) of the surface; ``where`` (S,3) its samples are, and how far they
-        move until each camera exposes, shift (C,S,3); ``expected`` (C*S,) thickness.
-        """
-        cloud = self.clouds[t]
-        assert cloud is not None
-        size, views = len(where), len(self.seen.rig)
-        sample, patch = self.self_contact.vertex, self.self_contact.patch
-        normal = normals[sample]
-        if vertices.device.type == "cpu":
-            found = body_cloud.match_compiled(
-                cloud.points, cloud.normals, vertices, normals, self.surface, reach
-            )
-        else:
-            found = body_cloud.match(
-                cloud.points, cloud.normals, vertices, normals, sample, patch, reach
-            )
-        if shift is not None:
-            moved = (shift[cloud.view, found.sample] * normal[found.sample]).sum(1)
-            found = found._replace(distance=found.distance - moved)
-        residual = found.distance[found.valid].abs().nanmedian()
-        # gathered by camera and sample: those that several cameras see tell their offsets
-        found = found._replace(sample=cloud.view * size + found.sample)
-        found, trust = self._with_seen_through(found, cloud, where, normal, shift)
-        apart, number = body_cloud.gather(found, trust, expected, views * size, huber=CLOUD_HUBER_M)
-        return apart.reshape(views, -1), number.reshape(views, -1), residual
-
-    def _with_seen_through(
-        self,
-        found: Matches,
-        cloud: PersonCloud,
-        where: Tensor,
-        normal: Tensor,
-        shift: Tensor | None,
-    ) -> tuple[Matches, Tensor]:
-        """One frame's matches and their trust, with those of samples that stick out of the person.
-
-        where, normal (S,3) of the samples, shift (C,S,3); matches count samples by camera.
-        """
-        size, sample, distance = len(where), [found.sample], [found.distance]
-        outward = normal.cpu().numpy()
-        for window in cloud.windows:
-            view = window.view
-            late = where if shift is None else where + shift[view]
-            out, inside = seen_through(
-                window, self.seen.rig[view], float(self.seen.depth_bias[view]),
-                late.cpu().numpy(), outward,
-            )  # fmt: skip
-            sample.append(torch.as_tensor(view * size + out, device=where.device))
-            distance.append(-self._tensor(inside))
-        extra = sum(len(part) for part in sample[1:])
-        trust = torch.cat([cloud.trust, cloud.trust.new_full((extra,), FREE_SPACE_TRUST)])
-        valid = torch.cat([found.valid, found.valid.new_ones(extra)])
-        return Matches(torch.cat(sample), torch.cat(distance), valid), trust
-
     def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Some frames of the bodies ``base`` (N,P) at a time: the first one's place, vertices and
         normals (b,R,3) of the surface. Those of short sequences are kept for the next call."""
@@ -374,10 +310,15 @@ class Evidence:
 
             def matched(one: tuple[int, Tensor, Tensor]) -> None:
                 t, vertices, normals = one
+                cloud = self.clouds[t]
+                assert cloud is not None
                 late = None if shift is None else shift[t]
-                of_views[t], points[t], self.cloud_residual[t] = self._matched(
-                    t, vertices, normals, where[t], late, expected, reach
+                skin = Skin(vertices, normals, where[t], late)
+                found = self._matcher.match(
+                    cloud, self.seen.rig, self.seen.depth_bias, skin, expected, reach
                 )
+                of_views[t], points[t] = found.distance, found.points
+                self.measured[t], self.cloud_residual[t] = found.measured, found.residual
 
             self._threads.map(matched, seen)
         self.by_view = ViewDistances(of_views, points, where, normal)

@@ -23,11 +23,13 @@ from intercap_core.body_fit.constants import (
     OUTLIER_VIEW_TRUST,
 )
 from intercap_core.body_fit.free_space import DepthWindow
+from intercap_core.body_fit.outlines import Outline, outline
 from intercap_core.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
 from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
+from intercap_core.detections.read import FROM_DETECTOR
 from intercap_core.errors import UserError
 from intercap_core.schemas import PERSON, SCENE
 from intercap_core.solve.thread_pool import ThreadPool
@@ -38,9 +40,10 @@ class Observations:
     """T frames, C cameras, K = 135 keypoints.
 
     keypoints (T,C,K,2) px and confidence (T,C,K), 0 = not seen; joints (T,K,3) triangulated, master
-    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none;
-    image_of (T,C): the set whose image of each camera shows each frame, -1 = none; times (T,) s;
-    time_offset (C,) s: each camera exposes later than the frame's time by this much.
+    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none, and who made
+    them, mask_source (T,C); image_of (T,C): the set whose image of each camera shows each frame, -1
+    = none; times (T,) s; time_offset (C,) s: each camera exposes later than the frame's time by
+    this much.
     """
 
     sequence: str
@@ -50,6 +53,7 @@ class Observations:
     joints: np.ndarray
     joint_views: np.ndarray
     masks: list[bytes]
+    mask_source: np.ndarray
     background: list[np.ndarray | None]
     depth_bias: np.ndarray
     image_of: np.ndarray
@@ -106,13 +110,13 @@ def read_observations(scene: Path, person: Path) -> Observations:
         keypoints = read["keypoints"].astype(np.float64)
         joints, views = read["joints"].astype(np.float64), read["joint_views"]
         inlier = read["inlier"]
-        masks = unpack_ragged(read["mask_offsets"], read["mask_rle"])
+        masks, source = unpack_ragged(read["mask_offsets"], read["mask_rle"]), read["mask_source"]
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
     disputed = (views >= 2)[:, None] & ~inlier
     confidence = np.where(disputed, OUTLIER_VIEW_TRUST * confidence, confidence)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
-        sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks,
+        sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks, source,
         background, depth_bias, image_of, time_offset, times,
     )  # fmt: skip
 
@@ -122,7 +126,8 @@ class PersonCloud:
     """One frame's person points of all views, master frame.
 
     points, normals (M,3) float32, metres, normals towards the camera; trust (M,) in (0,1]; view
-    (M,) index of the camera; windows: what each camera's depth shows around the person.
+    (M,) index of the camera; windows: what each camera's depth shows around the person; outlines:
+    the rims of the masks that a detector drew of the person.
     """
 
     points: Tensor
@@ -130,6 +135,7 @@ class PersonCloud:
     trust: Tensor
     view: Tensor
     windows: tuple[DepthWindow, ...] = ()
+    outlines: tuple[Outline, ...] = ()
 
     def through(
         self, rig: Rig, bias: np.ndarray, before: Rig, bias_before: np.ndarray
@@ -151,7 +157,7 @@ class PersonCloud:
 def person_clouds(
     frames: Path, seen: Observations, count: int, device: torch.device
 ) -> list[PersonCloud | None]:
-    """The cloud of every frame, about ``count`` points each; None = no depth, no mask."""
+    """The cloud of every frame, about ``count`` points each; None = no mask."""
     with Frames.open(frames) as reader:
         reader = reader.showing(seen.image_of)
         return ThreadPool(torch.get_num_threads()).map(
@@ -163,15 +169,18 @@ def _fused(
     reader: Frames, seen: Observations, t: int, count: int, device: torch.device
 ) -> PersonCloud | None:
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
-    windows = []
+    windows, outlines = [], []
     for c, camera in enumerate(seen.rig):
         rle = seen.masks[t * len(seen.rig) + c]
-        if not rle or camera.depth is None:
-            continue
-        depth = reader.depth(t, c)
-        if depth is None:
+        if not rle:
             continue
         mask = Runs(rle, camera.colour.height, camera.colour.width)
+        depth = None if camera.depth is None else reader.depth(t, c)
+        if seen.mask_source[t, c] == FROM_DETECTOR:
+            rim = outline(mask, camera.colour, c)
+            outlines += [] if rim is None else [rim]
+        if depth is None:
+            continue
         window = _window(camera, mask, depth)
         if window is None:
             continue
@@ -181,12 +190,13 @@ def _fused(
             rows, columns = window
             corner = (rows.start, columns.start)
             windows.append(DepthWindow(c, corner, depth[rows, columns].copy()))
-    if not seen_by:
+    if not seen_by and not outlines:
         return None
     # every n-th point: pixels are in scan order, so this spreads over the surface
     first = np.cumsum([0, *(len(index) for _, _, index in seen_by)])
     pick = np.unique(np.linspace(0, first[-1] - 1, min(count, first[-1])).astype(np.int64))
-    parts: list[tuple[np.ndarray, ...]] = []
+    none = np.zeros(0)
+    parts: list[tuple[np.ndarray, ...]] = [(none.reshape(0, 3), none.reshape(0, 3), none, none)]
     for (c, depth, index), start in zip(seen_by, first[:-1], strict=True):
         chosen = index[pick[(pick >= start) & (pick < start + len(index))] - start]
         placed = _placed(depth, seen.rig[c], chosen, seen.depth_bias[c])
@@ -196,8 +206,9 @@ def _fused(
         torch.as_tensor(points, dtype=torch.float32, device=device),
         torch.as_tensor(normals, dtype=torch.float32, device=device),
         torch.as_tensor(trust, dtype=torch.float32, device=device),
-        torch.as_tensor(view, device=device),
+        torch.as_tensor(view, dtype=torch.int64, device=device),
         tuple(windows),
+        tuple(outlines),
     )
 
 

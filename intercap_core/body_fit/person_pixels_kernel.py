@@ -41,7 +41,7 @@ def person_pixels(
     runs and its ``box`` x, y, width, height, not empty. What is ``hidden_m`` behind another pixel
     in one of the cells around, of ``cell`` colour pixels, is hidden. All but integers float32.
     """
-    mask = _drawn(ends, box, size[0])
+    mask = drawn(ends, box, size[0])
     across, down = int(size[1] / cell) + 1, int(size[0] / cell) + 1
     # cells around those that the mask touches
     left, top = max(int(box[0] / cell) - 2, 0), max(int(box[1] / cell) - 2, 0)
@@ -102,7 +102,7 @@ def person_pixels(
 
 
 @numba.njit(cache=True, nogil=True)
-def _drawn(ends, box, height):
+def drawn(ends, box, height):
     """The mask's box (w,h), column by column."""
     mask = np.zeros((box[2], box[3]), np.bool_)
     for run in range(1, len(ends), 2):

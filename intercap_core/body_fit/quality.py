@@ -103,8 +103,8 @@ def compare(
     """Residuals (N,C,K), in sigmas (K,) metres, of the keypoints ``index`` (K,), part by part.
 
     confidence (N,C,K), 0 = not seen; what is more than ``scale`` sigmas off is an outlier.
-    ``samples``: the joint (S,) that each of the cloud's samples hangs on and its weight (N,S), 0 =
-    no points; None without clouds.
+    ``samples``: the joint (S,) that each of the cloud's samples hangs on and whether depth measured
+    it (N,S) bool; None without clouds.
     """
     size = (len(whitened), len(BODY_PARTS))
     unknown, none = whitened.new_full(size, torch.nan), whitened.new_zeros(size)
@@ -125,7 +125,7 @@ def compare(
         result.views[:, column] = inliers.to(weight).median(1).values
         if samples is not None:
             on_part = np.isin(samples[0], _carriers_of(part))
-            result.measured[:, column] = (samples[1][:, on_part] > 0).to(weight).mean(1)
+            result.measured[:, column] = samples[1][:, on_part].to(weight).mean(1)
     return result
 
 

@@ -229,7 +229,7 @@ class Fitter:
                 index,
                 evidence.keypoint_sigma[index],
                 KEYPOINT_SCALE,
-                None if problem.rows is None else (evidence.sample_joints, problem.rows.weight),
+                None if problem.rows is None else (evidence.sample_joints, evidence.measured),
             ),
         )
 

@@ -36,6 +36,7 @@ differences from the paper are in ``docs/equations.md``.
 | beyond | keypoint offsets | energy/body_keypoints.py | assemble_offsets | - |
 | beyond | thickness of clothing | energy/body_samples.py | Covering | - |
 | beyond | free space | body_fit/free_space.py | seen_through | body_fit.cloud_weight |
+| beyond | rims of the person's masks | body_fit/outlines.py | touching | body_fit.cloud_weight |
 | 6 | E: sum of terms | joint/problem.py | joint_terms | - |
 | 6 | E_B | joint/terms/body_data.py | BodyData | - |
 | 6 | E_O, looked at anew | joint/terms/object_images.py | ObjectImagesData | joint.look_again |

@@ -1,0 +1,107 @@
+"""Planes through a mask's rim touch the body where they should, and are as far from it as it is off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core.body_fit.outlines import Outline, RimSamples, outline, touching
+from intercap_core.camera import masks
+from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.transforms import rigid
+
+LENS = Intrinsics(640, 480, 500.0, 505.0, 318.0, 243.0, (0.08, -0.03, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+CENTRE, RADIUS = np.array([0.15, -0.1, 2.0]), 0.25
+MASTER_FROM_COLOUR = rigid(
+    trimesh.transformations.euler_matrix(0.4, 0.3, -0.2)[:3, :3], np.array([0.3, 0.5, -0.2])
+)
+BALL = trimesh.creation.icosphere(subdivisions=4)
+SAMPLES = RimSamples(
+    np.arange(0, len(BALL.vertices), 3),
+    np.arange(0, len(BALL.vertices), 3),
+    np.array([_row[:20] for _row in np.argsort(
+        np.linalg.norm(BALL.vertices[::3, None] - BALL.vertices, axis=2), axis=1
+    )]),
+)  # fmt: skip
+
+
+def _mask(centre: np.ndarray, radius: float) -> masks.Runs:
+    """Pixels whose ray meets a ball."""
+    y, x = np.mgrid[: LENS.height, : LENS.width]
+    rays = LENS.unproject(np.stack([x, y], -1).reshape(-1, 2).astype(float))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    off = np.linalg.norm(np.cross(rays, centre), axis=1)
+    return _runs((off < radius).reshape(LENS.height, LENS.width))
+
+
+def _runs(mask: np.ndarray) -> masks.Runs:
+    return masks.Runs(masks.encode(mask), *mask.shape)
+
+
+def _rim(mask: masks.Runs) -> Outline:
+    found = outline(mask, LENS, 0)
+    assert found is not None
+    return found
+
+
+def _touching(rim: Outline, radius: float, late: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Of a ball where the seen one is, and so large; ``late`` metres along x of the camera."""
+    turn, shift = MASTER_FROM_COLOUR[:3, :3], MASTER_FROM_COLOUR[:3, 3]
+    vertices = (radius * BALL.vertices + CENTRE) @ turn.T + shift
+    moved = np.broadcast_to(late * turn[:, 0], (len(vertices), 3))
+    return touching(rim, MASTER_FROM_COLOUR, vertices, BALL.vertices @ turn.T, SAMPLES, 0.05, moved)
+
+
+def test_planes_touch_what_the_mask_is_of() -> None:
+    rim = _rim(_mask(CENTRE, RADIUS))
+    apart = (rim.normals * CENTRE).sum(1)  # of the ball's centre: inward
+    np.testing.assert_allclose(np.linalg.norm(rim.normals, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose((rim.normals * rim.rays).sum(1), 0, atol=1e-6)
+    assert apart.mean() == pytest.approx(-RADIUS, abs=0.0005)
+    assert np.abs(apart + RADIUS).max() < 0.004  # of a pixel, 4 mm wide there
+    assert 200 < len(rim.rays) < 500
+
+
+@pytest.mark.parametrize("smaller_m", [-0.02, 0.0, 0.01, 0.03])
+def test_the_distance_is_what_the_body_lacks(smaller_m: float) -> None:
+    rim = _rim(_mask(CENTRE, RADIUS))
+    sample, distance = _touching(rim, RADIUS - smaller_m)
+    assert len(sample) > 0.9 * len(rim.rays)
+    assert distance.mean() == pytest.approx(smaller_m, abs=0.0015)
+
+
+def test_what_is_farther_than_reach_is_left_out() -> None:
+    assert len(_touching(_rim(_mask(CENTRE, RADIUS)), RADIUS - 0.06)[0]) == 0
+
+
+def test_what_has_moved_when_the_camera_exposes_is_looked_for_there() -> None:
+    """On the side that it moves to it lacks less, on the other more."""
+    rim = _rim(_mask(CENTRE, RADIUS))
+    sample, distance = _touching(rim, RADIUS, late=0.01)
+    sideways = BALL.vertices[sample, 0]
+    assert distance[sideways > 0.9].mean() == pytest.approx(-0.0095, abs=0.002)
+    assert distance[sideways < -0.9].mean() == pytest.approx(0.0095, abs=0.002)
+
+
+def test_the_image_border_is_no_rim() -> None:
+    half = np.zeros((LENS.height, LENS.width), bool)
+    half[100:, :300] = True  # leaves the image on the left and below
+    normals = _rim(_runs(half)).normals
+    assert (normals[:, 0] > 0.9).any() and (normals[:, 1] < -0.9).any()
+    assert not (normals[:, 0] < -0.5).any() and not (normals[:, 1] > 0.5).any()
+
+
+def test_a_gap_between_limbs_has_a_rim_and_a_speck_has_none() -> None:
+    whole = np.zeros((LENS.height, LENS.width), bool)
+    whole[100:300, 100:300] = True
+    without = len(_rim(_runs(whole)).rays)
+    gap = whole.copy()
+    gap[150:250, 180:220] = False
+    rim = _rim(_runs(gap))
+    inner = np.abs(rim.rays[:, :2] / rim.rays[:, 2:]).max()
+    assert len(rim.rays) != without and inner < 1
+    speck = np.zeros_like(whole)
+    speck[200:204, 200:204] = True
+    assert outline(_runs(speck), LENS, 0) is None
+    assert outline(_runs(np.zeros_like(whole)), LENS, 0) is None
