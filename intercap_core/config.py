@@ -148,10 +148,13 @@ class BodyFitSettings(Model):
     """Fit jaw and expression from the face keypoints."""
     shape: Literal["shared", "per_frame"] = "shared"
     """One shape for the sequence, or a free shape in every frame as in the paper's first stage."""
+    betas: Annotated[int, Field(ge=1, le=300)] = 10
+    """Numbers of the shape. Most readers of SMPL-X take ten; the open body has thirty, with which
+    it lies some 4 % closer, a licensed file of full size 300."""
     points_per_frame: Annotated[int, Field(ge=200, le=20000)] = 1500
     """Person points kept of each frame's fused cloud."""
     cloud_weight: Annotated[float, Field(gt=0, le=1000)] = 1.0
-    """Weight of the cloud against the keypoints (lambda_D)."""
+    """Weight of points and rims of masks against the keypoints (lambda_D)."""
     self_penetration_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Weight of the body's parts not entering each other (lambda_P of equation 2)."""
 
@@ -441,7 +444,9 @@ class SubjectEntry(Model):
     subject: Name
     """Name of the person."""
     gender: Literal["female", "male", "neutral"]
-    """Which body file is used."""
+    """Which body file is used, or of the open body whose shapes are expected; neutral: of all."""
+    height: Annotated[float, Field(ge=0.5, le=2.6)] | None = None
+    """Barefoot, in metres, where it is known; believed to 2 cm."""
 
 
 class ContinuousSymmetry(Model):

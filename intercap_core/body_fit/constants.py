@@ -118,7 +118,7 @@ FRAMES_KEPT = 256
 # Priors on parameters that never change count so many times in every frame: their data's errors
 # persist over frames. One frame of a shape of its own has 1. Tuned on the studio.
 OFFSET_PRIOR_PER_FRAME = 0.3
-SHAPE_PRIOR_PER_FRAME = 1.0
+SHAPE_PRIOR_PER_FRAME = 0.3
 COVERING_PRIOR_PER_FRAME = 2.0
 # Frames whose cost exceeds the median by this factor are tried turned around. Tuned on the studio.
 TURN_WORSE = 1.5

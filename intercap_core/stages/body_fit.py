@@ -7,6 +7,7 @@ offsets, which all frames share.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import file_digest, load_pose_prior
-from intercap_core.body.loading import OPEN_BODY
+from intercap_core.body.loading import OPEN_BODY, load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.plausible import check_body
+from intercap_core.body.shape_prior import ShapePrior
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
 from intercap_core.body_fit.constants import (
@@ -33,7 +35,7 @@ from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, dige
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
-NUM_BETAS, NUM_EXPRESSION = 10, 10
+NUM_EXPRESSION = 10
 
 
 def run(
@@ -55,7 +57,10 @@ def run(
     cannot be used, or the artefacts do not belong together.
     """
     path = body_models.of(subject.gender) or OPEN_BODY
-    model = BodyModel.load(path, num_betas=NUM_BETAS, num_expression=NUM_EXPRESSION, device=device)
+    file = load_body_file(path, settings.betas, NUM_EXPRESSION)
+    shapes = ShapePrior.of(file, subject.gender, subject.height)
+    # the fit's shapes are in units of the subject's prior
+    model = BodyModel(shapes.centred(file), torch.device(device), torch.float32)
     check_body(model)
     pose_prior = load_pose_prior(body_models, model)
     seen = read_observations(scene, person)
@@ -123,7 +128,7 @@ def run(
         gender=subject.gender,
         body_model=file_digest(path),
     ) as writer:
-        _put_bodies(writer, params, joints)
+        _put_bodies(writer, replace(params, betas=shapes.betas(params.betas)), joints)
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", sigma)

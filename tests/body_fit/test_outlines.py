@@ -1,4 +1,4 @@
-"""Planes through a mask's rim touch the body where they should, and are as far from it as it is off."""
+"""Planes through a mask's rim touch the body where they should, and are as far from it as it is."""
 
 from __future__ import annotations
 

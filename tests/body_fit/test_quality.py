@@ -85,7 +85,7 @@ def test_limbs_that_nobody_sees_may_be_anywhere_in_their_reach(fine):
     joints = np.arange(55)
     legs = [k for k, name in enumerate(KEYPOINT_NAMES[:25]) if name.split("_")[-1] in LEG]
     confidence[:, :, legs] = 0
-    points = (joints, torch.ones(1, 55))
+    points = (joints, torch.ones(1, 55, dtype=torch.bool))
     evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, points)
     widened = quality.widened_sigma(sigma, evidence)
     assert set(_open(evidence, widened)) >= {"left_arm", "left_leg", "right_leg"}
@@ -96,8 +96,8 @@ def test_a_limb_that_one_view_sees_needs_points_of_its_own(fine):
     whitened, confidence, sigma = fine
     confidence[:, 1:] = 0
     joints = np.array([JOINT_INDEX["left_elbow"]] * 4 + [JOINT_INDEX["right_elbow"]] * 4)
-    weight = torch.tensor([[0.0, 0, 0, 0, 0, 0, 5, 5]])
-    evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, weight))
+    measured = torch.tensor([[False] * 6 + [True] * 2])
+    evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, measured))
     found = quality.unmeasured(evidence)[0]
     at = BODY_PARTS.index
     assert found[at("left_arm")] and not found[at("right_arm")] and not found[at("trunk")]
@@ -113,9 +113,8 @@ def test_every_point_on_a_limb_tells_a_little_of_how_it_leans(fine):
     joints = np.array([JOINT_INDEX["left_elbow"]] * 100)
     stated = []
     for points in (0, 2, 5, 10, 16):
-        weight = torch.zeros(1, 100)
-        weight[0, :points] = 5
-        evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, weight))
+        measured = torch.arange(100)[None] < points
+        evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, measured))
         stated.append(quality.widened_sigma(sigma, evidence)[0, JOINT_INDEX["left_wrist"]])
         named = quality.unmeasured_joints(evidence)[0]
         assert named[JOINT_INDEX["left_wrist"]] == (points < 15)
