@@ -60,11 +60,12 @@ CAPTURE_SETTINGS = [
     Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
 ]
 FIELD_SCENE_SETTINGS = [
-    Path(f"config/field/{name}.yaml") for name in ("starts_15", "starts_30", "starts_60", "floor")
+    Path(f"config/field/{name}.yaml")
+    for name in ("starts_15", "starts_30", "starts_60", "floor", "beam")
 ]
 FIELD_SETTINGS = [
     Path("config/evaluation/config.yaml"),
-    *(Path(f"config/field/{name}.yaml") for name in ("no_depth", "two_views", "alone")),
+    *(Path(f"config/field/{name}.yaml") for name in ("no_depth", "two_views", "alone", "beam")),
 ]
 OBJECT_SETTINGS = [
     Path(f"config/object/{name}.yaml")

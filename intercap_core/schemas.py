@@ -389,6 +389,7 @@ TRUTH = Schema(
         "depth_bias": Field(("C",), "float64", "what each camera's depth is too far by", "m", optional=True),
         "depth_recorded": Field(("T", "C"), "bool", "and depth that is not empty", optional=True),
         "ground_normal": Field(("3",), "float64", "true floor normal, up", "1", "master"),
+        "support_height": Field(("T", "2"), "float64", "above the floor, of the highest surface under the left and the right sole, of scripts whose feet stand on furniture", "m", optional=True),
         "body_visible": Field(("T", "Vt"), "bool", "some camera truly sees the vertex (of the clothed body)"),
         "object_visible": Field(("T", "Vo"), "bool", "some camera truly sees the vertex", optional=True),
     },

@@ -24,6 +24,9 @@ OUTLIER_PROBABILITY = 0.01
 # metres; and of one that swings. Tuned on the studio.
 STANDING_SPEED, SWING_SPEED = 0.06, 0.6
 STANDING_HEIGHT, SWING_HEIGHT = 0.02, 0.15
+# Share of what stands that stands on something else than the floor, or where the floor is not.
+# Tuned on the studio.
+STANDING_ELSEWHERE = 0.2
 
 # --- human motion
 

@@ -8,6 +8,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.contact.chain import Chain
 from intercap_core.contact.constants import (
     STANDING_BEGINS,
+    STANDING_ELSEWHERE,
     STANDING_HEIGHT,
     STANDING_S,
     STANDING_SPEED,
@@ -42,7 +43,8 @@ def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float
 
     ``sole`` (T, S, 3) its vertices and ``height`` (T, S) theirs above the floor, metres, None where
     no floor is known. A two-state chain over half-normal speeds and normal heights, of what stands
-    and of what swings.
+    and of what swings; what stands is on the floor, or on something at any height that a foot
+    reaches (a beam, a step), where stillness alone tells.
     """
     if len(sole) < 2:
         return np.zeros(0)
@@ -50,7 +52,10 @@ def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float
     odds = _log_ratio(speed, STANDING_SPEED, SWING_SPEED)
     if height is not None:
         low = np.abs(height).mean(1)
-        odds = odds + _log_ratio(np.maximum(low[1:], low[:-1]), STANDING_HEIGHT, SWING_HEIGHT)
+        on_floor = _log_ratio(np.maximum(low[1:], low[:-1]), STANDING_HEIGHT, SWING_HEIGHT)
+        odds = odds + np.logaddexp(
+            np.log1p(-STANDING_ELSEWHERE) + on_floor, np.log(STANDING_ELSEWHERE)
+        )
     return _STAND.posterior(odds[:, None], fps)[:, 0]
 
 

@@ -1,6 +1,7 @@
 """The field's part of `intercap evaluate` that ends with the metrics.
 
-No depth and other definitions of joints, few cameras; what the verdict without truth tells of them.
+No depth and other definitions of joints, few cameras, people alone, a beam; what the verdict
+without truth tells of them.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from intercap_core.project import Project
 from intercap_core.schemas import JOINT, TRUTH
 from intercap_core.studio.subjects import Subject
 
-NO_DEPTH, ALONE = "field_no_depth", "field_alone"
+NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
+_BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
 )  # fmt: skip
@@ -92,6 +94,15 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
             "field.no_depth_bone_worst_percent": 100 * float(bones.max()),
             "field.no_depth_height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in blind])),
         }
+    on_beam = [e.metrics for some in evaluations if some.dataset == BEAM for e in some.errors]
+    for stage in ("body_fit", "joint"):
+        suffix = "" if stage == "joint" else f"_{stage}"
+        for key in _BEAM_KEYS:
+            values = figures.pooled(on_beam, f"truth/{stage}/{key}")
+            if values is not None and np.isfinite(values).any():
+                unit = "mm_s" if key == "planted_speed" else "mm"
+                name = key.removeprefix("body_").removesuffix("_speed")
+                found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
     alone = [found for found in evaluations if found.dataset == ALONE]
     if alone:
         whole = [_of_a_person_alone(e.metrics) for some in alone for e in some.errors]

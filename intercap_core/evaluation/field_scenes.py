@@ -1,6 +1,6 @@
 """The field's part of `intercap evaluate` that ends with the scene.
 
-Cameras that started apart, rooms whose measured surface is mostly floor.
+Cameras that started apart, rooms whose measured surface is mostly floor, a person on a beam.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from intercap_core.metrics.field import FieldScene
 from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]
-STARTS, FLOOR = "field_starts", "field_floor"  # what datasets of either cause begin with
-_WIDTH = 112
+# What datasets of each cause begin with
+STARTS, FLOOR, BEAM = "field_starts", "field_floor", "field_beam"
+_WIDTH = 128
 
 
 def measure(project: Project, sequence: str) -> FieldScene:
@@ -32,6 +33,7 @@ def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     """Keys ``field.<measure>``; those of starts also by dataset."""
     found = keyed("field.", field.floor_figures(_of(evaluations, FLOOR)))
     found |= keyed("field.", field.start_figures(_of(evaluations, STARTS)))
+    found |= keyed("field.", field.beam_figures(_of(evaluations, BEAM)))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):
             rate = measured.dataset.removeprefix(STARTS)
@@ -47,7 +49,8 @@ def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
 def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
     """A row a recording."""
     console = console_of(_WIDTH)
-    heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse")
+    heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse",
+             "floor mm", "deg")  # fmt: skip
     table = Table("recording", *heads, box=None, title="the field, after scene")
     for found in evaluations:
         for e in found.errors:
@@ -61,6 +64,8 @@ def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
                 number(1e3 * float(e.after.mean()), 1),
                 number(1e3 * float(np.median(e.stated)), 1),
                 str(int((e.after > e.before + field.WORSE_M).sum())),
+                number(1e3 * e.floor_m, 1) or "-",
+                number(e.tilt_deg, 2) or "-",
             )
         for name in found.missing:
             table.add_row(f"{found.dataset}: {name}", "no scene")

@@ -1,6 +1,6 @@
 """Errors of the scene artefact of recordings as they are made outside a studio.
 
-Cameras out of step, rooms whose measured surface is mostly floor.
+Cameras out of step, rooms whose measured surface is mostly floor, feet that leave the floor.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.metrics.body import FOOT_JOINTS
 from intercap_core.metrics.capture import MEDIAN_CHI_1
 from intercap_core.metrics.extrinsics import CUBE_SIDE_M, displacement, rig_centre
+from intercap_core.metrics.planted import Floor
 from intercap_core.metrics.times import match_times
 from intercap_core.schemas import FRAMES, SCENE, TRUTH
 
@@ -27,7 +29,9 @@ class FieldScene:
     ``apart_s`` true time by which a camera's images are older than its sets say; ``late_s`` the
     error of the stated one, the median over images, ``sigma_s`` its stated deviation;
     ``set_aside``: the scene says that it cannot tell. ``before`` and ``after`` of the extrinsics
-    and their ``stated`` deviation, metres, RMS displacement over a 2 m cube.
+    and their ``stated`` deviation, metres, RMS displacement over a 2 m cube. ``floor_m`` by how
+    much the floor is off under the true feet, in the mean, and ``tilt_deg`` its tilt; NaN without
+    a floor.
     """
 
     sequence: str
@@ -39,6 +43,8 @@ class FieldScene:
     before: np.ndarray
     after: np.ndarray
     stated: np.ndarray
+    floor_m: float
+    tilt_deg: float
 
 
 def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
@@ -70,6 +76,13 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
             for key in ("master_from_colour_start", "master_from_colour")
         )
         stated = stated_displacement(found["master_from_colour"], found["camera_covariance"])
+        feet = true["joints"][at][:, FOOT_JOINTS].reshape(-1, 3)
+        floor_m, tilt_deg = floor_error(
+            found["ground_point"],
+            found["ground_normal"],
+            Floor(true["ground_normal"], float(true.attributes["ground_offset"])),
+            feet,
+        )
         counted = available.any(axis=0) & (np.arange(len(names)) != master)
         return FieldScene(
             str(found.attributes["sequence"]),
@@ -81,7 +94,22 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
             before[counted],
             after[counted],
             stated[counted],
+            floor_m,
+            tilt_deg,
         )
+
+
+def floor_error(
+    point: np.ndarray, normal: np.ndarray, true: Floor, feet: np.ndarray
+) -> tuple[float, float]:
+    """How far a floor through ``point`` (3,) with ``normal`` (3,) is from the ``true`` one, in the
+    mean over the places of the true floor under ``feet`` (N, 3), metres, and the angle between
+    them, degrees. NaN without a floor."""
+    if not np.isfinite(normal).all():
+        return float("nan"), float("nan")
+    under = feet - true.height(feet)[:, None] * true.normal
+    angle = np.degrees(np.arccos(np.clip(normal @ true.normal, -1.0, 1.0)))
+    return float(np.abs((under - point) @ normal).mean()), float(angle)
 
 
 def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -149,4 +177,17 @@ def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     }
     if known.any():
         found["extrinsics_normalised"] = float(np.median(after[known] / stated[known]))
+    return found
+
+
+def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Of people whose feet leave the floor: the floor under them, millimetres and degrees."""
+    if not scenes:
+        return {}
+    height = np.array([s.floor_m for s in scenes])
+    found = {"beam_floor_missing": float(np.isnan(height).sum())}
+    if np.isfinite(height).any():
+        found["beam_floor_mm"] = 1e3 * float(np.nanmean(height))
+        found["beam_floor_worst_mm"] = 1e3 * float(np.nanmax(height))
+        found["beam_tilt_deg"] = float(np.nanmean([s.tilt_deg for s in scenes]))
     return found

@@ -1,8 +1,8 @@
 """Feet: how still and how high those stand that truly stand, and how well the others are followed.
 
-A foot stands where enough of its sole truly rests near the floor. What truly carries it has to stay
-where it is; a fit that froze the feet would pass that, so that swinging feet and the lag with
-which a foot lifts are measured beside it.
+A foot stands where enough of its sole truly rests near the floor, or the furniture under it. What
+truly carries it has to stay where it is; a fit that froze the feet would pass that, so that
+swinging feet and the lag with which a foot lifts are measured beside it.
 """
 
 from __future__ import annotations
@@ -32,12 +32,16 @@ class Floor:
         return vectors - (vectors @ self.normal)[..., None] * self.normal
 
 
-def support(true_sole: np.ndarray, floor: Floor, fps: float) -> np.ndarray:
+def support(
+    true_sole: np.ndarray, floor: Floor, fps: float, level: np.ndarray | None = None
+) -> np.ndarray:
     """Vertices of a true sole (T, S, 3) that carry weight from a frame to the next: (T - 1, S).
 
-    None of a foot that does not stand.
+    ``level`` (T,) is how high above the floor what is under it lies, metres, None = it is the
+    floor. No vertices of a foot that does not stand.
     """
-    low = floor.height(true_sole) < SUPPORT_HEIGHT_M
+    above = floor.height(true_sole) if level is None else floor.height(true_sole) - level[:, None]
+    low = above < SUPPORT_HEIGHT_M
     speed = np.linalg.norm(np.diff(true_sole, axis=0), axis=-1) * fps
     carrying = low[1:] & low[:-1] & (speed < SUPPORT_SPEED_M_S)
     carrying[carrying.mean(1) < STANDING_SHARE] = False

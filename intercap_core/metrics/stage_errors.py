@@ -139,9 +139,7 @@ class StageErrors:
         """Of both soles' vertices (T, S, 3)."""
         assert self._truth.vertices is not None
         found = []
-        for sole, foot in zip(soles, _FEET, strict=True):
-            true = self._truth.vertices[:, regions[foot]].astype(np.float64)
-            carrying = support(true, self._truth.floor, self._fps)
+        for sole, true, carrying in zip(soles, *self._true_soles(regions), strict=True):
             found.append(foot_errors(sole, true, carrying, self._truth.floor, self._fps))
         return {
             "planted_speed": _since_before([foot.speed for foot in found]),
@@ -149,6 +147,19 @@ class StageErrors:
             "foot_swing": _since_before([foot.swing for foot in found]),
             "foot_centre": np.stack([sole.mean(1) for sole in soles], 1),
         }
+
+    def _true_soles(
+        self, regions: Mapping[str, np.ndarray]
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Vertices (T, S, 3) of both true soles, and which of them carry weight (T - 1, S)."""
+        truth = self._truth
+        assert truth.vertices is not None
+        soles = [truth.vertices[:, regions[foot]].astype(np.float64) for foot in _FEET]
+        carrying = [
+            support(sole, truth.floor, self._fps, level)
+            for sole, level in zip(soles, truth.support_height.T, strict=True)
+        ]
+        return soles, carrying
 
     def about_truth(self, regions: Mapping[str, np.ndarray]) -> Values:
         """What is true, of a body whose parts have these vertices."""
@@ -171,8 +182,8 @@ class StageErrors:
         truth = self._truth
         if truth.vertices is None:
             return {}
-        soles = [truth.vertices[:, regions[foot]].astype(np.float64) for foot in _FEET]
-        carried = [np.any(support(sole, truth.floor, self._fps), axis=1) for sole in soles]
+        soles, carrying = self._true_soles(regions)
+        carried = [np.any(vertices, axis=1) for vertices in carrying]
         near = {}
         if self._both is not None and self._true_distance is not None:
             nearest = [self._true_distance[:, regions[name]].min(1) for name in METRIC_REGIONS]

@@ -27,7 +27,8 @@ class Truth:
     them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
     (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
     ``translation`` (T, 3), of a person alone NaN, and the mesh empty; ``contact_region`` (T, 12) in
-    the order of METRIC_REGIONS; the ``floor`` that bare soles are on; ``master_from_colour``
+    the order of METRIC_REGIONS; the ``floor`` that bare soles are on, and how high above it what is
+    under the left and the right sole lies, ``support_height`` (T, 2); ``master_from_colour``
     (C, 4, 4) and ``camera_names``.
     """
 
@@ -43,6 +44,7 @@ class Truth:
     object_views: np.ndarray
     contact_region: np.ndarray
     floor: Floor
+    support_height: np.ndarray
     camera_names: tuple[str, ...]
     master_from_colour: np.ndarray
 
@@ -87,6 +89,7 @@ class Truth:
                 object_views=thing.views,
                 contact_region=file["region_contact"][at][:, columns],
                 floor=Floor(file["ground_normal"], offset),
+                support_height=_support_height(file, at),
                 camera_names=tuple(file.text("camera_names")),
                 master_from_colour=file["master_from_colour"],
             )
@@ -103,6 +106,10 @@ class Truth:
         points = samples.of(mesh.vertices, mesh.faces)
         nearest = cKDTree(self.object_vertices).query(points)[1]
         return self.object_vertices[nearest], self.object_visible[:, nearest]
+
+
+def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
+    return file["support_height"][at] if "support_height" in file else np.zeros((len(at), 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ GRID_MARGIN_S = 1.0
 BODY_LAG_S = 0.11  # the trunk follows the feet as if smoothed by this much
 SWAY_TO_STANCE = 0.35  # share of the way to the standing foot that the pelvis shifts in a step
 STEP_LIFT_M = 0.075
+STEP_UP_SHARE = 0.55  # of a step's time in which a foot is brought up, or down, an edge
 SOLE_FRONT_M = 0.12  # the ball of the foot, ahead of the ankle
 
 
@@ -92,13 +93,19 @@ class Pose:
 
 @dataclass(frozen=True)
 class Step:
-    """One foot's step: ``foot`` 0 left, 1 right; times in s; to ``place`` (2,), heading rad."""
+    """One foot's step: ``foot`` 0 left, 1 right; times in s; to ``place`` (2,), heading rad.
+
+    ``height`` metres above the floor of what it comes to stand on; ``aside`` metres by which it
+    swings out to its own side on the way, past what the other one stands on.
+    """
 
     foot: int
     start: float
     end: float
     place: tuple[float, float]
     heading: float = 0.0
+    height: float = 0.0
+    aside: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -138,7 +145,7 @@ class Footwork:
         ankle[:, :, 2] = self.ankle_height
         heading = np.full((count, 2), self.heading)
         pitch = np.zeros((count, 2))
-        placed, turned = self.start.copy(), [self.heading, self.heading]
+        placed, turned, raised = self.start.copy(), [self.heading, self.heading], [0.0, 0.0]
         for step in self.steps:
             share = ramp(times, step.start, step.end)
             u = np.clip((times - step.start) / (step.end - step.start), 0, 1)
@@ -151,7 +158,13 @@ class Footwork:
             lift = STEP_LIFT_M * min(1.0, 0.4 + length / 0.5) * np.sin(np.pi * u) ** 2
             # the ball or the heel stays above the floor as the foot rolls
             ankle[:, step.foot, 2] += lift + SOLE_FRONT_M * roll**2 / np.hypot(roll, 0.12)
+            ankle[:, step.foot, 2] += self._rise(times, step, raised[step.foot])
+            if step.aside:
+                out = (step.aside, -step.aside)[step.foot] * np.sin(np.pi * u) ** 2
+                across = np.array([-np.sin(step.heading), np.cos(step.heading)])
+                ankle[:, step.foot, :2] += out[:, None] * across
             placed[step.foot] = step.place
+            raised[step.foot] = step.height
             turned[step.foot] = step.heading
         stepped = np.concatenate([ankle, pitch[..., None], heading[..., None]], 2)
         guided = stepped.copy()
@@ -162,11 +175,27 @@ class Footwork:
             guided[:, foot] += share * (goal - guided[:, foot])
         return guided[..., :3], guided[..., 4], guided[..., 3]
 
+    @staticmethod
+    def _rise(times: np.ndarray, step: Step, before: float) -> np.ndarray:
+        """Metres (N,) by which a step brings a foot up from ``before``: up first, down last."""
+        rise, reach = step.height - before, STEP_UP_SHARE * (step.end - step.start)
+        if rise > 0:
+            return rise * ramp(times, step.start, step.start + reach)
+        return rise * ramp(times, step.end - reach, step.end)
+
+    def _level(self, times: np.ndarray) -> np.ndarray:
+        """The higher (N,) of what both feet stand on, metres."""
+        levels, raised = np.zeros((len(times), 2)), [0.0, 0.0]
+        for step in self.steps:
+            levels[:, step.foot] += self._rise(times, step, raised[step.foot])
+            raised[step.foot] = step.height
+        return levels.max(1)
+
     def pelvis(self, leg: float, hip_width: float, hip_drop: float, stand: float) -> CubicSpline:
         """Pelvis position and heading (4 channels) over time, low enough for both legs to reach.
 
         ``leg`` usable length hip to ankle, ``hip_width`` from the midline, ``hip_drop`` the hips
-        below the pelvis, ``stand`` the highest pelvis, all metres.
+        below the pelvis, ``stand`` the highest pelvis above what one stands on, all metres.
         """
         grid = np.arange(-GRID_MARGIN_S, self.end_s + GRID_MARGIN_S, GRID_STEP_S)
         ankle, heading, _ = self.feet(grid)
@@ -178,7 +207,7 @@ class Footwork:
         middle = gaussian_filter1d(middle, lag, axis=0, mode="nearest")
         facing = gaussian_filter1d(heading.mean(1), lag, mode="nearest")
         across = np.stack([-np.sin(facing), np.cos(facing)], 1)
-        top = np.full(len(grid), stand)
+        top = stand + self._level(grid)
         for foot, sign in ((0, 1.0), (1, -1.0)):
             hip = middle + sign * hip_width * across
             far = np.linalg.norm(ankle[:, foot, :2] - hip, axis=1)

@@ -22,6 +22,7 @@ from intercap_core.studio.stage import Moment, Stage
 CONTACT_M = 0.0045
 SEEN_PIXELS, SEEN_SHARE = 40, 0.05  # of the object, for a view to count as seeing it
 OFF_SURFACE_M = 0.001
+ABOVE_SOLE_M = 0.03  # what a sole stands on is sought from here
 ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 5
 
 
@@ -85,6 +86,8 @@ def write_truth(
         file.put("depth_bias", [camera.depth_bias for camera in recorded])
         file.put("depth_recorded", np.stack([camera.depth for camera in recorded], 1))
         file.put("ground_normal", normal)
+        if stage.interaction.leaves_floor:
+            file.put("support_height", support_height(stage, moment))
         file.put("body_visible", body_visible)
         if stage.thing:
             file.put("object_visible", object_visible)
@@ -110,6 +113,21 @@ def region_contact(stage: Stage, moment: Moment) -> np.ndarray:
         touching = np.zeros(len(points), bool)
         touching[near] = stage.thing.surface.signed_distance(local[near]) <= CONTACT_M
         result[t] = [touching[regions[name]].any() for name in CONTACT_REGIONS]
+    return result
+
+
+def support_height(stage: Stage, moment: Moment) -> np.ndarray:
+    """(T, 2): the highest surface of the room under each sole, left and right, above the floor."""
+    room, regions = stage.room, stage.fitted.regions
+    scene = scene_of((room.vertices, room.faces))
+    result = np.zeros((len(moment.body), 2))
+    for t, points in enumerate(stage.subject.on_fitted_topology(moment.body)):
+        for side, foot in enumerate(("left_foot", "right_foot")):
+            start = points[regions[foot]] + (0, 0, ABOVE_SOLE_M)
+            down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
+            rays = np.concatenate([start, down], 1).astype(np.float32)
+            far = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
+            result[t, side] = (start[:, 2] - far).max()
     return result
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,10 +12,13 @@ from intercap_core.camera.transforms import rigid
 from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.field import (
     FieldScene,
+    beam_figures,
+    floor_error,
     floor_figures,
     start_figures,
     stated_displacement,
 )
+from intercap_core.metrics.planted import Floor
 
 
 def _scene(fps: float, late_ms: list[float], **values: object) -> FieldScene:
@@ -27,7 +32,9 @@ def _scene(fps: float, late_ms: list[float], **values: object) -> FieldScene:
         "stated": np.full(count, 0.003),
     }
     made |= {key: np.array(value) for key, value in values.items()}
-    return FieldScene("a", fps, late_s=1e-3 * np.array(late_ms), **made)
+    return FieldScene(
+        "a", fps, late_s=1e-3 * np.array(late_ms), floor_m=0.004, tilt_deg=0.2, **made
+    )
 
 
 def test_cameras_are_solved_within_half_a_set_or_named() -> None:
@@ -52,8 +59,29 @@ def test_cameras_that_end_worse_than_given_are_counted() -> None:
     assert found["extrinsics_normalised"] == pytest.approx(1.0)
 
 
+def test_a_floor_is_measured_under_the_feet() -> None:
+    true = Floor(np.array([0.0, 0.0, 1.0]), 0.0)
+    feet = np.array([[1.0, 0.0, 0.25], [-1.0, 0.0, 0.0], [0.0, 2.0, 0.1]])
+    level = floor_error(np.array([0.0, 0, 0.03]), true.normal, true, feet)
+    assert level == pytest.approx((0.03, 0.0))
+    # tilted by one degree about y through the origin: 17.5 mm at either side, 0 on the axis
+    tilt = np.radians(1.0)
+    normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    height, angle = floor_error(np.zeros(3), normal, true, feet)
+    assert height == pytest.approx(2 / 3 * np.sin(tilt)) and angle == pytest.approx(1.0)
+    unknown = np.full(3, np.nan)
+    assert np.isnan(floor_error(unknown, unknown, true, feet)).all()
+
+
+def test_a_floor_that_is_missing_is_counted_and_no_error() -> None:
+    without = replace(_scene(15, [0]), floor_m=float("nan"), tilt_deg=float("nan"))
+    found = beam_figures([_scene(15, [0]), without])
+    assert found["beam_floor_missing"] == 1 and found["beam_floor_mm"] == pytest.approx(4.0)
+    assert beam_figures([without]) == {"beam_floor_missing": 1.0}
+
+
 def test_nothing_measured_gives_no_figures() -> None:
-    assert start_figures([]) == {} and floor_figures([]) == {}
+    assert start_figures([]) == {} and floor_figures([]) == {} and beam_figures([]) == {}
 
 
 def test_stated_displacement_is_that_of_poses_drawn_from_the_covariance() -> None:

@@ -76,6 +76,14 @@ def test_what_carries_is_low_and_still() -> None:
         assert support(tiptoe, FLOOR, FPS).any() == stands
 
 
+def test_what_carries_on_a_beam_is_near_its_top() -> None:
+    standing = sole(np.full(3, 0.2), np.zeros(3))
+    assert not support(standing, FLOOR, FPS).any()
+    assert support(standing, FLOOR, FPS, np.full(3, 0.2)).all()
+    # it comes over the beam between the first and the second frame
+    assert support(standing, FLOOR, FPS, np.array([0.0, 0.2, 0.2])).any(1).tolist() == [False, True]
+
+
 def test_a_planted_foot_is_held_to_place_and_height() -> None:
     true = sole(np.zeros(3), np.zeros(3))
     carrying = support(true, FLOOR, FPS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from intercap_core.errors import UserError
 from intercap_core.studio.interactions.base import Interaction
+from intercap_core.studio.interactions.beam_walk import BeamWalk
 from intercap_core.studio.interactions.bottle_drink import BottleDrink
 from intercap_core.studio.interactions.chair_sit import ChairSit
 from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
@@ -39,6 +40,7 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "chair_sit": ChairSit,
     "toolbox_carry": ToolboxCarry,
     "walk_and_wave": WalkAndWave,
+    "beam_walk": BeamWalk,
 }
 
 

@@ -82,7 +82,7 @@ class Interaction(ABC):
     Script time runs from 0 to ``SCRIPT_S``. ``centre`` is the middle of the action on the floor,
     in the script's frame: z up, the floor at z = 0. ``highlight`` is the script time around which a
     recording shorter than the script is taken. ``feet_meet_object``: feet touch it on
-    purpose.
+    purpose. ``leaves_floor``: feet stand on furniture.
     """
 
     puppet: Puppet
@@ -91,6 +91,7 @@ class Interaction(ABC):
     furniture: list[Box] = field(default_factory=list)
     object_class = ""
     feet_meet_object = False
+    leaves_floor = False
     highlight = SCRIPT_S / 2
     centre = (0.0, 0.0)
 

@@ -1,0 +1,94 @@
+"""A person alone: step up on a beam, balance along it, step down at its other end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.studio.controls import Footwork, Pose, Step, plateau
+from intercap_core.studio.hands import RELAXED
+from intercap_core.studio.interactions.base import SCRIPT_S, Box, Interaction, Performance
+from intercap_core.studio.interactions.feet import Foot
+from intercap_core.studio.motion import LEG_REACH, SIDES, Trunk
+
+LEFT, RIGHT = 0, 1
+BEAM_HALF_M, BEAM_HEIGHT_M = 0.05, (0.15, 0.30)
+STRIDE_M = (0.32, 0.38)  # along the beam
+BEFORE_M = 0.10  # toes on the floor from the beam's end
+BEYOND_M = 0.06  # heels and toes on the beam from its ends
+ASIDE_M = 0.11  # a foot swings past the one that stands
+STEP_S = ((0.05, 0.52), (0.50, 0.94), (0.92, 1.32), (1.30, 1.70), (1.68, 2.18), (2.16, 2.60))
+
+
+class BeamWalk(Interaction):
+    """Two steps up, two along, two down; the beam lies along x, its middle at the origin."""
+
+    leaves_floor = True
+    highlight = 1.3
+    centre = (0.0, 0.0)
+
+    def plan(self) -> None:
+        rng, puppet = self.rng, self.puppet
+        self.height = float(rng.uniform(*BEAM_HEIGHT_M))
+        stride, first = rng.uniform(*STRIDE_M), int(rng.integers(2))
+        heel, toe = self._soles()
+        length = heel + toe + 3 * stride + 2 * BEYOND_M
+        low = -length / 2
+        self.furniture.append(
+            Box((low, -BEAM_HALF_M, 0.0), (-low, BEAM_HALF_M, self.height), 0.0, "wood")
+        )
+        w = puppet.hip_width * 0.9
+        sides = np.array([w, -w])
+        before, after = low - BEFORE_M - toe, -low + BEFORE_M + heel
+        start = np.stack([np.full(2, before) + rng.normal(0, 0.01, 2), sides], 1)
+        steps = []
+        for count, (begin, end) in enumerate(STEP_S):
+            foot = first if count % 2 == 0 else 1 - first
+            if count < 4:
+                x = low + BEYOND_M + heel + count * stride
+                place = (float(x), float(rng.normal(0, 0.005)))
+                aside = ASIDE_M if count else 0.0
+                steps.append(Step(foot, begin, end, place, 0.0, self.height, aside))
+            else:
+                place = (float(after + rng.uniform(0, 0.03)), float(sides[foot]))
+                steps.append(Step(foot, begin, end, place, 0.0, 0.0, ASIDE_M))
+        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
+        self.pelvis_track = self.footwork.pelvis(
+            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
+        )
+
+    def _soles(self) -> tuple[float, float]:
+        """How far heels and toes reach behind and ahead of the ankles, metres."""
+        level = np.zeros((1, 5))
+        skins = [Foot(self.puppet, side).skin(level)[0] for side in range(len(SIDES))]
+        return (
+            max(float(-skin[:, 0].min()) for skin in skins),
+            max(float(skin[:, 0].max()) for skin in skins),
+        )
+
+    def _trunk(self, times: np.ndarray, balance: np.ndarray) -> Trunk:
+        track, sway = self.pelvis_track(times), self.sway(times)
+        pelvis = track[:, :3] + self.weight_shift(times)
+        pelvis[:, 2] -= 0.01
+        unsteady = 1 + 2.5 * balance[:, None]
+        bend, head = 0.6 * unsteady * sway[:, :3], 1.3 * sway[:, 3:]
+        bend[:, 0] += 0.04
+        head[:, 0] += 0.12 + 0.22 * balance  # one looks where one steps
+        return Trunk(pelvis, track[:, 3], bend, head)
+
+    def perform(self, times: np.ndarray) -> Performance:
+        puppet, feet = self.puppet, self.footwork.feet(times)
+        balance = plateau(times, 0.2, 0.7, 1.9, 2.5)
+        trunk = puppet.settled(self._trunk(times, balance), feet[0])
+        world, pelvis = puppet.trunk(trunk), trunk.pelvis
+        puppet.legs(world, pelvis, *feet)
+        swing = self.arm_swing(times)
+        for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
+            wrist = puppet.idle_wrist(world, pelvis, side, swing[:, side])
+            outward = sign * world[:, 9, :, 0] * (1, 1, 0)
+            out = balance[:, None] * (0.26 * outward + (0, 0, 0.16))
+            unsteady = 4 * balance[:, None] * swing[:, [side]] * (0, 0, 1)
+            puppet.arm_to(
+                world, pelvis, side, Pose(wrist.position + out + unsteady, wrist.rotation)
+            )
+            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+        return Performance(world, pelvis, np.full((len(times), 4, 4), np.nan))
