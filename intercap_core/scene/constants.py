@@ -122,6 +122,10 @@ OFTEN_VALID = 0.75
 VALID_AGREE = 0.8  # of such a pixel's valid samples
 STATIC_SHARE = 0.5  # above this the pixel shows background most of the time
 MIN_NORMALS_COSINE = 0.85  # 32 degrees: one surface's normals in two views; tuned on the studio
+# Of the weight that two cameras' background has in the registration, one direction of normals has
+# at most this share; others gain at most this factor. Normals within 20 degrees are one direction.
+# Tuned on the studio.
+MAX_DIRECTION_SHARE, MAX_DIRECTION_GAIN, DIRECTION_COSINE = 0.8, 3.0, 0.94
 MIN_PAIR_POINTS = 60  # fewer correspondences are chance; tuned on the studio
 # Neighbouring residuals err together (lens, multipath, bias): a pair of cameras counts as at most
 # this many independent measurements each way. Tuned on the studio.

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
+from intercap_core.scene.balance import balanced
 from intercap_core.scene.constants import (
     GATES_M,
     HELD_GATES_M,
@@ -320,6 +321,8 @@ class Registration:
                 share = weight / max(weight.sum(), 1e-9)
                 residual = residual - share @ residual
                 rows = rows - np.einsum("n,knf->kf", share, rows)[:, None]
+            else:
+                weight = balanced(weight, np.concatenate([match.normals for match in found]))
             sigma = max(SURFACE_SIGMA_FLOOR_M, SIGMA_PER_MAD * float(np.median(np.abs(residual))))
             weight /= sigma**2 * max(1.0, len(residual) / (2 * kind.effective_points))
             weighted = rows * weight[:, None]
