@@ -40,7 +40,7 @@ class CameraFacts:
     """One camera of a capture; seconds, metres, NaN = not known.
 
     ``state`` (T,) of STATES; ``slip`` (T,) whole frames; ``turned_deg`` and ``moved`` by
-    refinement.
+    refinement, ``slide`` the deviation of the pose in the direction in which it is least known.
     """
 
     name: str
@@ -53,6 +53,8 @@ class CameraFacts:
     depth_bias: float
     moved: float
     turned_deg: float
+    slide: float
+    verdict: str
     note: str
 
     @property
@@ -177,6 +179,10 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
     )
     has_depth = refined["depth_size"][:, 0] > 0
     notes = zip(recorded.text("note"), refined.text("note"), strict=True)
+    # artefacts from before each camera was judged by itself have neither
+    told = "camera_verdict" in refined
+    slides = np.linalg.norm(refined["camera_slide"], axis=1) if told else np.full(len(end), np.nan)
+    verdicts = refined.text("camera_verdict") if told else [""] * len(end)
     result = []
     for c, (name, words) in enumerate(zip(recorded.text("camera_names"), notes, strict=True)):
         there = np.flatnonzero(colour[:, c] | depth[:, c])
@@ -193,6 +199,8 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
                 depth_bias=float(bias[c]) if has_depth[c] else float("nan"),
                 moved=float(np.linalg.norm(end[c, :3, 3] - start[c, :3, 3])),
                 turned_deg=float(np.degrees(np.arccos(cosine[c]))),
+                slide=float(slides[c]) if slides[c] > 0 else float("nan"),
+                verdict=verdicts[c],
                 note="; ".join(dict.fromkeys(word for word in words if word)),
             )
         )
@@ -307,6 +315,8 @@ def _row(camera: CameraFacts, master: str) -> dict[str, Any]:
         "bias": 1e3 * camera.depth_bias,
         "moved": 1e3 * camera.moved,
         "turned": camera.turned_deg,
+        "slide": 1e3 * camera.slide,
+        "verdict": camera.verdict,
         "note": camera.note,
     }
 

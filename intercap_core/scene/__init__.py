@@ -16,8 +16,9 @@ In the order of a run (:mod:`intercap_core.stages.scene`):
 6. ``surface`` and ``moving``: background and foreground as thinned points with normals, the latter
    with their speed.
 7. ``extrinsics``: refines the poses, depth biases and time offsets and decides whether the result
-   is better than the start. The problem is in ``registration`` (point-to-plane residuals of all
-   pairs of cameras), ``body_constraints`` (reprojection of keypoints, points eliminated) and
+   is better than the start, ``camera_verdicts`` of each camera by itself. The problem is in
+   ``registration`` (point-to-plane residuals of all pairs of cameras, ``balance`` weighs them by
+   direction), ``body_constraints`` (reprojection of keypoints, points eliminated) and
    ``floor_constraint`` (one floor under all cameras).
 8. ``ground``: the floor's plane and the z-up frame.
 

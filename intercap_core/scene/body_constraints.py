@@ -6,10 +6,12 @@ stays small however many points there are.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera import projection
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert
@@ -28,12 +30,29 @@ from intercap_core.solve.robust import geman_mcclure_weight
 @dataclass(frozen=True, eq=False)
 class BodyViews:
     """The subject as all views see it: ``pixels`` (N, C, 2) and ``weights`` (N, C) of N points,
-    ``points`` (N, 3) triangulated at the start, and ``velocity`` (N, 3) m/s, 0 where unknown."""
+    ``points`` (N, 3) triangulated at the start, and ``velocity`` (N, 3) m/s, 0 where unknown.
+    ``unit`` (N,): points of one joint within the time that a detector's error lasts share one."""
 
     pixels: np.ndarray
     weights: np.ndarray
     points: np.ndarray
     velocity: np.ndarray
+    unit: np.ndarray
+
+    def subset(self, rows: np.ndarray) -> BodyViews:
+        """The points chosen."""
+        return BodyViews(
+            self.pixels[rows],
+            self.weights[rows],
+            self.points[rows],
+            self.velocity[rows],
+            self.unit[rows],
+        )
+
+    def halves(self) -> tuple[BodyViews, BodyViews]:
+        """The points of every second span of time, and the others."""
+        odd = self.unit // NUM_KEYPOINTS % 2 == 1
+        return self.subset(~odd), self.subset(odd)
 
 
 def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
@@ -46,7 +65,10 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
     gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
     weights = by_point[..., 2] * inlier * min(1.0, gap / KEYPOINT_ERROR_TIME_S)
     velocity = np.nan_to_num(velocities(subject.joints[:, BODY_POINTS], times)).reshape(-1, 3)
-    return BodyViews(by_point[good, :, :2], weights[good], points[good], velocity[good])
+    joint = np.arange(NUM_KEYPOINTS)[BODY_POINTS]
+    span = np.floor(times / KEYPOINT_ERROR_TIME_S).astype(np.int64)
+    unit = (NUM_KEYPOINTS * span[:, None] + joint).ravel()
+    return BodyViews(by_point[good, :, :2], weights[good], points[good], velocity[good], unit[good])
 
 
 def velocities(points: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -87,6 +109,22 @@ class BodyConstraint:
         matrix -= np.einsum("njk,njl->kl", cross, solved).reshape(matrix.shape)
         gradient -= np.einsum("njk,nj->k", solved, slope).reshape(gradient.shape)
         return matrix, gradient
+
+    def unit_errors(
+        self, poses: np.ndarray, offset: np.ndarray, camera: int
+    ) -> dict[Hashable, float]:
+        """By unit of the points that ``camera`` sees, after they have settled: the mean
+        reprojection error in all views, px."""
+        self(poses, offset)
+        residual, _, _, _ = self._linearised(poses, offset)
+        known = self._views.weights > 0
+        error = np.where(known, np.linalg.norm(residual, axis=-1), 0.0).sum(1)
+        error /= np.maximum(known.sum(1), 1)
+        result: dict[Hashable, float] = {}
+        for unit in np.unique(self._views.unit[known[:, camera]]):
+            own = error[known[:, camera] & (self._views.unit == unit)]
+            result[int(unit)] = float(own.mean())
+        return result
 
     def median_error(self, poses: np.ndarray, offset: np.ndarray) -> float:
         """Median reprojection error, px, after the points have settled."""

@@ -138,6 +138,11 @@ MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
 MIN_BODY_VIEWS = 3  # two views say nothing of their own relative pose along most motions
 MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
 MAY_WORSEN = 1.02  # in any group
+# By how many standard deviations a camera's refined pose has to be better than its given one; the
+# least spread, of log ratios, that errors of units are taken to have. Tuned on the studio.
+CHANCE_SIGMA, LEAST_UNIT_SPREAD = 2.0, 0.25
+DOUBTFUL_RATIO = 0.5  # of refined over given errors: above it a camera gets a second look
+WEAK_CAMERA_M = 0.010  # a camera that may slide by more is told
 WEAK_POINTS = 120  # held-out correspondences of a pair, background and moving together
 WEAK_RESIDUAL = 2.0  # times the median pair's
 KNOWN_OFFSET_SIGMA_S = 0.008  # less certain than what devices are off by: not known

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from intercap_core.camera.rig import Rig
-from intercap_core.scene.body_constraints import BodyConstraint, body_views
+from intercap_core.scene.body_constraints import BodyConstraint, BodyViews, body_views
+from intercap_core.scene.camera_verdicts import CameraVerdict, Judge
 from intercap_core.scene.constants import (
     CONVERGED_M,
     COVARIANCE_INFLATION,
@@ -34,6 +35,7 @@ from intercap_core.scene.registration import (
     OffsetInformation,
     PairResiduals,
     Registration,
+    Solution,
 )
 from intercap_core.scene.start_times import Starts
 from intercap_core.scene.subject_views import SubjectViews
@@ -57,9 +59,9 @@ class PairTable:
 class Refinement:
     """``poses`` (C, 4, 4) master_from_colour, ``bias`` (C,) metres to subtract from depth,
     ``offset`` and ``offset_sigma`` (C,) seconds, NaN sigma = not known; ``improved``: the poses are
-    better than the start's on held-out points; the pairs, the verdict and each camera's note, in
-    words. ``covariance`` (C, 7, C, 7) of each camera's rotation about its centre, rad, translation
-    and depth bias, m, given the master's pose."""
+    better than the start's on held-out points; the pairs and the verdict; which cameras (C,) were
+    ``refined``, each one's own verdict, and its note, in words. ``covariance`` (C, 7, C, 7) of each
+    camera's rotation about its centre, rad, translation and depth bias, m, given the master's."""
 
     poses: np.ndarray
     bias: np.ndarray
@@ -70,6 +72,8 @@ class Refinement:
     converged: bool
     pairs: PairTable
     verdict: str
+    refined: np.ndarray
+    verdicts: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -109,29 +113,76 @@ def refine(
         constraints.append(floor)  # where cameras overlap, their surfaces tell more
     held = registration.solve(given, (), known, free_poses=False)
     found, improved, ratios = held, False, []
+    verdicts: dict[int, CameraVerdict] = {}
+    covariance = held.covariance
     if free_poses and len(rig) > 1:
-        freed = registration.solve(given, constraints, known)
+
+        def solve(some: BodyViews | None, free: np.ndarray) -> Solution:
+            own = constraints
+            if some is not None:
+                own = [BodyConstraint(some, rig), *(one for one in constraints if one is not body)]
+            return registration.solve(given, own, known, free_poses=free)
+
+        freed = solve(None, np.ones(len(rig), bool))
         ratios = _ratios(registration, body, held.estimate, freed.estimate)
         if _better(ratios, freed.estimate):
-            found, improved = freed, True
+            judge = Judge(
+                registration,
+                lambda some, free: solve(some, free).estimate,
+                views if body else None,
+                held.estimate,
+                freed.estimate,
+            )
+            verdicts = judge.verdicts([c for c in range(len(rig)) if c != master])
+            own = np.array([c in verdicts and verdicts[c].refined for c in range(len(rig))])
+            improved = bool(own.any())
+            if improved:
+                all_of_them = own.sum() == len(verdicts)
+                found = freed if all_of_them else solve(None, own)
+                covariance = (
+                    freed.covariance
+                )  # what is kept is as well known as it would be refined
     pairs = _pair_table(registration, held.estimate, found.estimate)
     sigma = np.sqrt(np.diagonal(found.covariance[:, OFFSET, :, OFFSET]))
     unknown = sigma > KNOWN_OFFSET_SIGMA_S
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
     converged = found.last_step_m < CONVERGED_M
+    verdict = _verdict(rig, pairs, ratios, improved, converged, free_poses)
+    refined, words = _verdicts(rig, master, verdicts, verdict)
     return Refinement(
         found.estimate.poses,
         found.estimate.bias,
-        _stated_covariance(found.covariance, master),
+        _stated_covariance(covariance, master),
         np.where(unknown, given.offset, found.estimate.offset),
         sigma,
         improved,
         converged,
         pairs,
-        _verdict(rig, pairs, ratios, improved, converged, free_poses),
-        _notes(rig, master, pairs, views.weights, improved),
+        verdict,
+        refined,
+        words,
+        _notes(
+            rig,
+            master,
+            pairs,
+            views.weights,
+            refined,
+            floor.cameras if floor is not None and floor in constraints else (),
+        ),
     )
+
+
+def _verdicts(
+    rig: Rig, master: int, own: dict[int, CameraVerdict], said: str
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Which cameras (C,) were refined, and why, in words; of the rig as a whole where no camera was
+    judged by itself."""
+    refined = np.array([c in own and own[c].refined for c in range(len(rig))])
+    whole = "as given: " + said.removesuffix(": poses as given")
+    words = [str(own[c]) if c in own else whole for c in range(len(rig))]
+    words[master] = "the master, which the others are placed by"
+    return refined, tuple(words)
 
 
 def _stated_covariance(found: np.ndarray, master: int) -> np.ndarray:
@@ -221,20 +272,30 @@ def _verdict(
 
 
 def _notes(
-    rig: Rig, master: int, pairs: PairTable, body_weights: np.ndarray, improved: bool
+    rig: Rig,
+    master: int,
+    pairs: PairTable,
+    body_weights: np.ndarray,
+    improved: np.ndarray,
+    on_floor: Collection[int],
 ) -> tuple[str, ...]:
-    """What each camera's pose rests on, where that is less than the others'."""
+    """What each camera's pose rests on, where that is less than the others': ``improved`` (C,)
+    were refined, those ``on_floor`` are tied to the common floor."""
     linked = _linked(pairs.pairs, master)
     notes = []
     for c in range(len(rig)):
         if c in linked or len(rig) == 1:
             notes.append("")
-        elif improved and len(body_weights) and (body_weights[:, c] > 0).sum() >= MIN_BODY_POINTS:
-            notes.append(
-                "shares no surface with the others: its pose rests on the keypoints and the floor"
-            )
         else:
-            notes.append("shares no surface and no keypoints with the others: its pose is as given")
+            why = "shares no surface with the others" if rig[c].depth else "has no depth"
+            seen = len(body_weights) and (body_weights[:, c] > 0).sum() >= MIN_BODY_POINTS
+            if improved[c] and seen:
+                rests = "the keypoints and the floor" if c in on_floor else "the keypoints"
+                notes.append(f"{why}: its pose rests on {rests}")
+            elif seen:
+                notes.append(f"{why}: its pose is as given")
+            else:
+                notes.append(f"{why} and no keypoints with the others: its pose is as given")
     return tuple(notes)
 
 

@@ -32,6 +32,11 @@ class FloorConstraint:
         self._points = points
         self._up = up
 
+    @property
+    def cameras(self) -> frozenset[int]:
+        """Those that see the floor."""
+        return frozenset(self._points)
+
     @classmethod
     def of(cls, rig: Rig, surfaces: dict[int, Surface], ground: Ground) -> FloorConstraint | None:
         """The floor points near ``ground`` at the rig's poses; None where fewer than two cameras

@@ -200,17 +200,18 @@ class Registration:
         constraints: Sequence[Constraint] = (),
         timing: OffsetInformation | None = None,
         *,
-        free_poses: bool = True,
+        free_poses: bool | np.ndarray = True,
     ) -> Solution:
         """Refine ``start``; ``constraints`` add normal equations of the poses, ``timing`` those of
         the offsets.
 
-        Without ``free_poses`` the bias and the offsets alone are estimated.
+        Without ``free_poses``, of all or by camera (C,), the bias and the offsets alone are
+        estimated.
         """
         current = Estimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
         rows = self._free_rows(free_poses)
-        for gate in GATES_M if free_poses else HELD_GATES_M:
+        for gate in GATES_M if np.any(free_poses) else HELD_GATES_M:
             matrix = np.zeros((count, FREEDOMS, count, FREEDOMS))
             gradient = np.zeros((count, FREEDOMS))
             self._add_surfaces(matrix, gradient, current, gate)
@@ -234,10 +235,15 @@ class Registration:
             current, covariance.reshape(count, FREEDOMS, count, FREEDOMS), float(moved.max())
         )
 
-    def residuals(self, at: Estimate, kind: SurfaceKind) -> PairResiduals:
-        """Median |point to plane| of every pair of cameras over the held-out points."""
+    def residuals(
+        self, at: Estimate, kind: SurfaceKind, camera: int | None = None
+    ) -> PairResiduals:
+        """Median |point to plane| of every pair of cameras, or those of one ``camera``, over the
+        held-out points."""
         values = {}
         for a, b in combinations(self._seen.get(kind, {}), 2):
+            if camera is not None and camera not in (a, b):
+                continue
             ways = (
                 self._match(kind, *way, at, SURFACE_SEARCH_M, held_out=True)
                 for way in ((a, b), (b, a))
@@ -352,9 +358,9 @@ class Registration:
             matrix[c, :, c] += np.diag(precision)
             gradient[c] += precision * away
 
-    def _free_rows(self, free_poses: bool) -> np.ndarray:
+    def _free_rows(self, free_poses: bool | np.ndarray) -> np.ndarray:
         free = np.ones((len(self.rig), FREEDOMS), bool)
-        free[:, :6] = free_poses
+        free[:, :6] = np.broadcast_to(free_poses, len(self.rig))[:, None]
         free[self._master] = False
         free[self._master, BIAS] = True
         return np.flatnonzero(free.ravel())

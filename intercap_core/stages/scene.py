@@ -15,7 +15,8 @@ from intercap_core.config import SceneSettings, digest
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.scene.background import Background, background_of
-from intercap_core.scene.constants import BACKGROUND_CELL_M
+from intercap_core.scene.camera_verdicts import direction_in_words, weakest_motion
+from intercap_core.scene.constants import BACKGROUND_CELL_M, WEAK_CAMERA_M
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.feet import feet_off_the_floor, ground_of_feet
 from intercap_core.scene.floor_constraint import FloorConstraint
@@ -93,7 +94,10 @@ def run(
         ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
         ground, odd = _with_feet(source, rig, ground, subject)
         oddities += odd
+        slides, known_to = _slides(source, rig, refined, ground)
         notes = _notes(source, refined, moments, exchanges)
+        for note, slide, words in zip(notes, slides, known_to, strict=True):
+            note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
         _write(
             output,
             source,
@@ -104,7 +108,12 @@ def run(
             refined,
             ground,
             oddities,
-            notes,
+            ["; ".join(lines) for lines in notes],
+            slides,
+            [
+                "; ".join(filter(None, both))
+                for both in zip(refined.verdicts, known_to, strict=True)
+            ],
             settings,
         )
 
@@ -201,6 +210,8 @@ def _write(
     ground: Ground,
     oddities: list[str],
     notes: list[str],
+    slides: np.ndarray,
+    verdicts: list[str],
     settings: SceneSettings,
 ) -> None:
     pairs = refined.pairs
@@ -232,6 +243,9 @@ def _write(
         writer.put("master_from_colour_start", source.rig.master_from_colour)
         writer.put("depth_bias", refined.bias)
         writer.put("camera_covariance", refined.covariance)
+        writer.put("camera_refined", refined.refined)
+        writer.put("camera_verdict", verdicts)
+        writer.put("camera_slide", slides)
         writer.put("note", notes)
         writer.put("pairs", pairs.pairs)
         for k, kind in enumerate(("pair", "pair_moving")):
@@ -257,7 +271,7 @@ def _notes(
     refined: Refinement,
     moments: Moments,
     exchanges: Sequence[Exchange],
-) -> list[str]:
+) -> list[list[str]]:
     """What each camera's lens, pose and time rest on, and where it slips."""
     notes = [[note] if note else [] for note in refined.notes]
     for one in exchanges:
@@ -290,4 +304,20 @@ def _notes(
     for c, present in enumerate(source.present):
         if present and np.isnan(refined.offset_sigma[c]):
             notes[c].append("its time offset could not be told")
-    return ["; ".join(lines) for lines in notes]
+    return notes
+
+
+def _slides(
+    source: Frames, rig: Rig, refined: Refinement, ground: Ground
+) -> tuple[np.ndarray, list[str]]:
+    """By which each camera may let the rig's middle slide (C, 3), one standard deviation, metres,
+    and the same in words, "" = not at all."""
+    up = ground.normal if ground.found else _up(source, rig).direction
+    slides, words = np.zeros((len(rig), 3)), [""] * len(rig)
+    for c, pose in enumerate(rig.master_from_colour):
+        sigma, way = weakest_motion(refined.covariance[c, :, c], pose, ring_centre(rig))
+        if sigma > 0:
+            slides[c] = sigma * way
+            least = direction_in_words(way, pose, up)
+            words[c] = f"its pose is known to {1e3 * sigma:.1f} mm, least {least}"
+    return slides, words

@@ -55,7 +55,8 @@ def views_of(seed: int, noise_px: float) -> BodyViews:
     pixels = np.swapaxes(keypoints[..., :2], 1, 2).reshape(-1, 6, 2)
     pixels = pixels + rng.normal(0, noise_px, pixels.shape)
     points = apply(invert(UP), body.reshape(-1, 3))
-    return BodyViews(pixels, np.ones(pixels.shape[:2]), points, np.zeros(points.shape))
+    unit = np.arange(len(points))
+    return BodyViews(pixels, np.ones(pixels.shape[:2]), points, np.zeros(points.shape), unit)
 
 
 def test_surfaces_lie_on_the_room_and_face_the_camera():

@@ -13,6 +13,7 @@ from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import SceneSettings
 from intercap_core.errors import UserError
 from intercap_core.export.upright import z_up_frame
+from intercap_core.scene import camera_verdicts
 from intercap_core.schemas import SCENE
 from intercap_core.stages import scene
 from tests.helpers.synthetic_capture import (
@@ -77,6 +78,27 @@ def test_a_perfect_start_is_not_made_worse(tmp_path):
     assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.004
 
 
+def test_a_camera_that_was_given_right_is_kept_beside_others_that_are_refined(
+    tmp_path, monkeypatch
+):
+    # surfaces of six sets alone: nothing moves, and there is no second half of the keypoints
+    monkeypatch.setattr(camera_verdicts, "DOUBTFUL_RATIO", 0.35)
+    start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
+    poses = start.master_from_colour.copy()
+    poses[3] = TRUTH.master_from_colour[3]
+    start = start.moved(poses)
+    scene.run(**capture(tmp_path, start), settings=SceneSettings(), floor=None)
+    with artefacts.read(tmp_path / "scene.h5", SCENE) as found:
+        assert found["camera_refined"].tolist() == [False, True, True, False, True, True]
+        np.testing.assert_array_equal(found["master_from_colour"][3], poses[3])
+        verdicts, slides = found.text("camera_verdict"), found["camera_slide"]
+        known = np.linalg.norm(slides, axis=1)
+    assert verdicts[3].startswith("as given") and verdicts[1].startswith("refined")
+    assert known[0] == 0 and (known[1:] > 0).all() and (known < 0.02).all()
+    error = extrinsics_error(Rig.from_scene(tmp_path / "scene.h5"), TRUTH, MIDDLE)
+    assert error[1:].mean() < 0.006
+
+
 def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
     start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
     paths = capture(tmp_path, start)
@@ -86,6 +108,8 @@ def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
     with artefacts.read(paths["output"], SCENE) as found:
         assert not found.attributes["extrinsics_refined"]
         assert "switched off" in found.attributes["verdict"]
+        assert not found["camera_refined"].any()
+        assert all("switched off" in said for said in found.text("camera_verdict")[1:])
         np.testing.assert_array_equal(found["pair_residual_before"], found["pair_residual_after"])
         assert found.attributes["ground_source"] == "annotated"
         np.testing.assert_array_equal(found["master_from_colour"], start.master_from_colour)
