@@ -61,7 +61,8 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
     by_point = np.swapaxes(subject.keypoints[:, :, BODY_POINTS], 1, 2).reshape(-1, views, 3)
     inlier = np.swapaxes(subject.inlier[:, :, BODY_POINTS], 1, 2).reshape(-1, views)
     points = subject.joints[:, BODY_POINTS].reshape(-1, 3)
-    good = (subject.views[:, BODY_POINTS].ravel() >= MIN_BODY_VIEWS) & np.isfinite(points[:, 0])
+    enough = min(MIN_BODY_VIEWS, views)
+    good = (subject.views[:, BODY_POINTS].ravel() >= enough) & np.isfinite(points[:, 0])
     gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
     weights = by_point[..., 2] * inlier * min(1.0, gap / KEYPOINT_ERROR_TIME_S)
     velocity = np.nan_to_num(velocities(subject.joints[:, BODY_POINTS], times)).reshape(-1, 3)

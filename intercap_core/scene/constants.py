@@ -135,7 +135,9 @@ MOVING_EFFECTIVE_POINTS = 50.0  # over many moments and places
 # --- decision: poses ------------------------------------------------------------------------------
 
 MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
-MIN_BODY_VIEWS = 3  # two views say nothing of their own relative pose along most motions
+# Two views of a larger rig say little of their own relative pose; of a rig of two they are all that
+# there is: five of its six freedoms, the prior holds the distance.
+MIN_BODY_VIEWS = 3
 MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
 MAY_WORSEN = 1.02  # in any group
 # By how many standard deviations a camera's refined pose has to be better than its given one; the

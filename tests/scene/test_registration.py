@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.camera.triangulation import triangulate
-from intercap_core.scene.body_constraints import BodyConstraint, BodyViews
+from intercap_core.scene.body_constraints import BodyConstraint, BodyViews, body_views
 from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
+from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surface import surface_of
 from tests.helpers.synthetic_capture import (
     FURNITURE,
@@ -166,3 +167,23 @@ def test_poses_can_be_held_while_bias_is_found():
     assert held.last_step_m == 0
     left = held.estimate.bias - bias
     assert np.std(left) < 0.5 * np.std(bias)
+
+
+def test_two_views_count_only_where_the_rig_has_no_more():
+    def points(cameras: int) -> BodyViews:
+        shape = (20, cameras, 135)
+        seen_by_two = np.where(np.arange(cameras)[:, None] < 2, 1.0, 0.0) * np.ones(shape)
+        subject = SubjectViews(
+            np.repeat(seen_by_two[..., None], 3, axis=3),
+            seen_by_two > 0,
+            np.ones((20, 135, 3)),
+            np.full((20, 135), 2),
+        )
+        return body_views(subject, np.arange(20) / 15)
+
+    assert len(points(3).points) == 0
+    pair = points(2)
+    assert len(pair.points) == 20 * 25
+    seen, unseen = pair.halves()
+    assert len(seen.points) + len(unseen.points) == len(pair.points)
+    assert not set(seen.unit) & set(unseen.unit)
