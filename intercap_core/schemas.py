@@ -235,7 +235,7 @@ def _body(*, one_shape: bool) -> dict[str, Field]:
 
 BODY_FIT = Schema(
     name="body_fit",
-    version=2,
+    version=3,
     stage="body_fit",
     attributes={
         "sequence": "sequence name",

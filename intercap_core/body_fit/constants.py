@@ -119,7 +119,7 @@ FRAMES_KEPT = 256
 # persist over frames. One frame of a shape of its own has 1. Tuned on the studio.
 OFFSET_PRIOR_PER_FRAME = 0.3
 SHAPE_PRIOR_PER_FRAME = 0.3
-COVERING_PRIOR_PER_FRAME = 2.0
+COVERING_PRIOR_PER_FRAME = 0.7
 # Frames whose cost exceeds the median by this factor are tried turned around. Tuned on the studio.
 TURN_WORSE = 1.5
 # A jumped frame's new fit is kept if its cost is below factor * before + slack. Tuned on the

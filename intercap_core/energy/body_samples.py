@@ -41,8 +41,11 @@ COVERINGS = (
     Covering("forearm", 0.004, 0.7, 0.008),
     Covering("thigh", 0.009, 0.5, 0.010),
     Covering("lower_leg", 0.007, 0.6, 0.009),
-    Covering("foot", 0.005, 0.6, 0.009),
+    Covering("foot", 0.005, 1.0, 0.009),
+    Covering("sole", 0.007, 1.0, 0.009),
 )
+SOLE_M = 0.035  # above the lowest skin; a shoe's upper begins about there
+
 _COVERING_OF_JOINT = {
     "pelvis": "trunk", "spine1": "trunk", "spine2": "trunk", "spine3": "trunk",
     "collar": "trunk", "neck": "bare", "head": "hair", "jaw": "bare", "shoulder": "upper_arm",
@@ -86,6 +89,8 @@ def choose_samples(model: BodyModel) -> Samples:
     group = np.array([_covering(joint[v], names) for v in vertex])
     face = _is_face(template, joint, model)[vertex]
     group[face] = names.index("bare")
+    low = template[vertex, 1] < template[:, 1].min() + SOLE_M
+    group[low & (group == names.index("foot"))] = names.index("sole")
     return Samples(vertex, outside[near], group, hand[vertex])
 
 

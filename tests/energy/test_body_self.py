@@ -17,7 +17,7 @@ from intercap_core.body_fit.terms import Targets
 from intercap_core.energy import body_self as term
 from intercap_core.energy.body_constants import SELF_TOLERANCE_M
 from intercap_core.energy.body_keypoints import keypoint_set
-from intercap_core.energy.body_samples import choose_samples
+from intercap_core.energy.body_samples import COVERINGS, choose_samples
 from intercap_core.solve.levenberg_marquardt import minimise
 
 
@@ -161,7 +161,7 @@ def test_a_fit_to_keypoints_of_penetrating_limbs_comes_apart(
     problem = BodyProblem(
         model, keypoint_set(model, range(67)), choose_samples(model), params.vector().clone(),
         columns_of(model, hands=True, face=False, betas=False), False,
-        offsets=torch.zeros(25, 3).double(), u=torch.zeros(8).double(),
+        offsets=torch.zeros(25, 3).double(), u=torch.zeros(len(COVERINGS)).double(),
         targets=Targets(truth, torch.ones(1, 67).double(), 0.02),
     )  # fmt: skip
     before = _depth(model, params, _find(model, contact, params))
