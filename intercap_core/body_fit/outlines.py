@@ -133,5 +133,6 @@ def touching(
     )  # fmt: skip
     sample = samples.number[at]
     if late is not None:
-        distance -= (late[sample] * planes).sum(1)
+        # along the sample's normal, as the row that the distance goes to has it
+        distance -= (late[sample] * normals[samples.vertex[at]]).sum(1)
     return sample[valid], distance[valid]

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 class Minimum:
     """The final state, the equations there, the energy of each term at the start, the numbers of
     accepted ``steps`` and of ``refused`` ones, whether the last one gained little or would have,
-    and the frames (T,) that were ``held``: what would have moved them raised the energy."""
+    and the frames (T,) that were ``held``: whatever would have moved them raised the energy."""
 
     state: State
     equations: NormalEquations
@@ -60,7 +60,7 @@ def minimise(
     are rare, so equations are made anew after one rather than kept for it.
     """
     accepted, refused, gained, converged = 0, 0, 0.0, False
-    damping = np.full(len(state), INITIAL_DAMPING)
+    damping, moved = np.full(len(state), INITIAL_DAMPING), np.zeros(len(state), bool)
     here = linearise(state)
     before = here.energy
     for _ in range(max_steps):
@@ -92,11 +92,13 @@ def minimise(
         gain = here.total - there.total
         gained += gain
         state, here, accepted = trial, there, accepted + 1
+        moved |= damping < HELD_DAMPING
         damping = np.maximum(damping / DAMPING_DOWN, MIN_DAMPING)
         if gain < MIN_GAIN_SHARE * gained:
             converged = True
             break
-    return Minimum(state, here, before, accepted, refused, converged, damping >= HELD_DAMPING)
+    held = (damping >= HELD_DAMPING) & ~moved
+    return Minimum(state, here, before, accepted, refused, converged, held)
 
 
 def _risen(change: np.ndarray) -> np.ndarray:
