@@ -65,7 +65,10 @@ FIELD_SCENE_SETTINGS = [
 ]
 FIELD_SETTINGS = [
     Path("config/evaluation/config.yaml"),
-    *(Path(f"config/field/{name}.yaml") for name in ("no_depth", "two_views", "alone", "beam")),
+    *(
+        Path(f"config/field/{name}.yaml")
+        for name in ("no_depth", "builds", "shoes", "two_views", "alone", "beam")
+    ),
 ]
 OBJECT_SETTINGS = [
     Path(f"config/object/{name}.yaml")

@@ -1,7 +1,7 @@
 """The field's part of `intercap evaluate` that ends with the metrics.
 
-No depth and other definitions of joints, few cameras, people alone, a beam; what the verdict
-without truth tells of them.
+No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam;
+what the verdict without truth tells of them.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from intercap_core.schemas import JOINT, TRUTH
 from intercap_core.studio.subjects import Subject
 
 NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
+BUILDS, SHOES = "field_builds", "field_shoes"
 _BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
@@ -84,16 +85,11 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
     for key, name in (("flag_recall", "bad_recall"), ("flag_precision", "bad_precision")):
         if key in flags:
             found[f"field.{name}"] = flags[key]
-    blind = [e for some in evaluations if some.dataset == NO_DEPTH for e in some.errors]
-    if blind:
-        bones = np.abs(np.stack([e.bones for e in blind])).mean(axis=1)  # by person
-        pve = figures.truth_figures([e.metrics for e in blind], "joint")["body_pve_mm"]
-        found |= {
-            "field.no_depth_pve_mm": pve,
-            "field.no_depth_bone_percent": 100 * float(bones.mean()),
-            "field.no_depth_bone_worst_percent": 100 * float(bones.max()),
-            "field.no_depth_height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in blind])),
-        }
+    for dataset, name in ((NO_DEPTH, "no_depth"), (BUILDS, "builds"), (SHOES, "shoes")):
+        some = [e for found in evaluations if found.dataset == dataset for e in found.errors]
+        found |= keyed(f"field.{name}_", _of_bodies(some)) if some else {}
+    if "field.builds_pve_mm" in found and "field.no_depth_pve_mm" in found:
+        found["field.builds_ratio"] = found["field.builds_pve_mm"] / found["field.no_depth_pve_mm"]
     on_beam = [e.metrics for some in evaluations if some.dataset == BEAM for e in some.errors]
     for stage in ("body_fit", "joint"):
         suffix = "" if stage == "joint" else f"_{stage}"
@@ -109,6 +105,17 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
         count = len(whole) + sum(len(some.missing) for some in alone)
         found["field.people_alone_share"] = sum(whole) / count
     return found
+
+
+def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
+    """Skin, lengths of limbs and heights of some recordings' bodies."""
+    bones = np.abs(np.stack([e.bones for e in some])).mean(axis=1)  # by person
+    return {
+        "pve_mm": figures.truth_figures([e.metrics for e in some], "joint")["body_pve_mm"],
+        "bone_percent": 100 * float(bones.mean()),
+        "bone_worst_percent": 100 * float(bones.max()),
+        "height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in some])),
+    }
 
 
 def _of_a_person_alone(metrics: SequenceMetrics) -> bool:

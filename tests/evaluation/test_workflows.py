@@ -47,7 +47,7 @@ def test_projects_wait_for_those_that_make_their_recordings(
 ) -> None:
     orders = orders_of(wanted, _frames(wanted))
     by_name = {order.project.config.dataset: order for order in orders}
-    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 4 + 4
+    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 4 + 6
     assert orders[0] is by_name["object"]  # what most wait for comes first
     stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
     assert by_name["object"].stages == stages
