@@ -420,6 +420,25 @@ def close_mesh(
     )
 
 
+@app.command(name="keypoint-definition", rich_help_panel=LOOK)
+def keypoint_definition(
+    settings: Settings,
+    output: Annotated[Path, typer.Argument(metavar="OUT", help="The table to write, a .tsv.")],
+) -> None:
+    """Learn where your keypoint detector's joints lie, from recordings with depth.
+
+    OpenPose, COCO and MediaPipe mean points up to 3 cm apart by one name. Depth shows where they
+    lie on the body; the table, named in body_fit.keypoint_definition, tells it to recordings
+    without. Stage body_fit of at least three people with depth has to be done.
+
+    Example: intercap keypoint-definition lab/config.yaml lab/detector.tsv
+    """
+    _prepare()
+    from intercap_core.commands.definition import learn_definition
+
+    typer.echo(learn_definition(settings, output))
+
+
 @app.command(rich_help_panel=LOOK)
 def closeups(
     settings: Settings,

@@ -151,6 +151,10 @@ class BodyFitSettings(Model):
     betas: Annotated[int, Field(ge=1, le=300)] = 10
     """Numbers of the shape. Most readers of SMPL-X take ten; the open body has thirty, with which
     it lies some 4 % closer, a licensed file of full size 300."""
+    keypoint_definition: Path | None = None
+    """Where the detector's body points lie on the body: a table that ``intercap
+    keypoint-definition`` learns from recordings with depth; without it, within 10 mm of the body
+    model's."""
     points_per_frame: Annotated[int, Field(ge=200, le=20000)] = 1500
     """Person points kept of each frame's fused cloud."""
     cloud_weight: Annotated[float, Field(gt=0, le=1000)] = 1.0

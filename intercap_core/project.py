@@ -157,6 +157,7 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
         update={
             "body_models": _absolute(config.body_models, path.parent),
             "detections": _absolute(config.detections, path.parent),
+            "body_fit": _absolute(config.body_fit, path.parent),
             "joint": _absolute(config.joint, path.parent),
         }
     )
@@ -195,6 +196,12 @@ def _check_files(project: Project) -> None:
                 f"{project.path}: body_models.{field} is {file}, and there is no such file; "
                 "correct the path, or remove the line to use what is open"
             )
+    definition = project.config.body_fit.keypoint_definition
+    if definition is not None and not definition.is_file():
+        raise UserError(
+            f"{project.path}: body_fit.keypoint_definition is {definition}, and there is no such "
+            "file; write it by 'intercap keypoint-definition', or remove the line"
+        )
     for file in project.config.joint.lemo_files or ():
         if not file.is_file():
             raise UserError(

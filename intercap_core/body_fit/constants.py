@@ -28,6 +28,9 @@ PERSISTENCE = 1.5
 START_SIGMA_M = 0.04
 # m; a detector's joint differs from the body model's by about this much. Tuned on the studio.
 OFFSET_SIGMA_M = 0.010
+# Of a learnt definition: the least deviation, what an offset is fitted to (decisions: joints to
+# 3 mm), and the fewest people that it is learnt from, as a spread needs.
+DEFINITION_SIGMA_M, DEFINITION_FEWEST_PEOPLE = 0.003, 3
 # Detectors' errors grow as a power of falling confidence, which is measured on residuals: medians
 # in so many bins of confidence, each of at least so many. Tuned on the studio.
 CONFIDENCE_BINS = 6

@@ -18,9 +18,9 @@ from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.constants import (
     COVERING_PRIOR_PER_FRAME,
     OFFSET_PRIOR_PER_FRAME,
-    OFFSET_SIGMA_M,
     SHAPE_PRIOR_PER_FRAME,
 )
+from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.terms import Columns
 from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.solve.levenberg_marquardt import NormalEquations
@@ -41,13 +41,15 @@ class Layout:
     """Where n own and m shared parameters stand in a solver's vectors.
 
     columns (n,): own parameters. num_betas: length of the shape. one_shape: betas are shared.
-    fit_shared: offsets and coverings are shared parameters, else fixed.
+    fit_shared: offsets and coverings are shared parameters, else fixed. definition: what is
+    expected of the offsets.
     """
 
     columns: Tensor
     num_betas: int
     one_shape: bool
     fit_shared: bool
+    definition: Definition
 
     @property
     def shape(self) -> slice:
@@ -109,25 +111,33 @@ class Layout:
         return torch.cat(parts) if parts else like.new_zeros(0)
 
     def prior_cost(self, shared: Tensor) -> Tensor:
-        """Each frame's cost (scalar) of the shared parameters (m,): Gaussians about zero."""
+        """Each frame's cost (scalar) of the shared parameters (m,): Gaussians."""
         if not len(shared):
             return shared.new_zeros(())
-        return 0.5 * (self._precision(shared) * shared**2).sum()
+        return 0.5 * (self._precision(shared) * (shared - self._mean(shared)) ** 2).sum()
 
     def add_prior(self, shared: Tensor, equations: NormalEquations) -> None:
         """Add that cost to the normal equations of each frame, whose last columns are shared."""
         if len(shared):
             precision, first = self._precision(shared), equations.gradient.shape[1] - len(shared)
             equations.cost.add_(self.prior_cost(shared))
-            equations.gradient[:, first:] += precision * shared
+            equations.gradient[:, first:] += precision * (shared - self._mean(shared))
             equations.hessian.diagonal(dim1=1, dim2=2)[:, first:] += precision
 
     def _precision(self, like: Tensor) -> Tensor:
-        """Precision (m,) of the shared parameters' Gaussian about zero, in each frame."""
+        """Precision (m,) of the shared parameters' Gaussian, in each frame."""
         spread = []
         if self.one_shape:
             spread.append(like.new_ones(self.num_betas))
         if self.fit_shared:
-            spread.append(like.new_full((3 * NUM_OFFSETS,), OFFSET_SIGMA_M))
+            spread.append(torch.as_tensor(self.definition.sigma).to(like).repeat_interleave(3))
             spread.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
         return self.prior_counts(like) / torch.cat(spread) ** 2
+
+    def _mean(self, like: Tensor) -> Tensor:
+        """Mean (m,) of that Gaussian: zero but for the offsets."""
+        parts = [like.new_zeros(self.num_betas)] if self.one_shape else []
+        if self.fit_shared:
+            parts.append(torch.as_tensor(self.definition.offsets).to(like).reshape(-1))
+            parts.append(like.new_zeros(len(COVERINGS)))
+        return torch.cat(parts)

@@ -6,7 +6,7 @@ Which parameters it is a function of is said in :mod:`.layout`, its terms are in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from torch import Tensor
 from intercap_core.body.model import BodyModel
 from intercap_core.body.vposer import PoseGaussian
 from intercap_core.body_fit.compiled_terms import CompiledTerms
+from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.layout import Layout, Shared
 from intercap_core.body_fit.terms import Bodies, Observations, Targets, Terms, Views
 from intercap_core.body_fit.torch_terms import TorchTerms
@@ -39,8 +40,9 @@ class BodyProblem:
     belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
     where ``fit_shared`` says so, else fixed. touching: the body's parts that are inside each other,
     and the weight of that. pose: a learned prior of each frame's pose. hand_share: of an
-    observation that the prior of a hand's pose is in one frame, 1 where frames stand alone. terms:
-    by default the quickest form on the device of ``base``.
+    observation that the prior of a hand's pose is in one frame, 1 where frames stand alone.
+    definition: what is expected of the offsets. terms: by default the quickest form on the device
+    of ``base``.
     """
 
     model: BodyModel
@@ -59,6 +61,7 @@ class BodyProblem:
     pose: PoseGaussian | None = None
     hand_share: float = 1.0
     fit_shared: bool = False
+    definition: Definition = field(default_factory=Definition.unknown)
     terms: Terms | None = None
 
     def __post_init__(self) -> None:
@@ -70,7 +73,9 @@ class BodyProblem:
     @property
     def layout(self) -> Layout:
         """Where the parameters stand now."""
-        return Layout(self.columns, self.model.num_betas, self.one_shape, self.fit_shared)
+        return Layout(
+            self.columns, self.model.num_betas, self.one_shape, self.fit_shared, self.definition
+        )
 
     @property
     def shape_columns(self) -> slice:

@@ -21,6 +21,7 @@ from intercap_core.body_fit.constants import (
     TURN_WORSE,
     WIDENED,
 )
+from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
@@ -98,7 +99,8 @@ def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Ten
 class Fitter:
     """Fits all usable frames of one sequence; create, then :meth:`run`.
 
-    ``terms``: of the body's energy, by default the quickest form on the model's device.
+    ``terms``: of the body's energy, by default the quickest form on the model's device;
+    ``definition``: where the detector's points are expected.
     """
 
     def __init__(
@@ -109,8 +111,10 @@ class Fitter:
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
         terms: Terms | None = None,
+        definition: Definition | None = None,
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
+        self.definition = definition or Definition.unknown()
         self._terms = terms
         self._progress = Progress(log, "body: minimised", None, "rounds")
         self.evidence = Evidence(model, seen, clouds, settings.cloud_weight)
@@ -127,9 +131,10 @@ class Fitter:
             self.model, self.evidence.keypoints(), self.evidence.samples, base,
             columns_of(self.model, hands=False, face=False, betas=not self.one_shape),
             self.one_shape,
-            offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
+            offsets=torch.as_tensor(self.definition.offsets).to(base),
+            u=base.new_zeros(len(COVERINGS)),
             self_weight=self.settings.self_penetration_weight,
-            terms=self._terms,
+            definition=self.definition, terms=self._terms,
         )  # fmt: skip
         problem.targets = self._lifted()
         for widened in WIDENED if problem.targets else (1.0, 1.0):
@@ -302,7 +307,8 @@ class Fitter:
         problem = BodyProblem(
             self.model, self.evidence.keypoints(), self.evidence.samples, base,
             columns_of(self.model, hands=False, face=False, betas=True), False,
-            offsets=base.new_zeros(25, 3), u=base.new_zeros(len(COVERINGS)),
+            offsets=torch.as_tensor(self.definition.offsets).to(base),
+            u=base.new_zeros(len(COVERINGS)),
             targets=Targets(
                 self._tensor(np.nan_to_num(joints)), self._tensor(known), START_SIGMA_M
             ),

@@ -27,6 +27,7 @@ from intercap_core.body_fit.constants import (
     JUMP_M,
     WRONG_TRUNK_M,
 )
+from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.recover import jumps
 from intercap_core.body_fit.schedule import Fitter
@@ -71,7 +72,8 @@ def run(
             "keypoints and the camera poses of this sequence"
         )
     clouds = person_clouds(frames, seen, settings.points_per_frame, model.device)
-    fit = Fitter(model, seen, clouds, settings, pose_prior).run()
+    definition = Definition.read(settings.keypoint_definition)
+    fit = Fitter(model, seen, clouds, settings, pose_prior, definition=definition).run()
 
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be occluded: only the trunk decides whether this is the subject's body

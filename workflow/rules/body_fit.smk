@@ -4,6 +4,7 @@ rule body_fit:
         **artefacts_read("body_fit"),
         body=body_file,
         pose_prior=pose_prior_file,
+        keypoint_definition=keypoint_definition_file,
     output:
         body_fit=f"{RESULTS}/{{sequence}}/body_fit.h5",
     log:

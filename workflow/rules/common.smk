@@ -132,6 +132,11 @@ def pose_prior_file(wildcards):
     return existing(SETTINGS.body_models.vposer)
 
 
+def keypoint_definition_file(wildcards):
+    """Input function: where the detector's points lie, where the settings name a table."""
+    return existing(SETTINGS.body_fit.keypoint_definition)
+
+
 def motion_prior_files(wildcards):
     """Input function: the motion prior's weights and statistics, where the settings name them."""
     return existing(*(SETTINGS.joint.lemo_files or ()))

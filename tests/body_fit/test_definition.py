@@ -1,0 +1,73 @@
+"""A detector's definition: written, read, and what the fit's prior makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from intercap_core.body_fit.constants import OFFSET_SIGMA_M
+from intercap_core.body_fit.definition import POINTS, Definition
+from intercap_core.body_fit.layout import Layout
+from intercap_core.errors import UserError
+
+
+def _some(seed: int = 0) -> Definition:
+    random = np.random.default_rng(seed)
+    return Definition(random.normal(0, 0.01, (25, 3)).round(4), np.full(25, 0.004))
+
+
+def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
+    given = _some()
+    given.write(tmp_path / "own.tsv", "a lab")
+    found = Definition.read(tmp_path / "own.tsv")
+    np.testing.assert_allclose(found.offsets, given.offsets, atol=1e-9)
+    np.testing.assert_allclose(found.sigma, given.sigma)
+    assert (tmp_path / "own.tsv").read_text().startswith("# a lab\npoint\tx_mm")
+
+
+def test_without_a_table_the_points_are_the_models() -> None:
+    found = Definition.read(None)
+    assert not found.offsets.any() and (found.sigma == OFFSET_SIGMA_M).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda text: text.replace("x_mm", "x"), "columns are"),
+        (lambda text: text.replace(POINTS[3] + "\t", "shin\t"), "shin"),
+        (lambda text: text + text.splitlines()[2] + "\n", "one is there twice"),
+        (lambda text: text.replace(POINTS[0] + "\t", POINTS[0] + "\tfar"), "three offsets"),
+        (lambda text: text.replace("\t4.0\n", "\t0.0\n"), "deviation above 0"),
+        (lambda text: text.replace("\t4.0\n", "\tnan\n"), "deviation above 0"),
+        (lambda text: text.replace(POINTS[1] + "\t", POINTS[1] + "\t9"), "at most 100"),
+        (lambda text: "", "columns are missing"),
+    ],
+)
+def test_bad_tables_are_named(tmp_path: Path, change, told: str) -> None:
+    path = tmp_path / "own.tsv"
+    replace(_some(), offsets=np.full((25, 3), 0.01)).write(path, "a lab")
+    path.write_text(change(path.read_text().replace("\t10.0", "\t10.5")))
+    with pytest.raises(UserError, match=told) as error:
+        Definition.read(path)
+    assert str(path) in str(error.value) and "keypoint-definition" in str(error.value)
+
+
+def test_a_folder_or_no_file_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "none.tsv"):
+        with pytest.raises(UserError, match="no readable text"):
+            Definition.read(path)
+
+
+def test_the_prior_is_about_the_definition_and_its_gradient_is_its_slope() -> None:
+    known = _some(1)
+    layout = Layout(torch.arange(3), 10, True, True, known)
+    at = torch.as_tensor(known.offsets).reshape(-1)
+    mean = torch.cat([torch.zeros(10).double(), at, torch.zeros(9).double()])
+    assert layout.prior_cost(mean) == 0
+    step = torch.as_tensor(np.random.default_rng(2).normal(0, 1e-3, len(mean)))
+    wide = Layout(torch.arange(3), 10, True, True, Definition.unknown())
+    assert layout.prior_cost(mean + step) > wide.prior_cost(step)  # known better than unknown

@@ -1,0 +1,53 @@
+"""A detector's definition, learnt from people with depth, and told to a recording without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.body_fit.constants import DEFINITION_SIGMA_M
+from intercap_core.body_fit.definition import learnt
+from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
+from intercap_core.errors import UserError
+from intercap_core.schemas import BODY_FIT
+from intercap_core.stages import body_fit
+from tests.helpers.bodies import open_body
+from tests.stages.test_body_fit import Capture
+
+PLAIN = BodyFitSettings(hands=False, face=False)
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> list[Path]:
+    """Fits of three people with depth, then of one without,."""
+    model, found = open_body(), []
+    for number in range(4):
+        folder = tmp_path_factory.mktemp("person")
+        capture = Capture(model, folder, 3, cameras=4, pixel_noise=0.5, depth=number < 3)
+        found.append(folder / "body_fit.h5")
+        body_fit.run(
+            frames=capture.inputs.frames, scene=capture.inputs.scene,
+            person=capture.inputs.person, output=found[-1],
+            subject=SubjectEntry(subject=f"p{number}", gender="neutral"),
+            body_models=BodyModels(), settings=PLAIN,
+        )  # fmt: skip
+    return found
+
+
+def test_people_with_depth_are_averaged_and_the_others_left_out(people: list[Path]) -> None:
+    found, names = learnt(people)
+    assert names == ["p0", "p1", "p2"]
+    each = []
+    for path in people[:3]:
+        with artefacts.read(path, BODY_FIT) as fit:
+            each.append(fit["keypoint_offsets"])
+    np.testing.assert_allclose(found.offsets, np.mean(each, axis=0), atol=1e-6)
+    assert (found.sigma >= DEFINITION_SIGMA_M).all()
+
+
+def test_too_few_people_are_named(people: list[Path]) -> None:
+    with pytest.raises(UserError, match=r"2 people with depth \(p0, p1\).*without depth"):
+        learnt([*people[:2], people[3]])
