@@ -54,7 +54,10 @@ LEVER_M = 2.5  # from a camera to what it looks at, in a ring: turns a rotation 
 
 # --- human motion ---------------------------------------------------------------------------------
 
-MAX_SLIP = 4  # frames by which an image is late: slips of 1 to 4 occur in InterCap's recordings
+# By how much an image is late. What holds it back is a queue, of some images, or a computer that is
+# busy, for some time: slips of 1 to 4 images at 30 a second occur in InterCap's recordings, and the
+# greater of the two counts at other rates.
+MAX_SLIP_FRAMES, MAX_SLIP_S = 4, 4 / 30
 MAX_PATH_GAP_S = 0.35  # over which a path is carried on without sight; tuned on the studio
 MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
 FOOT_HEIGHT_M = 0.014  # of the lowest of heel and toe keypoints: the open body's, standing

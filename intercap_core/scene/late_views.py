@@ -13,7 +13,8 @@ from intercap_core.camera.triangulation import pixel_scale, reproject
 from intercap_core.detections.read import PeopleOfImages
 from intercap_core.person.sides import BODY_POINTS, swapped
 from intercap_core.person.subject import MIN_COMMON_POINTS, NOBODY
-from intercap_core.scene.constants import MAX_SLIP, SAME_PERSON_PX_AT_1080P
+from intercap_core.scene.constants import SAME_PERSON_PX_AT_1080P
+from intercap_core.scene.slips import longest_slip
 
 
 def with_late_views(
@@ -25,14 +26,14 @@ def with_late_views(
     *,
     fps: float,
     min_confidence: float,
-    max_slip: int = MAX_SLIP,
 ) -> np.ndarray:
     """Add to the subject's ``index`` (T, C), -1 = not seen, people who are where it was shortly
     before.
 
     ``joints`` (T, 135, 3) m, triangulated from the views that do see it, NaN = not known; ``times``
-    (T,) s. Looks back ``max_slip`` frames.
+    (T,) s. Looks back as far as slips are sought.
     """
+    reach_s = longest_slip(fps) / fps
     result = index.copy()
     body = joints[:, BODY_POINTS]
     limit = SAME_PERSON_PX_AT_1080P * pixel_scale(rig)
@@ -40,7 +41,7 @@ def with_late_views(
         found = detections.people(int(t), int(c))
         if not len(found):
             continue
-        before = _sets_before(times, int(t), max_slip / fps)
+        before = _sets_before(times, int(t), reach_s)
         expected = reproject(np.nan_to_num(body[before].reshape(-1, 3), nan=1.0), rig)[:, c]
         expected = expected.reshape(len(before), -1, 2)
         known = np.isfinite(body[before, :, 0])

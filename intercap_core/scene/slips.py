@@ -18,7 +18,8 @@ from intercap_core.camera.rig import Rig
 from intercap_core.scene.constants import (
     CLEAR_SLIP_GAIN,
     MANY_VIEWS,
-    MAX_SLIP,
+    MAX_SLIP_FRAMES,
+    MAX_SLIP_S,
     MIN_SLIP_GAIN,
     MIN_SLIP_GAIN_OF_SET,
     MIN_TIMING_SETS,
@@ -60,16 +61,20 @@ class Slips:
     intervals: tuple[Interval, ...]
 
 
+def longest_slip(fps: float) -> int:
+    """By how many frames, ``fps`` a second, an image may be late."""
+    return max(MAX_SLIP_FRAMES, round(MAX_SLIP_S * fps))
+
+
 def find_slips(
     keypoints: np.ndarray,
     rig: Rig,
     times: np.ndarray,
     fps: float,
     *,
-    max_slip: int = MAX_SLIP,
     master: int = 0,
 ) -> Slips:
-    """Find slips of up to ``max_slip`` frames in any camera, for a while or always.
+    """Find slips of up to :func:`longest_slip` frames in any camera, for a while or always.
 
     ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``times``
     (T,) s. A delay of all images of a camera is relative to the ``master``'s.
@@ -77,7 +82,8 @@ def find_slips(
     slip = np.zeros(keypoints.shape[:2], np.int32)
     if len(times) < MIN_TIMING_SETS or len(rig) < 2:
         return Slips(slip, ())
-    steps = [s for s in range(-max_slip, max_slip + 1) if s]
+    longest = longest_slip(fps)
+    steps = [s for s in range(-longest, longest + 1) if s]
     motion = build_motion(keypoints, rig, times)
     offset: np.ndarray | None = None
     always: list[Interval] = []

@@ -11,7 +11,7 @@ from intercap_core.camera.transforms import apply, invert
 from intercap_core.camera.triangulation import reproject
 from intercap_core.scene.constants import WINDOW_SETS
 from intercap_core.scene.keypoint_timing import keypoint_offsets
-from intercap_core.scene.slips import find_slips, interval_gains
+from intercap_core.scene.slips import find_slips, interval_gains, longest_slip
 from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import stick_person
@@ -45,8 +45,8 @@ def seen(exposures: np.ndarray, seed: int = 0, moving: bool = True) -> np.ndarra
     return keypoints
 
 
-def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0) -> np.ndarray:
-    return np.arange(len(slip))[:, None] / FPS - slip / FPS + offset
+def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0, fps: float = FPS) -> np.ndarray:
+    return np.arange(len(slip))[:, None] / fps - slip / fps + offset
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +107,20 @@ def test_whole_frames_of_delay_count_from_the_master():
     slip[:, 3], slip[:, 0] = 0, 2
     found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
     np.testing.assert_array_equal(found.slip, slip - slip[:, :1])
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(5, 4), (15, 4), (30, 4), (60, 8), (120, 16)])
+def test_slips_are_sought_as_long_in_time_and_in_frames_as_at_thirty_a_second(fps, frames):
+    assert longest_slip(fps) == frames
+
+
+def test_at_sixty_a_second_a_slip_lasts_more_frames():
+    slip = np.zeros((90, 6), np.int32)
+    slip[20:60, 2], slip[50:, 5] = 7, 5
+    times = np.arange(len(slip)) / 60
+    found = find_slips(seen(exposures(slip, fps=60.0)), RIG, times, 60.0)
+    assert sorted((i.camera, i.slip) for i in found.intervals) == [(2, 7), (5, 5)]
+    assert np.abs(found.slip - slip).mean() < 0.1
 
 
 def test_a_slip_while_nobody_moves_is_not_reported():
