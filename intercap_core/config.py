@@ -286,6 +286,8 @@ class StudioCapture(Model):
     """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
     starts_apart: Annotated[float, Field(ge=0, le=1.5)] = 0.0
     """The cameras are started apart by up to so many seconds, and their times do not tell."""
+    every: dict[Name, Annotated[int, Field(ge=2, le=12)]] = {}
+    """Cameras with fewer frames a second: {k2: 2} records every second frame set only."""
     keypoint_bias: Annotated[float, Field(ge=0, le=3)] = 1.0
     """Scale of what a detector means otherwise by the body's joints, 10 to 20 mm at 1."""
     room: Literal["random", "furnished", "sparse", "bare"] = "random"

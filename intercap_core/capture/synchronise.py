@@ -100,6 +100,15 @@ def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
     return shown
 
 
+def usual_steps(available: np.ndarray) -> np.ndarray:
+    """Sets (C,) from one image of a camera to its next, usually; 1 for a camera with fewer than 2.
+
+    ``available`` (T, C): the set holds an image of the camera.
+    """
+    steps = [np.diff(np.flatnonzero(camera)) for camera in available.T]
+    return np.array([float(np.median(step)) if len(step) else 1.0 for step in steps])
+
+
 def _nearest(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
     """Return the position of the target nearest to each value; of two equally near the first."""
     right = np.clip(np.searchsorted(sorted_targets, values), 1, max(1, len(sorted_targets) - 1))

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from intercap_core.camera.rig import Rig
+from intercap_core.capture.synchronise import usual_steps
 from intercap_core.scene.constants import (
     CLEAR_SLIP_GAIN,
     MANY_VIEWS,
@@ -198,6 +199,8 @@ class _Evidence:
         self._steps = steps
         self._late = np.stack([np.nan_to_num(motion.shifted(s / fps)) for s in steps])
         self._motion = _tolerant(motion, self._late)
+        # a camera of half the rate slips by two sets at a time
+        self._own_steps = np.rint(usual_steps(np.any(motion.seen, -1))).astype(int)
         noise = noise_of(self._motion)
         whole = windows(len(motion.times))
         between = [
@@ -208,7 +211,7 @@ class _Evidence:
 
     def best(self, camera: int) -> Interval | None:
         """The interval of one camera with the greatest gain, if significant."""
-        sets = len(self._motion.times)
+        sets, own_step = len(self._motion.times), self._own_steps[camera]
         root, series = _own_series(self._motion, camera)
         always = {step: np.zeros(series.shape[1]) for step in self._steps}
         top = None
@@ -221,7 +224,9 @@ class _Evidence:
             if not between:
                 for step, case in cases.items():
                     always[step] += case.gains(0, part.stop - part.start)
-            found = _best_of_window({s: case for s, case in cases.items() if s > 0})
+            found = _best_of_window(
+                {s: case for s, case in cases.items() if s > 0 and s % own_step == 0}
+            )
             if found is not None and (top is None or found.gain > top.gain):
                 top = replace(
                     found,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert
 from intercap_core.camera.triangulation import pixel_scale
+from intercap_core.capture.synchronise import usual_steps
 from intercap_core.detections.read import PeopleOfImages
 from intercap_core.scene.constants import (
     CLEAR_SIGMAS,
@@ -32,6 +33,7 @@ from intercap_core.scene.constants import (
     MAX_START_SHARE,
     MIN_CONFIDENCE,
     MIN_SHARED_S,
+    SLOWER_SETS,
     START_BLOCK_S,
     START_BLOCKS_SHARE,
     START_PEAK_S,
@@ -163,10 +165,28 @@ def _rays(detections: PeopleOfImages, rig: Rig, available: np.ndarray) -> np.nda
         order = np.argsort(-people[..., 2].sum(1), kind="stable")[:MAX_PEOPLE]
         for place, person in enumerate(people[order]):
             pixels[t, c, place] = middles(person)
+    for c, usual in enumerate(usual_steps(available)):
+        if usual >= SLOWER_SETS:
+            _carry_on(pixels[:, c], np.flatnonzero(available[:, c]), usual)
     found = np.empty_like(pixels)
     for c, camera in enumerate(rig):
         found[:, c] = camera.colour.unproject(pixels[:, c])[..., :2]
     return found
+
+
+def _carry_on(pixels: np.ndarray, images: np.ndarray, usual: float) -> None:
+    """Fill the ``pixels`` (T, P, K, 2) of a camera of fewer images a second than sets, in place, in
+    the sets between two of its ``images`` (N,), usually ``usual`` sets apart: people move evenly
+    over so short a time. Else one lag is judged by other pairs and moments than the next."""
+    for first, last in pairwise(images.tolist()):
+        if last - first > 2 * usual:
+            continue  # lost images: nothing is made up
+        apart = np.abs(pixels[first, :, None] - pixels[last, None]).sum(-1)  # (P, P, K)
+        size = _mean(np.moveaxis(apart, -1, 0))
+        same = np.where(np.isfinite(size), size, np.inf).argmin(1)
+        for t in range(first + 1, last):
+            share = (t - first) / (last - first)
+            pixels[t] = (1 - share) * pixels[first] + share * pixels[last, same]
 
 
 def middles(person: np.ndarray) -> np.ndarray:

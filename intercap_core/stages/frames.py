@@ -25,11 +25,16 @@ from intercap_core.capture.synchronise import (
     nearest_images,
     synchronise,
 )
+from intercap_core.capture.timestamps import rate_of
 from intercap_core.config import FramesSettings, SequenceEntry, digest
 from intercap_core.errors import UserError
 from intercap_core.schemas import FRAMES
 
 MIN_DRIFT_US = 1000.0  # less than the exposure of one image
+# By how much a camera's images are usually off from where they are beside their sets on the whole:
+# less is a device's unsteady clock, more moves a walking person by some millimetres.
+MIN_UNEVEN_US = 2000.0
+OTHER_RATE = 1.5  # times as many images a second: half way to double
 
 
 def run(
@@ -252,6 +257,7 @@ def _frame_sets(
 
 def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
     period_us = 1e6 / views[clock].fps
+    sets_per_s = rate_of(table.times_us) or views[clock].fps
     gaps = table.gaps(period_us)
     if gaps:
         lost = sum(length for _, length in gaps)
@@ -263,7 +269,11 @@ def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
         if not view.present:
             continue
         seen = np.flatnonzero(table.index[:, camera] >= 0)
-        if table.unmatched[camera]:
+        own = rate_of(view.usable_times) or sets_per_s
+        ratio = own / sets_per_s
+        if not 1 / OTHER_RATE < ratio < OTHER_RATE:
+            view.notes.append(_other_rate(own, sets_per_s, int(table.unmatched[camera])))
+        if table.unmatched[camera] and ratio < OTHER_RATE:
             used = np.zeros(len(view.colour_times), bool)
             used[table.index[seen, camera]] = True
             left_out = view.colour_times[view.colour_usable & ~used]
@@ -280,15 +290,34 @@ def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
                 f"its clock runs away from {views[clock].name}'s by {drift / 1e3:.1f} "
                 "ms over the recording"
             )
+        off = table.skew_us[seen, camera]
+        uneven = float(np.median(np.abs(off - np.median(off))))
+        if uneven > MIN_UNEVEN_US:
+            view.notes.append(
+                f"its images are unevenly beside their sets, usually {uneven / 1e3:.1f} ms off: "
+                "fits take all of them to be as late as they are on the whole"
+            )
         holes = int(seen[-1] - seen[0] + 1 - len(seen))
         early = len(table.times_us) - 1 - int(seen[-1])
         if holes:
             view.notes.append(f"no image in {holes} frame sets between its first and last")
-        if seen[0]:
+        alike = max(1.0, 1 / ratio)  # sets before the first image, or after the last, at its rate
+        if seen[0] >= alike:
             view.notes.append(f"begins {seen[0]} frame sets late")
-        if early:
+        if early >= alike:
             view.truncated = True
             view.notes.append(f"ends {early} frame sets early")
+
+
+def _other_rate(own: float, sets: float, unmatched: int) -> str:
+    """What is to be said of a camera with ``own`` images a second, which the sets do not have."""
+    text = f"it has {own:.3g} images a second beside {sets:.3g} frame sets"
+    if own > sets:
+        return (
+            f"{text}: {unmatched} images are left out; name it as the calibration's master to use "
+            "them"
+        )
+    return f"{text}: those between its images lack it"
 
 
 def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry) -> np.ndarray:

@@ -217,11 +217,17 @@ class PlainFolder(CaptureFolder):
         cameras = {}
         for camera, lens in zip(claimed, self.lenses(claimed), strict=True):
             pose = camera.colour_from_master
-            entry = {**_opencv(lens), "R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
+            entry: dict[str, object] = {
+                **_opencv(lens),
+                "R": pose[:3, :3].tolist(),
+                "T": pose[:3, 3].tolist(),
+            }
             if self.capture.depth:
                 assert camera.depth is not None and camera.colour_from_depth is not None
                 between = {"colour_from_depth": camera.colour_from_depth.tolist()}
                 entry["depth"] = {**_opencv(camera.depth), **between}
+            if camera.name in self.capture.every:
+                entry["fps"] = fps // self.capture.every[camera.name]
             cameras[camera.name] = entry
         content = {"master": claimed.names[0], "fps": fps, "cameras": cameras}
         (self.path / self.calibration).write_text(yaml.safe_dump(content, sort_keys=False))

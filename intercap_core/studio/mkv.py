@@ -18,6 +18,7 @@ import numpy as np
 
 from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
 
+KINECT_RATES = (5, 15, 30)  # frames a second
 TIMECODE_SCALE_NS = 1000  # block times are microseconds
 CLUSTER_SPAN_US = 30_000  # a block's time is a signed 16-bit number of microseconds in its cluster
 ColourFormat = Literal["MJPG", "NV12", "YUY2", "BGRA"]
@@ -83,7 +84,7 @@ class MkvWriter:
         with_imu: bool = False,
         colour_format: ColourFormat = "MJPG",
     ) -> None:
-        if fps not in (5, 15, 30):
+        if fps not in KINECT_RATES:
             raise ValueError(f"fps is {fps}, the device records at 5, 15 or 30")
         if start_offset_ns % TIMECODE_SCALE_NS:
             raise ValueError(f"start_offset_ns {start_offset_ns} is not a whole microsecond")

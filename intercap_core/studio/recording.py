@@ -56,7 +56,9 @@ class Kinect:
         number = 1 if "same_serial" in self.broken else index + 1
         self.serial = f"{100_000 + stage.noise.seed % 100_000:06d}{number:06d}"
         end = stage.frames // 2 if "dead_half" in self.broken else stage.frames
-        self.sets = [t for t in range(end) if t not in stage.rig.missing[index]]
+        self.every = stage.every[index]
+        lost = stage.rig.missing[index]
+        self.sets = [t for t in range(0, end, self.every) if t not in lost]
         self.has_depth = stage.has_depth and "no_depth" not in self.broken
 
     @property
@@ -111,7 +113,7 @@ class Kinect:
         candidates = []
         device = Device(
             self.index, self.claimed, self.serial, self.colour_mode, stage.depth_mode,
-            self.has_depth, stage.fps, min(self.device_time_us(t) for t in self.sets),
+            self.has_depth, stage.fps // self.every, min(self.device_time_us(t) for t in self.sets),
         )  # fmt: skip
         with folder.open(device) as files:
             for order, t in enumerate(self.sets):

@@ -18,6 +18,7 @@ from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.interactions.base import TrueObject
 from intercap_core.studio.layouts import camera_names
 from intercap_core.studio.looks import object_colours
+from intercap_core.studio.mkv import KINECT_RATES
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import true_mesh
@@ -31,7 +32,6 @@ from intercap_core.studio.tissue import press_out
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
 OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
 LOOKS = ("mesh", "plain", "printed")  # of the object, as likely as each other
-FASTEST_KINECT = 30  # frames a second of an Azure Kinect, and of the releases made with them
 SMALL_M = 0.35  # a smaller object may be hidden from most cameras
 
 
@@ -98,6 +98,7 @@ class Stage:
         if capture.starts_apart:
             apart = self.noise.rng("starts")
             self.rig = started_apart(self.rig, apart, capture.starts_apart, settings.fps)
+        self.every = [capture.every.get(name, 1) for name in self.rig.true.names]
         self.failures = Failures.draw(
             self.noise,
             frames=capture.frames,
@@ -223,10 +224,11 @@ def check_capture(
             f"studio: in interaction {capture.interaction!r} bare soles meet the object, "
             f"'shoes' is {capture.shoes!r}; set shoes: plain or another interaction"
         )
-    if settings.fps > FASTEST_KINECT and capture.layout != "plain":
+    if settings.fps > max(KINECT_RATES) and capture.layout != "plain":
         raise UserError(
-            f"studio: recordings of layout {capture.layout!r} have at most {FASTEST_KINECT} frames "
-            f"a second, 'fps' is {settings.fps}; set layout: plain or another fps"
+            f"studio: recordings of layout {capture.layout!r} have at most "
+            f"{max(KINECT_RATES)} frames a second, 'fps' is {settings.fps}; set "
+            "layout: plain or another fps"
         )
     people = (*subject_names(), *build_names())
     if capture.subject not in people:
@@ -239,9 +241,33 @@ def check_capture(
             f"studio: recordings of layout {capture.layout!r} are no videos; take 'video' out or "
             "set layout: plain"
         )
+    _check_rates(capture, settings)
     check_faults(
         capture.faults, layout=capture.layout, cameras=settings.cameras, frames=capture.frames
     )
+
+
+def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
+    """Raise UserError where a camera cannot record every n-th frame set."""
+    names = camera_names(capture.layout, settings.cameras)
+    for name, every in capture.every.items():
+        if name not in names:
+            raise UserError(
+                f"studio: 'every' names camera {name!r}, the cameras are {', '.join(names)}; "
+                "correct it"
+            )
+        if capture.layout not in ("plain", "k4a"):
+            raise UserError(
+                f"studio: cameras of layout {capture.layout!r} all have one rate; take 'every' out "
+                "or set layout: plain"
+            )
+        rates = KINECT_RATES if capture.layout == "k4a" else range(1, settings.fps)
+        if settings.fps % every or settings.fps // every not in rates:
+            raise UserError(
+                f"studio: camera {name!r} would have {settings.fps / every:g} frames a second, "
+                f"expected one of {', '.join(map(str, KINECT_RATES))} or, in layout plain, a whole "
+                "number; correct 'every'"
+            )
 
 
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:

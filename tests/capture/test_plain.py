@@ -207,6 +207,50 @@ def test_other_videos_are_stored_as_jpeg_with_a_note(capture, suffix, codec):
             assert np.abs(frames.colour(t, 2).astype(int) - expected[t]).mean() < 3
 
 
+def test_a_camera_of_half_the_rate_is_in_every_second_set(capture):
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    half = Fraction(FPS, 2)
+    write_video(capture.recordings / "top.mp4", 2, 4, "mjpeg", fps=half)
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 8 and frames.fps == FPS
+        assert frames.colour_available[:, 2].tolist() == [True, False] * 4
+        assert np.abs(frames.colour(6, 2).astype(int) - picture(2, 3)).mean() < 4
+    assert "12.5 images a second beside 25 frame sets: those between" in notes_of(output)["top"]
+    with artefacts.read(output, FRAMES) as read:
+        assert not read["truncated"].any()  # its last image is a set before the last
+
+
+def test_a_master_of_half_the_rate_leaves_images_out_and_says_so(capture):
+    for number in range(1, 8, 2):
+        (capture.recordings / "left" / f"{number:05d}.jpg").unlink()
+    with Frames.open(run(capture)) as frames:  # the stated rate: sets of the others between
+        assert frames.num_sets == 8 and frames.colour_available[:, 1:].all()
+    for number in (2, 4, 6):
+        path = capture.recordings / "left" / f"{number:05d}.jpg"
+        path.rename(path.with_name(f"{number // 2:05d}.jpg"))
+    capture.calibration.write_text(json.dumps(calibrated(left={"fps": FPS / 2})))
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 4 and frames.colour_available.all()
+    note = notes_of(output)["right"]
+    assert "25 images a second beside 12.5 frame sets" in note and "4 images are left out" in note
+    assert "max_skew_ms" not in note
+
+
+def test_uneven_images_are_in_the_sets_of_their_times_and_told(capture):
+    stamps = np.arange(8) / FPS + np.tile([0.0, 0.006], 4)
+    times = "".join(f"{number:05d}, {time:.6f}\n" for number, time in enumerate(stamps))
+    (capture.recordings / "right" / "timestamps.csv").write_text(times)
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.colour_available.all()
+        np.testing.assert_allclose(frames.skew_s[:, 1], np.tile([0.0, 0.006], 4), atol=1e-6)
+    assert "unevenly beside their sets, usually 3.0 ms off" in notes_of(output)["right"]
+    assert "unevenly" not in notes_of(output)["left"]
+
+
 def test_a_video_beside_a_folder_of_depth(capture):
     for image in (capture.recordings / "left").glob("*.jpg"):
         image.unlink()

@@ -67,6 +67,37 @@ def test_a_walker_shows_when_each_camera_started(fps, seconds):
     assert (found.sets == np.round(found.late * fps)).all()
 
 
+@dataclass
+class Slower:
+    """What ``seen`` shows, in every ``every[c]``-th set of camera c."""
+
+    seen: Late
+    every: list[int]
+
+    @property
+    def num_sets(self) -> int:
+        return self.seen.num_sets
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        there = t % self.every[c] == self.every[c] - 1
+        return self.seen.people(t, c) if there else np.zeros((0, 135, 3))
+
+    @property
+    def available(self) -> np.ndarray:
+        first = np.array(self.every) - 1
+        return np.arange(self.num_sets)[:, None] % self.every == first
+
+
+@pytest.mark.parametrize("every", [[1, 1, 2, 1, 1, 2], [1, 2, 2, 2, 2, 2], [1, 4, 1, 2, 3, 1]])
+def test_cameras_of_other_rates_are_brought_into_step(every):
+    """30 images a second beside 60, and so on."""
+    late = np.r_[0.0, np.random.default_rng(3).uniform(-1, 1, len(RIG) - 1)]
+    seen = Slower(walk(late, 60.0, 4.0), every)
+    found = find_starts(seen, RIG, np.arange(seen.num_sets) / 60, seen.available)
+    assert found.apart and not found.in_doubt.any()
+    assert np.abs(found.late - late).max() < 0.017
+
+
 def test_who_stands_still_shows_no_start():
     seen = walk(np.linspace(0, 1, len(RIG)), 15.0, 4.0, moving=False)
     found = find_starts(seen, RIG, np.arange(60) / 15, seen.available)

@@ -148,6 +148,9 @@ def test_faults_are_in_the_recordings_and_in_the_truth(broken_capture: Path) -> 
         ({"interaction": "dance"}, "no interaction 'dance'"),
         ({"interaction": "cup_drink"}, "needs object 'cup'"),
         ({"faults": ("dead_half",), "frames": 2}, "need 4 frames"),
+        ({"every": {"k9": 2}}, "names camera 'k9'"),
+        ({"every": {"k2": 2}}, "'k2' would have 7.5 frames a second"),
+        ({"every": {"k2": 3}, "layout": "behave"}, "'behave' all have one rate"),
     ],
 )
 def test_a_capture_that_cannot_be_made_is_told(capture: dict[str, object], says: str) -> None:
