@@ -27,7 +27,9 @@ from intercap_core.metrics.truth import Truth
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES
 
-_BY_FRAME = ("keypoints", "confidence", "joints", "joint_views", "image_of", "times")
+_BY_FRAME = (
+    "keypoints", "confidence", "joints", "joint_views", "mask_source", "image_of", "times",
+)  # fmt: skip
 _TENSORS = ("points", "normals", "trust", "view")  # of a cloud
 _CHUNK = 32  # bodies posed at once
 
@@ -79,7 +81,14 @@ class BodyClip:
         numbers, cameras = range(len(self))[frames], len(self.seen.rig)
         seen = replace(
             self.seen,
-            masks=[self.seen.masks[t * cameras + c] for t in numbers for c in range(cameras)],
+            **{
+                name: [
+                    getattr(self.seen, name)[t * cameras + c]
+                    for t in numbers
+                    for c in range(cameras)
+                ]
+                for name in ("masks", "beside")
+            },
             **{name: getattr(self.seen, name)[frames] for name in _BY_FRAME},
         )
         return replace(

@@ -30,6 +30,7 @@ MEGABYTE = 1 << 10  # in kilobytes
 # and what they point into.
 _PER_IMAGE = {
     "mask_offsets": ("mask_rle",),
+    "beside_offsets": ("beside_rle",),
     "candidate_offsets": (
         "candidate_scores", "candidate_extents", "candidate_things", "candidate_rle",
     ),

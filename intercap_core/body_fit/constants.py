@@ -73,6 +73,9 @@ FREE_SPACE_STEP_M = 0.01  # step of that search; tuned on the studio
 OUTLINE_POINTS = 400  # of a rim, a third of its pixels where a person fills 720 lines: speed
 OUTLINE_BLUR_PX = 3.0  # over which the rim's direction is measured; tuned on the studio
 SHORTEST_OUTLINE_PX = 40  # rims of smaller spots and holes are the network's; tuned on the studio
+# px outward of a rim of an image of 720 lines, at which another thing is looked for: masks are some
+# pixels apart. Tuned on the studio.
+BESIDE_AT_720P = (1.0, 4.0, 7.0)
 OUTLINE_TRUST = 1.0  # of a point of the rim, a measured point's; tuned on the studio
 # Largest cosine between the line of sight and the normal of what may be on the rim: two thirds of a
 # limb's spacing of samples. Tuned on the studio.

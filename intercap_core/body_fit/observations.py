@@ -40,10 +40,10 @@ class Observations:
     """T frames, C cameras, K = 135 keypoints.
 
     keypoints (T,C,K,2) px and confidence (T,C,K), 0 = not seen; joints (T,K,3) triangulated, master
-    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none, and who made
-    them, mask_source (T,C); image_of (T,C): the set whose image of each camera shows each frame, -1
-    = none; times (T,) s; time_offset (C,) s: each camera exposes later than the frame's time by
-    this much.
+    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none, who made
+    them, mask_source (T,C), and what else was detected, beside, likewise; image_of (T,C): the set
+    whose image of each camera shows each frame, -1 = none; times (T,) s; time_offset (C,) s: each
+    camera exposes later than the frame's time by this much.
     """
 
     sequence: str
@@ -54,6 +54,7 @@ class Observations:
     joint_views: np.ndarray
     masks: list[bytes]
     mask_source: np.ndarray
+    beside: list[bytes]
     background: list[np.ndarray | None]
     depth_bias: np.ndarray
     image_of: np.ndarray
@@ -111,13 +112,16 @@ def read_observations(scene: Path, person: Path) -> Observations:
         joints, views = read["joints"].astype(np.float64), read["joint_views"]
         inlier = read["inlier"]
         masks, source = unpack_ragged(read["mask_offsets"], read["mask_rle"]), read["mask_source"]
+        beside = [b""] * len(masks)
+        if "beside_offsets" in read:
+            beside = unpack_ragged(read["beside_offsets"], read["beside_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
     disputed = (views >= 2)[:, None] & ~inlier
     confidence = np.where(disputed, OUTLIER_VIEW_TRUST * confidence, confidence)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
         sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks, source,
-        background, depth_bias, image_of, time_offset, times,
+        beside, background, depth_bias, image_of, time_offset, times,
     )  # fmt: skip
 
 
@@ -171,13 +175,13 @@ def _fused(
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
     windows, outlines = [], []
     for c, camera in enumerate(seen.rig):
-        rle = seen.masks[t * len(seen.rig) + c]
-        if not rle:
+        at = t * len(seen.rig) + c
+        mask = _runs(seen.masks[at], camera)
+        if mask is None:
             continue
-        mask = Runs(rle, camera.colour.height, camera.colour.width)
         depth = None if camera.depth is None else reader.depth(t, c)
         if seen.mask_source[t, c] == FROM_DETECTOR:
-            rim = outline(mask, camera.colour, c)
+            rim = outline(mask, _runs(seen.beside[at], camera), camera.colour, c)
             outlines += [] if rim is None else [rim]
         if depth is None:
             continue
@@ -210,6 +214,10 @@ def _fused(
         tuple(windows),
         tuple(outlines),
     )
+
+
+def _runs(rle: bytes, camera: Camera) -> Runs | None:
+    return Runs(rle, camera.colour.height, camera.colour.width) if rle else None
 
 
 def person_pixels(

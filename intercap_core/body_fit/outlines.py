@@ -7,8 +7,9 @@ the rim's tangent span touches the surface where the normals agree. There the di
 
 with the camera's centre o, the plane's outward normal N, the vertex v of the body whose normal and
 place in the image are nearest, and the covering's thickness c as in
-:mod:`intercap_core.energy.body_cloud`. A rim at the image's border is not the person's, and masks
-made from the images alone have the form that was expected: only a detector's count.
+:mod:`intercap_core.energy.body_cloud`. A rim at the image's border is not the person's, nor one
+where another detected thing begins, which may be in front. Masks made from the images alone have
+the form that was expected: only a detector's count.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from intercap_core.body_fit import outlines_kernel
 from intercap_core.body_fit.constants import (
+    BESIDE_AT_720P,
     OUTLINE_BLUR_PX,
     OUTLINE_COSINE,
     OUTLINE_FACING,
@@ -47,11 +49,19 @@ class Outline:
     normals: np.ndarray
 
 
-def outline(mask: Runs, lens: Intrinsics, view: int) -> Outline | None:
-    """Some points of the mask's rim, evenly along it; None where there are none."""
+def outline(mask: Runs, beside: Runs | None, lens: Intrinsics, view: int) -> Outline | None:
+    """Some points of the mask's rim, evenly along it; None where there are none.
+
+    Where the rim meets what else was detected, ``beside``, the person may go on behind it.
+    """
     pixels, outward = _rim(mask)
     inside = (pixels > _BORDER_PX) & (pixels < np.array([mask.width, mask.height]) - 1 - _BORDER_PX)
-    keep = np.flatnonzero(inside.all(1))
+    own = inside.all(1)
+    if beside is not None:
+        for away in BESIDE_AT_720P:
+            ahead = np.rint(pixels + away * mask.height / 720 * outward).astype(int)
+            own &= ~beside.sample(*ahead.T)
+    keep = np.flatnonzero(own)
     if not len(keep):
         return None
     keep = keep[:: max(1, round(len(keep) / OUTLINE_POINTS))]

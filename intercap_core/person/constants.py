@@ -51,6 +51,7 @@ LARGEST_STEP_M = 0.3  # motion from set to set counts as this at most; tuned on 
 # --- solver effort
 EXCHANGE_ROUNDS = 2  # of exchanging limbs and triangulating again
 MAX_AGREEING_VIEWS = 10  # all 2^(C-1) assignments of sides are tried over so many views
+SAME_PERSON_SHARE = 0.5  # of a candidate's mask within the subject's: the same person; judged
 OUTSIDE_GRID = 64  # steps along the longer side of a mask on whose grid its outside is counted
 
 # --- decision: who is the subject

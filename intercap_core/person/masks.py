@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from pycocotools import mask as coco_mask
 
 from intercap_core.body.keypoints import SKELETON, keypoint_pairs
 from intercap_core.camera.masks import Runs
@@ -16,6 +17,7 @@ from intercap_core.person.constants import (
     MIN_MASK_POINTS,
     OUTSIDE_COST,
     OUTSIDE_GRID,
+    SAME_PERSON_SHARE,
 )
 
 # Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
@@ -51,6 +53,29 @@ def choose_mask(
         if score > best_score:
             best, best_score = candidate.rle, score
     return best
+
+
+def others_beside(candidates: list[Candidate], person: bytes) -> bytes:
+    """The RLE of all other candidates together, those left out that lie mostly within the
+    ``person``'s mask: the same person again, or a part; empty where there are none. Their RLEs
+    have been parsed, as :func:`choose_mask` does."""
+    if not person or not candidates:
+        return b""
+    width, height = candidates[0].image_size
+    mask = {"size": [height, width], "counts": person}
+    others = [
+        {"size": [height, width], "counts": candidate.rle}
+        for candidate in candidates
+        if candidate.rle != person
+    ]
+    if not others:
+        return b""
+    # with iscrowd, the share of the first that lies within the second
+    within = coco_mask.iou(others, [mask], [1])[:, 0]
+    apart = [
+        other for other, share in zip(others, within, strict=True) if share < SAME_PERSON_SHARE
+    ]
+    return bytes(coco_mask.merge(apart)["counts"]) if apart else b""
 
 
 def _samples(points: np.ndarray, seen: np.ndarray) -> np.ndarray:

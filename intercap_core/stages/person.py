@@ -21,7 +21,7 @@ from intercap_core.detections.read import (
 from intercap_core.errors import UserError
 from intercap_core.person.exposure import at_set_times
 from intercap_core.person.lifting import Lifter
-from intercap_core.person.masks import choose_mask
+from intercap_core.person.masks import choose_mask, others_beside
 from intercap_core.person.middles import fill_middles
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import NOBODY, find_subject
@@ -75,8 +75,12 @@ def run(
                 f"{_why(found)}"
             )
         masks = _masks(found, keypoints, points, rig, settings.min_confidence)
+        beside = [
+            others_beside(found.candidates(t, c), masks[t * len(rig) + c])
+            for t, c in np.ndindex(found.num_sets, len(rig))
+        ]
         segmented = _from_images(images.showing(image_of), source, found, points, settings)
-    _write(output, found, person, keypoints, points, missing, masks, segmented, settings)
+    _write(output, found, person, keypoints, points, missing, masks, beside, segmented, settings)
 
 
 def _why(found: Detections) -> str:
@@ -165,6 +169,7 @@ def _write(
     points: Triangulation,
     missing: np.ndarray,
     masks: list[bytes],
+    beside: list[bytes],
     segmented: dict[tuple[int, int], ViewSegments],
     settings: PersonSettings,
 ) -> None:
@@ -172,7 +177,7 @@ def _write(
     mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOBODY_LOOKED)
     if settings.segmentation == "images":
         mask_source[:] = NOBODY_LOOKED
-        masks = [b""] * len(masks)
+        masks = beside = [b""] * len(masks)
     candidates: list[list[ImageCandidate]] = [[] for _ in masks]
     for (t, c), segments in segmented.items():
         image = t * views + c
@@ -199,6 +204,9 @@ def _write(
         writer.put("missing", missing)
         writer.put("mask_offsets", offsets)
         writer.put("mask_rle", rle)
+        beside_offsets, beside_rle = artefacts.pack_ragged(beside)
+        writer.put("beside_offsets", beside_offsets)
+        writer.put("beside_rle", beside_rle)
         writer.put("mask_source", mask_source)
         if segmented or settings.segmentation == "images":
             _put_candidates(writer, candidates)

@@ -40,7 +40,7 @@ def _runs(mask: np.ndarray) -> masks.Runs:
 
 
 def _rim(mask: masks.Runs) -> Outline:
-    found = outline(mask, LENS, 0)
+    found = outline(mask, None, LENS, 0)
     assert found is not None
     return found
 
@@ -103,5 +103,18 @@ def test_a_gap_between_limbs_has_a_rim_and_a_speck_has_none() -> None:
     assert len(rim.rays) != without and inner < 1
     speck = np.zeros_like(whole)
     speck[200:204, 200:204] = True
-    assert outline(_runs(speck), LENS, 0) is None
-    assert outline(_runs(np.zeros_like(whole)), LENS, 0) is None
+    assert outline(_runs(speck), None, LENS, 0) is None
+    assert outline(_runs(np.zeros_like(whole)), None, LENS, 0) is None
+
+
+def test_where_another_thing_begins_the_person_may_go_on() -> None:
+    whole = np.zeros((LENS.height, LENS.width), bool)
+    whole[100:300, 100:300] = True
+    held = np.zeros_like(whole)
+    held[150:250, 302:400] = True  # two pixels beside the mask's right border
+    found = outline(_runs(whole), _runs(held), LENS, 0)
+    assert found is not None
+    at = LENS.project(found.rays.astype(float))
+    on_the_right = at[:, 0] > 298
+    assert on_the_right.any()
+    assert not ((at[:, 1] > 152) & (at[:, 1] < 248) & on_the_right).any()

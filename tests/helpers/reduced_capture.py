@@ -78,8 +78,9 @@ class Reduction:
         self, old: Artefact, key: str, names: list[str], kept: list[int]
     ) -> np.ndarray | list[str]:
         """A whole dataset with its T and C axes cut and what is taken away blanked out."""
-        if key in ("mask_offsets", "mask_rle"):
-            return self._masks(old, names, kept)[key == "mask_rle"]
+        if key in ("mask_offsets", "mask_rle", "beside_offsets", "beside_rle"):
+            what, which = key.split("_")
+            return self._masks(old, what, names, kept)[which == "rle"]
         if key == "pairs" or key.startswith("pair_"):
             return old[key][:0]
         values = old[key].copy()
@@ -110,9 +111,9 @@ class Reduction:
         return list(values) if values.dtype == object else values
 
     def _masks(
-        self, old: Artefact, names: list[str], kept: list[int]
+        self, old: Artefact, what: str, names: list[str], kept: list[int]
     ) -> tuple[np.ndarray, np.ndarray]:
-        masks = unpack_ragged(old["mask_offsets"], old["mask_rle"])
+        masks = unpack_ragged(old[f"{what}_offsets"], old[f"{what}_rle"])
         total = len(masks) // len(names) if self.sets is None else self.sets
         until = self.images_until or {}
         return pack_ragged(
