@@ -52,7 +52,8 @@ def truth() -> tuple[BodyClip, Tensor]:
     confidence = np.ones(pixels.shape[:-1])
     observations = Observations(
         "known", rig, pixels, confidence, keypoints, np.full((FRAMES, 135), 3),
-        [b""] * FRAMES * len(rig), [None] * len(rig), np.zeros(len(rig)),
+        [b""] * FRAMES * len(rig), np.zeros((FRAMES, len(rig))), [b""] * FRAMES * len(rig),
+        [None] * len(rig), np.zeros(len(rig)),
         np.zeros((FRAMES, len(rig)), int), np.zeros(len(rig)), np.arange(FRAMES) / 15,
     )  # fmt: skip
     normals = vertex_normals(output.vertices, model.faces)

@@ -43,9 +43,8 @@ def test_such_frames_are_usable_near_placed_ones_with_enough_of_the_body():
     times[11] += 2.0  # nobody near
     seen = Observations(
         "test", rig, np.zeros((frames, 2, 135, 2)), np.zeros((frames, 2, 135)), joints,
-        np.ones((frames, 135), int), [b""] * 2 * frames, np.zeros((frames, 2)), [None, None],
-        np.zeros(2),
-        np.zeros((frames, 2), int), np.zeros(2), times,
+        np.ones((frames, 135), int), [b""] * 2 * frames, np.zeros((frames, 2)), [b""] * 2 * frames,
+        [None, None], np.zeros(2), np.zeros((frames, 2), int), np.zeros(2), times,
     )  # fmt: skip
     assert np.flatnonzero(~seen.placed).tolist() == [4, 5, 11]
     assert np.flatnonzero(~seen.usable).tolist() == [5, 11]
