@@ -9,6 +9,7 @@ from rich.console import Console
 
 from intercap_core.errors import UserError
 from intercap_core.pipeline import outcome
+from intercap_core.pipeline.job import warnings_of
 from intercap_core.project import Project
 from intercap_core.stage_list import SEQUENCE_STAGES
 
@@ -42,7 +43,10 @@ def remarks(project: Project) -> list[Remarks]:
             if not path.is_file():
                 continue
             try:
-                texts += [f"{stage}: {note}" for note in outcome.notes(stage, path)]
+                notes = outcome.notes(stage, path)
+                texts += [f"{stage}: {note}" for note in notes]
+                log = Path(project.logs) / name / f"{stage}.log"
+                texts += [f"{stage}: {text}" for text in _not_noted(log, name, notes)]
                 if stage == "metrics":
                     flagged, frames, reasons = outcome.flagged_frames(path)
                     told = [f"{text} ({count})" for text, count in reasons[:REASONS_TOLD]]
@@ -53,6 +57,12 @@ def remarks(project: Project) -> list[Remarks]:
         if texts:
             found.append(Remarks(name, flagged, frames, tuple(texts)))
     return sorted(found, key=lambda one: (-one.share, -len(one.texts), one.sequence))
+
+
+def _not_noted(log: Path, sequence: str, notes: list[str]) -> list[str]:
+    """What the stage's last job warned of and its artefact does not say."""
+    warned = (text.removeprefix(f"sequence {sequence}: ") for text in warnings_of(log))
+    return [text for text in warned if not any(note in text or text in note for note in notes)]
 
 
 def print_remarks(project: Project, console: Console) -> None:

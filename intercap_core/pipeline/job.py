@@ -25,6 +25,7 @@ THREAD_VARIABLES = (
 # Last line of a job's log; `intercap run` shows these.
 FINISHED = "finished in"
 FAILED = "failed:"
+WARNED = "warning:"
 
 
 def set_threads(threads: int) -> None:
@@ -44,7 +45,7 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     log = Path(log)
     log.parent.mkdir(parents=True, exist_ok=True)
     handler = logging.FileHandler(log, mode="w", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
+    handler.setFormatter(_Marked("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
     logger = logging.getLogger("intercap_core")
     logger.setLevel(logging.INFO)
     logger.addHandler(handler)
@@ -66,6 +67,25 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
+
+
+class _Marked(logging.Formatter):
+    """Warnings say that they are: :func:`warnings_of` finds them again."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        if record.levelno == logging.WARNING:
+            record.message = f"{WARNED} {record.message}"
+        return super().formatMessage(record)
+
+
+def warnings_of(log: Path) -> list[str]:
+    """The warnings in a job's log, each once, in their order; none where there is no log."""
+    if not log.is_file():
+        return []
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    said = (line.partition(" ")[2] for line in lines)
+    warned = (text.removeprefix(WARNED).strip() for text in said if text.startswith(WARNED))
+    return list(dict.fromkeys(warned))
 
 
 def last_words(log: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ from intercap_core.commands.closing import print_remarks, remarks
 from intercap_core.commands.inspect import print_summary
 from intercap_core.config import MetricsSettings
 from intercap_core.pipeline import outcome
+from intercap_core.pipeline.job import job
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import SEQUENCE_STAGES
 from intercap_core.stages import metrics
@@ -92,6 +94,21 @@ def test_a_run_ends_with_remarks_worst_first(project: Project) -> None:
     printed = stream.getvalue()
     assert "1 of 1 sequences have remarks, worst first" in printed
     assert "s01 (logs: " in printed and "k2: its pose is as given" in printed
+
+
+def test_what_was_only_logged_is_repeated_once(project: Project) -> None:
+    """What the artefact says already is not."""
+    folder = Path(project.logs) / "s01"
+    folder.mkdir(parents=True)
+    with job("s01: scene", folder / "scene.log"):
+        logger = logging.getLogger("intercap_core.scene")
+        logger.info("nothing to worry about")
+        logger.warning("sequence s01: camera k2: its pose is as given")
+        for _ in range(2):
+            logger.warning("the floor is a guess")
+    (found,) = remarks(project)
+    said = [text for text in found.texts if text.startswith("scene: ")]
+    assert said == ["scene: camera k2: its pose is as given", "scene: the floor is a guess"]
 
 
 def test_texts_are_printed_as_they_are(
