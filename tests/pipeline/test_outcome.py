@@ -96,8 +96,11 @@ def test_a_run_ends_with_remarks_worst_first(project: Project) -> None:
     assert "s01 (logs: " in printed and "k2: its pose is as given" in printed
 
 
-def test_what_was_only_logged_is_repeated_once(project: Project) -> None:
-    """What the artefact says already is not."""
+def test_what_was_only_logged_is_repeated_once(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the artefact says already is not. Logs are where one works."""
+    monkeypatch.chdir(tmp_path)
     folder = Path(project.logs) / "s01"
     folder.mkdir(parents=True)
     with job("s01: scene", folder / "scene.log"):
