@@ -162,7 +162,7 @@ PERSON = Schema(
         "mask_offsets": Field(("M+1",), "int64", "start of each mask's RLE, in the order of (T, C)"),
         "mask_rle": Field(("B",), "uint8", "COCO compressed RLE of the person in the image that shows this moment, empty = no mask"),
         "beside_offsets": Field(("M+1",), "int64", "start of each image's RLE in beside_rle; no beside_ datasets: nothing else was detected", optional=True),
-        "beside_rle": Field(("B2",), "uint8", "COCO compressed RLE of all that a detector found in the image beside the person: where it meets the mask, the person may go on behind it; empty = nothing", optional=True),
+        "beside_rle": Field(("B2",), "uint8", "COCO compressed RLE of where the mask's border may not be the person's: all else that a detector found in the image, or what a mask made from colour assumed; empty = nothing", optional=True),
         "mask_source": Field(("T", "C"), "int8", "who segmented the person: 0 nobody, 1 a detector, 2 the images alone"),
         "candidate_offsets": Field(("M+1",), "int64", "first candidate of each image, and the end, in the order of (T, C): what was segmented from the images alone; no candidate_ datasets where nothing was", optional=True),
         "candidate_scores": Field(("N",), "float32", "how likely the candidate is a thing, 0 to 1", optional=True),

@@ -180,7 +180,8 @@ def _fused(
         if mask is None:
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
-        if seen.mask_source[t, c] == FROM_DETECTOR:
+        # a mask made from colour says where its rim is the person's; where depth is, depth says it
+        if seen.mask_source[t, c] == FROM_DETECTOR or (depth is None and seen.beside[at]):
             rim = outline(mask, _runs(seen.beside[at], camera), camera.colour, c)
             outlines += [] if rim is None else [rim]
         if depth is None:

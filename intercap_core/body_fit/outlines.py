@@ -9,7 +9,7 @@ with the camera's centre o, the plane's outward normal N, the vertex v of the bo
 place in the image are nearest, and the covering's thickness c as in
 :mod:`intercap_core.energy.body_cloud`. A rim at the image's border is not the person's, nor one
 where another detected thing begins, which may be in front. Masks made from the images alone have
-the form that was expected: only a detector's count.
+the form that was expected, but for what moved before a known background.
 """
 
 from __future__ import annotations

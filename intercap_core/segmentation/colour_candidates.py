@@ -33,6 +33,7 @@ from intercap_core.segmentation.constants import (
     SATURATED,
     SHADOW,
     THING_MARGINS,
+    UNSURE_CELLS,
 )
 from intercap_core.segmentation.depth_masks import encode_window
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
@@ -65,8 +66,12 @@ class ColourSegmenter:
         moved = before(image, *background)
         # clothes of the wall's colour, or a place that the person never left: take the body's
         # volume
-        person = drawn(bones, camera, moved.shape, 0)
-        person |= moved & drawn(bones, camera, moved.shape, MASK_MARGINS)
+        body = drawn(bones, camera, moved.shape, 0)
+        person = body | (moved & drawn(bones, camera, moved.shape, MASK_MARGINS))
+        # the volume's own border, what was cut off, and what has no background are no outline
+        block = np.ones((2 * UNSURE_CELLS + 1,) * 2, np.uint8)
+        assumed = cv2.dilate((body & ~moved).view(np.uint8), block) > 0
+        unsure = assumed | (moved & ~person) | ~background[1]
         things = moved & ~drawn(bones, camera, moved.shape, THING_MARGINS)
         block = np.ones((3, 3), np.uint8)
         rest = cv2.morphologyEx(things.view(np.uint8), cv2.MORPH_OPEN, block)
@@ -77,7 +82,10 @@ class ColourSegmenter:
             ImageCandidate(self._rle(label == k, camera), COLOUR_SCORE, float("nan"), -1)
             for k in large[:MAX_COLOUR_CANDIDATES]
         ]
-        return ViewSegments(self._rle(person, camera) if person.any() else b"", candidates)
+        if not person.any():
+            return ViewSegments(b"", candidates)
+        beside = self._rle(unsure, camera) if unsure.any() else b""
+        return ViewSegments(self._rle(person, camera), candidates, beside)
 
     def _image(self, t: int, c: int) -> np.ndarray | None:
         jpeg = self._frames.colour_jpeg(t, c)

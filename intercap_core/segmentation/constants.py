@@ -89,6 +89,7 @@ WITHIN_REACH_M = 0.35  # of a keypoint of the person at some time; tuned on the 
 
 # --- solver effort
 COLOUR_SCALE = 2  # images are decoded at half their size, which JPEG does in a quarter of the time
+UNSURE_CELLS = 4  # around the volume where nothing moved, in which a border is the volume's; judged
 MAX_COLOUR_SAMPLES = 15  # images of which the background is the median
 MIN_COLOUR_SAMPLES = 3  # of a pixel without the person: fewer tell no background
 MAX_DEPTH_SAMPLES = 25  # images looked at for what leaves its place

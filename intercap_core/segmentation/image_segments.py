@@ -20,7 +20,9 @@ class ImageCandidate:
 
 @dataclass(frozen=True)
 class ViewSegments:
-    """The person's RLE, empty = not seen, and candidates of one view."""
+    """The person's RLE, empty = not seen, and candidates of one view. ``beside``: the RLE of where
+    a border of the person's says nothing, empty = it says nothing anywhere."""
 
     person: bytes
     candidates: list[ImageCandidate]
+    beside: bytes = b""

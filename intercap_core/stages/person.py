@@ -177,13 +177,13 @@ def _write(
     mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOBODY_LOOKED)
     if settings.segmentation == "images":
         mask_source[:] = NOBODY_LOOKED
-        masks = beside = [b""] * len(masks)
+        masks, beside = [b""] * len(masks), [b""] * len(masks)
     candidates: list[list[ImageCandidate]] = [[] for _ in masks]
     for (t, c), segments in segmented.items():
         image = t * views + c
         candidates[image] = segments.candidates
         if not masks[image]:
-            masks[image] = segments.person
+            masks[image], beside[image] = segments.person, segments.beside
             mask_source[t, c] = FROM_IMAGES
     offsets, rle = artefacts.pack_ragged(masks)
     inlier = np.swapaxes(points.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
