@@ -26,6 +26,7 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
 from intercap_core.joint.problem import Problem, joint_terms
+from intercap_core.joint.result import CONTRADICTED
 from intercap_core.joint.sequential import Flags
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData, Residuals
@@ -288,7 +289,7 @@ def _flag_reasons(
         (sunk, "object deep inside the body"),
         *estimate.distrust(),
         (stuck, "no step of the joint fit lowered its energy"),
-        (against_images, "the images contradict the object's pose"),
+        (against_images, CONTRADICTED),
         (np.full(len(state), bool(against_floor)), against_floor),
     )
     return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]

@@ -15,17 +15,21 @@ from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State
 from intercap_core.schemas import JOINT
 
+CONTRADICTED = "the images contradict the object's pose"  # among the reasons of a flag
+
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
     """The ``state``, ``probability`` (T, R) of contact, the ``cameras`` with their ``time_offset``
-    (C,), seconds, and the frames (T,) that are ``flagged``."""
+    (C,), seconds, the frames (T,) that are ``flagged``, and those among them in which the images
+    have ``contradicted`` the object's pose."""
 
     state: State
     probability: np.ndarray
     cameras: Cameras
     time_offset: np.ndarray
     flagged: np.ndarray
+    contradicted: np.ndarray
 
     @classmethod
     def read(cls, path: Path, scene: Artefact) -> JointResult:
@@ -46,4 +50,5 @@ class JointResult:
                 Cameras(rig, joint["depth_bias"]),
                 joint["time_offset"],
                 joint["flagged"],
+                np.array([CONTRADICTED in reason for reason in joint.text("flag_reason")]),
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -24,8 +24,8 @@ TRUE = {
 @dataclass(frozen=True)
 class StatedError:
     """Of a sequence's ``part``: the ``stated`` error, millimetres, within ``factor`` of which four
-    of five true errors are, and the ``true`` one; NaN where it is not known. ``silent``: why
-    nothing is stated."""
+    of five true errors are, and the ``true`` one over the frames of which it is stated; NaN where
+    it is not known. ``silent``: why nothing is stated."""
 
     sequence: str
     part: str
@@ -40,18 +40,33 @@ def stated_errors(sequence: SequenceMetrics) -> list[StatedError]:
     values = sequence.values
     if "verdict/error" not in values:
         return []
-    true = figures.truth_figures([sequence], "joint") if sequence.has_truth else {}
     return [
         StatedError(
             sequence.name,
             str(part),
             1e3 * float(values["verdict/error"][place]),
             float(values["verdict/error_factor"][place]),
-            true.get(TRUE[str(part)], float("nan")),
+            _true(sequence, str(part), np.isfinite(values["verdict/error_frame"][place])),
             str(values["verdict/silent"][place]),
         )
         for place, part in enumerate(values["verdict/part_names"])
     ]
+
+
+def _true(sequence: SequenceMetrics, part: str, stated: np.ndarray) -> float:
+    """The true error of a part, millimetres, over the frames (T,) of which an error is stated, all
+    where it is stated of none; NaN without truth."""
+    if not sequence.has_truth:
+        return float("nan")
+    judged = sequence
+    if stated.any():
+        some = {
+            key: value[stated] if key.startswith("truth/") and len(value) == len(stated) else value
+            for key, value in sequence.values.items()
+            if np.ndim(value)
+        }
+        judged = replace(sequence, values=some)
+    return figures.truth_figures([judged], "joint").get(TRUE[part], float("nan"))
 
 
 def mean_stated(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:

@@ -80,7 +80,7 @@ class Verdict:
             sequential = inputs.sequential
             parts = [part for part in Part if part != Part.OBJECT or inputs.geometry.has_object]
         stated = {
-            part: state(held, part, _sigma(sequential, part), _known(sequential, part))
+            part: state(held, part, _sigma(sequential, part), _known(sequential, result, part))
             for part in parts
         }
         for part, said in stated.items():
@@ -132,9 +132,9 @@ def _sigma(fits: SequentialFits, part: Part) -> np.ndarray:
     return np.sqrt((fits.joint_sigma[:, JOINTS[part]] ** 2).mean(axis=1))
 
 
-def _known(fits: SequentialFits, part: Part) -> np.ndarray:
-    """Frames (T,) in which the part was measured."""
+def _known(fits: SequentialFits, result: JointResult, part: Part) -> np.ndarray:
+    """Frames (T,) in which the part was measured, and is where it was measured."""
     flags = fits.flags
     if part == Part.OBJECT:
-        return ~flags.lost
+        return ~flags.lost & ~result.contradicted
     return ~flags.filled

@@ -66,6 +66,7 @@ def _sequence(name: str, stated: float, true: float, silent: str = "") -> Sequen
         "verdict/error": np.array([1e-3 * stated]),
         "verdict/error_factor": np.array([1.5]),
         "verdict/silent": np.array([silent]),
+        "verdict/error_frame": np.full((1, 3), 1e-3 * stated),
         "truth/joint/body_pve": np.full(3, 1e-3 * true),
     }
     return SequenceMetrics(name, "p", "cup", 30.0, True, values)
@@ -84,6 +85,16 @@ def test_figures_of_stated_errors() -> None:
     assert found["within_factor_share"] == pytest.approx(2 / 3)
     assert found["bad_sequence_recall"] == pytest.approx(1 / 2)
     assert found["silent_share"] == pytest.approx(1 / 4)
+
+
+def test_the_true_error_is_that_of_frames_with_a_stated_one() -> None:
+    """Where a pose is filled in, nothing is stated, and the flags say so."""
+    sequence = _sequence("a", 6, 6)
+    sequence.values["truth/joint/body_pve"] = np.array([0.006, 0.008, 0.9])
+    sequence.values["verdict/error_frame"] = np.array([[0.006, 0.006, np.nan]])
+    assert stated_errors(sequence)[0].true == pytest.approx(7)
+    sequence.values["verdict/error_frame"][:] = np.nan  # of no frame: then of all
+    assert stated_errors(sequence)[0].true == pytest.approx(1e3 * (0.006 + 0.008 + 0.9) / 3)
 
 
 def test_no_figures_without_verdict_or_truth() -> None:
