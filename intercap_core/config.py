@@ -293,8 +293,8 @@ class StudioCapture(Model):
     room: Literal["random", "furnished", "sparse", "bare"] = "random"
     """With walls and furniture, a floor with two low pieces, or only a floor; by chance one capture
     in five is bare."""
-    passer_by: bool = False
-    """Another person walks through the room, 0.8 to 1.6 m past the subject."""
+    passer_by: Literal["nobody", "walks", "stands"] = "nobody"
+    """Another person in the room, who walks 0.8 to 1.6 m past the subject or stands there."""
     shoes: Literal["plain", "heavy"] = "plain"
     """Shoes as thin as skin, or heavy ones: soles of 22 mm, 10 to 15 mm round the feet."""
     look: Literal["random", "mesh", "plain", "printed"] = "random"

@@ -367,7 +367,7 @@ TRUTH = Schema(
     },
     optional_attributes={
         "room": "furnished; sparse: a floor and two low pieces; or bare: a floor and nothing else",
-        "passer_by": "studio subject who walks past; absent where nobody does",
+        "passer_by": "studio subject who walks past or stands by; absent where nobody does",
         "sole_m": "how far soles of shoes are below the bare feet, metres; absent where they are not",
         "faults": "what was broken on purpose, camera by camera; empty where nothing was",
     },

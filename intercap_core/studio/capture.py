@@ -57,7 +57,9 @@ def make_capture(
     stage = Stage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
     detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
-    segmenter = Segmenter(stage.noise, stage.frames, stage.thing.name, capture.passer_by)
+    segmenter = Segmenter(
+        stage.noise, stage.frames, stage.thing.name, passer_by=stage.passer_by is not None
+    )
     recorded = []
     progress = Progress(log, "recorded", len(stage.rig.true), "cameras")
     for index in range(len(stage.rig.true)):

@@ -1,8 +1,8 @@
-"""Another person who walks straight through the room, past the subject, and touches nothing.
+"""Another person in the room, who touches nothing: walks straight past the subject, or stands by.
 
-The way is drawn until one fits: 0.8 to 1.6 m from the subject where the two are nearest, clear of
-the object, of furniture and of the cameras. Walls have no doors: where one is in the way, the
-person comes out of it.
+The way, or the place, is drawn until one fits: 0.8 to 1.6 m from the subject where the two are
+nearest, clear of the object, of furniture and of the cameras. Walls have no doors: where one is in
+the way, the person comes out of it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.studio.controls import Footwork, Step
+from intercap_core.studio.controls import Footwork, Step, Wander
 from intercap_core.studio.hands import RELAXED
 from intercap_core.studio.looks import body_colours
 from intercap_core.studio.motion import LEG_REACH, Puppet, Trunk
@@ -29,6 +29,8 @@ STEP_S = (0.46, 0.54)
 STRIDE = (0.72, 0.84)  # of a leg's length, from one foot to the other
 SWINGS = 0.94  # of a step's time in which the foot is in the air
 ARM_SWING_M, LEAN, COUNTER_TURN = 0.16, 0.05, 0.08  # metres; rad of the trunk
+SWAY_RAD = 0.01  # of trunk and head
+PLACE_S = 0.03  # the way is tried at such steps
 CELL_M = 0.05  # of the floor plan
 FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is a thing that one walks around
 OTHER_COLOURS = 0.25  # at least this far from the subject's, mean of the clothed surface, RGB
@@ -49,7 +51,10 @@ class Passing:
 
 @dataclass(frozen=True)
 class Way:
-    """A straight way, ``heading`` rad; at ``when`` s of the recording one is at ``place`` (2,)."""
+    """A straight way, ``heading`` rad; at ``when`` s of the recording one is at ``place`` (2,).
+
+    Of somebody who stands, it is where and towards what.
+    """
 
     place: np.ndarray
     heading: float
@@ -62,7 +67,7 @@ class Way:
 
 
 class PasserBy:
-    """The other person of one recording.
+    """The other person of one recording, who ``stands`` or walks.
 
     ``times`` (N,) s over the recording, at which ``pelvis`` (N, 2) and ``thing`` (N, 2) are the
     places of subject and object on the floor, in the stage; ``eyes`` (C, 2) those of the cameras.
@@ -77,6 +82,8 @@ class PasserBy:
         times: np.ndarray,
         pelvis: np.ndarray,
         thing: np.ndarray,
+        *,
+        stands: bool = False,
     ) -> None:
         rng = noise.rng("passer-by")
         others = [name for name in subject_names() if name != subject.name]
@@ -84,7 +91,8 @@ class PasserBy:
         self.puppet = Puppet(self.subject)
         self.colours = _other_colours(noise, self.subject, subject)
         self.step_s, stride = rng.uniform(*STEP_S), rng.uniform(*STRIDE) * self.puppet.leg
-        self.speed = stride / self.step_s
+        self.stands, self.speed = stands, 0.0 if stands else stride / self.step_s
+        self.sway = Wander(6, SWAY_RAD, noise.rng("passer-by sways"))
         self.way = self._way(rng, _things(room), eyes, times, pelvis, thing)
         self._walk(stride)
 
@@ -98,13 +106,14 @@ class PasserBy:
         thing: np.ndarray,
     ) -> Way:
         """A way that fits; raises UserError where none does."""
-        whole = np.arange(-FLOOR_HALF_M, FLOOR_HALF_M, 0.05) / self.speed
+        fine = np.linspace(times[0], times[-1], 1 + int(np.ptp(times) / PLACE_S))
         for _ in range(TRIES):
             heading, far = rng.uniform(0, 2 * np.pi), rng.uniform(*PASSES_M)
             moment = round(rng.uniform(*PASSES_WITHIN) * (len(times) - 1))
             left = np.array([-np.sin(heading), np.cos(heading)])
-            way = Way(pelvis[moment] + far * left, heading, float(times[moment]))
-            path, places = way.at(times, self.speed), way.at(way.when + whole, self.speed)
+            looks = heading - np.pi / 2 if self.stands else heading  # at the subject
+            way = Way(pelvis[moment] + far * left, looks, float(times[moment]))
+            path, places = way.at(times, self.speed), way.at(fine, self.speed)
             nearest = np.linalg.norm(path - pelvis, axis=1).min()
             if (
                 PASSES_M[0] <= nearest <= PASSES_M[1]
@@ -114,15 +123,17 @@ class PasserBy:
             ):
                 return way
         raise UserError(
-            "studio: nobody finds a way past the subject through this room; set passer_by: false, "
+            "studio: nobody finds a place beside the subject in this room; set passer_by: nobody, "
             "another seed or room: bare"
         )
 
     def _walk(self, stride: float) -> None:
-        """Footsteps along x of the walker's own frame, from x = 0 at the time 0."""
+        """Footsteps along x of the person's own frame, from x = 0 at the time 0; none, with the
+        feet side by side, of somebody who stands."""
         puppet, across = self.puppet, 0.7 * self.puppet.hip_width
-        count = int(np.ceil(2 * (FLOOR_HALF_M + 1) / stride))
-        start = np.array([[-0.5 * stride, across], [0.5 * stride, -across]])
+        count = 0 if self.stands else int(np.ceil(2 * (FLOOR_HALF_M + 1) / stride))
+        apart = 0.0 if self.stands else 0.5 * stride
+        start = np.array([[-apart, across], [apart, -across]])
         steps = []
         for k in range(count):
             begin, foot = k * self.step_s, k % 2
@@ -155,13 +166,16 @@ class PasserBy:
         track, feet = self.track(own), self.footwork.feet(own)
         phase = np.pi * own / self.step_s  # a half turn is a step, the left foot's first
         bend, head = np.zeros((2, len(own), 3))
-        bend[:, 0], bend[:, 1] = LEAN, COUNTER_TURN * np.sin(phase - np.pi / 2)
+        walks = 0.0 if self.stands else 1.0
+        sway = self.sway(times)
+        bend[:, 0], bend[:, 1] = LEAN * walks, walks * COUNTER_TURN * np.sin(phase - np.pi / 2)
+        bend, head = bend + sway[:, :3], head + sway[:, 3:]
         trunk = puppet.settled(Trunk(track[:, :3], track[:, 3], bend, head), feet[0])
         world = puppet.trunk(trunk)
         puppet.legs(world, trunk.pelvis, *feet)
         # an arm is ahead while the foot of its side is behind
         for side, sign in enumerate((1.0, -1.0)):
-            swing = sign * ARM_SWING_M * np.cos(phase)
+            swing = sign * walks * ARM_SWING_M * np.cos(phase)
             puppet.arm_to(
                 world, trunk.pelvis, side, puppet.idle_wrist(world, trunk.pelvis, side, swing)
             )

@@ -119,7 +119,9 @@ class Stage:
             twin=Twin(corners, self.thing.faces) if self.thing else None,
             hidden=self._highlight() if self.thing and size < SMALL_M else None,
         )
-        self.passer_by = self._passer_by(eyes[:, :2, 3]) if capture.passer_by else None
+        self.passer_by = None
+        if capture.passer_by != "nobody":
+            self.passer_by = self._passer_by(eyes[:, :2, 3], stands=capture.passer_by == "stands")
 
     def _thing(self, entry: ObjectEntry, capture: StudioCapture) -> TrueObject:
         """The object as it truly is in this capture."""
@@ -134,7 +136,7 @@ class Stage:
             object_colours(look, vertices, colours / 255.0, rng),
         )
 
-    def _passer_by(self, eyes: np.ndarray) -> PasserBy:
+    def _passer_by(self, eyes: np.ndarray, *, stands: bool) -> PasserBy:
         played = self.interaction.perform(
             self.interaction.script_times(self.set_times, self.duration)
         )
@@ -144,7 +146,14 @@ class Stage:
             (place @ played.stage_from_object)[:, :2, 3] if self.thing else np.full((1, 2), np.inf)
         )
         return PasserBy(
-            self.noise, self.subject, self.room, eyes, self.set_times, pelvis[:, :2], thing
+            self.noise,
+            self.subject,
+            self.room,
+            eyes,
+            self.set_times,
+            pelvis[:, :2],
+            thing,
+            stands=stands,
         )
 
     def _highlight(self) -> np.ndarray:

@@ -25,7 +25,7 @@ from intercap_core.studio.stage import Stage
 
 Entry = Callable[[str], ObjectEntry]
 CAPTURE = StudioCapture(
-    interaction="stool_sit", subject="s06", seed=5, frames=10, layout="plain", passer_by=True
+    interaction="stool_sit", subject="s06", seed=5, frames=10, layout="plain", passer_by="walks"
 )
 SETTINGS = StudioSettings(captures={}, cameras=3, colour_mode="720P", fps=5)
 
@@ -56,6 +56,23 @@ def test_somebody_else_walks_past_and_touches_nothing(stage: Stage, walker: Pass
     assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
     pace = np.linalg.norm(np.diff(passing.joints[:, 0], axis=0), axis=1) * 30
     assert pace.min() > 0.8 and pace.max() < 2.2
+
+
+def test_somebody_else_stands_by_and_looks_on(object_entry: Entry) -> None:
+    stage = Stage(
+        CAPTURE.model_copy(update={"passer_by": "stands"}), SETTINGS, object_entry("stool")
+    )
+    times = np.arange(0, stage.duration, 1 / 15)
+    moment, passing = stage.at(times), stage.passer_by.at(times)
+    assert passing.present.all()
+    assert np.ptp(passing.joints[:, 0], axis=0).max() < 0.02  # sways, and does not walk
+    assert np.ptp(passing.joints[:, 0], axis=0).max() > 0
+    towards = (moment.joints - passing.joints)[:, 0, :2]
+    apart = np.linalg.norm(towards, axis=1)
+    assert PASSES_M[0] - 0.05 < apart.min() < PASSES_M[1] + 0.05
+    ahead = passing.pelvis[:, :2, 2]  # the pelvis' z looks ahead
+    assert ((ahead * towards).sum(1) / apart > 0.5).all()
+    assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
 
 
 def test_the_walker_comes_from_the_edge_and_leaves(walker: PasserBy) -> None:
