@@ -200,6 +200,7 @@ MAX_START_S = 1.5  # cameras are started by hand or by one command that reaches 
 MAX_START_SHARE = 0.4  # of the recording: less in common tells little; tuned on the studio
 MIN_SHARED_S = 1.0  # that two cameras must both have recorded, to tell when they started
 MAX_PEOPLE = 3  # of an image, the surest
+LINK_SLACK_RAD = 0.05  # scatter of a person's middles between images; a detector's few pixels
 EPIPOLAR_PX_AT_1080P = (
     6.0  # what two views of one moment disagree by, over time; tuned on the studio
 )

@@ -13,27 +13,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import invert
 from intercap_core.camera.triangulation import pixel_scale
-from intercap_core.capture.synchronise import usual_steps
 from intercap_core.detections.read import PeopleOfImages
 from intercap_core.scene.constants import (
     CLEAR_SIGMAS,
     EPIPOLAR_PX_AT_1080P,
     FEWEST_BLOCKS,
     FEWEST_SETS_APART,
-    MAX_PEOPLE,
     MAX_START_S,
     MAX_START_SHARE,
-    MIN_CONFIDENCE,
     MIN_SHARED_S,
-    SLOWER_SETS,
     START_BLOCK_S,
     START_BLOCKS_SHARE,
     START_PEAK_S,
@@ -41,14 +37,9 @@ from intercap_core.scene.constants import (
     START_SIGMAS,
     START_WORSE,
 )
+from intercap_core.scene.people_in_view import followed
 
-_PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
-_SIDES = [
-    (_PLACE[f"left_{name}"], _PLACE[f"right_{name}"])
-    for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-]
-_ALONE = [_PLACE[name] for name in ("nose", "neck", "mid_hip")]
-MIDDLES = len(_ALONE) + len(_SIDES)
+_NO_MOTION_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +131,7 @@ def find_starts(
     fewest = max(MIN_SHARED_S / step, 1)
     if reach < 1 or sets - reach < fewest:
         return together
-    pairs = _Pairs.of(_rays(detections, rig, available), rig, reach, fewest)
+    pairs = _Pairs.of(followed(detections, rig, times, available), rig, reach, fewest)
     late = _descended(pairs, master)
     others = [c for c in range(views) if c != master]
     # that one camera surely started apart says that nobody started them together
@@ -154,47 +145,6 @@ def find_starts(
         else:
             found.in_doubt[c] = True
     return found
-
-
-def _rays(detections: PeopleOfImages, rig: Rig, available: np.ndarray) -> np.ndarray:
-    """(T, C, P, K, 2) x and y at z = 1 of the middles of an image's people, NaN = not seen."""
-    images = {(t, c): detections.people(t, c) for t, c in np.argwhere(available).tolist()}
-    most = max((len(people) for people in images.values()), default=0)
-    pixels = np.full((*available.shape, max(1, min(most, MAX_PEOPLE)), MIDDLES, 2), np.nan)
-    for (t, c), people in images.items():
-        order = np.argsort(-people[..., 2].sum(1), kind="stable")[:MAX_PEOPLE]
-        for place, person in enumerate(people[order]):
-            pixels[t, c, place] = middles(person)
-    for c, usual in enumerate(usual_steps(available)):
-        if usual >= SLOWER_SETS:
-            _carry_on(pixels[:, c], np.flatnonzero(available[:, c]), usual)
-    found = np.empty_like(pixels)
-    for c, camera in enumerate(rig):
-        found[:, c] = camera.colour.unproject(pixels[:, c])[..., :2]
-    return found
-
-
-def _carry_on(pixels: np.ndarray, images: np.ndarray, usual: float) -> None:
-    """Fill the ``pixels`` (T, P, K, 2) of a camera of fewer images a second than sets, in place, in
-    the sets between two of its ``images`` (N,), usually ``usual`` sets apart: people move evenly
-    over so short a time. Else one lag is judged by other pairs and moments than the next."""
-    for first, last in pairwise(images.tolist()):
-        if last - first > 2 * usual:
-            continue  # lost images: nothing is made up
-        apart = np.abs(pixels[first, :, None] - pixels[last, None]).sum(-1)  # (P, P, K)
-        size = _mean(np.moveaxis(apart, -1, 0))
-        same = np.where(np.isfinite(size), size, np.inf).argmin(1)
-        for t in range(first + 1, last):
-            share = (t - first) / (last - first)
-            pixels[t] = (1 - share) * pixels[first] + share * pixels[last, same]
-
-
-def middles(person: np.ndarray) -> np.ndarray:
-    """Pixels (K, 2) that do not depend on which side is called left, of keypoints (135, 3); NaN
-    where one of the two is not seen."""
-    known = np.where(person[:, 2:] >= MIN_CONFIDENCE, person[:, :2], np.nan)
-    between = [(known[left] + known[right]) / 2 for left, right in _SIDES]
-    return np.concatenate([known[_ALONE], between])
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,24 +188,36 @@ class _Pairs:
 
 
 def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -> np.ndarray:
-    """One lag's costs (T,) of :class:`_Pairs`: of the two people who agree best in a set, how far
-    the distances to each other's epipolar lines are from their medians over time."""
+    """One lag's costs (T,) of :class:`_Pairs`: of each person whom camera a follows, and the one of
+    camera b who agrees best all along, how far the distances to each other's epipolar lines are
+    from their medians over time; the mean over people by how much they move."""
     sets = len(rays)
     found = np.full(sets, np.nan)
     at = slice(max(0, -lag), min(sets, sets - lag))
     if at.stop - at.start < fewest:
         return found
-    distance = _epipolar(rays[at, a], rays[at.start + lag : at.stop + lag, b], rig, a, b)
-    flat = distance.reshape(len(distance), -1, MIDDLES)
-    size = _mean(np.moveaxis(np.abs(flat), -1, 0))
-    best = flat[np.arange(len(flat)), np.where(np.isfinite(size), size, np.inf).argmin(1)]
-    best[:, np.isfinite(best).sum(0) < fewest] = np.nan
-    if np.isfinite(best).any(1).sum() < fewest:
-        return found
-    known = np.isfinite(best).any(0)
-    change = (best[:, known] - np.nanmedian(best[:, known], axis=0)) / EPIPOLAR_PX_AT_1080P
-    found[at] = _mean((change**2 / (1 + change**2)).T)
+    first = rays[at, a]
+    distance = _epipolar(first, rays[at.start + lag : at.stop + lag, b], rig, a, b)
+    seen = np.isfinite(distance).sum(0, keepdims=True)
+    distance = np.where(seen >= fewest, distance, np.nan)  # of people who are seen for long enough
+    known = np.isfinite(distance).any(-1)  # (T, P, Q)
+    size = _mean(_mean(np.moveaxis(np.abs(distance), -1, 0)))
+    size[known.sum(0) < fewest] = np.nan
+    cost, weight = np.full((2, first.shape[1], len(first)), np.nan)
+    for p in np.flatnonzero(np.isfinite(size).any(1)):
+        own = distance[:, p, np.nanargmin(size[p])]
+        own = own[:, np.isfinite(own).any(0)]
+        change = (own - np.nanmedian(own, axis=0)) / EPIPOLAR_PX_AT_1080P
+        cost[p] = _mean((change**2 / (1 + change**2)).T)
+        weight[p] = np.where(np.isfinite(cost[p]), _moves(first[:, p]), np.nan)
+    found[at] = _mean(weight * cost) / _mean(weight)
     return found
+
+
+def _moves(rays: np.ndarray) -> float:
+    """How far, rad, somebody's rays (T, K, 2) are from their mean: who stands still is in step with
+    anything, and says nothing. Never 0."""
+    return _NO_MOTION_RAD + float(np.nanmean(np.sqrt(np.nanvar(rays, axis=0).sum(-1))))
 
 
 def _epipolar(first: np.ndarray, second: np.ndarray, rig: Rig, a: int, b: int) -> np.ndarray:

@@ -11,9 +11,11 @@ from intercap_core.camera.transforms import apply, invert
 from intercap_core.camera.triangulation import reproject
 from intercap_core.person.sides import swapped
 from intercap_core.scene.moments import find_moments
-from intercap_core.scene.start_times import InStep, Starts, find_starts, middles
+from intercap_core.scene.people_in_view import middles
+from intercap_core.scene.start_times import InStep, Starts, find_starts
 from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture
 from tests.helpers.synthetic_capture import ring
+from tests.helpers.synthetic_people import seen_by, walking
 from tests.scene.test_slips import walker
 
 RIG, UP = ring()
@@ -65,6 +67,26 @@ def test_a_walker_shows_when_each_camera_started(fps, seconds):
     assert found.apart and not found.in_doubt.any()
     assert np.abs(found.late - late).max() < 0.5 / fps  # what is left, offsets tell
     assert (found.sets == np.round(found.late * fps)).all()
+
+
+@pytest.mark.parametrize("apart", [False, True], ids=["together", "apart"])
+def test_somebody_who_stands_by_does_not_put_cameras_out_of_step(apart):
+    """Of both people a detector means some points otherwise in each view, and in any order: what is
+    taken off one over time is not the other's. Who stands still agrees at any time."""
+    fps, rng = 15.0, np.random.default_rng(11)
+    late = np.r_[0.0, rng.uniform(-1, 1, len(RIG) - 1)] * apart
+    seen = walk(late, fps, 5.0)
+    standing = seen_by(walking(1, np.array([0.9, -0.7]), np.zeros(2)), RIG, UP)[0]
+    for c in range(len(RIG)):
+        meant = rng.normal(0, 15, (2, 135, 2))
+        for row in seen.images:
+            other = standing[c].copy()
+            other[:, :2] += rng.normal(0, 2, (135, 2)) + meant[0]
+            row[c][0][:, :2] += meant[1]
+            row[c].insert(int(rng.integers(2)), other)
+    found = find_starts(seen, RIG, np.arange(seen.num_sets) / fps, seen.available)
+    assert found.apart == apart and not found.in_doubt.any()
+    assert np.abs(found.late - late).max() < 0.5 / fps
 
 
 @dataclass
