@@ -67,7 +67,7 @@ FIELD_SETTINGS = [
     Path("config/evaluation/config.yaml"),
     *(
         Path(f"config/field/{name}.yaml")
-        for name in ("no_depth", "builds", "shoes", "two_views", "alone", "beam")
+        for name in ("no_depth", "builds", "shoes", "two_views", "alone", "beam", "passer_by")
     ),
 ]
 OBJECT_SETTINGS = [

@@ -530,6 +530,19 @@ class InitialObjectPose(Model):
     """Of the mesh's origin, metres."""
 
 
+class SubjectPoint(Model):
+    """A point of one image that lies on the subject, where several people are in the room."""
+
+    camera: str
+    """Name of the camera, as in the calibration."""
+    frame: FrameNumber = 0
+    """Frame set of the image."""
+    x: float
+    """Pixels from the left edge of the colour image as recorded."""
+    y: float
+    """Pixels from its upper edge."""
+
+
 def _width(points: tuple[Position, ...]) -> float:
     """Largest distance of a point from the line through the first one and the one furthest off."""
     first = points[0]
@@ -556,6 +569,9 @@ class Annotation(Model):
     """Where the object is in one frame; absent = search."""
     floor: tuple[Position, ...] | None = None
     """Three or more points of the floor, master camera frame, metres; absent = fit."""
+    subject: tuple[SubjectPoint, ...] = ()
+    """Who of several people is the subject; more than one point where it left and came back;
+    absent = who handles the object, or is seen most."""
     drop_frames: tuple[FrameNumber, ...] = ()
     """Frame sets to treat as not recorded."""
 
@@ -584,6 +600,9 @@ class Annotation(Model):
             return (
                 f"object_pose.frame is {self.object_pose.frame}, the recording has {count} frames"
             )
+        for index, point in enumerate(self.subject):
+            if point.frame >= count:
+                return f"subject[{index}].frame is {point.frame}, the recording has {count} frames"
         beyond = [frame for frame in self.drop_frames if frame >= count]
         if beyond:
             return f"drop_frames holds {beyond[0]}, the recording has {count} frames"

@@ -144,15 +144,18 @@ SCENE = Schema(
 
 PERSON = Schema(
     name="person",
-    version=5,
+    version=6,
     stage="person",
     attributes={
         "sequence": "sequence name",
         "images_alone": "whether the candidates of the images alone replace a detector's",
+        "chosen_by": "how the subject was told from other people: 'alone' (there were none), 'named' (annotated), 'handling' (who touches the object), 'middle' (who is seen most, near the middle of the cameras)",
+        "doubts": "what speaks against the choice of the subject, in words; empty = nothing",
     },
     fields={
         "camera_names": Field(("C",), "str", "one name a camera"),
         "person": Field(("T", "C"), "int32", "index among the people of the image that shows this moment (image_of of the scene), -1 = not seen"),
+        "others": Field(("T",), "int32", "how many other people were placed"),
         "keypoints": Field(("T", "C", "135", "3"), "float32", "the subject's x, y, confidence in the image that shows this moment, as exposed (time_offset of the scene later); 0 = not seen", "px", "colour image"),
         "joints": Field(("T", "135", "3"), "float32", "keypoints at the set's time, triangulated, or lifted by one view's depth where few are, neck and mid hip else the middles of shoulders and hips; NaN = not known", "m", "master"),
         "joint_views": Field(("T", "135"), "int8", "views that agree on the point; 1 = lifted by depth"),

@@ -243,6 +243,9 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ),
         ("object_pose: {frame: 0, translation: [0, 0, 1]}\n", ["rotation_vector", "required"]),
         ("drop_frames: [x]\n", ["drop_frames.0", "'x'"]),
+        ("subject: [{camera: k1, frame: 0, x: 612}]\n", ["subject.0.y", "required"]),
+        ("subject: [{camera: k1, frame: 0, x: .nan, y: 1}]\n", ["subject.0.x", "finite"]),
+        ("subject: [{camera: k1, frame: -2, x: 1, y: 1}]\n", ["subject.0.frame", "-2"]),
         ("flor: []\n", ["flor", "not permitted"]),
         ("contact: [\n", ["not valid YAML"]),
         ("- 1\n", ["expected names and values"]),
@@ -296,6 +299,7 @@ def test_annotation_past_the_end(folder: Path) -> None:
             "contact": [{"part": "seat", "start": 0, "end": 20}],
             "object_pose": {"frame": 11, "rotation_vector": [0, 0, 0], "translation": [0, 0, 1]},
             "drop_frames": [3, 30],
+            "subject": [{"camera": "k1", "frame": 10, "x": 1, "y": 1}],
         }
     )
     assert annotation.check_frames(31) is None
@@ -303,6 +307,9 @@ def test_annotation_past_the_end(folder: Path) -> None:
     assert "contact[0].end is 20" in str(annotation.check_frames(19))
     pose = annotation.model_copy(update={"contact": None, "drop_frames": ()})
     assert "object_pose.frame is 11" in str(pose.check_frames(11))
+    who = pose.model_copy(update={"object_pose": None})
+    assert who.check_frames(11) is None
+    assert "subject[0].frame is 10" in str(who.check_frames(10))
 
 
 def test_digest_follows_content_alone() -> None:

@@ -1,6 +1,7 @@
 """The field's part of `intercap evaluate` that ends with the metrics.
 
-No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam;
+No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam,
+somebody else in the room;
 what the verdict without truth tells of them.
 """
 
@@ -17,7 +18,7 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.evaluation.part import Figures, Measured, Part, console_of, keyed, number
-from intercap_core.metrics import figures
+from intercap_core.metrics import figures, subject_right
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.verdict_figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
@@ -25,22 +26,24 @@ from intercap_core.schemas import JOINT, TRUTH
 from intercap_core.studio.subjects import Subject
 
 NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
-BUILDS, SHOES = "field_builds", "field_shoes"
+BUILDS, SHOES, PASSER_BY = "field_builds", "field_shoes", "field_passer_by"
 _BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
 )  # fmt: skip
-_WIDTH = 112
+_WIDTH = 122
 
 
 @dataclass(frozen=True, eq=False)
 class FieldSequence:
     """What stage ``metrics`` has measured; the relative errors (B,) of the limbs' lengths, and the
-    error of the person's height, metres."""
+    error of the person's height, metres; of all images with a chosen person the share in which it
+    is the subject."""
 
     metrics: SequenceMetrics
     bones: np.ndarray
     height_m: float
+    subject_right: float
 
 
 FieldSequences = Measured[FieldSequence]
@@ -63,7 +66,9 @@ def measure(project: Project, sequence: str) -> FieldSequence:
         person = Subject.load(str(true.attributes["subject"]))
     height = float(np.ptp(vertices[:, 1])) - float(np.ptp(person.rest[:, 1]))
     metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
-    return FieldSequence(metrics, own / known - 1, height)
+    chosen, scene = (project.artefact(sequence, stage) for stage in ("person", "scene"))
+    right = subject_right.measure(chosen, scene, row.truth)
+    return FieldSequence(metrics, own / known - 1, height, right)
 
 
 def _lengths(joints: np.ndarray) -> np.ndarray:
@@ -99,6 +104,13 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
                 unit = "mm_s" if key == "planted_speed" else "mm"
                 name = key.removeprefix("body_").removesuffix("_speed")
                 found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
+    several = [found for found in evaluations if found.dataset == PASSER_BY]
+    if several:
+        shares = [e.subject_right for some in several for e in some.errors]
+        shares += [0.0 for some in several for _ in some.missing]
+        found["field.subject_right_share"] = float(np.mean(shares))
+        if every := [e.metrics for some in several for e in some.errors]:
+            found["field.passer_by_pve_mm"] = figures.truth_figures(every, "joint")["body_pve_mm"]
     alone = [found for found in evaluations if found.dataset == ALONE]
     if alone:
         whole = [_of_a_person_alone(e.metrics) for some in alone for e in some.errors]
@@ -128,7 +140,7 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
     """A row a recording: true and stated errors, limbs, height."""
     console = console_of(_WIDTH)
     heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
-             "bones %", "height mm")  # fmt: skip
+             "bones %", "height mm", "subject %")  # fmt: skip
     table = Table("recording", *heads, box=None, title="the field, after metrics")
     for found in evaluations:
         for e in found.errors:
@@ -144,6 +156,7 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
                 number(100 * float(e.metrics.values["flagged"].mean()), 0),
                 number(100 * float(np.abs(e.bones).mean()), 1),
                 number(1e3 * e.height_m, 0),
+                number(100 * e.subject_right, 0),
             )
         for name in found.missing:
             table.add_row(f"{found.dataset}: {name}", "no metrics")

@@ -2,7 +2,9 @@
 
 In the order of a run:
 
-- ``subject``: people of one set matched over views by geometry, tracked; the subject's track chosen
+- ``groups``: people of one set matched over views by geometry; ``tracks``: followed over time;
+  ``people``: known again after an absence, by place and build; ``subject``: who of them it is, by
+  the points that ``named`` reads, by who touches the object (``touching``), or by who is seen most
 - ``lifting``: keypoints of a single view placed by the depth beside them
 - ``swaps``: sides exchanged by the detector: steadied over time in each view, then triangulated and
   corrected; ``agreement`` decides set by set which views disagree, ``facing`` which of two mirrored

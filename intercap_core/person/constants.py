@@ -33,6 +33,12 @@ HAND_INSET_M = 0.008  # half a finger's thickness
 # Between shoulders, between hips, metres, half of an adult's breadth: nearer, one occludes the
 # other.
 OCCLUDED_BREADTH_M = (0.18, 0.09)
+# How far adults' thighs, shanks, upper arms, forearms, shoulders (from joint to joint) and trunks
+# are spread, metres: standard deviations over the open body's shapes.
+BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
+# A median length errs by as much however many sets tell: detectors' biases by pose; tuned
+BUILD_FLOOR_M = 0.012
+MIN_BUILD_SETS = 5  # that know a bone; also so many neighbouring sets err alike; tuned
 BODY_DEPTH_M = 0.25  # from the body's middle, along the ray, an unmoving part may lie; tuned
 SHORT_BONE_M = 0.03  # vectors shorter than this have no reliable direction; tuned on the studio
 HAND_ROOT_APART_M = 0.08  # body's and hand's wrist of one arm are nearer together; tuned
@@ -42,7 +48,12 @@ MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
 # Hands reach some 5 m/s in everyday tasks and people stand two metres from a capture ring's
 # cameras: what moves faster in an image is another detection. Radians a second.
 MAX_IMAGE_SPEED_RAD_S = 2.5
-MAX_LINK_GAP_S = 2.0  # tracks of a person are joined over at most this; tuned on the studio
+# Over at most this a person is followed by place alone; longer gaps are a matter of build, too.
+FOLLOWED_GAP_S = 0.4  # tuned on the studio
+# Over at most this a single view takes somebody for who was last known there, and a joined track
+# is not in doubt; tuned on the studio.
+MAX_LINK_GAP_S = 2.0
+WALKING_SPEED_M_S = 1.2  # of who is not seen for a while
 LINK_SLACK_M = 0.25  # scatter of a person's centre between sets; tuned on the studio
 MOTION_MEMORY_S = 0.5  # motion is judged over gaps of at most this; tuned on the studio
 STEP_M = 0.04  # motion from set to set that costs 1 (negative log likelihood); tuned on the studio
@@ -61,8 +72,18 @@ MIN_COMMON_POINTS = 5  # body points; fewer do not tell two people apart; tuned 
 SAME_PERSON_PX_AT_1080P = 60.0
 MOVED_PX_FACTOR = 2.0  # that limit is this much wider where the subject has moved since
 SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the studio
+SAME_PERSON_M = 0.3  # between centres, of people who share a detection; nobody stands nearer
 LIFTED_SUPPORT = 0.5  # of a point that one view lifts by depth; triangulated, it counts about two
 CENTRE_RANGE_M = 1.5  # support counts half so far from the ring's middle; tuned on the studio
+HANDLING_WEIGHT = 4.0  # support counts so much more where somebody touches the object; judged
+TOUCH_REACH = 0.03  # of a person's height in an image, beyond the keypoints: a hand's breadth
+# Support of another person, seen at the same time, over the subject's, from which it is said that
+# it might be the one; judged.
+RIVAL_SHARE = 0.5
+# Logarithms of how much more likely two tracks are of one person than of two, by build: below the
+# first they are not joined, below the second, after a gap, it is said.
+OTHER_BUILD, SURE_BUILD = -3.0, 1.0
+NAMED_REACH = 0.15  # of a person's height in an image, from bones to the point that names it
 ENOUGH_TRIANGULATED = 8  # body points; a set with so many needs no lifting; tuned on the studio
 MIN_MOVING_POINTS = (
     6  # points before the background; with fewer, the person is taken for part of it

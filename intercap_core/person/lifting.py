@@ -35,8 +35,8 @@ from intercap_core.person.constants import (
     OCCLUDED_BREADTH_M,
     SURFACE_M,
 )
+from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
-from intercap_core.person.subject import NOBODY
 
 
 def _insets() -> np.ndarray:

@@ -16,6 +16,11 @@ from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
 from intercap_core.object_track.absent import SOURCE as NO_TRACK
 
+_CHOSEN_BY = {
+    "named": ", the subject is named",
+    "handling": ", the subject handles the object",
+    "middle": ", the subject is seen most",
+}
 _SURE = 0.5  # contact that is likelier than not
 
 
@@ -105,9 +110,12 @@ def _scene(a: Artefact) -> str:
 
 def _person(a: Artefact) -> str:
     seen, missing = a["person"] >= 0, a["missing"]
+    among = int((a["others"] > 0).sum())
+    others = f"; others in {among} frames{_CHOSEN_BY.get(str(a.attributes['chosen_by']), '')}"
     return (
         f"the subject in {_share(~missing)} frames, by {float(seen.sum(axis=1).mean()):.1f} views "
         f"on average; a mask in {100 * float((a['mask_source'] > 0).mean()):.0f} % of images"
+        + (others if among else "")
     )
 
 

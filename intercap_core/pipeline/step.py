@@ -62,6 +62,7 @@ def run_step(
         "floor": annotation.floor,
         "initial": annotation.object_pose,
         "contact": annotation.contact,
+        "subject_points": annotation.subject,
     }
     run(**{name: known[name] for name in inspect.signature(run).parameters})
     if not STAGES[stage].writes_folder:

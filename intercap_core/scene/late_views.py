@@ -11,8 +11,9 @@ import numpy as np
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import pixel_scale, reproject
 from intercap_core.detections.read import PeopleOfImages
+from intercap_core.person.constants import MIN_COMMON_POINTS
+from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import BODY_POINTS, swapped
-from intercap_core.person.subject import MIN_COMMON_POINTS, NOBODY
 from intercap_core.scene.constants import SAME_PERSON_PX_AT_1080P
 from intercap_core.scene.slips import longest_slip
 

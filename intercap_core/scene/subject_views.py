@@ -9,9 +9,10 @@ import numpy as np
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
 from intercap_core.detections.read import PeopleOfImages
+from intercap_core.person.groups import NOBODY
 from intercap_core.person.middles import fill_middles
 from intercap_core.person.sides import BODY_POINTS
-from intercap_core.person.subject import NOBODY, find_subject
+from intercap_core.person.subject import find_subject
 from intercap_core.person.swaps import triangulate_people
 from intercap_core.scene.constants import LOOSE_PX_AT_1080P, MIN_CONFIDENCE
 from intercap_core.scene.late_views import with_late_views
@@ -38,7 +39,7 @@ class SubjectViews:
 
 def subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
     """Find the subject at the start's poses; all 0 and NaN where no two views agree on anybody."""
-    index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE)
+    index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE).people
     found = triangulated(_keypoints_of(detections, index), rig)
     if len(times) < 2:
         return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import Triangulation, reproject
 from intercap_core.capture.frames import Frames
-from intercap_core.config import PersonSettings, digest
+from intercap_core.config import ObjectEntry, PersonSettings, SubjectPoint, digest
 from intercap_core.detections.read import (
     FROM_DETECTOR,
     FROM_IMAGES,
@@ -20,24 +21,36 @@ from intercap_core.detections.read import (
 )
 from intercap_core.errors import UserError
 from intercap_core.person.exposure import at_set_times
+from intercap_core.person.groups import NOBODY
 from intercap_core.person.lifting import Lifter
 from intercap_core.person.masks import choose_mask, others_beside
 from intercap_core.person.middles import fill_middles
+from intercap_core.person.named import named_people
 from intercap_core.person.sides import BODY_POINTS
-from intercap_core.person.subject import NOBODY, find_subject
+from intercap_core.person.subject import Subject, find_subject
 from intercap_core.person.swaps import steady_sides, triangulate_people
+from intercap_core.person.touching import touches_of
 from intercap_core.schemas import PERSON, SCENE
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
 
 
 def run(
-    *, frames: Path, detections: Path, scene: Path, output: Path, settings: PersonSettings
+    *,
+    frames: Path,
+    detections: Path,
+    scene: Path,
+    output: Path,
+    settings: PersonSettings,
+    object_: ObjectEntry | None = None,
+    subject_points: Sequence[SubjectPoint] = (),
 ) -> None:
     """Find the subject by geometry and write the person artefact.
 
-    A set in which one view alone sees the subject takes its points from that view's depth; sets in
-    which neither two views nor depth place it are flagged ``missing``. Raises UserError where that
-    is so in every set, or the inputs are of different captures.
+    Of several people it is who is at the annotation's ``subject_points``, or who handles the object
+    (its entry tells the labels of its candidates), or who is seen most near the middle. A set in
+    which one view alone sees the subject takes its points from that view's depth; sets in which
+    neither two views nor depth place it are flagged ``missing``. Raises UserError where that is so
+    in every set, the inputs are of different captures, or a point names nobody.
     """
     found = Detections.load(detections)
     with artefacts.read(scene, SCENE) as source, Frames.open(frames) as images:
@@ -53,7 +66,17 @@ def run(
         found = found.showing(image_of)
         confident = settings.min_confidence
         lifter = Lifter(images.showing(image_of), source, min_confidence=confident)
-        person = find_subject(found, rig, times, min_confidence=confident, lift=lifter.people)
+        labels = None if object_ is None else object_.labels
+        subject = find_subject(
+            found,
+            rig,
+            times,
+            min_confidence=confident,
+            lift=lifter.people,
+            touches=None if labels is None else touches_of(found, labels, min_confidence=confident),
+            named=named_people(subject_points, found, image_of, min_confidence=confident),
+        )
+        person = subject.people
         keypoints = subject_keypoints(found, person)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
         # rays of one moment meet; what is written down is where each camera saw the points
@@ -80,7 +103,7 @@ def run(
             for t, c in np.ndindex(found.num_sets, len(rig))
         ]
         segmented = _from_images(images.showing(image_of), source, found, points, settings)
-    _write(output, found, person, keypoints, points, missing, masks, beside, segmented, settings)
+    _write(output, found, subject, keypoints, points, missing, masks, beside, segmented, settings)
 
 
 def _why(found: Detections) -> str:
@@ -164,7 +187,7 @@ def _from_images(
 def _write(
     output: Path,
     detections: Detections,
-    person: np.ndarray,
+    subject: Subject,
     keypoints: np.ndarray,
     points: Triangulation,
     missing: np.ndarray,
@@ -173,7 +196,7 @@ def _write(
     segmented: dict[tuple[int, int], ViewSegments],
     settings: PersonSettings,
 ) -> None:
-    sets, views = person.shape
+    sets, views = subject.people.shape
     mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOBODY_LOOKED)
     if settings.segmentation == "images":
         mask_source[:] = NOBODY_LOOKED
@@ -193,9 +216,12 @@ def _write(
         settings_digest=digest(settings),
         sequence=detections.sequence,
         images_alone=settings.segmentation == "images",
+        chosen_by=subject.chosen_by,
+        doubts="; ".join(subject.doubts),
     ) as writer:
         writer.put("camera_names", list(detections.camera_names))
-        writer.put("person", person)
+        writer.put("person", subject.people)
+        writer.put("others", subject.others)
         writer.put("keypoints", keypoints)
         writer.put("joints", points.points.reshape(sets, NUM_KEYPOINTS, 3))
         writer.put("joint_views", points.views.reshape(sets, NUM_KEYPOINTS))

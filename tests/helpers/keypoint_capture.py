@@ -15,7 +15,8 @@ import yaml
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
-from intercap_core.person.subject import NOBODY, find_subject
+from intercap_core.person.groups import NOBODY
+from intercap_core.person.subject import find_subject
 from intercap_core.scene.constants import MIN_CONFIDENCE
 from intercap_core.scene.late_views import with_late_views
 from intercap_core.scene.subject_views import triangulated
@@ -155,7 +156,12 @@ def subject_keypoints(capture: KeypointCapture) -> np.ndarray:
     """The subject's keypoints (T, C, 135, 3), sides put right, as the scene stage finds them;
     zeros where not seen."""
     people = _People(capture)
-    index = find_subject(people, capture.rig, capture.times, min_confidence=MIN_CONFIDENCE)  # type: ignore[arg-type]
+    index = find_subject(
+        people,  # type: ignore[arg-type]
+        capture.rig,
+        capture.times,
+        min_confidence=MIN_CONFIDENCE,
+    ).people
     first = triangulated(_keypoints(people, index), capture.rig)
     index = with_late_views(
         index,

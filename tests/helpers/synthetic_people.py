@@ -39,9 +39,12 @@ def stick_person() -> np.ndarray:
     return points
 
 
-def walking(sets: int, start: np.ndarray, step: np.ndarray, turn: float = 0.02) -> np.ndarray:
-    """(T, 135, 3), z up: the stick person from ``start`` (2,), ``step`` (2,) metres a set."""
-    person = stick_person()
+def walking(
+    sets: int, start: np.ndarray, step: np.ndarray, turn: float = 0.02, size: float = 1.0
+) -> np.ndarray:
+    """(T, 135, 3), z up: the stick person, ``size`` times as large, from ``start`` (2,), ``step``
+    (2,) metres a set."""
+    person = size * stick_person()
     result = np.empty((sets, *person.shape))
     for t in range(sets):
         c, s = np.cos(turn * t), np.sin(turn * t)

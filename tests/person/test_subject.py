@@ -20,7 +20,7 @@ TIMES = np.arange(T) / 15
 
 def subject_of(tmp_path, people) -> np.ndarray:
     path = write_detections(tmp_path / "detections.h5", RIG, people)
-    return find_subject(Detections.load(path), RIG, TIMES, min_confidence=0.3)
+    return find_subject(Detections.load(path), RIG, TIMES, min_confidence=0.3).people
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,9 @@ def test_after_a_second_of_nobody_the_subject_is_still_the_same(tmp_path):
     gap = slice(15, 30)
     people[gap] = [[[] for _ in range(6)] for _ in range(15)]
     path = write_detections(tmp_path / "detections.h5", RIG, people)
-    found = find_subject(Detections.load(path), RIG, np.arange(sets) / 15, min_confidence=0.3)
+    found = find_subject(
+        Detections.load(path), RIG, np.arange(sets) / 15, min_confidence=0.3
+    ).people
     expected = first.astype(np.int32)
     expected[gap] = -1
     np.testing.assert_array_equal(found, expected)
@@ -136,7 +138,9 @@ def test_two_who_pass_each_other_are_not_exchanged(tmp_path, apart_m):
         people[t][c] = [both[i][t, c] for i in who]
         expected[t, c] = who.index(0) if 0 in who else -1
     path = write_detections(tmp_path / "detections.h5", RIG, people)
-    found = find_subject(Detections.load(path), RIG, np.arange(sets) / 15, min_confidence=0.3)
+    found = find_subject(
+        Detections.load(path), RIG, np.arange(sets) / 15, min_confidence=0.3
+    ).people
     seen = expected >= 0
     np.testing.assert_array_equal(found[seen], expected[seen])
     # where a view misses the subject, the one who stands at the same place may be taken for it

@@ -68,6 +68,10 @@ def test_touching_re_runs_nothing(flow: Flow) -> None:
             {"object_track", "joint", "metrics", "export"},
         ),
         ("drop_frames: [2]\n", {"frames", "detections", *AFTER_SCENE}),
+        (
+            "subject: [{camera: k1, frame: 0, x: 612, y: 340}]\n",
+            {"person", "object_track", "body_fit", "joint", "metrics", "export"},
+        ),
         ("# nothing yet\ncontact:\n", set()),
     ],
 )

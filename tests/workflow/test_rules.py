@@ -35,6 +35,7 @@ def test_a_rule_depends_on_all_that_its_stage_is_given(stage: str) -> None:
         "floor": "floor",
         "initial": "object_pose",
         "contact": "contact",
+        "subject_points": "subject",
     }
     annotated = "".join(f'"{sections[name]}"' for name in sections if name in names)
     found = re.search(r"annotation=annotation_of\((.*)\)", RULES[stage])

@@ -2,6 +2,7 @@ rule person:
     """The subject over views, and the triangulated keypoints."""
     input:
         **artefacts_read("person"),
+        annotation=ancient(annotation_input("subject")),
     output:
         person=f"{RESULTS}/{{sequence}}/person.h5",
     log:
@@ -16,6 +17,8 @@ rule person:
         runtime=30,
     params:
         settings=settings_of("person"),
+        annotation=annotation_of("subject"),
+        object=tracked_object,
         code=code_of("person"),
     message:
         "{wildcards.sequence}: finding the subject in all views"

@@ -1,0 +1,188 @@
+"""The people of one frame set, matched over its views by geometry.
+
+The order of people in a detector's file says nothing: detections whose rays meet are one person. In
+a set where no rays meet, depth tells where the people of each single view are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.triangulation import midpoints, pixel_scale, reproject, view_pairs
+from intercap_core.person.constants import (
+    LIFTED_SUPPORT,
+    MIN_COMMON_POINTS,
+    SAME_PERSON_GAP_M,
+    SAME_PERSON_M,
+    SAME_PERSON_PX_AT_1080P,
+)
+from intercap_core.person.sides import BODY_POINTS, PARTNER
+
+NOBODY = -1
+
+_MIRRORED = PARTNER[BODY_POINTS]  # the body's points with left and right exchanged
+_Proposal = tuple[float, np.ndarray, tuple[int, int], tuple[int, int]]
+Lift = Callable[[int, int, np.ndarray], np.ndarray]
+"""Points (P, 25, 3), master frame, NaN = not known, of the people (P, 25, 3) that view c sees in
+set t, by its depth alone: called with t, c and the people."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """One person in one frame set: ``members`` (C,) index of the view's person or -1, ``points``
+    (25, 3) metres, NaN = not known, ``support``, the number of points seen, over views, and
+    ``errors`` (C,), how far the points are from each member's, share of what is allowed."""
+
+    members: np.ndarray
+    points: np.ndarray
+    support: float
+    errors: np.ndarray
+
+    @property
+    def views(self) -> int:
+        """How many views see the person."""
+        return int((self.members != NOBODY).sum())
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Median of the known points (3,)."""
+        return np.nanmedian(self.points, 0)
+
+    def without(self, views: np.ndarray) -> Group:
+        """The same person, not seen by some ``views`` (C,) bool."""
+        return replace(self, members=np.where(views, NOBODY, self.members))
+
+
+def groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[Group]:
+    """Group one set's people (P, 25, 3) of each view; best supported first."""
+    rays, seen = [], []
+    for c, found in enumerate(people):
+        directions = rig[c].colour.unproject(found[..., :2]) if len(found) else np.zeros((0, 25, 3))
+        rays.append(directions @ rig[c].master_from_colour[:3, :3].T)
+        seen.append(found[..., 2] >= min_confidence)
+    pairs, rest = view_pairs(rig)
+    proposals = _pair_proposals(pairs, rays, seen, rig) or _pair_proposals(rest, rays, seen, rig)
+    grown: list[Group] = []
+    for _, points, first, second in sorted(proposals, key=lambda p: p[0]):
+        if any(
+            g.members[first[0]] == first[1] and g.members[second[0]] == second[1] for g in grown
+        ):
+            continue  # a better pair of views has led to these two already
+        group = _grow(points, first, second, people, seen, rig)
+        if group is not None:
+            grown.append(group)
+    grown.sort(key=lambda group: -group.support)
+    result: list[Group] = []
+    for group in grown:
+        result = _with_another(result, group)
+    return result
+
+
+def _with_another(groups: list[Group], group: Group) -> list[Group]:
+    """Add a person whom two views or more see as nobody else; a detection that two people could be
+    is that one's whom it fits better."""
+    shared = [(group.members == g.members) & (group.members != NOBODY) for g in groups]
+    if group.views - int(np.any(shared, axis=0).sum() if shared else 0) < 2:
+        return groups
+    result = []
+    for other, both in zip(groups, shared, strict=True):
+        if both.any() and np.linalg.norm(group.centre - other.centre) < SAME_PERSON_M:
+            return groups
+        worse = group.errors >= other.errors
+        group = group.without(both & worse)
+        result.append(other.without(both & ~worse))
+    return [*result, group] if all(g.views > 1 for g in result) else groups
+
+
+def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[Group]:
+    """Every person (P, 25, 3) of each view as a group of its own; best supported first."""
+    result = []
+    for c, found in enumerate(people):
+        for i, points in enumerate(lift(t, c, found) if len(found) else ()):
+            count = int(np.isfinite(points[:, 0]).sum())
+            if count >= MIN_COMMON_POINTS:
+                members = np.full(len(people), NOBODY, np.int32)
+                members[c] = i
+                result.append(Group(members, points, LIFTED_SUPPORT * count, np.zeros(len(people))))
+    return sorted(result, key=lambda group: -group.support)
+
+
+def _pair_proposals(
+    pairs: list[tuple[int, int]], rays: list[np.ndarray], seen: list[np.ndarray], rig: Rig
+) -> list[_Proposal]:
+    """Two views' people whose rays meet: the median gap, metres, points (25, 3) and (view, person)
+    of both."""
+    centres = rig.master_from_colour[:, :3, 3]
+    result = []
+    for a, b in pairs:
+        if not len(rays[a]) or not len(rays[b]):
+            continue
+        # A detector may take a back for a front: also try one view mirrored.
+        other = np.stack([rays[b], rays[b][:, _MIRRORED]])
+        other_seen = np.stack([seen[b], seen[b][:, _MIRRORED]])
+        points, gap = midpoints(rays[a][:, None], other[:, None], centres[a], centres[b])
+        common = seen[a][:, None] & other_seen[:, None] & np.isfinite(gap)  # (2, Pa, Pb, 25)
+        enough = common.sum(-1) >= MIN_COMMON_POINTS
+        for i, j in np.argwhere(enough.any(0)):
+            for side in np.flatnonzero(enough[:, i, j]):
+                at = (side, i, j)
+                middle_gap = float(np.median(gap[at][common[at]]))
+                if middle_gap < SAME_PERSON_GAP_M:
+                    known = np.where(common[at][:, None], points[at], np.nan)
+                    result.append((middle_gap, known, (a, int(i)), (b, int(j))))
+                    break
+    return result
+
+
+def _mirror(body: np.ndarray) -> np.ndarray:
+    """Exchange left and right of body points (25, n)."""
+    return body[_MIRRORED]
+
+
+def _grow(
+    points: np.ndarray,
+    first: tuple[int, int],
+    second: tuple[int, int],
+    people: list[np.ndarray],
+    seen: list[np.ndarray],
+    rig: Rig,
+) -> Group | None:
+    """Add to a proposal the person of every view that it reprojects onto."""
+    members = np.full(len(rig), NOBODY, np.int32)
+    members[first[0]], members[second[0]] = first[1], second[1]
+    pixels = reproject(np.nan_to_num(points), rig)
+    known = np.isfinite(points[:, 0])
+    limits = SAME_PERSON_PX_AT_1080P * pixel_scale(rig)
+    support, errors = 0.0, np.full(len(rig), np.inf)
+    for c in range(len(rig)):
+        best = limits[c]
+        options = [int(members[c])] if members[c] != NOBODY else range(len(people[c]))
+        for i in options:
+            error, count = distance_to(pixels[:, c], known, people[c][i], seen[c][i])
+            if count >= MIN_COMMON_POINTS and error < best:
+                best, members[c] = error, i
+        if members[c] != NOBODY and best < limits[c]:
+            errors[c] = best / limits[c]
+            support += float((known & seen[c][members[c]]).sum()) * (1 - errors[c])
+    return Group(members, points, support, errors) if support > 0 else None
+
+
+def distance_to(
+    pixels: np.ndarray, known: np.ndarray, person: np.ndarray, seen: np.ndarray
+) -> tuple[float, int]:
+    """Median distance, px, of reprojected points (25, 2) to a person, sides exchanged if better."""
+    best, count = np.inf, 0
+    for candidate, visible in (
+        (person, seen),
+        (_mirror(person), _mirror(seen[:, None])[:, 0]),
+    ):
+        common = known & visible
+        if common.sum() >= MIN_COMMON_POINTS:
+            error = float(np.median(np.linalg.norm(pixels - candidate[:, :2], axis=-1)[common]))
+            if error < best:
+                best, count = error, int(common.sum())
+    return best, count

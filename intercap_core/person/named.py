@@ -1,0 +1,92 @@
+"""The detections that a user names by points in images (annotation ``subject``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from intercap_core.body.keypoints import SKELETON, keypoint_pairs
+from intercap_core.config import SubjectPoint
+from intercap_core.detections.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.person.constants import NAMED_REACH
+from intercap_core.person.sides import BODY_POINTS
+from intercap_core.person.subject import Named
+
+_BONES = keypoint_pairs(SKELETON)
+
+
+def named_people(
+    points: Sequence[SubjectPoint],
+    detections: Detections,
+    image_of: np.ndarray,
+    *,
+    min_confidence: float,
+) -> list[Named]:
+    """Who is at each point: the person whose bones are nearest, for their size in the image.
+
+    ``detections`` by moment, ``image_of`` (T, C) of the scene artefact: the frame whose image shows
+    each. Raises UserError, naming the entry, for an unknown camera, a frame without an image, a
+    point outside of it, and where nobody was detected.
+    """
+    return [
+        _named(f"subject[{k}]", point, detections, image_of, min_confidence)
+        for k, point in enumerate(points)
+    ]
+
+
+def _named(
+    entry: str,
+    point: SubjectPoint,
+    detections: Detections,
+    image_of: np.ndarray,
+    min_confidence: float,
+) -> Named:
+    names = detections.camera_names
+    told = f"sequence {detections.sequence}: the annotation's {entry}"
+    if point.camera not in names:
+        raise UserError(
+            f"{told} names camera {point.camera!r}; the recording has {', '.join(names)}"
+        )
+    c = names.index(point.camera)
+    where = f"camera {point.camera}, frame {point.frame}"
+    shows = np.flatnonzero(image_of[:, c] == point.frame)
+    if not len(shows):
+        raise UserError(
+            f"{told} names {where}, which has no image, or one that is not in step; name the "
+            "person in another frame or camera"
+        )
+    width, height = (int(n) for n in detections.image_sizes[c])
+    if not (0 <= point.x < width and 0 <= point.y < height):
+        raise UserError(
+            f"{told} is at x {point.x:g}, y {point.y:g}; {where} has {width} x {height} pixels"
+        )
+    t, at = int(shows[0]), np.array([point.x, point.y])
+    people = detections.people(t, c)[:, BODY_POINTS]
+    away = [_distance(person, at, min_confidence) for person in people]
+    nearest = int(np.argmin(away)) if away else -1
+    if nearest < 0 or away[nearest] > NAMED_REACH:
+        seen = [person[person[:, 2] >= min_confidence, :2] for person in people]
+        places = ", ".join(
+            f"({x:.0f}, {y:.0f})" for x, y in (np.median(body, 0) for body in seen if len(body))
+        )
+        raise UserError(
+            f"{told} is at x {point.x:g}, y {point.y:g} of {where}, where nobody was detected; "
+            f"there are people at {places or 'no place of it'}"
+        )
+    return Named(t, c, nearest, entry)
+
+
+def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> float:
+    """Distance of a point (2,) from the bones of a person (25, 3), share of its size."""
+    seen = person[:, 2] >= min_confidence
+    bones = _BONES[seen[_BONES].all(1)]
+    if not len(bones):
+        return np.inf
+    start, end = person[bones[:, 0], :2], person[bones[:, 1], :2]
+    along = end - start
+    length = np.maximum((along**2).sum(1), 1e-9)
+    share = np.clip(((point - start) * along).sum(1) / length, 0, 1)
+    away = np.linalg.norm(start + share[:, None] * along - point, axis=1).min()
+    return float(away / max(np.ptp(person[seen, :2], axis=0).max(), 1.0))
