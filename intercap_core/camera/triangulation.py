@@ -44,6 +44,21 @@ class Triangulation:
         return self.inlier.sum(1).astype(np.int8)
 
 
+def spread(found: Triangulation, rig: Rig) -> np.ndarray:
+    """What each point (N,) is off by, metres, by how the views that agree on it disagree; 0 where
+    there is none.
+
+    n views tell 3 coordinates by 2n. With an RMS distance of e pixels the variance of one of them
+    is n e^2 / (2n - 3), and each of the point's is told by about 2n / 3 of them.
+    """
+    eyes = rig.master_from_colour[:, :3, 3]
+    away = np.linalg.norm(found.points[:, None] - eyes, axis=2)
+    metres = away / np.array([camera.colour.fx for camera in rig])
+    views = np.maximum(found.inlier.sum(1), 2)
+    pixel = np.where(found.inlier, metres, 0.0).sum(1) / views
+    return np.nan_to_num(found.error * pixel * np.sqrt(1.5 / (2 * views - 3)))
+
+
 def pixel_scale(rig: Rig) -> np.ndarray:
     """(C,) pixels of each camera for one pixel of a 1080p image (by image height)."""
     return np.array([camera.colour.height / 1080 for camera in rig])

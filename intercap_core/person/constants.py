@@ -75,7 +75,9 @@ SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the stu
 SAME_PERSON_M = 0.3  # between centres, of people who share a detection; nobody stands nearer
 LIFTED_SUPPORT = 0.5  # of a point that one view lifts by depth; triangulated, it counts about two
 CENTRE_RANGE_M = 1.5  # support counts half so far from the ring's middle; tuned on the studio
-HANDLING_WEIGHT = 4.0  # support counts so much more where somebody touches the object; judged
+# Support of who touches the object most counts so much more, others' by how much they touch it;
+# where nobody touches it in this share of the images that show both, nothing is said; judged.
+HANDLING_WEIGHT, LEAST_HANDLING = 4.0, 0.05
 TOUCH_REACH = 0.03  # of a person's height in an image, beyond the keypoints: a hand's breadth
 # Support of another person, seen at the same time, over the subject's, from which it is said that
 # it might be the one; judged.

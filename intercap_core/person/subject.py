@@ -19,6 +19,7 @@ from intercap_core.errors import UserError
 from intercap_core.person.constants import (
     CENTRE_RANGE_M,
     HANDLING_WEIGHT,
+    LEAST_HANDLING,
     MAX_LINK_GAP_S,
     MOVED_PX_FACTOR,
     RIVAL_SHARE,
@@ -119,8 +120,12 @@ def _chosen(
     by = "alone"
     if len(likely) > 1:
         handling = {k: _handling(people[k].whole, touches) if touches else 0.0 for k in likely}
-        by = "handling" if max(handling.values()) > 0 else "middle"
-        likely = {k: score * (1 + HANDLING_WEIGHT * handling[k]) for k, score in likely.items()}
+        most = max(handling.values())
+        by = "handling" if most >= LEAST_HANDLING else "middle"
+        if by == "handling":
+            likely = {
+                k: score * (1 + HANDLING_WEIGHT * handling[k] / most) for k, score in likely.items()
+            }
     best, *others = sorted(likely, key=lambda k: -likely[k])
     doubts += people[best].doubts
     if others and likely[others[0]] > RIVAL_SHARE * likely[best]:

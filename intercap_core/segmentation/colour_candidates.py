@@ -37,20 +37,23 @@ from intercap_core.segmentation.constants import (
 )
 from intercap_core.segmentation.depth_masks import encode_window
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.segmentation.person_volume import bones_of
+from intercap_core.segmentation.moving_person import MovingPerson
 
 
 class ColourSegmenter:
     """Segments the views of a recording that have colour alone.
 
     ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
-    (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known.
+    (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known, ``sigma`` (T, 135)
+    what they are off by.
     """
 
-    def __init__(self, frames: Frames, scene: Artefact, joints: np.ndarray) -> None:
+    def __init__(
+        self, frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray
+    ) -> None:
         self._frames = frames
         self._rig = Rig.from_artefact(scene)
-        self._joints = joints
+        self._person = MovingPerson(joints, sigma, scene)
         self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
 
     def segment(self, t: int, c: int) -> ViewSegments | None:
@@ -58,7 +61,7 @@ class ColourSegmenter:
         if c not in self._backgrounds:
             self._backgrounds[c] = self._background(c)
         background = self._backgrounds[c]
-        bones = bones_of(self._joints[t])
+        bones = self._person.bones(t, c)
         image = self._image(t, c) if background is not None and len(bones) else None
         if image is None or background is None:
             return None
@@ -102,7 +105,7 @@ class ColourSegmenter:
             sets = sets[np.linspace(0, len(sets) - 1, MAX_COLOUR_SAMPLES).round().astype(int)]
         images, people = [], []
         for t in sets:
-            image, bones = self._image(int(t), c), bones_of(self._joints[t])
+            image, bones = self._image(int(t), c), self._person.bones(int(t), c)
             if image is not None:
                 images.append(image)
                 people.append(drawn(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))

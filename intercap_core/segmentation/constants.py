@@ -81,6 +81,7 @@ TRACE_MARGINS, TRACE_SHARE = 1.0, 0.4  # within the person, at this share of mom
 
 # --- human motion
 MAX_HAND_SPEED_M_S = 8.0  # above what hands reach in everyday tasks (some 5 m/s)
+UNTOLD_OFFSET_S = 0.01  # a camera's time offset that could not be told is off by; as scenes spread
 MAX_KEYPOINT_GAP_S = 0.5  # a keypoint lost for less is where it lies between; tuned on the studio
 # Around the person's path, above the highest keypoint: where things are looked for, metres; tuned
 # on the studio.

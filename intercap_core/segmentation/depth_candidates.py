@@ -23,7 +23,6 @@ import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.segmentation.constants import (
     ABOVE_HEAD_M,
@@ -34,8 +33,6 @@ from intercap_core.segmentation.constants import (
     FAR_CUT,
     FLOOR_M,
     MAX_COMPONENTS,
-    MAX_HAND_SPEED_M_S,
-    MAX_KEYPOINT_GAP_S,
     MIN_POINTS,
     MIN_VIEW_POINTS,
     NEAR_CUT,
@@ -52,10 +49,10 @@ from intercap_core.segmentation.depth_masks import Cells, Projected
 from intercap_core.segmentation.foreground import DepthBackground, DepthView, sampled_images
 from intercap_core.segmentation.free_space import without_free_space, without_person_traces
 from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.segmentation.person_volume import bones_of, outside
+from intercap_core.segmentation.moving_person import MovingPerson
+from intercap_core.segmentation.person_volume import outside
 from intercap_core.segmentation.static_things import extent, find_static_things
 from intercap_core.segmentation.voxels import components
-from intercap_core.solve.velocity import limited_velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +83,17 @@ class DepthSegmenter:
     """Segments the views of a recording that have depth.
 
     ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
-    (T, 135, 3) the subject's keypoints in the master frame, ``cameras`` which of them to look at.
+    (T, 135, 3) the subject's keypoints in the master frame and ``sigma`` (T, 135) what they are off
+    by, metres, ``cameras`` which of them to look at.
     """
 
     def __init__(
-        self, frames: Frames, scene: Artefact, joints: np.ndarray, cameras: list[int]
+        self,
+        frames: Frames,
+        scene: Artefact,
+        joints: np.ndarray,
+        sigma: np.ndarray,
+        cameras: list[int],
     ) -> None:
         self._frames = frames
         rig = Rig.from_artefact(scene)
@@ -98,8 +101,7 @@ class DepthSegmenter:
         upright = bool(np.isfinite(zup).all())
         grounded = bool(scene.attributes["ground_found"]) and upright
         zup = zup if upright else np.eye(4)
-        times = scene["times"]
-        bias, self._late = np.nan_to_num(scene["depth_bias"]), scene["time_offset"]
+        bias = np.nan_to_num(scene["depth_bias"])
         self.cameras = [
             c
             for c in cameras
@@ -109,12 +111,9 @@ class DepthSegmenter:
             c: DepthView(rig[c], float(bias[c]), zup @ rig[c].master_from_depth)
             for c in self.cameras
         }
-        joints = apply(zup, joints.reshape(-1, 3)).reshape(joints.shape)
-        self._joints = fill_short_gaps(joints, times, max_gap_s=MAX_KEYPOINT_GAP_S)
-        self._velocity = np.nan_to_num(
-            limited_velocity(self._joints, times, max_speed=MAX_HAND_SPEED_M_S)
-        )
-        everywhere = self._joints[np.isfinite(self._joints).all(-1)]
+        self._person = MovingPerson(joints, sigma, scene, zup)
+        joints = self._person.joints
+        everywhere = joints[np.isfinite(joints).all(-1)]
         self._low = everywhere.min(0) - AROUND_PATH_M
         above = ABOVE_HEAD_M if upright else AROUND_PATH_M
         self._high = everywhere.max(0) + np.array([AROUND_PATH_M, AROUND_PATH_M, above])
@@ -130,8 +129,8 @@ class DepthSegmenter:
             for c in self.cameras
         ]
         backgrounds = without_free_space(views, backgrounds, self._low, self._high)
-        some = self._joints[:: max(1, len(times) // PERSON_SAMPLES)]
-        bodies = [bones_of(joints) for joints in some]
+        some = range(0, len(joints), max(1, len(joints) // PERSON_SAMPLES))
+        bodies = [self._person.bones_at(t) for t in some]
         backgrounds = [
             without_person_traces(view, background, bodies)
             for view, background in zip(views, backgrounds, strict=True)
@@ -179,7 +178,7 @@ class DepthSegmenter:
         points, local = view.points(image, index)
         inside = ((points > self._low) & (points < self._high)).all(1)
         points, local, index = points[inside], local[inside], index[inside]
-        bones = bones_of(self._joints[t] + self._late[c] * self._velocity[t])
+        bones = self._person.bones(t, c)
         away = outside(points, bones)
         # background unknown to this view may be known to another one
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
@@ -317,25 +316,3 @@ def _masks(seen: _ViewPoints, proposed: list[tuple[_Component, np.ndarray]]) -> 
         if rle:
             candidates.append(ImageCandidate(rle, one.score, one.extent_m, component))
     return ViewSegments(projected.rle(person, things), candidates)
-
-
-def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
-    """Keypoints (T, K, 3), NaN = not known, with short gaps filled by linear interpolation.
-
-    A gap is filled up to ``max_gap_s`` from its nearest known time of ``times`` (T,) seconds; at
-    the beginning and the end the nearest known place is held.
-    """
-    result = joints.copy()
-    for k in range(joints.shape[1]):
-        known = np.flatnonzero(np.isfinite(joints[:, k]).all(1))
-        if not len(known):
-            continue
-        for t in np.flatnonzero(~np.isfinite(joints[:, k]).all(1)):
-            after = int(np.searchsorted(known, t))
-            around = known[max(after - 1, 0) : after + 1]
-            if np.abs(times[around] - times[t]).min() > max_gap_s:
-                continue
-            result[t, k] = [
-                np.interp(times[t], times[around], joints[around, k, i]) for i in range(3)
-            ]
-    return result

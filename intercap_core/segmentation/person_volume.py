@@ -33,14 +33,17 @@ from intercap_core.segmentation.constants import (
 _SIDE_RADII_M = {bone: LIMB_RADII_M[bone] for bone in LIMB_BONES} | SOLE_RADII_M
 
 
-def bones_of(joints: np.ndarray) -> np.ndarray:
+def bones_of(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
     """Bones (B, 9) float32 of one moment: both ends, both radii, margin; metres; hands last.
 
-    ``joints`` (135, 3), NaN = not known; a bone without one of its ends is left out.
+    ``joints`` (135, 3), NaN = not known; a bone without one of its ends is left out. A margin is
+    that of the surface and, where ``sigma`` (135,) is given, metres, that of the bone's ends.
     """
-    at = {name: joints[i] for i, name in enumerate(KEYPOINT_NAMES[:67])}
+    off = np.zeros(len(joints)) if sigma is None else sigma
+    points = np.column_stack([joints, off])  # (135, 4)
+    at = {name: points[i] for i, name in enumerate(KEYPOINT_NAMES[:67])}
     at["middle_ear"] = _middle(at["left_ear"], at["right_ear"])
-    size = float(np.linalg.norm(at["neck"] - at["mid_hip"])) / USUAL_TRUNK_M
+    size = float(np.linalg.norm((at["neck"] - at["mid_hip"])[:3])) / USUAL_TRUNK_M
     size = float(np.clip(size, SMALLEST_BUILD, LARGEST_BUILD)) if np.isfinite(size) else 1.0
     radii = list(TRUNK_RADII_M.items())
     for side in ("left", "right"):
@@ -49,7 +52,13 @@ def bones_of(joints: np.ndarray) -> np.ndarray:
     rows = [(at[a], at[b], size * ra, size * rb, margin) for (a, b), (ra, rb, margin) in radii]
     for side in ("left", "right"):
         rows += _hand(at, side)
-    found = np.array([[*a, *b, ra, rb, margin] for a, b, ra, rb, margin in rows], np.float32)
+    found = np.array(
+        [
+            [*a[:3], *b[:3], ra, rb, np.hypot(margin, (a[3] + b[3]) / 2)]
+            for a, b, ra, rb, margin in rows
+        ],
+        np.float32,
+    )
     return found[np.isfinite(found).all(1)].reshape(-1, 9)
 
 
@@ -70,7 +79,8 @@ def _hand(
     if known >= MIN_FINGERS:
         return rows
     along = wrist - at[f"{side}_elbow"]
-    along = along / max(float(np.linalg.norm(along)), 1e-6) * BLIND_HAND_LENGTH_M
+    along[3] = 0.0  # as uncertain as the wrist
+    along *= BLIND_HAND_LENGTH_M / max(float(np.linalg.norm(along)), 1e-6)
     return [(wrist, wrist + along, BLIND_HAND_RADIUS_M, BLIND_HAND_RADIUS_M, BLIND_HAND_MARGIN_M)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
-from intercap_core.camera.triangulation import Triangulation, reproject
+from intercap_core.camera.triangulation import Triangulation, reproject, spread
 from intercap_core.capture.frames import Frames
 from intercap_core.config import ObjectEntry, PersonSettings, SubjectPoint, digest
 from intercap_core.detections.read import (
@@ -102,7 +102,7 @@ def run(
             others_beside(found.candidates(t, c), masks[t * len(rig) + c])
             for t, c in np.ndindex(found.num_sets, len(rig))
         ]
-        segmented = _from_images(images.showing(image_of), source, found, points, settings)
+        segmented = _from_images(images.showing(image_of), source, found, points, rig, settings)
     _write(output, found, subject, keypoints, points, missing, masks, beside, segmented, settings)
 
 
@@ -170,6 +170,7 @@ def _from_images(
     scene: artefacts.Artefact,
     found: Detections,
     points: Triangulation,
+    rig: Rig,
     settings: PersonSettings,
 ) -> dict[tuple[int, int], ViewSegments]:
     """What the images alone show, by moment and camera, where the settings ask for it."""
@@ -181,7 +182,8 @@ def _from_images(
     from intercap_core.segmentation.image_segmentation import segment_images
 
     joints = points.points.reshape(*wanted.shape[:1], NUM_KEYPOINTS, 3)
-    return segment_images(images, scene, joints, wanted)
+    sigma = spread(points, rig).reshape(joints.shape[:2])
+    return segment_images(images, scene, joints, wanted, sigma)
 
 
 def _write(
