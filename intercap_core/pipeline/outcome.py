@@ -111,11 +111,11 @@ def _scene(a: Artefact) -> str:
 def _person(a: Artefact) -> str:
     seen, missing = a["person"] >= 0, a["missing"]
     among = int((a["others"] > 0).sum())
+    masked = 100 * float((np.diff(a["mask_offsets"]) > 0).mean())
     others = f"; others in {among} frames{_CHOSEN_BY.get(str(a.attributes['chosen_by']), '')}"
     return (
         f"the subject in {_share(~missing)} frames, by {float(seen.sum(axis=1).mean()):.1f} views "
-        f"on average; a mask in {100 * float((a['mask_source'] > 0).mean()):.0f} % of images"
-        + (others if among else "")
+        f"on average; a mask in {masked:.0f} % of images" + (others if among else "")
     )
 
 
