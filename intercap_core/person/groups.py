@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -31,7 +32,7 @@ Lift = Callable[[int, int, np.ndarray], np.ndarray]
 set t, by its depth alone: called with t, c and the people."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Group:
     """One person in one frame set: ``members`` (C,) index of the view's person or -1, ``points``
     (25, 3) metres, NaN = not known, ``support``, the number of points seen, over views, and
@@ -47,7 +48,7 @@ class Group:
         """How many views see the person."""
         return int((self.members != NOBODY).sum())
 
-    @property
+    @cached_property
     def centre(self) -> np.ndarray:
         """Median of the known points (3,)."""
         return np.nanmedian(self.points, 0)
