@@ -16,10 +16,10 @@ from intercap_core.config import (
     ObjectEntry,
     ObjectTrackSettings,
 )
-from intercap_core.joint.inputs import open_inputs
+from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.sequential import SequentialFits
-from intercap_core.schemas import SCENE
+from intercap_core.schemas import BODY_FIT, JOINT, SCENE
 from intercap_core.verdict.hold_out import JOINTS, HeldOut, hold_out
 from intercap_core.verdict.part import Part
 from intercap_core.verdict.stated import FEATURES, Stated, state
@@ -79,8 +79,11 @@ class Verdict:
             held = hold_out(inputs, settings, result)
             sequential = inputs.sequential
             parts = [part for part in Part if part != Part.OBJECT or inputs.geometry.has_object]
+            moved = _moved(inputs, result, body_fit, joint)
         stated = {
-            part: state(held, part, _sigma(sequential, part), _known(sequential, result, part))
+            part: state(
+                held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)
+            )
             for part in parts
         }
         for part, said in stated.items():
@@ -130,6 +133,23 @@ def _sigma(fits: SequentialFits, part: Part) -> np.ndarray:
     if part == Part.OBJECT:
         return fits.object_sigma
     return np.sqrt((fits.joint_sigma[:, JOINTS[part]] ** 2).mean(axis=1))
+
+
+def _moved(
+    inputs: JointInputs, result: JointResult, body_fit: Path, joint: Path
+) -> dict[Part, np.ndarray]:
+    """By how much the joint fit is elsewhere than the sequential ones (T,), metres, RMS over a
+    part's joints; of the object at its centre of mass."""
+    with artefacts.read(body_fit, BODY_FIT) as before, artefacts.read(joint, JOINT) as after:
+        apart = ((after["joints"] - before["joints"]).astype(float) ** 2).sum(axis=2)
+    found = {part: np.sqrt(apart[:, at].mean(axis=1)) for part, at in JOINTS.items()}
+    if inputs.geometry.has_object:
+        middle = inputs.geometry.mesh.centre_of_mass
+        old, new = inputs.sequential.state, result.state
+        turned = (new.rotation - old.rotation) @ middle
+        shift = turned + new.translation - old.translation
+        found[Part.OBJECT] = np.linalg.norm(shift, axis=1)
+    return found
 
 
 def _known(fits: SequentialFits, result: JointResult, part: Part) -> np.ndarray:

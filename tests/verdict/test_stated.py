@@ -27,11 +27,17 @@ def _held(shift: float, keypoint: float) -> HeldOut:
 
 
 def test_features_add_up_as_squares() -> None:
-    said = state(_held(0.003, 0.02), Part.BODY, np.full(T, 0.005), np.ones(T, bool))
-    rest, (shift, keypoint, sigma), spread = FACTORS[Part.BODY]
+    said = state(
+        _held(0.003, 0.02), Part.BODY, np.full(T, 0.005), np.full(T, 0.004), np.ones(T, bool)
+    )
+    rest, (shift, keypoint, sigma, moved), spread = FACTORS[Part.BODY]
     jackknife = np.sqrt(2 / 3 * 3 * 0.003**2)
     expected = np.sqrt(
-        rest**2 + (shift * jackknife) ** 2 + (keypoint * 0.02) ** 2 + (sigma * 0.005) ** 2
+        rest**2
+        + (shift * jackknife) ** 2
+        + (keypoint * 0.02) ** 2
+        + (sigma * 0.005) ** 2
+        + (moved * 0.004) ** 2
     )
     assert said.error == pytest.approx(expected)
     assert said.by_frame == pytest.approx(np.full(T, expected))
@@ -40,7 +46,7 @@ def test_features_add_up_as_squares() -> None:
 
 def test_frames_that_were_filled_in_say_nothing() -> None:
     known = np.array([True, True, True, False])
-    said = state(_held(0.003, 0.02), Part.OBJECT, np.full(T, 0.005), known)
+    said = state(_held(0.003, 0.02), Part.OBJECT, np.full(T, 0.005), np.zeros(T), known)
     assert np.isfinite(said.error)
     np.testing.assert_array_equal(np.isfinite(said.by_frame), known)
 
@@ -55,7 +61,7 @@ def test_frames_that_were_filled_in_say_nothing() -> None:
     ],
 )
 def test_nothing_is_said_without_evidence(held: HeldOut | None, known: int, reason: str) -> None:
-    said = state(held, Part.BODY, np.full(T, 0.005), np.arange(T) < known)
+    said = state(held, Part.BODY, np.full(T, 0.005), np.zeros(T), np.arange(T) < known)
     assert np.isnan(said.error) and np.isnan(said.by_frame).all()
     assert reason in said.silent
 
