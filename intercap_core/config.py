@@ -10,15 +10,28 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    model_validator,
+)
 
 from intercap_core.schemas import CONTACT_REGIONS
 
 MAX_POSITION_M = 50.0  # a capture volume is some metres wide
 MIN_FLOOR_WIDTH_M = 0.01  # floor points this close to one line give no plane
+# Of a start that is read off a time code, or off the frame of a clap: of a frame of 1/25 s, which
+# is seen as a whole, an even error of 1/25/sqrt(12) = 12 ms, and as much of the clock that is read.
+START_SIGMA_S = 0.02
 
 
 def _metres(value: float) -> float:
@@ -27,6 +40,11 @@ def _metres(value: float) -> float:
             f"positions are in metres, below {MAX_POSITION_M:.0f}; this looks like millimetres"
         )
     return value
+
+
+def _as_text(name: Any) -> Any:
+    """Names that are numbers are written as such: YAML reads them so."""
+    return str(name) if isinstance(name, int) and not isinstance(name, bool) else name
 
 
 def _not_reserved(name: str) -> str:
@@ -40,6 +58,9 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 RESERVED_SEQUENCES = ("recordings", "tables")  # folders beside those of the sequences
 Vector3 = tuple[float, float, float]
+CameraName = Annotated[str, BeforeValidator(_as_text), Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Seconds = Annotated[float, Field(strict=True)]
+StartSigma = Annotated[float, Field(strict=True, gt=0.0, le=10.0)]
 SequenceName = Annotated[Name, AfterValidator(_not_reserved)]
 Metres = Annotated[float, AfterValidator(_metres)]
 Position = tuple[Metres, Metres, Metres]
@@ -560,6 +581,21 @@ def _width(points: tuple[Position, ...]) -> float:
     return max(map(beside, points))
 
 
+class StatedStart(Model):
+    """When one camera started, and how well that is known."""
+
+    seconds: Seconds
+    """When its first image was taken, on the clock that all of them are stated on."""
+    sigma: StartSigma | None = None
+    """Standard deviation, seconds; absent = starts_sigma."""
+
+
+Start = Annotated[
+    Annotated[Seconds, Tag("number")] | Annotated[StatedStart, Tag("entries")],
+    Discriminator(lambda value: "number" if not isinstance(value, dict | Model) else "entries"),
+]
+
+
 class Annotation(Model):
     """annotations/<sequence>.yaml; every section is optional."""
 
@@ -574,6 +610,21 @@ class Annotation(Model):
     absent = who handles the object, or is seen most."""
     drop_frames: tuple[FrameNumber, ...] = ()
     """Frame sets to treat as not recorded."""
+    starts: dict[CameraName, Start] | None = None
+    """When cameras took their first images, seconds on one clock, whatever its zero: by camera, or
+    with a deviation of its own. The master is among them; absent = by the motion and the sound."""
+    starts_sigma: StartSigma = START_SIGMA_S
+    """Standard deviation of each of the starts that has none of its own, seconds."""
+
+    @model_validator(mode="after")
+    def _starts_beside_others(self) -> Annotation:
+        if self.starts is None and "starts_sigma" in self.model_fields_set:
+            raise ValueError("starts_sigma is stated without starts")
+        if self.starts is not None and len(self.starts) < 2:
+            raise ValueError(
+                "starts names fewer than two cameras; a start is told beside another's"
+            )
+        return self
 
     @model_validator(mode="after")
     def _floor_points(self) -> Annotation:
@@ -589,6 +640,29 @@ class Annotation(Model):
             for section in ("contact", "object_pose"):
                 if getattr(self, section):
                     return f"{section} is annotated, and the sequence names no object"
+        return None
+
+    @property
+    def stated_starts(self) -> dict[str, tuple[float, float]]:
+        """Seconds and their standard deviation by camera; empty where no start is stated."""
+        stated = {}
+        for name, start in (self.starts or {}).items():
+            if isinstance(start, StatedStart):
+                stated[name] = (start.seconds, start.sigma or self.starts_sigma)
+            else:
+                stated[name] = (start, self.starts_sigma)
+        return stated
+
+    def check_cameras(self, names: Sequence[str], master: str) -> str | None:
+        """Say which start is of none of the cameras ``names``, or that the ``master``'s lacks."""
+        for name in self.starts or ():
+            if name not in names:
+                return f"starts names camera {name!r}, the cameras are {', '.join(names)}"
+        if self.starts and master not in self.starts:
+            return (
+                f"starts lacks {master}, the master, beside which the others' are told (0 where "
+                "they are counted from it)"
+            )
         return None
 
     def check_frames(self, count: int) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,10 +89,14 @@ class Project:
             )
         with contextlib.suppress(artefacts.Unreadable):
             with artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source:
-                count = len(source["times"])
+                count, names = len(source["times"]), source.text("camera_names")
+                master = str(source.attributes["master"])
             problem = annotation.check_frames(count)
             if problem:
                 raise UserError(f"{path}: {problem} (numbered from 0); correct the entry")
+            problem = annotation.check_cameras(names, master)
+            if problem:
+                raise UserError(f"{path}: {problem}; correct the entry")
         return annotation
 
     def annotation_sections(self, sequence: str) -> dict[str, Any]:
@@ -276,8 +281,20 @@ def tidy(path: Path) -> Path:
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 
+def _without_base_60(tag: str, pattern: re.Pattern[str]) -> re.Pattern[str]:
+    """A scalar's ``pattern`` in YAML, without numbers that have colons."""
+    numbers = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+    return re.compile(f"(?![^:]*:)(?:{pattern.pattern})", re.X) if tag in numbers else pattern
+
+
 class _Loader(yaml.SafeLoader):
-    """The safe loader, which refuses a key that a mapping has twice."""
+    """The safe loader, which refuses a key that a mapping has twice, and reads 10:00:12:13 as text:
+    YAML 1.1 means a number to the base of 60, a user a time code."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 (as the base class has it)
+        first: [(tag, _without_base_60(tag, pattern)) for tag, pattern in resolvers]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()

@@ -246,6 +246,18 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ("subject: [{camera: k1, frame: 0, x: 612}]\n", ["subject.0.y", "required"]),
         ("subject: [{camera: k1, frame: 0, x: .nan, y: 1}]\n", ["subject.0.x", "finite"]),
         ("subject: [{camera: k1, frame: -2, x: 1, y: 1}]\n", ["subject.0.frame", "-2"]),
+        ("starts: {k1: 0}\n", ["starts names fewer than two cameras"]),
+        ("starts: [0, 1]\n", ["starts", "[0, 1]"]),
+        ("starts: {k1: 0, k2: true}\n", ["starts.k2", "True"]),
+        ("starts: {k1: 0, k2: '0.4'}\n", ["starts.k2", "'0.4'"]),
+        ("starts: {k1: 0, k2: .inf}\n", ["starts.k2", "finite"]),
+        ("starts: {k1: 10:00:12:13, k2: 10:00:12:20}\n", ["starts.k1", "'10:00:12:13'"]),
+        ("starts: {k1: 0, k/2: 1}\n", ["starts.k/2", "letters, digits"]),
+        ("starts: {k1: 0, k2: {sigma: 1}}\n", ["starts.k2", "seconds", "required"]),
+        ("starts: {k1: 0, k2: {seconds: 1, sigma: 0}}\n", ["starts.k2", "sigma", "greater", "0"]),
+        ("starts: {k1: 0, k2: 1}\nstarts_sigma: -1\n", ["starts_sigma", "greater", "-1"]),
+        ("starts: {k1: 0, k2: 1}\nstarts_sigma: 20\n", ["starts_sigma", "10", "20"]),
+        ("starts_sigma: 0.1\n", ["starts_sigma is stated without starts"]),
         ("flor: []\n", ["flor", "not permitted"]),
         ("contact: [\n", ["not valid YAML"]),
         ("- 1\n", ["expected names and values"]),
@@ -310,6 +322,16 @@ def test_annotation_past_the_end(folder: Path) -> None:
     who = pose.model_copy(update={"object_pose": None})
     assert who.check_frames(11) is None
     assert "subject[0].frame is 10" in str(who.check_frames(10))
+
+
+def test_starts_of_cameras_that_are_not_there() -> None:
+    stated = Annotation.model_validate({"starts": {"k1": 0, 2: {"seconds": -1.5, "sigma": 0.1}}})
+    assert stated.stated_starts == {"k1": (0.0, 0.02), "2": (-1.5, 0.1)}
+    assert stated.check_cameras(["k1", "2"], "k1") is None
+    said = str(stated.check_cameras(["k1", "k2", "k3"], "k1"))
+    assert said == "starts names camera '2', the cameras are k1, k2, k3"
+    assert "lacks k3, the master" in str(stated.check_cameras(["k1", "2", "k3"], "k3"))
+    assert Annotation().check_cameras(["k1"], "k1") is None and not Annotation().stated_starts
 
 
 def test_digest_follows_content_alone() -> None:

@@ -123,6 +123,21 @@ class Frames:
         return self._by_moment(self._artefact["skew"], np.nan)
 
     @cached_property
+    def first_image_s(self) -> np.ndarray:
+        """(C,) when each camera's first image was taken by its own times, seconds since the first
+        set, NaN = it has no image in any set."""
+        result = np.full(len(self.present), np.nan)
+        index, skew = self._artefact["colour_index"], self._artefact["skew"].astype(float)
+        for c, name in enumerate(self.rig.names):
+            seen = np.flatnonzero(index[:, c] >= 0)
+            if len(seen):
+                taken = self._artefact[f"cameras/{name}/colour_time"]
+                t = seen[0]
+                since = (taken[index[t, c]] - taken[0]) * 1e-6
+                result[c] = self.time_s[t] + skew[t, c] - since
+        return result
+
+    @cached_property
     def gravity(self) -> np.ndarray:
         """(C, 3): the direction down, unit, in each colour camera's frame; NaN = not known."""
         return self._artefact["gravity"]

@@ -116,6 +116,8 @@ def check_sequences(project: Project) -> Findings:
             project.annotation(name)
         except UserError as error:
             faults.append(Fault(name, str(error)))
+        else:
+            faults += _faults_of_starts(project, name)
         mesh = None if row.object is None else meshes[row.object]
         if mesh is not None:
             faults.append(Fault(name, mesh))
@@ -127,6 +129,23 @@ def check_sequences(project: Project) -> Findings:
         found.notes += [Fault(name, message) for message in looked.notes]
         found.summaries += [Fault(name, looked.summary)] if looked.summary else []
     return found
+
+
+def _faults_of_starts(project: Project, name: str) -> list[Fault]:
+    """Whether the annotation states starts of cameras that are not there; what else is wrong with
+    the recordings is told elsewhere."""
+    from intercap_core.capture.layouts import open_layout
+
+    annotation, row = project.annotation(name), project.sequences[name]
+    if annotation.starts is None or project.recordings_made(name) is not None:
+        return []
+    try:
+        extrinsics = open_layout(row).extrinsics
+    except (UserError, OSError):
+        return []
+    problem = annotation.check_cameras(list(extrinsics.master_from_colour), extrinsics.master)
+    path = project.annotation_path(name)
+    return [Fault(name, f"{path}: {problem}; correct the entry")] if problem else []
 
 
 def notes_of_sequences(project: Project) -> list[Fault]:

@@ -150,7 +150,7 @@ def _cell(text: str) -> str:
 
 def _resolved(entry: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
     """Follow references, also those of optional and repeated entries, to an inner model."""
-    options = [option for option in entry.get("anyOf", ()) if option.get("type") != "null"]
+    options = _options(entry)
     for candidate in (*options, entry.get("items", {}), entry.get("additionalProperties", {})):
         if isinstance(candidate, dict) and candidate:
             found = _resolved(candidate, top)
@@ -161,9 +161,15 @@ def _resolved(entry: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
     return entry
 
 
+def _options(entry: dict[str, Any]) -> list[dict[str, Any]]:
+    """The forms that an entry may have, beside being absent."""
+    either = (*entry.get("anyOf", ()), *entry.get("oneOf", ()))
+    return [option for option in either if option.get("type") != "null"]
+
+
 def _kind(entry: dict[str, Any], top: dict[str, Any]) -> str:
     """What a value may be, in words."""
-    options = [option for option in entry.get("anyOf", ()) if option.get("type") != "null"]
+    options = _options(entry)
     if options:
         return " or ".join(_kind(option, top) for option in options)
     if "enum" in entry or "const" in entry:
@@ -176,6 +182,9 @@ def _kind(entry: dict[str, Any], top: dict[str, Any]) -> str:
             return f"list of {len(entry['prefixItems'])} numbers"
         return f"list of: {_kind(entry.get('items', {}), top)}"
     if kind == "object":
+        values = entry.get("additionalProperties", {})
+        if isinstance(values, dict) and _options(values):
+            return f"names, each with {_kind(values, top)}"
         return "names, each with entries as below"
     if entry.get("format") == "path":
         return "path"

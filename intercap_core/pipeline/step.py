@@ -60,6 +60,7 @@ def run_step(
         "truth": row.truth,
         "frames_to_drop": annotation.drop_frames,
         "floor": annotation.floor,
+        "starts": annotation.stated_starts,
         "initial": annotation.object_pose,
         "contact": annotation.contact,
         "subject_points": annotation.subject,

@@ -210,6 +210,10 @@ EPIPOLAR_PX_AT_1080P = (
 START_BLOCK_S, START_BLOCKS_SHARE, START_SIGMAS, START_WORSE = 0.3, 0.7, 3.0, 0.2
 CLEAR_SIGMAS, START_PEAK_S, FEWEST_SETS_APART, FEWEST_BLOCKS = 1.0, 0.15, 2, 4
 START_ROUNDS = 5
+# Of what is stated of a start and what keypoints say, together: beyond, they are followed. With a
+# smaller number one honest statement in some thousand would be overruled, and told.
+DENIED_SIGMAS = 4.0
+LITTLE_ADDED = 0.7  # of a stated deviation that is left: the start rests on what was stated
 SLOWER_SETS = 1.5  # usual sets from one of a camera's images to the next: half way to half the rate
 MANY_VIEWS = 4  # suffice for the body's motion without those that slip
 

@@ -144,7 +144,7 @@ def refine(
                 )  # what is kept is as well known as it would be refined
     pairs = _pair_table(registration, held.estimate, found.estimate)
     sigma = np.sqrt(np.diagonal(found.covariance[:, OFFSET, :, OFFSET]))
-    unknown = sigma > KNOWN_OFFSET_SIGMA_S
+    unknown = (sigma > KNOWN_OFFSET_SIGMA_S) & np.isnan(starts.sigma)  # a stated time is known
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
     converged = found.last_step_m < CONVERGED_M

@@ -106,7 +106,7 @@ def find_slips(
     if slip.any():
         undisturbed = keypoints.copy()
         if len(rig) >= MANY_VIEWS:
-            undisturbed[slip != _constant(slip)] = 0
+            undisturbed[slip != constant_slip(slip)] = 0
         motion = build_motion(by_moment(undisturbed, slip), rig, times, motion.paths.points)
     offset = np.zeros(len(rig)) if offset is None else offset
     slip, intervals = _polished(slip, keypoints, motion, offset, steps, fps)
@@ -119,7 +119,7 @@ def _whole(interval: Interval, sets: int) -> bool:
     return interval.last - interval.first + 1 == sets
 
 
-def _constant(slip: np.ndarray) -> np.ndarray:
+def constant_slip(slip: np.ndarray) -> np.ndarray:
     """The delay common to all images of each camera (C,), in frames."""
     return np.where((slip != 0).all(0), np.median(slip, 0), 0).astype(np.int32)
 
@@ -165,7 +165,7 @@ def _polished(
     """Find each interval once more, against the motion that no slip disturbs any longer."""
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
-        constant = _constant(slip)[c]
+        constant = constant_slip(slip)[c]
         for run in _runs(slip[:, c] != constant):
             before = slip.copy()
             before[run, c] = constant

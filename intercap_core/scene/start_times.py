@@ -7,29 +7,28 @@ between the knees, ...), which stay where they are when a detector exchanges lef
 each pair of cameras and each lag the distances are summed robustly, each middle's median taken off,
 which is the calibration's error and not the time's; the lags of all pairs together give the
 cameras' times. Where the person hardly moves, or a motion repeats itself, nothing is said.
+
+What is stated of a start is where the search begins, as the images' own times are where nothing is:
+a camera leaves it where the views surely agree better elsewhere, and denies it if that is far away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import invert
-from intercap_core.camera.triangulation import pixel_scale
 from intercap_core.detections.read import PeopleOfImages
 from intercap_core.scene.constants import (
     CLEAR_SIGMAS,
-    EPIPOLAR_PX_AT_1080P,
     FEWEST_BLOCKS,
     FEWEST_SETS_APART,
     MAX_START_S,
     MAX_START_SHARE,
     MIN_SHARED_S,
+    PRIOR_OFFSET_S,
     START_BLOCK_S,
     START_BLOCKS_SHARE,
     START_PEAK_S,
@@ -38,21 +37,32 @@ from intercap_core.scene.constants import (
     START_WORSE,
 )
 from intercap_core.scene.people_in_view import followed
-
-_NO_MOTION_RAD = 1e-6
+from intercap_core.scene.start_costs import Pairs, mean
+from intercap_core.scene.stated_starts import StatedStarts, combined
 
 
 @dataclass(frozen=True, eq=False)
 class Starts:
     """By how much each camera's images are older than their sets say, all along: ``late`` (C,) s,
     the master's 0, and the nearest whole number of ``sets`` (C,). ``apart``: the cameras were not
-    started together. ``in_doubt`` (C,): then this camera's time could not be told."""
+    started together. ``in_doubt`` (C,): then this camera's time could not be told. ``sigma`` (C,) s
+    that ``late`` is off by where it rests on what was stated, else NaN; ``denied`` (C,): something
+    was stated, and the keypoints say otherwise."""
 
     late: np.ndarray
     sets: np.ndarray
     in_doubt: np.ndarray
     apart: bool
     step_s: float
+    sigma: np.ndarray
+    denied: np.ndarray
+
+    @classmethod
+    def as_stated(cls, stated: StatedStarts, step_s: float) -> Starts:
+        """What is stated, and of other cameras what their images' times say."""
+        none = np.zeros(len(stated.late), bool)
+        late = np.nan_to_num(stated.late)
+        return cls(late, stated.sets(step_s), none, False, step_s, stated.sigma.copy(), none.copy())
 
     @property
     def offset(self) -> np.ndarray:
@@ -61,17 +71,21 @@ class Starts:
 
     @property
     def offset_sigma(self) -> np.ndarray | None:
-        """(C,) s that these offsets are off by: half a set; None where nothing started apart."""
-        return np.full(len(self.late), self.step_s / 2) if self.apart else None
+        """(C,) s that these offsets are off by: what was stated, else half a set of cameras that
+        started apart; None where nothing is stated and nothing started apart."""
+        stated = np.isfinite(self.sigma)
+        if not self.apart and not stated.any():
+            return None
+        return np.where(stated, self.sigma, self.step_s / 2 if self.apart else PRIOR_OFFSET_S)
 
     def in_step(self, values: np.ndarray) -> np.ndarray:
         """Values (T, C, ...) of images, with each camera's moved to the sets of its moments; 0
         where there is no image."""
-        return self._moved(values, self.sets)
+        return moved(values, self.sets)
 
     def of_images(self, values: np.ndarray) -> np.ndarray:
         """Values (T, C, ...) of moments, as :meth:`in_step` gives them, moved back."""
-        return self._moved(values, -self.sets)
+        return moved(values, -self.sets)
 
     def with_slips(self, slip: np.ndarray) -> np.ndarray:
         """By how many sets (T, C) images are late in all, from slips (T, C) that were found in
@@ -80,14 +94,16 @@ class Starts:
         place = np.clip(np.arange(len(slip))[:, None] - self.sets, 0, last)
         return np.take_along_axis(slip, place, 0) + self.sets.astype(slip.dtype)
 
-    @staticmethod
-    def _moved(values: np.ndarray, by: np.ndarray) -> np.ndarray:
-        sets = len(values)
-        result = np.zeros_like(values)
-        for c, shift in enumerate(by.tolist()):
-            there = slice(max(0, -shift), max(0, min(sets, sets - shift)))
-            result[there, c] = values[max(0, shift) : max(0, sets + min(0, shift)), c]
-        return result
+
+def moved(values: np.ndarray, by: np.ndarray, fill: float = 0) -> np.ndarray:
+    """Values (T, C, ...) of images with each camera's ``by`` (C,) sets earlier; ``fill`` where
+    there are none."""
+    sets = len(values)
+    result = np.full_like(values, fill)
+    for c, shift in enumerate(by.tolist()):
+        there = slice(max(0, -shift), max(0, min(sets, sets - shift)))
+        result[there, c] = values[max(0, shift) : max(0, sets + min(0, shift)), c]
+    return result
 
 
 @dataclass(frozen=True)
@@ -117,207 +133,185 @@ def find_starts(
     available: np.ndarray,
     *,
     master: int = 0,
+    stated: StatedStarts | None = None,
 ) -> Starts:
-    """When the cameras started, from all people that they show.
+    """When the cameras started, from all people that they show, and from what is ``stated``.
 
     ``times`` (T,) s of the sets; ``available`` (T, C): the set has an image of the camera.
     """
     views, sets = len(rig), len(times)
     step = float(np.median(np.diff(times))) if sets > 1 else 0.0
-    together = Starts(np.zeros(views), np.zeros(views, int), np.zeros(views, bool), False, step)
+    told = stated or StatedStarts.nothing(views)
+    as_stated = Starts.as_stated(told, step)
     if sets < 2 or views < 2:
-        return together
+        return as_stated
     reach = min(round(MAX_START_S / step), int(MAX_START_SHARE * sets))
     fewest = max(MIN_SHARED_S / step, 1)
     if reach < 1 or sets - reach < fewest:
-        return together
-    pairs = _Pairs.of(followed(detections, rig, times, available), rig, reach, fewest)
-    late = _descended(pairs, master)
+        return as_stated
+    rays = moved(followed(detections, rig, times, available), as_stated.sets, np.nan)
+    search = _Search(
+        Pairs.of(rays, rig, reach, fewest), master, step, told.bounds(step, reach), told.known
+    )
+    late, denied = search.agreed()
     others = [c for c in range(views) if c != master]
+    sure = {c: bool(denied[c]) or search.is_apart(late, c) for c in others}
     # that one camera surely started apart says that nobody started them together
-    if not any(_is_apart(pairs, late, c, step) for c in others):
-        return together
-    found = replace(together, apart=True)
+    if not any(sure.values()) and not told.says_apart(step):
+        return as_stated
+    found = replace(as_stated, apart=True, denied=denied)
     for c in others:
-        if _is_clear(pairs, late, c, step):
-            found.late[c] = (late[c] + _between(pairs, late, c)) * step
-            found.sets[c] = late[c]
-        else:
-            found.in_doubt[c] = True
+        if told.known[c] and not sure[c]:
+            continue
+        if not told.known[c]:
+            # that somebody moves at all is not known where only what is stated says "apart"
+            moves = any(sure.values()) or abs(late[c]) < FEWEST_SETS_APART
+            if not moves or not search.is_clear(late, c):
+                found.in_doubt[c] = True
+                continue
+        found.late[c] = (found.sets[c] + late[c] + search.between(late, c)) * step
+        found.sets[c] += late[c]
+        if denied[c]:
+            found.sigma[c] = np.nan
+        elif told.known[c]:
+            found.late[c], found.sigma[c] = combined(
+                (found.late[c], step / 2), (told.late[c], told.sigma[c])
+            )
     return found
 
 
 @dataclass(frozen=True, eq=False)
-class _Pairs:
-    """How badly two cameras a < b agree, 0 to 1, if b's image of set t + lag shows what a's of set
-    t does: ``cost[a, b]`` (4 reach + 1, T), lags from - 2 reach, NaN = not known."""
+class _Search:
+    """How late cameras are beside what is stated, whole sets: ``bounds`` (C,) within which they do
+    not deny it, of cameras of which something is ``stated`` (C,)."""
 
-    cost: dict[tuple[int, int], np.ndarray]
-    views: int
-    reach: int
+    pairs: Pairs
+    master: int
+    step: float
+    bounds: np.ndarray
+    stated: np.ndarray
 
-    @classmethod
-    def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> _Pairs:
-        """From ``rays`` (T, C, P, K, 2); lags at which fewer than ``fewest`` sets tell stay NaN."""
-        lags = range(-2 * reach, 2 * reach + 1)
-        cost = {
-            (a, b): np.stack([_cost(rays, rig, a, b, lag, fewest) for lag in lags])
-            for a, b in combinations(range(len(rig)), 2)
-        }
-        return cls(cost, len(rig), reach)
+    def agreed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Sets (C,) where the views agree best, and which cameras (C,) deny what is stated: they do
+        one after another, the surest first, since a wrong one disturbs the rest."""
+        denied = np.zeros(len(self.bounds), bool)
+        bounds = self.bounds.copy()
+        while True:
+            late = self._descended(bounds)
+            doubtful = self.stated & ~denied & (late != 0)
+            doubtful &= [not self.is_apart(late, c) for c in range(len(late))]
+            if doubtful.any():  # nothing sure leads away from what is stated
+                bounds[doubtful] = 0
+                continue
+            denials = {
+                c: denial
+                for c in np.flatnonzero(self.stated & ~denied).tolist()
+                if (denial := self._denial(late, c)) > 0
+            }
+            if not denials:
+                return late, denied
+            denied[max(denials, key=lambda c: denials[c])] = True
+            bounds = np.where(denied, self.pairs.reach, self.bounds)
 
-    def series(self, camera: int, late: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
-        """The cost (T + 2 reach,) of a camera's pairs with ``others`` by moment, if it is late by
-        ``late`` sets and they by ``sets`` (C,)."""
-        found = []
-        for other in others:
-            a, b = sorted((camera, other))
-            own, theirs = (late, int(sets[other]))
-            lag = own - theirs if a == other else theirs - own
-            row = self.cost[a, b][lag + 2 * self.reach]
-            series = np.full(len(row) + 2 * self.reach, np.nan)
-            start = self.reach - (theirs if a == other else own)  # a's set t shows moment t - late
-            series[start : start + len(row)] = row
-            found.append(series)
-        return _mean(np.array(found))
+    def _denial(self, late: np.ndarray, camera: int) -> float:
+        """By how much the views agree better with a camera out of its bounds, 0 = not surely."""
+        profile = self.pairs.profile(camera, self._others(camera), late)
+        tried = np.arange(-self.pairs.reach, self.pairs.reach + 1)
+        if not np.isfinite(profile).any():
+            return 0.0
+        best = int(tried[np.nanargmin(profile)])
+        if abs(best) <= self.bounds[camera]:
+            return 0.0
+        there = late.copy()
+        there[camera] = best
+        if not self.is_apart(there, camera, int(late[camera])) or not self.is_clear(there, camera):
+            return 0.0
+        return float(self._worse(there, camera, int(late[camera])).mean())
 
-    def profile(self, camera: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
-        """Mean cost (2 reach + 1,) by how late a camera is, NaN where no pair tells."""
-        tried = range(-self.reach, self.reach + 1)
-        return _mean(np.array([self.series(camera, k, others, sets) for k in tried]).T)
+    def _descended(self, bounds: np.ndarray) -> np.ndarray:
+        """How late (C,), in sets, cameras are where all pairs agree best, within ``bounds`` (C,):
+        they join one after another, the clearest first, then each is moved until none moves."""
+        pairs, master = self.pairs, self.master
+        sets, joined = np.zeros(pairs.views, int), [master]
+        waiting = [c for c in range(pairs.views) if c != master]
+        while waiting:
+            profiles = {c: pairs.profile(c, joined, sets, int(bounds[c])) for c in waiting}
+            # what is stated needs no motion to be told
+            least = np.where(self.stated, np.finfo(float).tiny, 0.0)
+            gains = {
+                c: max(_gain(profile), least[c]) if np.isfinite(profile).any() else 0.0
+                for c, profile in profiles.items()
+            }
+            c = max(waiting, key=lambda c: gains[c])
+            if gains[c] > 0:
+                sets[c] = np.nanargmin(profiles[c]) - pairs.reach
+                joined.append(c)
+            waiting.remove(c)
+        for _ in range(START_ROUNDS):
+            before = sets.copy()
+            for c in joined[1:]:
+                profile = pairs.profile(c, [o for o in joined if o != c], sets, int(bounds[c]))
+                if np.isfinite(profile).any():
+                    sets[c] = np.nanargmin(profile) - pairs.reach
+            if (before == sets).all():
+                break
+        return sets
 
+    def is_apart(self, sets: np.ndarray, camera: int, instead: int = 0) -> bool:
+        """Whether a camera is in no doubt not at ``instead``: by more than what slips and offsets
+        explain, and the views disagree with it again and again over the recording."""
+        if abs(sets[camera] - instead) < FEWEST_SETS_APART:
+            return False
+        worse = self._worse(sets, camera, instead)
+        if len(worse) < FEWEST_BLOCKS:
+            return False
+        series = self.pairs.series(camera, int(sets[camera]), self._others(camera), sets)
+        usual = np.nanmean(series)
+        least = max(START_WORSE * usual, START_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
+        return bool((worse > 0).mean() >= START_BLOCKS_SHARE and worse.mean() > least)
 
-def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -> np.ndarray:
-    """One lag's costs (T,) of :class:`_Pairs`: of each person whom camera a follows, and the one of
-    camera b who agrees best all along, how far the distances to each other's epipolar lines are
-    from their medians over time; the mean over people by how much they move."""
-    sets = len(rays)
-    found = np.full(sets, np.nan)
-    at = slice(max(0, -lag), min(sets, sets - lag))
-    if at.stop - at.start < fewest:
-        return found
-    first = rays[at, a]
-    distance = _epipolar(first, rays[at.start + lag : at.stop + lag, b], rig, a, b)
-    seen = np.isfinite(distance).sum(0, keepdims=True)
-    distance = np.where(seen >= fewest, distance, np.nan)  # of people who are seen for long enough
-    known = np.isfinite(distance).any(-1)  # (T, P, Q)
-    size = _mean(_mean(np.moveaxis(np.abs(distance), -1, 0)))
-    size[known.sum(0) < fewest] = np.nan
-    cost, weight = np.full((2, first.shape[1], len(first)), np.nan)
-    for p in np.flatnonzero(np.isfinite(size).any(1)):
-        own = distance[:, p, np.nanargmin(size[p])]
-        own = own[:, np.isfinite(own).any(0)]
-        change = (own - np.nanmedian(own, axis=0)) / EPIPOLAR_PX_AT_1080P
-        cost[p] = _mean((change**2 / (1 + change**2)).T)
-        weight[p] = np.where(np.isfinite(cost[p]), _moves(first[:, p]), np.nan)
-    found[at] = _mean(weight * cost) / _mean(weight)
-    return found
+    def is_clear(self, sets: np.ndarray, camera: int) -> bool:
+        """Whether the views agree better at a camera's time than at any that is not near."""
+        pairs = self.pairs
+        profile = pairs.profile(camera, self._others(camera), sets)
+        tried = np.arange(-pairs.reach, pairs.reach + 1)
+        far = (np.abs(tried - sets[camera]) * self.step > START_PEAK_S) & np.isfinite(profile)
+        if not far.any() or not np.isfinite(profile[sets[camera] + pairs.reach]):
+            return False
+        next_best = int(tried[far][profile[far].argmin()])
+        worse = self._worse(sets, camera, next_best)
+        if len(worse) < FEWEST_BLOCKS:
+            return True  # hardly anything was seen at the same time: a time like any other
+        return bool(worse.mean() > CLEAR_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
 
+    def _worse(self, sets: np.ndarray, camera: int, late: int) -> np.ndarray:
+        """By how much (N,) a camera's views agree worse if it is ``late`` by so many sets than at
+        its own time, mean of each block of time in which both are known."""
+        others = self._others(camera)
+        own = self.pairs.series(camera, int(sets[camera]), others, sets)
+        change = self.pairs.series(camera, late, others, sets) - own
+        size = max(1, round(START_BLOCK_S / self.step))
+        whole = change[: len(change) // size * size].reshape(-1, size)
+        return mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
 
-def _moves(rays: np.ndarray) -> float:
-    """How far, rad, somebody's rays (T, K, 2) are from their mean: who stands still is in step with
-    anything, and says nothing. Never 0."""
-    return _NO_MOTION_RAD + float(np.nanmean(np.sqrt(np.nanvar(rays, axis=0).sum(-1))))
+    def between(self, sets: np.ndarray, camera: int) -> float:
+        """How far from its whole number of sets, in sets, a parabola of a camera's cost is
+        lowest."""
+        place = sets[camera] + self.pairs.reach
+        profile = self.pairs.profile(camera, self._others(camera), sets)
+        profile = profile[max(place - 1, 0) : place + 2]
+        if len(profile) < 3 or not np.isfinite(profile).all():
+            return 0.0
+        bend = profile[0] - 2 * profile[1] + profile[2]
+        return (
+            float(np.clip((profile[0] - profile[2]) / (2 * bend), -0.5, 0.5)) if bend > 0 else 0.0
+        )
 
-
-def _epipolar(first: np.ndarray, second: np.ndarray, rig: Rig, a: int, b: int) -> np.ndarray:
-    """Signed distances (T, P, Q, K) of people (T, P, K, 2) of camera a and (T, Q, K, 2) of b from
-    each other's epipolar lines, pixels at 1080p (Sampson)."""
-    b_from_a = invert(rig[b].master_from_colour) @ rig[a].master_from_colour
-    x, y, z = b_from_a[:3, 3]
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a[:3, :3]
-    scale = pixel_scale(rig)
-    focal = np.mean([rig[c].colour.fx / scale[c] for c in (a, b)])
-    one, two = (np.concatenate([p, np.ones_like(p[..., :1])], -1) for p in (first, second))
-    line, back = (one @ essential.T)[:, :, None], (two @ essential)[:, None]
-    size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
-    return focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
-
-
-def _descended(pairs: _Pairs, master: int) -> np.ndarray:
-    """How late (C,), in sets, cameras are where all pairs agree best: they join one after another,
-    the clearest first, then each is moved until none moves."""
-    sets, joined = np.zeros(pairs.views, int), [master]
-    waiting = [c for c in range(pairs.views) if c != master]
-    while waiting:
-        profiles = {c: pairs.profile(c, joined, sets) for c in waiting}
-        gains = {c: _gain(profile) for c, profile in profiles.items()}
-        c = max(waiting, key=lambda c: gains[c])
-        if gains[c] > 0:
-            sets[c] = np.nanargmin(profiles[c]) - pairs.reach
-            joined.append(c)
-        waiting.remove(c)
-    for _ in range(START_ROUNDS):
-        before = sets.copy()
-        for c in joined[1:]:
-            profile = pairs.profile(c, [o for o in joined if o != c], sets)
-            sets[c] = np.nanargmin(profile) - pairs.reach
-        if (before == sets).all():
-            break
-    return sets
+    def _others(self, camera: int) -> list[int]:
+        return [c for c in range(self.pairs.views) if c != camera]
 
 
 def _gain(profile: np.ndarray) -> float:
     """How much better the best of a profile is than usual; 0 where nothing is known."""
     known = profile[np.isfinite(profile)]
     return float(np.median(known) - known.min()) if len(known) else 0.0
-
-
-def _is_apart(pairs: _Pairs, sets: np.ndarray, camera: int, step: float) -> bool:
-    """Whether a camera is in no doubt out of step: by more than what slips and offsets explain, and
-    the views disagree with that it is in step again and again over the recording."""
-    if abs(sets[camera]) < FEWEST_SETS_APART:
-        return False
-    worse = _worse(pairs, sets, camera, 0, step)
-    if len(worse) < FEWEST_BLOCKS:
-        return False
-    usual = np.nanmean(pairs.series(camera, int(sets[camera]), _others(pairs, camera), sets))
-    least = max(START_WORSE * usual, START_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
-    return bool((worse > 0).mean() >= START_BLOCKS_SHARE and worse.mean() > least)
-
-
-def _is_clear(pairs: _Pairs, sets: np.ndarray, camera: int, step: float) -> bool:
-    """Whether the views agree better at a camera's time than at any that is not near."""
-    profile = pairs.profile(camera, _others(pairs, camera), sets)
-    tried = np.arange(-pairs.reach, pairs.reach + 1)
-    far = (np.abs(tried - sets[camera]) * step > START_PEAK_S) & np.isfinite(profile)
-    if not far.any() or not np.isfinite(profile[sets[camera] + pairs.reach]):
-        return False
-    next_best = int(tried[far][profile[far].argmin()])
-    worse = _worse(pairs, sets, camera, next_best, step)
-    if len(worse) < FEWEST_BLOCKS:
-        return True  # hardly anything was seen at the same time: a time like any other
-    return bool(worse.mean() > CLEAR_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
-
-
-def _worse(pairs: _Pairs, sets: np.ndarray, camera: int, late: int, step: float) -> np.ndarray:
-    """By how much (N,) a camera's views agree worse if it is ``late`` by so many sets than at its
-    own time, mean of each block of time in which both are known."""
-    others = _others(pairs, camera)
-    own = pairs.series(camera, int(sets[camera]), others, sets)
-    change = pairs.series(camera, late, others, sets) - own
-    size = max(1, round(START_BLOCK_S / step))
-    whole = change[: len(change) // size * size].reshape(-1, size)
-    return _mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
-
-
-def _others(pairs: _Pairs, camera: int) -> list[int]:
-    return [c for c in range(pairs.views) if c != camera]
-
-
-def _between(pairs: _Pairs, sets: np.ndarray, camera: int) -> float:
-    """How far from its whole number of sets, in sets, a parabola of a camera's cost is lowest."""
-    place = sets[camera] + pairs.reach
-    profile = pairs.profile(camera, _others(pairs, camera), sets)[max(place - 1, 0) : place + 2]
-    if len(profile) < 3 or not np.isfinite(profile).all():
-        return 0.0
-    bend = profile[0] - 2 * profile[1] + profile[2]
-    return float(np.clip((profile[0] - profile[2]) / (2 * bend), -0.5, 0.5)) if bend > 0 else 0.0
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is known; NaN where nothing is."""
-    known = np.isfinite(values)
-    count = known.sum(0)
-    total = np.where(known, values, 0.0).sum(0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

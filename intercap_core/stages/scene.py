@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,8 @@ from intercap_core.scene.ground import (
 from intercap_core.scene.lens_exchange import Exchange, exchange_lenses
 from intercap_core.scene.moments import Moments, find_moments
 from intercap_core.scene.moving import moving_surfaces
+from intercap_core.scene.start_verdicts import note_of_stated
+from intercap_core.scene.stated_starts import StatedStarts, when
 from intercap_core.scene.subject_views import SubjectViews, triangulated
 from intercap_core.scene.surface import Surface, background_surfaces
 from intercap_core.scene.up import (
@@ -46,13 +48,20 @@ Floor = Sequence[tuple[float, float, float]]
 
 
 def run(
-    *, frames: Path, detections: Path, output: Path, settings: SceneSettings, floor: Floor | None
+    *,
+    frames: Path,
+    detections: Path,
+    output: Path,
+    settings: SceneSettings,
+    floor: Floor | None,
+    starts: Mapping[str, tuple[float, float]] | None = None,
 ) -> None:
     """Write the scene artefact of one sequence.
 
-    ``floor`` are annotated floor points, master frame, metres, which override the fit. Raises
+    ``floor`` are annotated floor points, master frame, metres, which override the fit; ``starts``
+    annotated times of cameras' first images and their standard deviations, seconds. Raises
     UserError where the recording has no image at all, the two artefacts are of different
-    recordings, or the annotated points give no plane.
+    recordings, the annotated points give no plane, or the annotated starts nothing in common.
     """
     with Frames.open(frames) as source:
         if not source.available.any():
@@ -68,8 +77,9 @@ def run(
                 f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
             )
         rig, master = source.rig, source.rig.names.index(source.master)
+        stated = _stated_starts(source, starts or {}, master)
         moments = find_moments(
-            people, rig, source.time_s, source.fps, source.available, master=master
+            people, rig, source.time_s, source.fps, source.available, master=master, stated=stated
         )
         subject, image_of = moments.subject, moments.image_of
         oddities = _check_stated_up(source, subject)
@@ -95,7 +105,7 @@ def run(
         ground, odd = _with_feet(source, rig, ground, subject)
         oddities += odd
         slides, known_to = _slides(source, rig, refined, ground)
-        notes = _notes(source, refined, moments, exchanges)
+        notes = _notes(source, refined, moments, stated, exchanges)
         for note, slide, words in zip(notes, slides, known_to, strict=True):
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
         _write(
@@ -116,6 +126,20 @@ def run(
             ],
             settings,
         )
+
+
+def _stated_starts(
+    source: Frames, starts: Mapping[str, tuple[float, float]], master: int
+) -> StatedStarts:
+    names = source.rig.names
+    if not starts:
+        return StatedStarts.nothing(len(names))
+    stated = StatedStarts.of(starts, names, master, source.first_image_s, "the annotation")
+    try:
+        stated.check_common(source.time_s, names)
+    except UserError as error:
+        raise UserError(f"sequence {source.sequence}: {error}") from None
+    return stated
 
 
 def _backgrounds(
@@ -270,6 +294,7 @@ def _notes(
     source: Frames,
     refined: Refinement,
     moments: Moments,
+    stated: StatedStarts,
     exchanges: Sequence[Exchange],
 ) -> list[list[str]]:
     """What each camera's lens, pose and time rest on, and where it slips."""
@@ -285,21 +310,22 @@ def _notes(
                 f"and were put right ({shown})"
             )
     starts = moments.starts
-    for c in np.flatnonzero(starts.sets).tolist():
-        seconds, when = abs(starts.late[c]), "later" if starts.late[c] > 0 else "earlier"
-        notes[c].append(
-            f"it started {seconds:.3f} s {when} than its times say, and was brought into step"
-        )
+    for c in np.flatnonzero(source.present & ~stated.known & (starts.sets != 0)).tolist():
+        notes[c].append(f"it started {when(starts.late[c])}, and was brought into step")
+    for c in np.flatnonzero(source.present).tolist():
+        left, sigma = float(refined.offset[c]), float(refined.offset_sigma[c])
+        note = note_of_stated(stated, starts, moments.slips, c, left, sigma)
+        notes[c] += [note] if note else []
     for c in np.flatnonzero(starts.in_doubt).tolist():
         notes[c].append(
             "set aside: the cameras were not started together, and by how much this one is out of "
-            "step could not be told"
+            "step could not be told; state when it started (starts of the annotation)"
         )
     for interval in moments.slips.intervals:
-        count, when = abs(interval.slip), "late" if interval.slip > 0 else "early"
+        count, way = abs(interval.slip), "late" if interval.slip > 0 else "early"
         frames = "1 frame" if count == 1 else f"{count} frames"
         notes[interval.camera].append(
-            f"its images are {frames} {when} in sets {interval.first} to {interval.last}"
+            f"its images are {frames} {way} in sets {interval.first} to {interval.last}"
         )
     for c, present in enumerate(source.present):
         if present and np.isnan(refined.offset_sigma[c]):

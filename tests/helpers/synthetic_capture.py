@@ -187,9 +187,11 @@ def write_frames(
     dropped: np.ndarray | None = None,
     gravity: np.ndarray | None = None,
     stated: Mapping[str, np.ndarray] | None = None,
+    colour_times: bool = False,
 ) -> Path:
     """Write a frames artefact without colour; ``depths`` has (T, H, W) uint16 for each camera,
-    ``stated`` what is stated of the calibration's world, by dataset."""
+    ``stated`` what is stated of the calibration's world, by dataset; ``colour_times``: with the
+    device times of colour images, which begin at 7 s."""
     count = len(rig)
     sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
     none = np.full((num_sets, count), -1)
@@ -208,4 +210,7 @@ def write_frames(
         for index, name in enumerate(rig.names):
             if depths is not None:
                 writer.put(f"cameras/{name}/depth", depths[index])
+            if colour_times:
+                times = 7_000_000 + np.rint(np.arange(num_sets) * 1e6 / 15).astype(np.int64)
+                writer.put(f"cameras/{name}/colour_time", times)
     return path

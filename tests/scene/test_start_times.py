@@ -9,10 +9,13 @@ import pytest
 
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.camera.triangulation import reproject
+from intercap_core.errors import UserError
 from intercap_core.person.sides import swapped
 from intercap_core.scene.moments import find_moments
 from intercap_core.scene.people_in_view import middles
 from intercap_core.scene.start_times import InStep, Starts, find_starts
+from intercap_core.scene.start_verdicts import note_of_stated
+from intercap_core.scene.stated_starts import StatedStarts, when
 from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking
@@ -169,9 +172,14 @@ def test_middles_do_not_depend_on_sides():
     assert np.isnan(middles(person)).any(axis=1).sum() == 1
 
 
+def brought(late: np.ndarray, sets: np.ndarray) -> Starts:
+    none = np.zeros(len(late), bool)
+    return Starts(late, sets, none, True, 0.1, np.full(len(late), np.nan), none)
+
+
 def test_images_move_to_their_moments_and_back():
     """Camera 1's images are two sets old, camera 2's are one ahead."""
-    starts = Starts(np.array([0, 0.21, -0.1]), np.array([0, 2, -1]), np.zeros(3, bool), True, 0.1)
+    starts = brought(np.array([0, 0.21, -0.1]), np.array([0, 2, -1]))
     images = np.arange(1, 16).reshape(5, 3)
     moved = starts.in_step(images)
     assert moved[:, 0].tolist() == images[:, 0].tolist()
@@ -188,7 +196,120 @@ def test_images_move_to_their_moments_and_back():
 
 def test_people_follow_the_images():
     late = Late([[[np.full((135, 3), t)] for _ in range(2)] for t in range(4)], np.zeros(2, int))
-    starts = Starts(np.zeros(2), np.array([0, 1]), np.array([False, False]), True, 0.1)
+    starts = brought(np.zeros(2), np.array([0, 1]))
     seen = InStep(late, starts)
     assert seen.num_sets == 4
     assert seen.people(1, 1)[0, 0, 0] == 2 and not len(seen.people(3, 1))
+
+
+def stated(late: np.ndarray, sigma: float = 0.028) -> StatedStarts:
+    """What somebody states of all cameras but the master."""
+    late = np.r_[np.nan, late[1:]]
+    source = ("", *("the annotation",) * (len(late) - 1))
+    return StatedStarts(late, np.where(np.isnan(late), np.nan, sigma), source)
+
+
+def test_who_stands_still_is_brought_into_step_as_stated():
+    late = np.r_[0.0, np.random.default_rng(4).uniform(-1, 1, len(RIG) - 1)]
+    seen = walk(late, 15.0, 4.0, moving=False)
+    told = stated(late + 0.01)
+    moments = find_moments(
+        seen, RIG, np.arange(60) / 15, 15.0, seen.available, master=0, stated=told
+    )
+    starts = moments.starts
+    assert not starts.in_doubt.any() and not starts.denied.any()
+    assert (starts.sets == np.round(told.sets(1 / 15))).all()
+    np.testing.assert_allclose(starts.late[1:], late[1:] + 0.01, atol=1e-9)
+    np.testing.assert_allclose(starts.offset_sigma[1:], 0.028)
+    left = starts.sets / 15 - starts.offset - late
+    assert np.abs(left[1:]).max() < 0.011
+
+
+@pytest.mark.parametrize("seconds", [4.0, 6.0])
+def test_a_stated_start_may_be_farther_than_any_search(seconds):
+    """More than a third of the recording: no search without it looks so far."""
+    late = np.zeros(len(RIG))
+    late[2] = 0.55 * seconds
+    seen = walk(late, 15.0, seconds)
+    times = np.arange(seen.num_sets) / 15
+    found = find_starts(seen, RIG, times, seen.available, stated=stated(late + 0.01))
+    assert found.apart and not found.in_doubt.any() and not found.denied.any()
+    assert np.abs(found.late - late).max() < 0.03
+
+
+@pytest.mark.parametrize(("fps", "wrong"), [(15.0, 0.4), (30.0, -0.4), (60.0, 0.4)])
+def test_a_wrong_start_is_denied_by_who_walks(fps, wrong):
+    late = np.r_[0.0, np.random.default_rng(6).uniform(-0.8, 0.8, len(RIG) - 1)]
+    seen = walk(late, fps, 4.0)
+    times = np.arange(seen.num_sets) / fps
+    told = stated(late + wrong * (np.arange(len(RIG)) == 2))
+    moments = find_moments(seen, RIG, times, fps, seen.available, master=0, stated=told)
+    starts = moments.starts
+    assert np.flatnonzero(starts.denied).tolist() == [2] and np.isnan(starts.sigma[2])
+    assert np.abs(starts.late - late).max() < 0.5 / fps + 0.02
+    note = note_of_stated(told, starts, moments.slips, 2, moments.timing.offset[2], 0.002)
+    assert note.startswith("the annotation has it start") and "deny" in note
+    assert f"{abs(late[2] + wrong):.3f} s" in note
+    for c in (1, 3, 4, 5):
+        kept = note_of_stated(told, starts, moments.slips, c, moments.timing.offset[c], 0.002)
+        assert "and was brought into step: so say the annotation and the keypoints" in kept
+
+
+def test_a_sharp_statement_that_is_a_little_wrong_is_denied_by_the_offsets():
+    """Told to a millisecond, wrong by 20: no whole set, so that the offsets tell."""
+    late = np.zeros(len(RIG))
+    seen = walk(late, 30.0, 4.0)
+    told = stated(np.array([0, 0.02, 0, 0, 0, 0]), 0.001)
+    times = np.arange(seen.num_sets) / 30
+    moments = find_moments(seen, RIG, times, 30.0, seen.available, master=0, stated=told)
+    assert np.flatnonzero(moments.starts.denied).tolist() == [1]
+    late = moments.slip.mean(0) / 30 - moments.timing.offset
+    assert (
+        np.abs(late).max() < 0.004
+        and np.abs(moments.starts.offset - moments.timing.offset)[1] < 1e-9
+    )
+
+
+def test_of_cameras_that_nobody_states_the_keypoints_tell():
+    late = np.r_[0.0, 0.7, -0.6, 0.5, -0.4, 0.3]
+    seen = walk(late, 15.0, 5.0)
+    told = stated(np.where(np.arange(6) < 3, late, np.nan))
+    told = StatedStarts(told.late, np.where(np.isnan(told.late), np.nan, 0.028), told.source)
+    found = find_starts(seen, RIG, np.arange(seen.num_sets) / 15, seen.available, stated=told)
+    assert not found.in_doubt.any() and np.abs(found.late - late).max() < 0.5 / 15
+    still = walk(late, 15.0, 5.0, moving=False)
+    found = find_starts(still, RIG, np.arange(seen.num_sets) / 15, still.available, stated=told)
+    assert found.apart and found.in_doubt.tolist() == [False] * 3 + [True] * 3
+
+
+def test_starts_are_told_beside_the_times_of_the_files():
+    """k2 began to record 2 s after k1; its file's times say 0.5 s."""
+    told = StatedStarts.of(
+        {"k1": (100.0, 0.03), "k2": (102.0, 0.04)},
+        ["k1", "k2", "k3"],
+        0,
+        np.array([0.0, 0.5, 0.0]),
+        "the annotation",
+    )
+    np.testing.assert_allclose(told.late, [np.nan, -1.5, np.nan])
+    np.testing.assert_allclose(told.sigma, [np.nan, 0.05, np.nan])
+    assert told.sets(0.1).tolist() == [0, -15, 0] and told.says_apart(0.1)
+    assert when(told.late[1]) == "1.500 s later than its times say"
+    with pytest.raises(UserError, match=r"annotation has camera k2 start 1\.500 s later"):
+        told.check_common(np.array([0, 1.6]), ["k1", "k2", "k3"])
+    told.check_common(np.array([0, 3.0]), ["k1", "k2", "k3"])
+
+
+def test_two_sources_are_put_together_unless_they_disagree():
+    nan = np.nan
+    first = StatedStarts(
+        np.array([nan, 0.5, 0.5, nan]), np.array([nan, 0.02, 0.02, nan]), ("", *"aa", "")
+    )
+    other = StatedStarts(
+        np.array([nan, 0.53, 0.9, 0.1]), np.array([nan, 0.01, 0.01, 0.01]), ("", *"bbb")
+    )
+    both, odd = first.beside(other)
+    np.testing.assert_allclose(both.late, [nan, 0.524, 0.5, 0.1])
+    np.testing.assert_allclose(both.sigma, [nan, 0.02 / 5**0.5, 0.02, 0.01])
+    assert both.source == ("", "a and b", "a", "b")
+    assert [bool(text) for text in odd] == [False, False, True, False]

@@ -206,3 +206,43 @@ def test_a_rig_without_any_overlap_is_told_and_not_made_worse(tmp_path, with_peo
     before = extrinsics_error(start, TRUTH, MIDDLE)[1:].mean()
     after = extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE)[1:].mean()
     assert after < (0.6 * before if with_people else before + 1e-9)
+
+
+def standing(tmp_path: Path, sets: int = 30) -> dict[str, Path]:
+    """Somebody who stands still before cameras without depth."""
+    rng = np.random.default_rng(1)
+    still = seen_by(walking(sets, np.array([-0.3, -0.2]), np.zeros(2), 0.0), TRUTH, UP)
+    still[..., :2] += rng.normal(0, 2, still[..., :2].shape)
+    people = [[[still[t, c]] for c in range(len(TRUTH))] for t in range(sets)]
+    return {
+        "frames": write_frames(tmp_path / "frames.h5", TRUTH, num_sets=sets, colour_times=True),
+        "detections": write_detections(tmp_path / "detections.h5", TRUTH, people),
+        "output": tmp_path / "scene.h5",
+    }
+
+
+def test_a_stated_start_serves_where_nobody_moves(tmp_path):
+    """Cameras started by hand; only the annotation knows of it."""
+    paths = standing(tmp_path)
+    starts = {"k1": (3600.0, 0.02), "k2": (3600.48, 0.02), "k3": (3599.8, 0.04)}
+    scene.run(**paths, settings=SceneSettings(), floor=None, starts=starts)
+    with artefacts.read(paths["output"], SCENE) as found:
+        notes, slip = found.text("note"), found["slip"]
+        offset, sigma = found["time_offset"], found["time_offset_sigma"]
+        image_of = found["image_of"]
+    late = slip.mean(0) / 15 - offset
+    np.testing.assert_allclose(late[:3], [0, -0.48, 0.2], atol=0.02)  # of keypoints, noise
+    assert (slip == slip[0]).all()
+    np.testing.assert_allclose(sigma[1:3], [0.028, 0.045], rtol=0.25)
+    assert "its start rests on the annotation: 0.4" in notes[1]
+    assert "s later than its times say, known to 0.02" in notes[1]
+    assert "s earlier than its times say, known to 0.03" in notes[2]
+    # nobody states when the others started: they are set aside, and it is said what to do
+    assert "state when it started" in notes[3] and (image_of[:, 3] == -1).all()
+
+
+def test_starts_that_leave_nothing_in_common_are_refused(tmp_path):
+    paths = standing(tmp_path)
+    starts = {"k1": (0.0, 0.02), "k2": (480.0, 0.02)}  # milliseconds
+    with pytest.raises(UserError, match=r"sequence test: .* k2 start 480\.000 s later .* 1\.9 s"):
+        scene.run(**paths, settings=SceneSettings(), floor=None, starts=starts)

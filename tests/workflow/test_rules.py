@@ -33,11 +33,12 @@ def test_a_rule_depends_on_all_that_its_stage_is_given(stage: str) -> None:
     sections = {
         "frames_to_drop": "drop_frames",
         "floor": "floor",
+        "starts": 'starts", "starts_sigma',
         "initial": "object_pose",
         "contact": "contact",
         "subject_points": "subject",
     }
-    annotated = "".join(f'"{sections[name]}"' for name in sections if name in names)
+    annotated = ", ".join(f'"{sections[name]}"' for name in sections if name in names)
     found = re.search(r"annotation=annotation_of\((.*)\)", RULES[stage])
     assert (found.group(1) if found else "") == annotated
     entries = {

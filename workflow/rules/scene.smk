@@ -2,7 +2,7 @@ rule scene:
     """Refined extrinsics, ground plane and background."""
     input:
         **artefacts_read("scene"),
-        annotation=ancient(annotation_input("floor")),
+        annotation=ancient(annotation_input("floor", "starts", "starts_sigma")),
     output:
         scene=f"{RESULTS}/{{sequence}}/scene.h5",
     log:
@@ -17,7 +17,7 @@ rule scene:
         runtime=60,
     params:
         settings=settings_of("scene"),
-        annotation=annotation_of("floor"),
+        annotation=annotation_of("floor", "starts", "starts_sigma"),
         code=code_of("scene"),
     message:
         "{wildcards.sequence}: refining the cameras, finding the floor"
