@@ -157,11 +157,12 @@ def find_starts(
     others = [c for c in range(views) if c != master]
     sure = {c: bool(denied[c]) or search.is_apart(late, c) for c in others}
     # that one camera surely started apart says that nobody started them together
-    if not any(sure.values()) and not told.says_apart(step):
-        return as_stated
-    found = replace(as_stated, apart=True, denied=denied)
+    found = replace(as_stated, apart=any(sure.values()) or told.says_apart(step), denied=denied)
+    shown = search.shown(late)
     for c in others:
-        if told.known[c] and not sure[c]:
+        if told.known[c] and not denied[c] and not shown[c]:
+            continue
+        if not told.known[c] and not found.apart:
             continue
         if not told.known[c]:
             # that somebody moves at all is not known where only what is stated says "apart"
@@ -173,10 +174,13 @@ def find_starts(
         found.sets[c] += late[c]
         if denied[c]:
             found.sigma[c] = np.nan
+        elif told.known[c] and told.sigma[c] > step / 2:
+            found.sigma[c] = step / 2  # the views tell more; slips are sought from the best place
         elif told.known[c]:
             found.late[c], found.sigma[c] = combined(
                 (found.late[c], step / 2), (told.late[c], told.sigma[c])
             )
+            found.sets[c] = round(found.late[c] / step)
     return found
 
 
@@ -199,7 +203,7 @@ class _Search:
         while True:
             late = self._descended(bounds)
             doubtful = self.stated & ~denied & (late != 0)
-            doubtful &= [not self.is_apart(late, c) for c in range(len(late))]
+            doubtful &= ~self.shown(late)
             if doubtful.any():  # nothing sure leads away from what is stated
                 bounds[doubtful] = 0
                 continue
@@ -263,6 +267,10 @@ class _Search:
         if abs(sets[camera] - instead) < FEWEST_SETS_APART:
             return False
         worse = self._worse(sets, camera, instead)
+        return self._surely(worse, sets, camera)
+
+    def _surely(self, worse: np.ndarray, sets: np.ndarray, camera: int) -> bool:
+        """Whether views agree ``worse`` (N,) than at a camera's time in no doubt."""
         if len(worse) < FEWEST_BLOCKS:
             return False
         series = self.pairs.series(camera, int(sets[camera]), self._others(camera), sets)
@@ -270,18 +278,43 @@ class _Search:
         least = max(START_WORSE * usual, START_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
         return bool((worse > 0).mean() >= START_BLOCKS_SHARE and worse.mean() > least)
 
-    def is_clear(self, sets: np.ndarray, camera: int) -> bool:
-        """Whether the views agree better at a camera's time than at any that is not near."""
+    def shown(self, sets: np.ndarray) -> np.ndarray:
+        """Of which cameras (C,) the motion shows that they are near these times: where it does of
+        one in no doubt, somebody moves, and of others it has to be clear."""
+        views = range(len(sets))
+        surely = np.array([c != self.master and self._is_shown(sets, c) for c in views])
+        if not surely.any():
+            return surely
+        return surely | [c != self.master and self.is_clear(sets, c, if_few=False) for c in views]
+
+    def _is_shown(self, sets: np.ndarray, camera: int) -> bool:
+        """Whether a camera's time is in no doubt near this one, or at least not what is stated."""
+        if self.is_apart(sets, camera):
+            return True
+        next_best = self._next_best(sets, camera)
+        return next_best is not None and self._surely(
+            self._worse(sets, camera, next_best), sets, camera
+        )
+
+    def _next_best(self, sets: np.ndarray, camera: int) -> int | None:
+        """The best time of a camera that is not near its own; None where either is not known."""
         pairs = self.pairs
         profile = pairs.profile(camera, self._others(camera), sets)
         tried = np.arange(-pairs.reach, pairs.reach + 1)
         far = (np.abs(tried - sets[camera]) * self.step > START_PEAK_S) & np.isfinite(profile)
         if not far.any() or not np.isfinite(profile[sets[camera] + pairs.reach]):
+            return None
+        return int(tried[far][profile[far].argmin()])
+
+    def is_clear(self, sets: np.ndarray, camera: int, *, if_few: bool = True) -> bool:
+        """Whether the views agree better at a camera's time than at any that is not near;
+        ``if_few`` where hardly anything was seen at the same time."""
+        next_best = self._next_best(sets, camera)
+        if next_best is None:
             return False
-        next_best = int(tried[far][profile[far].argmin()])
         worse = self._worse(sets, camera, next_best)
         if len(worse) < FEWEST_BLOCKS:
-            return True  # hardly anything was seen at the same time: a time like any other
+            return if_few
         return bool(worse.mean() > CLEAR_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
 
     def _worse(self, sets: np.ndarray, camera: int, late: int) -> np.ndarray:

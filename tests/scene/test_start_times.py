@@ -225,6 +225,17 @@ def test_who_stands_still_is_brought_into_step_as_stated():
     assert np.abs(left[1:]).max() < 0.011
 
 
+def test_an_honest_statement_does_not_hold_who_walks_back():
+    """The master's own statement is wrong by a set and a third, which is in all the others'."""
+    late = np.r_[0.0, np.random.default_rng(7).uniform(-0.8, 0.8, len(RIG) - 1)]
+    seen = walk(late, 30.0, 4.0)
+    times = np.arange(seen.num_sets) / 30
+    for told in (None, stated(late + 0.044)):
+        found = find_moments(seen, RIG, times, 30.0, seen.available, master=0, stated=told)
+        assert not found.starts.denied.any() and not found.slips.intervals
+        np.testing.assert_allclose(found.slip.mean(0) / 30 - found.timing.offset, late, atol=0.004)
+
+
 @pytest.mark.parametrize("seconds", [4.0, 6.0])
 def test_a_stated_start_may_be_farther_than_any_search(seconds):
     """More than a third of the recording: no search without it looks so far."""
