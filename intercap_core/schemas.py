@@ -51,6 +51,8 @@ FRAMES = Schema(
         "present": Field(("C",), "bool", "the recording could be read"),
         "truncated": Field(("C",), "bool", "the recording ends before its time or is cut"),
         "note": Field(("C",), "str", "what is degraded about this camera, in words"),
+        "sound_start": Field(("C",), "float64", "when each camera took its first image by the sound that the recordings share, on a clock of any zero; NaN = it shares none", "s", optional=True),
+        "sound_start_sigma": Field(("C",), "float64", "standard deviation of it, in which devices' sound against their images is the most", "s", optional=True),
         "times": Field(("T",), "float64", "time of each set since the first, master clock", "s"),
         "dropped": Field(("T",), "bool", "dropped by annotation: treated as seen by no camera"),
         "colour_index": Field(("T", "C"), "int32", "this set's image in cameras/<c>/colour, -1 = none"),

@@ -12,6 +12,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import encoded_size
+from intercap_core.capture.sound import Sound
 from intercap_core.capture.source import CameraRecording, Image, Layout
 from intercap_core.errors import UserError
 from intercap_core.progress import Progress
@@ -28,7 +29,7 @@ class View:
 
     ``colour_times`` and ``depth_times`` are device times, microseconds, in the order of the
     artefact's images; ``depth_delay_us`` is not taken off. Images that no frame set may use are
-    False in ``colour_usable`` and ``depth_usable``.
+    False in ``colour_usable`` and ``depth_usable``. ``sound`` where the recording has any.
     """
 
     name: str
@@ -45,6 +46,7 @@ class View:
     depth_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     colour_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     depth_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    sound: Sound | None = None
 
     @property
     def present(self) -> bool:
@@ -76,6 +78,7 @@ def extract(name: str, layout: Layout, writer: artefacts.Writer, *, depth: bool 
             view.fps, view.serial = recording.fps, recording.serial
             view.depth_delay_us = recording.depth_delay_us
             _Copy(recording, view, writer, depth=depth).run()
+            view.sound = recording.sound()
     except UserError as error:
         view.notes.append(str(error))
         view.camera = None

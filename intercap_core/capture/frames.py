@@ -137,6 +137,16 @@ class Frames:
                 result[c] = self.time_s[t] + skew[t, c] - since
         return result
 
+    @property
+    def sound_starts(self) -> dict[str, tuple[float, float]]:
+        """When cameras took their first images by the sound, seconds on a clock of any zero, and
+        its standard deviation, by name; without those that share no sound."""
+        if "sound_start" not in self._artefact:
+            return {}
+        pairs = zip(self._artefact["sound_start"], self._artefact["sound_start_sigma"], strict=True)
+        told = dict(zip(self.rig.names, pairs, strict=True))
+        return {n: (float(s), float(d)) for n, (s, d) in told.items() if np.isfinite(s)}
+
     @cached_property
     def gravity(self) -> np.ndarray:
         """(C, 3): the direction down, unit, in each colour camera's frame; NaN = not known."""

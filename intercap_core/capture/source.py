@@ -18,6 +18,7 @@ import numpy as np
 from intercap_core.camera.extrinsics_files import Extrinsics
 from intercap_core.camera.rig import Camera
 from intercap_core.capture.glance import Glance
+from intercap_core.capture.sound import Sound
 from intercap_core.config import SequenceEntry
 
 
@@ -74,6 +75,10 @@ class CameraRecording(ABC):
         Images that are damaged are left out and counted in a note. No depth image is given where
         ``camera.depth`` is None.
         """
+
+    def sound(self) -> Sound | None:
+        """The recording's sound, after :meth:`images`; None = it has none."""
+        return None
 
     @abstractmethod
     def glance(self) -> Glance:

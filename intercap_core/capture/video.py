@@ -17,6 +17,7 @@ from intercap_core.camera.rig import Camera
 from intercap_core.capture.encoded import JPEG_QUALITY, jpeg_of
 from intercap_core.capture.glance import Glance, glance_at_video
 from intercap_core.capture.image_files import faults_of_files, read_shots
+from intercap_core.capture.sound import Sound, read_sound
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.capture.timestamps import Timestamps, shots_of
 from intercap_core.errors import UserError
@@ -75,6 +76,7 @@ class VideoRecording(CameraRecording):
             [], depth, fps=rate, offset_s=offset_s, times=times, source=path.with_suffix("")
         )
         self._damaged = 0
+        self._first_s: float | None = None  # of the first image, on the file's clock
 
     def close(self) -> None:
         """Close the file."""
@@ -97,6 +99,7 @@ class VideoRecording(CameraRecording):
         first: float | None = None
         for stamp, content in self._copied() if copied else self._decoded():
             seconds = count / self.fps if stamp is None else stamp
+            self._first_s = seconds if self._first_s is None else self._first_s
             first = seconds if first is None else first
             if self._times is not None:
                 if count >= len(self._times):
@@ -116,6 +119,10 @@ class VideoRecording(CameraRecording):
         if self.truncated:
             self.notes.append(f"the file is cut off: {count} images could be read")
         yield from read_shots(self, self._shots)
+
+    def sound(self) -> Sound | None:
+        """The file's first sound track."""
+        return None if self._first_s is None else read_sound(self.source, self._first_s)
 
     def _packets(self) -> Iterator[Any]:
         demuxed = self._container.demux(self._stream)

@@ -15,6 +15,7 @@ from intercap_core.errors import UserError
 from intercap_core.scene.constants import (
     DENIED_SIGMAS,
     FEWEST_SETS_APART,
+    IN_STEP_SIGMAS,
     MIN_SHARED_S,
 )
 
@@ -82,6 +83,12 @@ class StatedStarts:
         """Whether some camera surely started at another time than its images' times say."""
         least = FEWEST_SETS_APART * step_s + DENIED_SIGMAS * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
+
+    def unless_in_step(self) -> StatedStarts:
+        """These, or nothing where they all agree with that the images' own times are of one clock:
+        those are then the better ones."""
+        apart = (np.abs(self.late) > IN_STEP_SIGMAS * self.sigma)[self.known].any()
+        return self if apart else StatedStarts.nothing(len(self.late))
 
     def check_common(self, times: np.ndarray, names: Sequence[str]) -> None:
         """Raise UserError where a camera would have recorded nothing at the same time as the

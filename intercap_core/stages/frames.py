@@ -19,6 +19,7 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.capture.clocks import WRONG, best_epoch, drift_us, epochs
 from intercap_core.capture.extract import View, extract
 from intercap_core.capture.layouts import open_layout
+from intercap_core.capture.sound_delays import sound_starts
 from intercap_core.capture.synchronise import (
     SetTable,
     distance_to,
@@ -89,6 +90,10 @@ def run(
         writer.put("present", [view.present for view in views])
         writer.put("truncated", [view.truncated for view in views])
         writer.put("note", ["; ".join(view.notes) for view in views])
+        started, sigma = sound_starts([view.sound if view.present else None for view in views])
+        if np.isfinite(started).any():
+            writer.put("sound_start", started)
+            writer.put("sound_start_sigma", sigma)
         writer.put("times", (table.times_us - table.times_us[0]) * 1e-6)
         writer.put("dropped", dropped)
         writer.put("colour_index", colour_index)

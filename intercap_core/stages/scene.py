@@ -77,7 +77,7 @@ def run(
                 f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
             )
         rig, master = source.rig, source.rig.names.index(source.master)
-        stated = _stated_starts(source, starts or {}, master)
+        stated, disagree = _stated_starts(source, starts or {}, master)
         moments = find_moments(
             people, rig, source.time_s, source.fps, source.available, master=master, stated=stated
         )
@@ -106,7 +106,8 @@ def run(
         oddities += odd
         slides, known_to = _slides(source, rig, refined, ground)
         notes = _notes(source, refined, moments, stated, exchanges)
-        for note, slide, words in zip(notes, slides, known_to, strict=True):
+        for note, odd_start, slide, words in zip(notes, disagree, slides, known_to, strict=True):
+            note += [odd_start] if odd_start else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
         _write(
             output,
@@ -130,16 +131,19 @@ def run(
 
 def _stated_starts(
     source: Frames, starts: Mapping[str, tuple[float, float]], master: int
-) -> StatedStarts:
-    names = source.rig.names
-    if not starts:
-        return StatedStarts.nothing(len(names))
-    stated = StatedStarts.of(starts, names, master, source.first_image_s, "the annotation")
+) -> tuple[StatedStarts, list[str]]:
+    """What the annotation and the sound say, and of each camera where they disagree, in words."""
+    names, heard = source.rig.names, source.sound_starts
+    if not starts and not heard:
+        return StatedStarts.nothing(len(names)), [""] * len(names)
+    first = source.first_image_s
+    annotated = StatedStarts.of(starts, names, master, first, "the annotation")
     try:
-        stated.check_common(source.time_s, names)
+        annotated.check_common(source.time_s, names)
     except UserError as error:
         raise UserError(f"sequence {source.sequence}: {error}") from None
-    return stated
+    by_sound = StatedStarts.of(heard, names, master, first, "the sound").unless_in_step()
+    return annotated.beside(by_sound)
 
 
 def _backgrounds(

@@ -188,10 +188,12 @@ def write_frames(
     gravity: np.ndarray | None = None,
     stated: Mapping[str, np.ndarray] | None = None,
     colour_times: bool = False,
+    sound: Mapping[str, np.ndarray] | None = None,
 ) -> Path:
     """Write a frames artefact without colour; ``depths`` has (T, H, W) uint16 for each camera,
     ``stated`` what is stated of the calibration's world, by dataset; ``colour_times``: with the
-    device times of colour images, which begin at 7 s."""
+    device times of colour images, which begin at 7 s; ``sound`` when it says cameras started, by
+    dataset."""
     count = len(rig)
     sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
     none = np.full((num_sets, count), -1)
@@ -205,7 +207,7 @@ def write_frames(
             dropped=dropped,
             gravity=gravity,
         )
-        for key, values in (stated or {}).items():
+        for key, values in {**(stated or {}), **(sound or {})}.items():
             writer.put(key, values)
         for index, name in enumerate(rig.names):
             if depths is not None:

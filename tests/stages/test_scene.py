@@ -208,14 +208,18 @@ def test_a_rig_without_any_overlap_is_told_and_not_made_worse(tmp_path, with_peo
     assert after < (0.6 * before if with_people else before + 1e-9)
 
 
-def standing(tmp_path: Path, sets: int = 30) -> dict[str, Path]:
-    """Somebody who stands still before cameras without depth."""
+def standing(tmp_path: Path, sets: int = 30, sound: np.ndarray | None = None) -> dict[str, Path]:
+    """Somebody who stands still before cameras without depth; ``sound`` (C,) s says when they
+    started."""
+    told = {} if sound is None else {"sound_start": sound, "sound_start_sigma": 0 * sound + 0.03}
     rng = np.random.default_rng(1)
     still = seen_by(walking(sets, np.array([-0.3, -0.2]), np.zeros(2), 0.0), TRUTH, UP)
     still[..., :2] += rng.normal(0, 2, still[..., :2].shape)
     people = [[[still[t, c]] for c in range(len(TRUTH))] for t in range(sets)]
     return {
-        "frames": write_frames(tmp_path / "frames.h5", TRUTH, num_sets=sets, colour_times=True),
+        "frames": write_frames(
+            tmp_path / "frames.h5", TRUTH, num_sets=sets, colour_times=True, sound=told
+        ),
         "detections": write_detections(tmp_path / "detections.h5", TRUTH, people),
         "output": tmp_path / "scene.h5",
     }
@@ -246,3 +250,31 @@ def test_starts_that_leave_nothing_in_common_are_refused(tmp_path):
     starts = {"k1": (0.0, 0.02), "k2": (480.0, 0.02)}  # milliseconds
     with pytest.raises(UserError, match=r"sequence test: .* k2 start 480\.000 s later .* 1\.9 s"):
         scene.run(**paths, settings=SceneSettings(), floor=None, starts=starts)
+
+
+def test_the_sound_serves_where_nobody_moves(tmp_path):
+    heard = np.array([0.0, 0.48, -0.2, 0.02, 0.3, np.nan])
+    paths = standing(tmp_path, sound=heard)
+    scene.run(
+        **paths, settings=SceneSettings(), floor=None, starts={"k1": (0, 0.02), "k2": (0.9, 0.02)}
+    )
+    with artefacts.read(paths["output"], SCENE) as found:
+        notes, late = found.text("note"), found["slip"].mean(0) / 15 - found["time_offset"]
+        seen = (found["image_of"] >= 0).any(0)
+    np.testing.assert_allclose(late[:5], [0, -0.9, 0.2, -0.02, -0.3], atol=0.03)
+    assert seen.tolist() == [True] * 5 + [False]
+    assert "its start rests on the sound: 0." in notes[2]
+    assert "the annotation has it start 0.900 s later" in notes[1]
+    assert "the sound 0.480 s later than its times say: the first was taken" in notes[1]
+
+
+def test_sound_of_images_that_are_in_step_changes_nothing(tmp_path):
+    """Devices lay sound tens of milliseconds beside their images: times of one clock are better."""
+    (tmp_path / "heard").mkdir()
+    quiet, heard = (
+        standing(tmp_path),
+        standing(tmp_path / "heard", sound=np.array([0.0, 0.05, -0.06, 0.02, 0.08, np.nan])),
+    )
+    for paths in (quiet, heard):
+        scene.run(**paths, settings=SceneSettings(), floor=None)
+    assert quiet["output"].read_bytes() == heard["output"].read_bytes()
