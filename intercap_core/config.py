@@ -326,6 +326,10 @@ class StudioCapture(Model):
     """Whether the cameras record depth."""
     video: bool = False
     """Plain recordings as one video a camera instead of a folder of images."""
+    sound: bool = False
+    """Whether videos carry sound: steps, a voice, reverberation, each device's noise and delay."""
+    states_starts: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Also write an annotation that says when cameras started, with this deviation, seconds."""
     faults: tuple[StudioFault, ...] = ()
     """What is broken in this recording on top of the usual errors; see docs/studio.md."""
 

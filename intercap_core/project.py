@@ -111,7 +111,9 @@ class Project:
     def annotation_made(self, sequence: str) -> bool:
         """Whether the studio writes this sequence's annotation, beside the recordings."""
         captures = self.config.studio.captures if self.config.studio else {}
-        return sequence in captures and captures[sequence].annotate
+        if sequence not in captures:
+            return False
+        return captures[sequence].annotate or captures[sequence].states_starts is not None
 
     def recordings_made(self, sequence: str) -> Path | None:
         """Folder into which the studio writes this sequence; None for a real recording."""

@@ -18,7 +18,7 @@ from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.masks import Segmenter
 from intercap_core.studio.recording import Kinect
 from intercap_core.studio.stage import Stage
-from intercap_core.studio.truth import erring_annotation, write_truth
+from intercap_core.studio.truth import erring_annotation, erring_starts, write_truth
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +38,10 @@ def make_capture(
 
     Holds the recordings and calibration in the layout of ``capture``,
     keypoints/<camera>/<image>_keypoints.json, candidates/<camera>.json, truth.h5, annotation.yaml
-    if ``capture.annotate``, and last capture.json, the sorted list of the files with their SHA-256.
-    ``objects`` is the tracked object's entry, None of a person alone. The same arguments give the
-    same bytes. Raises UserError for a subject, interaction, object or fault that the studio does
-    not have, and for an ``output`` that holds something else.
+    if ``capture.annotate`` or it states starts, and last capture.json, the sorted list of the files
+    with their SHA-256. ``objects`` is the tracked object's entry, None of a person alone. The same
+    arguments give the same bytes. Raises UserError for a subject, interaction, object or fault that
+    the studio does not have, and for an ``output`` that holds something else.
     """
     output = Path(output)
     if output.exists():
@@ -76,8 +76,11 @@ def make_capture(
         capture,
         recorded,
     )
-    if capture.annotate:
-        text = yaml.safe_dump(erring_annotation(stage, moment, contact), sort_keys=True)
+    annotation = erring_annotation(stage, moment, contact) if capture.annotate else {}
+    if capture.states_starts is not None:
+        annotation |= erring_starts(stage, capture.states_starts)
+    if annotation:
+        text = yaml.safe_dump(annotation, sort_keys=True)
         (output / "annotation.yaml").write_text(text)
     _write_manifest(output, sequence)
 

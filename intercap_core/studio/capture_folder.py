@@ -16,6 +16,7 @@ from intercap_core.camera.rig import Camera, Rig
 from intercap_core.config import StudioCapture, StudioFault
 from intercap_core.studio.alignment import Aligner
 
+SOUND_RATE = 16_000  # samples a second
 WRONG_SIZE = 1.5  # of the images that a wrong calibration is for
 SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
 
@@ -23,7 +24,8 @@ SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
 @dataclass(frozen=True)
 class Device:
     """One camera of the rig: ``camera`` as it claims to be, always with depth; ``depth`` says
-    whether it records any; ``first_us`` is its first device time."""
+    whether it records any; ``first_us`` is its first device time; ``sound`` (N,) float32 from its
+    first image on, at :data:`SOUND_RATE`, None = it records none."""
 
     index: int
     camera: Camera
@@ -33,6 +35,7 @@ class Device:
     depth: bool
     fps: int
     first_us: int
+    sound: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any
 
 import av
 import cv2
+import numpy as np
 import yaml
 from pycocotools import mask as coco
 from scipy.spatial.transform import Rotation
@@ -25,6 +26,7 @@ from intercap_core.config import LayoutName
 from intercap_core.studio.alignment import Aligner
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.capture_folder import (
+    SOUND_RATE,
     CameraFiles,
     CaptureFolder,
     Device,
@@ -265,6 +267,8 @@ class _PlainVideo(ImageFiles):
             device.camera.colour.height,
         )
         self._stream.pix_fmt = "yuvj420p"
+        if device.sound is not None:
+            self._write_sound(device.sound)
 
     def _paths(self, shot: Shot) -> tuple[Path | None, Path]:
         return None, self._folder / "depth" / f"{len(self._times):06d}.png"
@@ -276,6 +280,14 @@ class _PlainVideo(ImageFiles):
         packet.pts = packet.dts = shot.time_us - self._first_us
         self._container.mux(packet)
         self._times.append(f"{shot.time_us / 1e6:.6f}\n")
+
+    def _write_sound(self, samples: np.ndarray) -> None:
+        """As phones do, AAC; the muxer lays it between the images."""
+        stream = self._container.add_stream("aac", rate=SOUND_RATE, layout="mono")
+        frame = av.AudioFrame.from_ndarray(samples[None], format="fltp", layout="mono")
+        frame.sample_rate, frame.pts, frame.time_base = SOUND_RATE, 0, Fraction(1, SOUND_RATE)
+        for packet in [*stream.encode(frame), *stream.encode(None)]:
+            self._container.mux(packet)
 
     def close(self) -> None:
         self._container.close()

@@ -20,6 +20,7 @@ from intercap_core.studio.passer_by import Passing
 from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, Cast, Photographer, Surface, View
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.sensor import DepthSensor
+from intercap_core.studio.sound import heard
 from intercap_core.studio.stage import Moment, Stage
 
 START_US = 1_000_000  # device time of the first set
@@ -114,6 +115,7 @@ class Kinect:
         device = Device(
             self.index, self.claimed, self.serial, self.colour_mode, stage.depth_mode,
             self.has_depth, stage.fps // self.every, min(self.device_time_us(t) for t in self.sets),
+            self._sound() if folder.capture.sound else None,
         )  # fmt: skip
         with folder.open(device) as files:
             for order, t in enumerate(self.sets):
@@ -152,6 +154,13 @@ class Kinect:
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
         return Recorded(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
+
+    def _sound(self) -> np.ndarray:
+        """What the device hears from its first image to its last."""
+        first, last = min(self.sets), max(self.sets)
+        late = self.stage.rig.late_s[self.index]
+        length = (last + 1 - first) / self.stage.fps
+        return heard(self.stage, self.index, self.stage.set_times[first] - late, length)
 
     def _inertial(
         self,

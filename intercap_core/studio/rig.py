@@ -39,7 +39,8 @@ class StudioRig:
     recordings and the erring poses of the rig file. ``master_from_stage`` (4, 4). ``offset_s``
     (C,): how much later than its device time (without the stagger) each camera exposes.
     ``missing``: for each camera the set indices that it did not record. ``slip`` (T, C): whole
-    frames by which an image is older than its device time says.
+    frames by which an image is older than its device time says. ``late_s`` (C,): what all along of
+    that and of ``offset_s`` is because the camera was started apart.
     """
 
     true: Rig
@@ -48,6 +49,7 @@ class StudioRig:
     offset_s: np.ndarray
     missing: tuple[frozenset[int], ...]
     slip: np.ndarray
+    late_s: np.ndarray
 
 
 def build_rig(
@@ -105,7 +107,13 @@ def build_rig(
     offset = np.clip(offset, -MAX_OFFSET_S * noise, MAX_OFFSET_S * noise)
     missing, slip = _slips(rng, cameras, frames, slips, noise)
     return StudioRig(
-        Rig(tuple(true)), Rig(tuple(claimed)), master_from_stage, offset, missing, slip
+        Rig(tuple(true)),
+        Rig(tuple(claimed)),
+        master_from_stage,
+        offset,
+        missing,
+        slip,
+        np.zeros(cameras),
     )
 
 
@@ -120,7 +128,9 @@ def started_apart(
         late[most] = np.copysign(seconds * rng.uniform(0.9, 1.0), late[most])
     late[0] = 0
     sets = np.round(late * fps).astype(np.int32)
-    return replace(rig, slip=rig.slip + sets, offset_s=rig.offset_s + sets / fps - late)
+    return replace(
+        rig, slip=rig.slip + sets, offset_s=rig.offset_s + sets / fps - late, late_s=late
+    )
 
 
 def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:

@@ -250,6 +250,10 @@ def check_capture(
             f"studio: recordings of layout {capture.layout!r} are no videos; take 'video' out or "
             "set layout: plain"
         )
+    if capture.sound and not capture.video:
+        raise UserError(
+            "studio: only videos carry sound; take 'sound' out or set video: true and layout: plain"
+        )
     _check_rates(capture, settings)
     check_faults(
         capture.faults, layout=capture.layout, cameras=settings.cameras, frames=capture.frames

@@ -197,3 +197,17 @@ def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict
         },
         "floor": floor,
     }
+
+
+def erring_starts(stage: Stage, sigma: float) -> dict[str, Any]:
+    """When each camera's first image was taken, as somebody reads it off a clock that counts the
+    hours of a day, wrong by ``sigma`` s."""
+    rng = stage.noise.rng("stated starts")
+    clock = float(rng.uniform(0, 86_400))
+    starts = {}
+    for c, name in enumerate(stage.rig.true.names):
+        lost = stage.rig.missing[c]
+        first = min(t for t in range(0, stage.frames, stage.every[c]) if t not in lost)
+        taken = stage.set_times[first] - stage.rig.late_s[c]
+        starts[name] = round(clock + float(taken + rng.normal(0, sigma)), 4)
+    return {"starts": starts, "starts_sigma": max(sigma, 0.001)}

@@ -59,6 +59,8 @@ def test_cameras_that_start_apart_are_late_by_sets_and_a_rest(fps: int) -> None:
     apart = started_apart(rig, np.random.default_rng(8), 0.5, fps)
     late = (apart.slip - rig.slip) / fps - (apart.offset_s - rig.offset_s)
     assert (late == late[0]).all()  # all along
+    np.testing.assert_allclose(apart.late_s, late[0], atol=1e-12)
+    assert not rig.late_s.any()
     assert late[0, 0] == 0 and 0.45 <= np.abs(late[0]).max() <= 0.5
     assert np.abs(apart.offset_s - rig.offset_s).max() <= 0.5 / fps + 1e-12
     assert len(np.unique(late[0])) == len(late[0])
@@ -150,6 +152,7 @@ def test_faults_are_in_the_recordings_and_in_the_truth(broken_capture: Path) -> 
         ({"faults": ("dead_half",), "frames": 2}, "need 4 frames"),
         ({"every": {"k9": 2}}, "names camera 'k9'"),
         ({"every": {"k2": 2}}, "'k2' would have 7.5 frames a second"),
+        ({"sound": True, "layout": "plain"}, "only videos carry sound"),
         ({"every": {"k2": 3}, "layout": "behave"}, "'behave' all have one rate"),
     ],
 )
