@@ -290,8 +290,11 @@ class Evidence:
             )
         return body_self.join([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
 
-    def match(self, problem: BodyProblem, reach: float) -> CloudRows:
-        """Correspondences of all frames at the problem's bodies, within ``reach`` metres."""
+    def match(
+        self, problem: BodyProblem, reach: float, only: np.ndarray | None = None
+    ) -> CloudRows:
+        """Correspondences of all frames at the problem's bodies, within ``reach`` metres: of all
+        cameras, or of the one of each frame that ``only`` (N,) names."""
         count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
         params = self.model.parameters(problem.base)
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
@@ -312,6 +315,8 @@ class Evidence:
                 t, vertices, normals = one
                 cloud = self.clouds[t]
                 assert cloud is not None
+                if only is not None:
+                    cloud = cloud.of_view(int(only[t]))
                 late = None if shift is None else shift[t]
                 skin = Skin(vertices, normals, where[t], late)
                 found = self._matcher.match(

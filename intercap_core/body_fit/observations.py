@@ -141,6 +141,18 @@ class PersonCloud:
     windows: tuple[DepthWindow, ...] = ()
     outlines: tuple[Outline, ...] = ()
 
+    def of_view(self, view: int) -> PersonCloud:
+        """What camera ``view`` alone shows."""
+        mine = self.view == view
+        return PersonCloud(
+            self.points[mine],
+            self.normals[mine],
+            self.trust[mine],
+            self.view[mine],
+            tuple(window for window in self.windows if window.view == view),
+            tuple(rim for rim in self.outlines if rim.view == view),
+        )
+
     def through(
         self, rig: Rig, bias: np.ndarray, before: Rig, bias_before: np.ndarray
     ) -> PersonCloud:

@@ -190,6 +190,13 @@ class Fitter:
         self._expect_pose(problem)
         self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
+    def observe_only(self, problem: BodyProblem, view: np.ndarray) -> None:
+        """Compare the problem's bodies with one camera of each frame, ``view`` (N,): its points and
+        masks, and the body's keypoints. What :meth:`observe` took is spent."""
+        if self.evidence.has_cloud:
+            problem.rows = self.evidence.match(problem, CLOUD_REACH_M[-1], view)
+        self.evidence.observe_keypoints(problem)
+
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
         """Median pixel error (N,C) and cloud distance (N,), metres; NaN = nothing seen."""
         found = self._of_body(problem, self.evidence.pixel_residuals(problem))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -13,6 +14,10 @@ from intercap_core.camera import projection
 RAY_SPACING = 4  # px between the rays of a large image that are computed one by one
 SMALL_IMAGE = 100_000  # px: nothing is gained by interpolating
 DEFAULT_METRIC_RADIUS = 1.7  # what the Azure Kinect SDK takes where a calibration says 0
+
+# Rays by size and parameters, for as long as some lens holds them: every reader of a recording has
+# lenses of its own.
+_TABLES: WeakValueDictionary[tuple[int, int, bytes], np.ndarray] = WeakValueDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +92,20 @@ class Intrinsics:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z, computed once.
+        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z, computed once for all
+        lenses of the same parameters that are in use.
 
         NaN where the calibration does not hold (outside the metric radius). A large image whose
         calibration holds everywhere has every ``RAY_SPACING``-th ray computed and the others
         interpolated by cubic splines, to 1e-4 px.
         """
+        key = (self.width, self.height, self.parameters.tobytes())
+        table = _TABLES.get(key)
+        if table is None:
+            _TABLES[key] = table = self._ray_table()
+        return table
+
+    def _ray_table(self) -> np.ndarray:
         u, v = np.arange(self.width), np.arange(self.height)
         coarse_u, coarse_v = (np.linspace(0, n[-1], -(-n[-1] // RAY_SPACING) + 1) for n in (u, v))
         small = self.width * self.height <= SMALL_IMAGE

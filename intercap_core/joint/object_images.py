@@ -10,10 +10,11 @@ from intercap_core.config import ObjectTrackSettings
 from intercap_core.joint.cameras import Cameras
 from intercap_core.joint.constants import VIEWS_KEPT_BYTES
 from intercap_core.object_track.constants import TRACKING_FACES
-from intercap_core.object_track.evidence import PoseEvidence, evidence_at
+from intercap_core.object_track.evidence import PoseEvidence, evidence_at, report_at
 from intercap_core.object_track.free_turns import free_turns, without_turns
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.object_track.view_report import ViewReport
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import open_renderer
 from intercap_core.solve.thread_pool import ThreadPool
@@ -36,6 +37,7 @@ class ObjectImages:
         threads: ThreadPool | None = None,
     ) -> None:
         """``threads`` look at a frame each where the CPU draws, None is one."""
+        self._recording = recording
         self._views = ViewCache(recording.views, VIEWS_KEPT_BYTES)
         self._geometry = list(recording.geometry)
         self._settings, self._labels = settings, labels
@@ -71,6 +73,30 @@ class ObjectImages:
         by ``twists`` (T, 6), without what facets seem to say of the turns of a round one."""
         found = self._threads.map(lambda t: self._look(t, poses[t], twists[t]), frames)
         return dict(zip(frames, found, strict=True))
+
+    def compare(
+        self, frames: Sequence[int], poses: np.ndarray, twists: np.ndarray, camera: np.ndarray
+    ) -> dict[int, ViewReport]:
+        """How the one ``camera`` (T,) of each of ``frames`` agrees with its pose, of those (T, 4,
+        4) of an object that moves by ``twists`` (T, 6), where it has an image and a pose."""
+        place = {c: number for number, c in enumerate(self.cameras)}
+        shown = [t for t in frames if int(camera[t]) in place]
+
+        def one(t: int) -> ViewReport:
+            number = place[int(camera[t])]
+            kept = self._views.kept(t)
+            view = self._recording.view(t, number) if kept is None else kept[number]
+            return report_at(
+                self.mesh,
+                view.through(self._geometry[number]),
+                poses[t],
+                min_overlap=self._settings.min_overlap,
+                labels=self._labels,
+                twist=twists[t],
+                renderer=self._renderer,
+            )
+
+        return dict(zip(shown, self._threads.map(one, shown), strict=True))
 
     def _look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
         views = [

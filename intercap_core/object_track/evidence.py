@@ -71,6 +71,23 @@ def evidence_at(
     )
 
 
+def report_at(
+    mesh: ObjectMesh,
+    view: View,
+    pose: np.ndarray,
+    *,
+    min_overlap: float,
+    labels: tuple[str, ...] = (),
+    twist: np.ndarray | None = None,
+    renderer: Renderer | None = None,
+) -> ViewReport:
+    """How one view agrees with ``pose`` (4, 4): what :func:`evidence_at` reports of it."""
+    renderer = renderer or default_renderer()
+    (fit,) = view_fits(renderer, mesh, [view], pose, min_overlap, labels, twist)
+    fit.choose()
+    return fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
+
+
 def views_noise(found: Sequence[PoseEvidence]) -> float:
     """Factor of the evidence's stated variance, from how far the views' gradients disagree.
 

@@ -74,16 +74,19 @@ class ObjectRecording:
 
     def views(self, t: int) -> list[View]:
         """What each usable camera shows of moment t."""
-        found = []
-        for c, geometry, room in zip(self.cameras, self.geometry, self._rooms, strict=True):
-            candidates = [
-                (candidate.index, candidate.label, candidate.score, candidate.rle)
-                for candidate in self._candidates(t, c)
-            ]
-            depth = self._frames.depth(t, c)
-            detected = bool(self._detections.candidates_found[t, c])
-            found.append(View.build(geometry, depth, self._masks[t][c], candidates, detected, room))
-        return found
+        return [self.view(t, place) for place in range(len(self.cameras))]
+
+    def view(self, t: int, place: int) -> View:
+        """What the usable camera at ``place`` among :attr:`cameras` shows of moment t."""
+        c = self.cameras[place]
+        candidates = [
+            (candidate.index, candidate.label, candidate.score, candidate.rle)
+            for candidate in self._candidates(t, c)
+        ]
+        depth = self._frames.depth(t, c)
+        detected = bool(self._detections.candidates_found[t, c])
+        geometry, room = self.geometry[place], self._rooms[place]
+        return View.build(geometry, depth, self._masks[t][c], candidates, detected, room)
 
     def pictures(self, t: int) -> list[np.ndarray | None]:
         """The colour image (h, w, 3) uint8 BGR of each usable camera at moment t, on its reduced

@@ -27,6 +27,11 @@ class ViewCache:
         with self._lock:
             return self._get(t)
 
+    def kept(self, t: int) -> list[View] | None:
+        """The views of frame t where they are kept; nothing is loaded, and none is forgotten."""
+        with self._lock:
+            return self._kept.get(t)
+
     def _get(self, t: int) -> list[View]:
         if t in self._kept:
             self._kept.move_to_end(t)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,9 @@ from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.state import State
+from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.object_images import ObjectImagesData
+from intercap_core.object_track.view_report import ViewReport
 from intercap_core.verdict.constants import HELD_S
 from intercap_core.verdict.part import Part
 from intercap_core.verdict.refits import Refits
@@ -64,7 +67,7 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
     state = result.state
     _hold_fixed(assembly, result)
     assembly.problem.refresh(state)
-    within = _view_errors(assembly)
+    within = _within(assembly)
     seen = np.isfinite(within.keypoint_px).any(axis=0)
     cameras = np.flatnonzero(seen)
     if len(cameras) < 2:
@@ -84,14 +87,11 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
     block = np.arange(len(state)) // max(1, round(inputs.fps * HELD_S))
     turn = block % len(cameras)
     mixed = _taken(without, turn)
-    assembly.body.refresh(mixed)
-    assembly.object_.refresh(mixed)
-    judged = _view_errors(assembly)
     held = cameras[turn]
+    judged = _judged(assembly, mixed, held)
     points = _points(inputs, state)
     moved = [_points(inputs, other) for other in without]
     halves = _points(inputs, _taken(half, np.arange(len(state)) % 2))
-    judged = _of_held(judged, held)
     return HeldOut(
         cameras,
         held,
@@ -110,29 +110,39 @@ def _hold_fixed(assembly: Assembly, result: JointResult) -> None:
     """Cameras, time offsets and contact as the result has them."""
     if assembly.contact is not None:
         assembly.contact.take_probability(result.probability)
-    assembly.body.refresh(result.state)
-    assembly.body.take_offsets(result.time_offset)
+    assembly.body.take_cameras(result.cameras, result.time_offset)
     assembly.object_.take_offsets(result.time_offset)
-    assembly.body.take_cameras(result.cameras)
     if isinstance(assembly.object_, ObjectImagesData):
         assembly.object_.take_cameras(result.cameras)
 
 
-def _view_errors(assembly: Assembly) -> ViewErrors:
-    """At the state at which body and object were refreshed last."""
-    keypoint = assembly.body.residuals().keypoint_px
+def _within(assembly: Assembly) -> ViewErrors:
+    """Of all cameras, at the state at which body and object were refreshed last."""
+    images = assembly.object_
+    return _view_errors(
+        assembly.body, images.reports() if isinstance(images, ObjectImagesData) else ()
+    )
+
+
+def _judged(assembly: Assembly, state: State, held: np.ndarray) -> ViewErrors:
+    """Those of the camera that judges each frame, ``held`` (T,), alone, at ``state``."""
+    images = assembly.object_
+    assembly.body.compare(state, held)
+    found = _view_errors(
+        assembly.body, images.compare(state, held) if isinstance(images, ObjectImagesData) else ()
+    )
+    mine = np.arange(found.keypoint_px.shape[1]) == held[:, None]
+    return ViewErrors(*(np.where(mine, values, np.nan) for values in vars(found).values()))
+
+
+def _view_errors(body: BodyData, reports: Iterable[tuple[int, int, ViewReport]]) -> ViewErrors:
+    """Of the body as it was compared last, and the object's ``reports`` by frame and camera."""
+    keypoint = body.residuals().keypoint_px
     overlap, depth = np.full((2, *keypoint.shape), np.nan)
-    if isinstance(assembly.object_, ObjectImagesData):
-        for t, camera, report in assembly.object_.reports():
-            overlap[t, camera] = report.overlap
-            depth[t, camera] = report.depth_residual_m
-    return ViewErrors(keypoint, assembly.body.person_by_view(), overlap, depth)
-
-
-def _of_held(errors: ViewErrors, held: np.ndarray) -> ViewErrors:
-    """Those of the camera that judges each frame (T,) alone."""
-    mine = np.arange(errors.keypoint_px.shape[1]) == held[:, None]
-    return ViewErrors(*(np.where(mine, values, np.nan) for values in vars(errors).values()))
+    for t, camera, report in reports:
+        overlap[t, camera] = report.overlap
+        depth[t, camera] = report.depth_residual_m
+    return ViewErrors(keypoint, body.person_by_view(), overlap, depth)
 
 
 def _at_person(pixels: np.ndarray, result: JointResult, joints: np.ndarray) -> np.ndarray:

@@ -106,6 +106,13 @@ class BodyData(Term):
         if self._bridged is None:
             self._bridged = state.body.copy()
 
+    def compare(self, state: State, camera: np.ndarray) -> None:
+        """Have :meth:`residuals` and :meth:`person_by_view` tell of ``state``, of the one
+        ``camera`` (T,) of each frame alone: others show nothing of the person's points. Before
+        equations are made again, :meth:`refresh`."""
+        self._place(state)
+        self._fitter.observe_only(self._problem, camera[self._fitter.frames])
+
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
         equations.add_blocks(self.name, BODY, *self._equations(state))
@@ -151,9 +158,13 @@ class BodyData(Term):
         energy[bridged] = 0.5 * (precision * offset**2).sum(axis=1)
         return hessian, gradient, energy
 
-    def take_cameras(self, cameras: Cameras) -> None:
-        """See through these cameras from the next :meth:`refresh` on."""
-        self._fitter.evidence.take_cameras(cameras.rig, cameras.depth_bias)
+    def take_cameras(self, cameras: Cameras, time_offset: np.ndarray | None = None) -> None:
+        """See through these cameras, that expose so late (C,), seconds, from the next
+        :meth:`refresh` on; None leaves the offsets as they are."""
+        evidence = self._fitter.evidence
+        evidence.take_cameras(cameras.rig, cameras.depth_bias)
+        if time_offset is not None:
+            evidence.seen = replace(evidence.seen, time_offset=time_offset)
 
     def sights(self, state: State, share: float) -> Sights:
         """What keypoints and clouds of the trusted frames say of poses and cameras, at

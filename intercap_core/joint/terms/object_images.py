@@ -106,10 +106,15 @@ class ObjectImagesData(Term):
 
     def _look(self, poses: np.ndarray) -> dict[int, PoseEvidence]:
         """The evidence of every tracked frame at its pose (T, 4, 4)."""
+        frames = np.flatnonzero(self._tracked.seen).tolist()
+        return self._images.look(frames, poses, self._motion(poses))
+
+    def _motion(self, poses: np.ndarray) -> np.ndarray:
+        """Twists (T, 6) of the tracked frames' poses (T, 4, 4)."""
         tracked = self._tracked
         motion = twists(poses, tracked.seen, tracked.times)
         motion[tracked.resting] = 0
-        return self._images.look(np.flatnonzero(tracked.seen).tolist(), poses, motion)
+        return motion
 
     def _take(self, t: int, evidence: PoseEvidence) -> None:
         """Hold the frame's quadratic form."""
@@ -140,6 +145,14 @@ class ObjectImagesData(Term):
             )
             matrix[t], gradient[t] = form.matrix, form.slope
         return _equations(matrix, gradient, self._offset(state))
+
+    def compare(self, state: State, camera: np.ndarray) -> Iterator[tuple[int, int, ViewReport]]:
+        """Frame, camera, and how its view agrees with ``state``, of the one ``camera`` (T,) of each
+        tracked frame; the last look stays."""
+        poses = rigid(state.rotation, state.translation)
+        frames = np.flatnonzero(self._tracked.seen).tolist()
+        for t, report in self._images.compare(frames, poses, self._motion(poses), camera).items():
+            yield t, int(camera[t]), report
 
     def reports(self) -> Iterator[tuple[int, int, ViewReport]]:
         """Frame, camera, and how its view agreed with the pose of the last look."""
