@@ -178,6 +178,11 @@ def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
         ("rec/k2.mkv", None, "sequence 'good': rig.json: has no pose of k2"),
         ("rig.json", "{}", "sequence 'good': rig.json: expected 'master'"),
         ("cup.ply", "a mesh", "sequence 'good': cup.ply: "),
+        (
+            "annotations/good.yaml",
+            "starts: {k1: 0, k9: 0.5}",
+            "sequence 'good': annotations/good.yaml: starts names camera 'k9', the cameras are k1;",
+        ),
         ("annotations/godo.yaml", "", "problem: annotations/godo.yaml: no sequence has this"),
         ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
     ],
