@@ -467,8 +467,11 @@ def test_real_recordings_below_the_results_are_never_made(small_project: Path) -
     assert "virtual recording" not in done.stdout
 
 
-def test_a_run_without_a_terminal_says_how_far_it_is(small_project: Path) -> None:
-    project = load_project(small_project / "config.yaml")
+def test_a_run_without_a_terminal_says_how_far_it_is(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project)
+    project = load_project(Path("config.yaml"))
     watcher = Watcher(project, Console(file=io.StringIO()))
     watcher.transcript.parent.mkdir(parents=True)
     watcher.transcript.write_text("1 of 9 steps (11%) done\n3 of 9 steps (33%) done\n")
