@@ -22,9 +22,9 @@ class Factors(NamedTuple):
     spread: float
 
 
-# Fitted by `python -m bench.verdict` to the studio's truth: 41 recordings seen by two to six cameras,
-# with and without depth, at usual and twice the noise, with other builds, people alone and a beam.
-# The spreads are those of kinds of recordings that were left out of the fit.
+# Fitted by `python -m bench.verdict` to the studio's truth: 41 recordings seen by two to six
+# cameras, with and without depth, at usual and twice the noise, with other builds, people alone and
+# a beam. The spreads are those of kinds of recordings that were left out of the fit.
 FACTORS = {
     Part.BODY: Factors(0.0041, (1.55, 0.07, 0.69, 1.08), 1.28),
     Part.HANDS: Factors(0.0, (0.97, 0.15, 0.81, 1.40), 1.25),
