@@ -18,7 +18,7 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 # stays under 75 without it and under 120 with all. Of the objects' 34 minutes 11 are for detections
 # that are drawn anew.
 BUDGET_MINUTES = {
-    "sequences": 23, "captures": 13, "objects": 34, "bodies": 13, "field_scenes": 15, "field": 21,
+    "sequences": 23, "captures": 13, "objects": 34, "bodies": 12, "field_scenes": 15, "field": 22,
 }  # fmt: skip
 BUDGET_CORES = 2
 STUDIO = "studio"

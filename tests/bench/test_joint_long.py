@@ -21,7 +21,9 @@ def _write(path: Path, frames: int) -> None:
     rng = np.random.default_rng(0)
     masks = [b"" if i == 1 else f"{i:b}".encode() for i in range(frames * VIEWS)]
     rles = [bytes([i]) * (i % 3) for i in range(frames)]  # a candidate in each first view
-    with artefacts.write(path, PERSON, sequence="s", images_alone=True) as writer:
+    with artefacts.write(
+        path, PERSON, sequence="s", images_alone=True, chosen_by="alone", doubts=""
+    ) as writer:
         writer.put("camera_names", ["k1", "k2"])
         offsets, data = pack_ragged(masks)
         writer.put("mask_offsets", offsets)
@@ -36,7 +38,7 @@ def _write(path: Path, frames: int) -> None:
         for name, shape in {
             "person": (VIEWS,), "keypoints": (VIEWS, 135, 3), "joints": (135, 3),
             "joint_views": (135,), "joint_error": (135,), "inlier": (VIEWS, 135),
-            "mask_source": (VIEWS,),
+            "mask_source": (VIEWS,), "others": (),
         }.items():  # fmt: skip
             writer.put(name, rng.integers(0, 2, (frames, *shape)))
 

@@ -107,7 +107,9 @@ def write_capture(
         for c, camera in enumerate(rig)
     ]
     offsets, runs = pack_ragged(masks)
-    with artefacts.write(paths.person, PERSON, sequence="test", images_alone=False) as writer:
+    with artefacts.write(
+        paths.person, PERSON, sequence="test", images_alone=False, chosen_by="alone", doubts=""
+    ) as writer:
         writer.put("camera_names", rig.names)
         writer.put("person", np.where(present[:, None], 0, -1).repeat(cameras, 1).astype(int))
         writer.put("keypoints", observed)
@@ -116,6 +118,7 @@ def write_capture(
         writer.put("joint_error", np.zeros((count, 135)))
         writer.put("inlier", (observed[..., 2] > 0) & (views > 0)[:, None])
         writer.put("missing", ~present)
+        writer.put("others", np.zeros(count, np.int32))
         writer.put("mask_offsets", offsets)
         writer.put("mask_rle", runs)
         writer.put("mask_source", np.ones((count, cameras), int))

@@ -224,7 +224,14 @@ class ObjectCapture:
                 w.put(f"{group}/rle", rle)
         offsets, rle = pack_ragged([images[t][c][1] for t in range(count) for c in range(cameras)])
         shape = (count, cameras, 135)
-        with artefacts.write(paths["person"], PERSON, sequence="glide", images_alone=False) as w:
+        with artefacts.write(
+            paths["person"],
+            PERSON,
+            sequence="glide",
+            images_alone=False,
+            chosen_by="alone",
+            doubts="",
+        ) as w:
             w.put("camera_names", names)
             w.put("person", np.zeros((count, cameras), np.int32))
             w.put("keypoints", np.zeros((*shape, 3)))
@@ -233,6 +240,7 @@ class ObjectCapture:
             w.put("joint_error", np.full((count, 135), np.nan))
             w.put("inlier", np.zeros(shape, bool))
             w.put("missing", np.zeros(count, bool))
+            w.put("others", np.zeros(count, np.int32))
             w.put("mask_offsets", offsets)
             w.put("mask_rle", rle)
             w.put("mask_source", np.ones((count, cameras), np.int8))

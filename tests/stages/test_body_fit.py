@@ -307,7 +307,11 @@ def with_keypoints(source: Path, target: Path, change: Callable[[np.ndarray], No
     """A copy of a person artefact with its keypoints (T,C,135,3) changed in place."""
     with (
         artefacts.read(source, PERSON) as read,
-        artefacts.write(target, PERSON, sequence="test", images_alone=False) as writer,
+        artefacts.write(
+            target,
+            PERSON,
+            **{name: read.attributes[name] for name in ("sequence", *PERSON.attributes)},
+        ) as writer,
     ):
         for key in read.keys(""):
             values = read.text(key) if key == "camera_names" else read[key]
