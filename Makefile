@@ -17,6 +17,9 @@
 # make oracle    how far the studio's cameras, depth biases and mesh take the joint fit, and what a mesh
 #                with holes costs it, on the recordings of evaluate-quick (run that first):
 #                results/oracle.json
+# make report    the site of the demo from what is computed
+# make scale-report  what 223 sequences of 300 frames cost the site, of the demo's (run that first):
+#                into results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -27,7 +30,7 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench ablation oracle docs environment clean
+    evaluate evaluate-quick bench ablation oracle report scale-report docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -79,6 +82,12 @@ ablation: $(STAMP)
 
 oracle: $(STAMP)
 	$(BIN)/python -m bench.oracle --cores $(CORES)
+
+report: $(STAMP)
+	$(BIN)/intercap report config/demo/config.yaml
+
+scale-report: $(STAMP)
+	$(BIN)/python -m bench.scale_report
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

@@ -13,14 +13,17 @@ include: "workflow/rules/object_track.smk"
 include: "workflow/rules/body_fit.smk"
 include: "workflow/rules/joint.smk"
 include: "workflow/rules/metrics.smk"
+include: "workflow/rules/summary.smk"
+include: "workflow/rules/page.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/dataset.smk"
 
 
 rule all:
-    """Artefacts, exports and the report of every sequence."""
+    """Artefacts, exports and pages of every sequence, and the site."""
     default_target: True
     input:
         rules.dataset.output,
+        expand(f"{RESULTS}/site/sequences/{{sequence}}", sequence=SEQUENCES),
         expand(f"{RESULTS}/{{sequence}}/export", sequence=SEQUENCES),
     localrule: True

@@ -90,14 +90,14 @@ def _frames(read: Artefact, schema: artefacts.Schema) -> int:
 
 
 def _extended(read: Artefact, schema: artefacts.Schema, key: str, order: np.ndarray) -> np.ndarray:
-    values = read[key]
-    if schema.field_of(key).dims[:1] != ("T",):
+    values, dims = read[key], schema.field_of(key).dims
+    if "T" not in dims:
         return values
     if key == "times":
         return values[0] + np.median(np.diff(values)) * np.arange(len(order))
     if key == "image_of":
         return _nearest_sets(values, order)
-    return values[order]
+    return np.take(values, order, axis=dims.index("T"))
 
 
 def _nearest_sets(image_of: np.ndarray, order: np.ndarray) -> np.ndarray:
@@ -153,7 +153,7 @@ def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) 
     return float(done.stdout.split()[-1])
 
 
-def _peak_mb() -> float:
+def peak_mb() -> float:
     """Of this process since it was started. Not that of getrusage, which knows the parent's."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
@@ -171,7 +171,7 @@ def _main(arguments: Sequence[str] | None = None) -> None:
     inputs = {name: given.folder / f"{name}.h5" for name in STAGES["joint"].reads}
     output = given.folder / "joint.h5"
     run_step("joint", project, given.sequence, inputs=inputs, output=output)
-    print(f"{_peak_mb():.1f}")
+    print(f"{peak_mb():.1f}")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -239,12 +240,17 @@ def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: st
 class Artefact:
     """A validated artefact that is open for reading. Obtained from :func:`read`."""
 
-    def __init__(self, file: h5py.File, path: Path, schema: Schema) -> None:
+    def __init__(
+        self, file: h5py.File, path: Path, schema: Schema, found: Mapping[str, h5py.Dataset]
+    ) -> None:
+        """``found``: datasets that are open already, by key; looking one up costs more than reading
+        a short one."""
         self._file = file
         self._schema = schema
+        self._found = dict(found)
         self.path = path
 
-    @property
+    @cached_property
     def attributes(self) -> dict[str, Any]:
         """The root attributes as Python values."""
         return {
@@ -252,18 +258,17 @@ class Artefact:
         }
 
     def __contains__(self, key: str) -> bool:
-        return key in self._file
+        return key in self._found or key in self._file
 
     def keys(self, prefix: str = "") -> list[str]:
         """The sorted names of all datasets whose name starts with ``prefix``."""
-        found: list[str] = []
+        names: list[str] = []
+        self._file.visit(names.append)
 
-        def visit(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and name.startswith(prefix):
-                found.append(name)
+        def is_dataset(name: str) -> bool:
+            return name in self._found or isinstance(self._file[name], h5py.Dataset)
 
-        self._file.visititems(visit)
-        return sorted(found)
+        return sorted(name for name in names if name.startswith(prefix) and is_dataset(name))
 
     def __getitem__(self, key: str) -> np.ndarray:
         """Read one whole dataset; text comes back as an object array of ``str``."""
@@ -271,13 +276,15 @@ class Artefact:
 
     def rows(self, key: str, selection: Any) -> np.ndarray:
         """Read part of a dataset, e.g. one image: ``rows("cameras/k1/depth", 7)``."""
-        if key not in self._file:
+        if key not in self:
             raise Unreadable(
                 f"{self.path}: dataset {key!r} is missing; re-run stage "
                 f"'{self._schema.stage}' for this sequence"
             )
         try:
-            values = self._file[key][selection]
+            if key not in self._found:
+                self._found[key] = self._file[key]
+            values = self._found[key][selection]
         except (OSError, RuntimeError) as error:
             raise Unreadable(
                 f"{self.path}: dataset {key!r} is damaged (its checksum does not match); delete "
@@ -343,13 +350,14 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
         ) from error
     with file:
         try:
-            _validate(file, path, schema, again)
+            found = _validate(file, path, schema, again)
         except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
             raise Unreadable(f"{path}: its contents are damaged; delete it and {again}") from error
-        yield Artefact(file, path, schema)
+        yield Artefact(file, path, schema, found)
 
 
-def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> None:
+def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> dict[str, h5py.Dataset]:
+    """The declared datasets that are there, by key."""
     found = str(file.attrs.get("schema", "none"))
     if found != schema.name:
         raise Unreadable(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
@@ -370,14 +378,18 @@ def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> None:
         if name not in file.attrs:
             raise Unreadable(f"{path}: attribute {name!r} is missing; {again}")
     lengths: dict[str, int] = {}
+    datasets = {}
     for key, declared in schema.fields.items():
         if "{camera}" in key:
             continue
-        if key not in file:
+        dataset = file.get(key)
+        if dataset is None:
             if declared.optional:
                 continue
             raise Unreadable(f"{path}: dataset {key!r} is missing; {again}")
-        _check_dataset(file[key], key, declared, lengths, path, again)
+        _check_dataset(dataset, key, declared, lengths, path, again)
+        datasets[key] = dataset
+    return datasets
 
 
 def _check_dataset(

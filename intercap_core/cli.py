@@ -211,15 +211,16 @@ def run(context: typer.Context, settings: Settings = DEFAULT_SETTINGS, cores: Co
 
 @app.command(rich_help_panel=WHOLE)
 def report(settings: Settings = DEFAULT_SETTINGS) -> None:
-    """Aggregate the sequences' metrics into tables, heatmaps, summary and the HTML page.
+    """Write the site of what is computed: a page for each sequence, and tables, heatmaps and the
+    overview of all.
 
     Example: intercap report config/demo/config.yaml
     """
     _prepare()
-    from intercap_core.pipeline.step import run_dataset
+    from intercap_core.commands.report import write_site
     from intercap_core.project import load_project
 
-    typer.echo(run_dataset(load_project(settings)))
+    typer.echo(write_site(load_project(settings)))
 
 
 @app.command(rich_help_panel=WHOLE)
@@ -355,7 +356,7 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         project = load_project(settings)
         name = _known(project.sequences, sequence)
         written = output or project.artefact(name, stage)
-        if stage != "export":
+        if not STAGES[stage].writes_folder:
             _check_output(written, replace_any=output is None)
         inputs = {other: project.artefact(name, other) for other in SEQUENCE_STAGES}
         run_step(stage, project, name, inputs=inputs, output=written)

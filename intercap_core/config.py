@@ -56,7 +56,7 @@ def _not_reserved(name: str) -> str:
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=80)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
-RESERVED_SEQUENCES = ("recordings", "tables")  # folders beside those of the sequences
+RESERVED_SEQUENCES = ("recordings", "site", "tables")  # folders beside those of the sequences
 Vector3 = tuple[float, float, float]
 CameraName = Annotated[str, BeforeValidator(_as_text), Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Seconds = Annotated[float, Field(strict=True)]
@@ -251,15 +251,14 @@ class MetricsSettings(Model):
     with what it shows, and state their errors."""
 
 
-class ReportSettings(Model):
-    """The HTML page."""
+class PageSettings(Model):
+    """The page of each sequence."""
 
-    cameras: Annotated[int, Field(ge=1, le=16)] = 2
-    """Cameras shown with overlays, for each sequence."""
+    cameras: Annotated[int, Field(ge=1, le=16)] = 6
+    """Cameras shown with the fit drawn over their images; those that see most of body and object
+    where there are more."""
     frames: Annotated[int, Field(ge=1, le=50)] = 4
-    """Frames shown with overlays, for each camera."""
-    max_sequences: Annotated[int, Field(ge=1, le=1000)] = 12
-    """Sequences shown with overlays; where there are more, the worst ones."""
+    """Frames shown with the fit drawn over them, for each camera."""
 
 
 class ExportSettings(Model):
@@ -414,7 +413,7 @@ class Config(Model):
     """Body and object together."""
     metrics: MetricsSettings = MetricsSettings()
     """Distances and errors."""
-    report: ReportSettings = ReportSettings()
+    page: PageSettings = PageSettings()
     """The HTML page."""
     export: ExportSettings = ExportSettings()
     """Files for other tools."""
@@ -434,6 +433,9 @@ class SequenceEntry(Model):
     """Row of subjects.tsv."""
     object: Name | None = None
     """Key of objects.yaml; empty = a person alone, and no object is looked for."""
+    intent: Name | None = None
+    """What the person was asked to do with the object, e.g. use or pass; empty = not stated.
+    Statistics are given by it, nothing else depends on it."""
     recordings: Path
     """Folder of the recordings, one file or folder for each camera."""
     layout: LayoutName = "k4a"

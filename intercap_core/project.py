@@ -62,8 +62,15 @@ class Project:
         return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
     def artefact(self, sequence: str, stage: str) -> Path:
-        """Where a stage of this sequence writes: a file, or the folder of the export."""
+        """Where a stage of this sequence writes: a file, or the folder of the export or page."""
+        if stage == "page":
+            return self.site / "sequences" / sequence
         return self.results / sequence / ("export" if stage == "export" else f"{stage}.h5")
+
+    @property
+    def site(self) -> Path:
+        """Folder of the pages, which can be given away as it is."""
+        return self.results / "site"
 
     def annotation(self, sequence: str) -> Annotation:
         """Load this sequence's annotation; empty where there is no file.

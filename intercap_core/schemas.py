@@ -512,6 +512,41 @@ METRICS = Schema(
     },
 )  # fmt: skip
 
+PER_VERTEX_METRICS = frozenset({"body_to_object", "object_to_body"})
+
+# What the figures of all sequences together are made from: the metrics without distances by vertex.
+SUMMARY = Schema(
+    name="summary",
+    version=1,
+    stage="summary",
+    frame="none: values by frame, and on meshes in rest pose",
+    attributes={
+        **METRICS.attributes,
+        "intent": "what the person was asked to do with the object; empty = the table does not say",
+        "gender": "which body file was used",
+        "body_model": "digest of the body file",
+        "num_betas": "numbers of the body's shape",
+        "num_expression": "numbers of the face's expression",
+    },
+    fields={
+        **{key: declared for key, declared in METRICS.fields.items() if key not in PER_VERTEX_METRICS},
+        "body_contact_frames": Field(("V",), "int32", "frames in which the body vertex is within 4.5 mm of the object", optional=True),
+        "rig/camera_names": Field(("Cr",), "str", "one name a camera"),
+        "rig/images": Field(("Cr",), "int32", "frames with a colour image of their moment"),
+        "rig/time_offset": Field(("Cr",), "float64", "how much later than the master the camera exposed", "s"),
+        "rig/time_offset_sigma": Field(("Cr",), "float64", "stated deviation of it; NaN = not known", "s"),
+        "rig/depth_bias": Field(("Cr",), "float64", "what the camera's depth is too far by", "m"),
+        "rig/moved": Field(("Cr",), "float64", "RMS displacement over a 2 m cube, by which refinement moved the camera; NaN = the master, or no images", "m"),
+        "rig/note": Field(("Cr",), "str", "what is degraded about the camera, in words"),
+        "rig/pairs": Field(("Q", "2"), "int32", "cameras whose static surfaces overlap"),
+        "rig/pair_residual_before": Field(("Q",), "float64", "median distance between them as given; NaN = too few points", "m"),
+        "rig/pair_residual_after": Field(("Q",), "float64", "the same after refinement", "m"),
+        "made_by/stages": Field(("S",), "str", "stages whose artefacts the sequence's result rests on"),
+        "made_by/versions": Field(("S",), "int32", "of each artefact's schema"),
+        "made_by/settings": Field(("S",), "str", "digest of the settings that each was made with"),
+    },
+)  # fmt: skip
+
 HEATMAPS = Schema(
     name="heatmaps",
     version=1,

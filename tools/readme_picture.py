@@ -1,6 +1,6 @@
-"""The README's picture: overlays from the demo's report, side by side.
+"""The README's picture: overlays from the pages of the demo's sequences, side by side.
 
-python tools/readme_picture.py results/demo/report.html docs/pictures/demo.jpg
+python tools/readme_picture.py results/demo/site docs/pictures/demo.jpg
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 
 HEIGHT = 460
-FRAMES_OF_EACH = (1, 2)  # of the overlays in one row of the report
+FRAMES_OF_EACH = (1, 2)  # of the overlays of a page's first camera
 QUALITY = 82
 
 
-def main(report: Path, output: Path) -> None:
+def main(site: Path, output: Path) -> None:
     """Tile two overlays of every sequence, first camera, at one height."""
-    page = report.read_text(encoding="utf-8")
     tiles = []
-    for section in re.split(r'<section class="sequence"', page)[1:]:
-        images = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", section)
+    for page in sorted(site.glob("sequences/*/index.html")):
+        text = page.read_text(encoding="utf-8")
+        images = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", text)
         for index in FRAMES_OF_EACH:
             image = cv2.imdecode(np.frombuffer(base64.b64decode(images[index]), np.uint8), 1)
             width = round(image.shape[1] * HEIGHT / image.shape[0])

@@ -32,7 +32,7 @@ LAYERS: tuple[Mapping[str, str], ...] = (
         "project": "settings, tables and annotations, loaded and checked together",
     },
     {
-        "report": "charts, pictures and the page of a dataset",
+        "report": "charts, pictures and the pages of the site",
         "export": "files for other tools: InterCap, AMASS, BOP, glb",
     },
     {
@@ -68,7 +68,8 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     {"schemas": "what every artefact holds"},
     {"artefacts": "the one place that opens HDF5"},
 )
-ROOM_OF = {"frames": "capture"}  # stages that are not named as their room
+# Stages that are not named as their room.
+ROOM_OF = {"frames": "capture", "summary": "metrics", "page": "report"}
 SHARED = ("contact", "energy", "body", "rigid", "camera", "solve")  # by several stages
 Graph = dict[str, set[str]]
 

@@ -31,7 +31,7 @@ COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
 LAST_LINES = 15
 STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # how Snakemake says how far it is
-AGGREGATES = ("report.html", "summary.json")
+AGGREGATES = ("site/index.html", "summary.json")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
         )
         run_watched(command, Watcher(project, console), console)
     print_remarks(project, console)
-    report = project.results / "report.html"
+    report = project.site / "index.html"
     if report.is_file():
         words = f"report: {report.resolve()}"
         console.print(words, highlight=False, markup=False, soft_wrap=True)

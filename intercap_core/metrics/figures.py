@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
 from intercap_core.metrics import contact, object_errors, penetration
 from intercap_core.metrics.object_errors import ObjectErrors
-from intercap_core.schemas import METRICS
+from intercap_core.schemas import METRICS, PER_VERTEX_METRICS
 from intercap_core.stage_list import ESTIMATES
 
 SUMMARY_TRUTH = (
@@ -24,7 +25,7 @@ SUMMARY_PENETRATION = (
     "mean_mm", "median_mm", "p98_mm", "share_le_5mm", "share_le_7mm", "share_le_20mm",
 )  # fmt: skip
 BAD_BODY_M = 0.040  # a body frame beyond this PVE should have been flagged
-_PER_VERTEX = ("body_to_object", "object_to_body", "object_sample_points", "object_sample_contact")
+_PER_VERTEX = PER_VERTEX_METRICS | {"object_sample_points", "object_sample_contact"}
 
 Figures = dict[str, float]
 
@@ -44,12 +45,17 @@ class SequenceMetrics:
     def read(cls, path: Path) -> SequenceMetrics:
         """Raises UserError as :func:`artefacts.read` does."""
         with artefacts.read(path, METRICS) as artefact:
-            told = artefact.attributes
-            values = {
-                key: artefact[key]
-                for key in artefact.keys()  # noqa: SIM118 (not a dict)
-                if key not in _PER_VERTEX
-            }
+            return cls.of(artefact)
+
+    @classmethod
+    def of(cls, artefact: Artefact) -> SequenceMetrics:
+        """From an open metrics artefact, or the summary of one."""
+        told = artefact.attributes
+        values = {
+            key: artefact[key]
+            for key in artefact.keys()  # noqa: SIM118 (not a dict)
+            if key in METRICS.fields and key not in _PER_VERTEX
+        }
         return cls(
             str(told["sequence"]), str(told["subject"]), str(told["object"]),
             float(told["fps"]), bool(told["has_truth"]), values,

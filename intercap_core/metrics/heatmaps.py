@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.metrics.contact import CONTACT_M, vertex_contact
-from intercap_core.schemas import METRICS
+from intercap_core.metrics.summary import SequenceSummary
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,38 +29,37 @@ class Heatmaps:
     objects: dict[str, SurfaceHeat]
 
 
-def collect(paths: Sequence[Path]) -> Heatmaps:
-    """Add up the metrics artefacts at 4.5 mm; raises UserError as reading does.
+def collect(summaries: Sequence[SequenceSummary]) -> Heatmaps:
+    """Add up the sequences' counts at 4.5 mm.
 
     Sequences without an object count in none of the maps. Bodies of another vertex count than the
-    first one's are left out of the body's map, which lies on one topology.
+    first one's are left out of the body's map, which lies on one topology. Raises UserError where
+    an object was measured with two meshes.
     """
     body = np.zeros(0)
     body_frames = 0
     counts: dict[str, np.ndarray] = {}
     points: dict[str, np.ndarray] = {}
     frames: dict[str, int] = {}
-    for path in paths:
-        with artefacts.read(path, METRICS) as artefact:
-            if "body_to_object" not in artefact:
-                continue
-            name = str(artefact.attributes["object"])
-            distance = artefact["body_to_object"]
-            if body_frames == 0:
-                body = np.zeros(distance.shape[1])
-            if distance.shape[1] == len(body):
-                body += vertex_contact(distance, CONTACT_M).sum(0)
-                body_frames += len(distance)
-            here, found = artefact["object_sample_points"], artefact["object_sample_contact"]
-            if name not in counts:
-                counts[name], points[name], frames[name] = np.zeros(len(found)), here, 0
-            if not np.array_equal(points[name], here):
-                raise UserError(
-                    f"{path}: object {name!r} was measured with another mesh than in the "
-                    "sequences before; re-run stage 'metrics' for this sequence"
-                )
-            counts[name] += found
-            frames[name] += len(distance)
+    for summary in summaries:
+        contact, here, found = summary.body_contact, summary.surface, summary.surface_contact
+        if contact is None or here is None or found is None:
+            continue
+        name, count = summary.metrics.object_, len(summary.metrics)
+        if body_frames == 0:
+            body = np.zeros(len(contact))
+        if len(contact) == len(body):
+            body += contact
+            body_frames += count
+        if name not in counts:
+            counts[name], points[name], frames[name] = np.zeros(len(found)), here, 0
+        if not np.array_equal(points[name], here):
+            raise UserError(
+                f"sequence {summary.name!r}: object {name!r} was measured with another mesh than "
+                "in the sequences before; re-run stage 'metrics' for this sequence"
+            )
+        counts[name] += found
+        frames[name] += count
     return Heatmaps(
         body / max(1, body_frames),
         body_frames,

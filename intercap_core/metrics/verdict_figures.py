@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -35,12 +36,22 @@ class StatedError:
     silent: str = ""
 
 
-def stated_errors(sequence: SequenceMetrics) -> list[StatedError]:
+def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
     """Of every judged part; empty where no verdict was asked for."""
+    if sequence not in _known:
+        _known[sequence] = _stated(sequence)
+    return _known[sequence]
+
+
+# Tables, figures and pages each ask for them, and those with truth take a while.
+_known: WeakKeyDictionary[SequenceMetrics, tuple[StatedError, ...]] = WeakKeyDictionary()
+
+
+def _stated(sequence: SequenceMetrics) -> tuple[StatedError, ...]:
     values = sequence.values
     if "verdict/error" not in values:
-        return []
-    return [
+        return ()
+    return tuple(
         StatedError(
             sequence.name,
             str(part),
@@ -50,7 +61,7 @@ def stated_errors(sequence: SequenceMetrics) -> list[StatedError]:
             str(values["verdict/silent"][place]),
         )
         for place, part in enumerate(values["verdict/part_names"])
-    ]
+    )
 
 
 def _true(sequence: SequenceMetrics, part: str, stated: np.ndarray) -> float:

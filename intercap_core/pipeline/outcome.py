@@ -31,7 +31,12 @@ def line(stage: str, path: Path) -> str:
 
 
 def notes(stage: str, path: Path) -> list[str]:
-    """What of the artefact is degraded, in words, each once; raises UserError as :func:`line`."""
+    """What of the artefact is degraded, in words, each once; raises UserError as :func:`line`.
+
+    A summary repeats what the metrics say: of it there is nothing.
+    """
+    if stage == "summary":
+        return []
     with artefacts.read(path, getattr(schemas, stage.upper())) as artefact:
         found = []
         if "note" in artefact:
@@ -165,6 +170,14 @@ def _metrics(a: Artefact) -> str:
     return f"{said}{_share(a['flagged'])} frames flagged"
 
 
+def _summary(summary: Artefact) -> str:
+    flagged = summary["flagged"]
+    words = f"{len(flagged)} frames, {int(flagged.sum())} flagged"
+    if "contact_frame" in summary:
+        words += f", {_share(summary['contact_frame'])} in contact"
+    return words
+
+
 _LINES: dict[str, Callable[[Artefact], str]] = {
     "frames": _frames,
     "detections": _detections,
@@ -174,6 +187,7 @@ _LINES: dict[str, Callable[[Artefact], str]] = {
     "body_fit": _body_fit,
     "joint": _joint,
     "metrics": _metrics,
+    "summary": _summary,
 }
 
 

@@ -16,7 +16,7 @@ from intercap_core.errors import UserError
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import last_failure
 from intercap_core.project import Project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.stage_list import STAGES
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def run_step(
     known: dict[str, Any] = {
         **inputs,
         "output": output,
-        "settings": getattr(project.config, stage),
+        "settings": getattr(project.config, stage, None),  # not every stage has any
         "body_settings": project.config.body_fit,
         "track_settings": project.config.object_track,
         "joint_settings": project.config.joint,
@@ -131,34 +131,23 @@ def run_studio(project: Project, sequence: str) -> Path:
 
 
 def run_dataset(project: Project) -> Path:
-    """Aggregate the project's sequences and write the report; returns the page's path.
+    """Merge the sequences' summaries; returns the path of the site's first page.
 
-    Sequences that the project excludes because they failed are named in it. Raises UserError
-    where an artefact is missing or broken.
+    Sequences that the project excludes because they failed are named in it, and those whose
+    summary is missing or broken. Raises UserError where none is left.
     """
     from intercap_core.stages import dataset
 
     folder = project.results
     reasons = {name: last_failure(project.logs / name) for name in project.config.exclude}
-    dataset.run(
+    return dataset.run(
         dataset=project.config.dataset,
-        sequences={
-            name: {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES}
-            for name in project.sequences
-        },
+        summaries={name: project.artefact(name, "summary") for name in project.sequences},
         objects=project.objects,
-        subjects=project.subjects,
         body_models=project.config.body_models,
-        settings=project.config.report,
-        report=folder / "report.html",
+        site=project.site,
         summary=folder / "summary.json",
         heatmaps=folder / "heatmaps.h5",
         tables_folder=folder / "tables",
         failed={name: reason for name, reason in reasons.items() if reason},
-        truths={
-            name: row.truth
-            for name, row in project.sequences.items()
-            if row.truth is not None and row.truth.is_file()
-        },
     )
-    return folder / "report.html"

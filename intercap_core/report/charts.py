@@ -15,6 +15,7 @@ _WIDTH, _HEIGHT = 520, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 34, 44
 _ROW = 22
 _LABEL = 150
+_LETTER = 6.6  # width of a letter of a legend, on average
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +68,11 @@ def line_chart(
             for x, y in zip(line.x, line.y, strict=True)
         )
         parts.append(f'<polyline {_stroke(line.colour)} points="{points}"/>')
-    for index, line in enumerate(line for line in series if line.name):
-        x = _LEFT + 100 * index
+    x = _LEFT
+    for line in (line for line in series if line.name):
         parts.append(f'<line {_stroke(line.colour)} x1="{x}" x2="{x + 20}" {_same("y", 14)}/>')
         parts.append(_text(x + 26, 18, line.name, "legend", "start"))
+        x += max(100, 44 + _LETTER * len(line.name))
     parts.append(_text(_LEFT + inner_width / 2, _HEIGHT - 8, x_label, "label", "middle"))
     parts.append(
         f'<text class="label" text-anchor="middle" transform="translate(14 '
@@ -242,7 +244,8 @@ def bar_pairs(rows: Sequence[BarPair], unit: str) -> str:
         values = " → ".join(
             f"{v:.1f}" if math.isfinite(v) else "–" for v in (row.before, row.after)
         )
-        text = f"{values}  ·  {row.beside}{', weak' if row.weak else ''}"
+        beside = f"  ·  {row.beside}" if row.beside else ""
+        text = f"{values}{beside}{', weak' if row.weak else ''}"
         parts.append(_text(left + inner + 10, y + 12, text, "tick", "start"))
     parts.append(_text(left + inner / 2, height - 6, unit, "label", "middle"))
     return "".join([*parts, "</svg>"])

@@ -1,4 +1,4 @@
-"""Pictures of the contact heatmaps: the body from four sides of interest, objects from two."""
+"""Pictures of the contact heatmaps: the body, each hand and each object from two sides."""
 
 from __future__ import annotations
 
@@ -44,19 +44,26 @@ def colours(values: np.ndarray, top: float) -> np.ndarray:
     return np.column_stack([np.interp(share, _STOP_AT, stops[:, k]) for k in range(3)])
 
 
-def body_pictures(model: BodyModel, likelihood: np.ndarray, top: float) -> list[HeatPicture]:
-    """Front and back with lowered arms, and both sides of both hands."""
+def body_surfaces(
+    model: BodyModel, likelihood: np.ndarray
+) -> list[tuple[str, list[HeatPicture], float]]:
+    """The body, front and back with lowered arms, and each hand from both sides.
+
+    Each with its name and its own highest likelihood, which its last colour stands for, as in the
+    paper's figure: hands touch far more often than the rest.
+    """
     params = model.zeros(1)
     for index, turn in ((JOINT_INDEX["left_shoulder"], -1), (JOINT_INDEX["right_shoulder"], 1)):
         params.body_pose[:, 3 * (index - 1) + 2] = turn * _ARMS_DOWN
     with torch.no_grad():
         standing = model.forward(params).vertices[0].numpy().astype(np.float64)
-    faces, paint = model.faces.numpy(), colours(likelihood, top)
-    up = np.array([0, 1.0, 0])
-    pictures = [
+    faces, top = model.faces.numpy(), highest(likelihood)
+    paint, up = colours(likelihood, top), np.array([0, 1.0, 0])
+    whole = [
         _look(standing, faces, paint, view, up, (280, 480), name)
         for name, view in (("front", [0, 0, 1.0]), ("back", [0, 0, -1.0]))
     ]
+    surfaces = [("body", whole, top)]
     template = model.template.numpy().astype(np.float64)
     with torch.no_grad():
         joints = model.forward(model.zeros(1)).joints[0].numpy()
@@ -65,11 +72,19 @@ def body_pictures(model: BodyModel, likelihood: np.ndarray, top: float) -> list[
         shown = outwards * (template[:, 0] - wrist) > -_WRIST_M
         kept = faces[shown[faces].all(1)]
         fingers = np.array([outwards, 0, 0])  # the T-pose's fingers point away from the body
-        for what, view in (("palm", [0, -1.0, 0]), ("back", [0, 1.0, 0])):
-            pictures.append(
-                _look(template, kept, paint, view, fingers, (240, 240), f"{side} hand, {what}")
-            )
-    return pictures
+        top = highest(likelihood[shown])
+        paint = colours(likelihood, top)
+        hand = [
+            _look(template, kept, paint, view, fingers, (240, 240), f"{side} hand, {what}")
+            for what, view in (("palm", [0, -1.0, 0]), ("back", [0, 1.0, 0]))
+        ]
+        surfaces.append((f"{side} hand", hand, top))
+    return surfaces
+
+
+def highest(likelihood: np.ndarray) -> float:
+    """What a map's last colour stands for: its maximum; all grey where nothing touches."""
+    return max(float(likelihood.max(initial=0.0)), 1e-6)
 
 
 def object_pictures(

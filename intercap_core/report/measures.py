@@ -15,6 +15,7 @@ from intercap_core.stage_list import ESTIMATES
 _MAX_CAMERA_ROWS = 40
 _HISTOGRAM_MM = 30.0
 _BIN_MM = 1.0
+_LEAST_ACCELERATION_MM = 5.0  # top of the chart, at the least
 _PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, the paper's Experiments
 _NAMES = {"object_track": "object track", "body_fit": "body fit", "joint": "joint"}
 # key, what it is, digits, whether more is better (None: neither)
@@ -166,6 +167,35 @@ def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
             marks=((5, "5"), (7, "7"), (20, "20")),
         ),
     }
+
+
+def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
+    """Share of frames up to an acceleration, of body and object; "" where no frame has one."""
+    lines = []
+    for name, colour, key in (
+        ("body", "c1", "acceleration_body"),
+        ("object", "c2", "acceleration_object"),
+    ):
+        values = figures.pooled(sequences, key)
+        known = np.zeros(0) if values is None else 1e3 * values[np.isfinite(values)]
+        if len(known):
+            lines.append((name, colour, np.sort(known.astype(np.float64))))
+    if not lines:
+        return ""
+    top = max(_LEAST_ACCELERATION_MM, max(float(np.quantile(v, 0.99)) for _, _, v in lines))
+    grid = np.linspace(0, top, 121)
+    return charts.line_chart(
+        [
+            charts.Series(
+                name, colour, grid, 100 * np.searchsorted(values, grid, "right") / len(values)
+            )
+            for name, colour, values in lines
+        ],
+        x_label="acceleration, mm/frame² at 30 fps",
+        y_label="frames, %",
+        x_range=(0.0, top),
+        y_range=(0.0, 100.0),
+    )
 
 
 def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str, Any]]:

@@ -62,9 +62,9 @@ def serve() -> None:
     for name in PRELOADED:
         importlib.import_module(name)
     from intercap_core.pipeline.code_digest import code_digest
-    from intercap_core.stage_list import SEQUENCE_STAGES
+    from intercap_core.stage_list import STAGES
 
-    for stage in (*SEQUENCE_STAGES, "export", "dataset"):
+    for stage in (*STAGES, "dataset"):
         code_digest(f"stages.{stage}")
     files = imported()
     for line in sys.stdin:

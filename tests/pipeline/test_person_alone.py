@@ -36,7 +36,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
         "dataset: trial\n"
         f"results: {folder / 'results'}\n"
         "body_fit: {points_per_frame: 300}\n"
-        "report: {cameras: 1, frames: 1}\n"
+        "page: {cameras: 1, frames: 1}\n"
         "studio: {colour_mode: 720P, cameras: 2, captures: {alone: "
         "{interaction: walk_and_wave, subject: s04, seed: 31, frames: 6, annotate: true}}}\n"
     )
@@ -111,10 +111,11 @@ def test_files_for_other_tools_hold_the_body(project: Project) -> None:
 
 
 def test_the_report_leaves_objects_and_contact_out(project: Project) -> None:
-    page = (project.results / "report.html").read_text()
-    for part in ('id="penetration"', 'id="heatmaps"', 'id="tracks"', "in contact</text>", ">nan"):
-        assert part not in page
-    assert "people alone" in page and 'id="bodies"' in page
+    overview = (project.site / "index.html").read_text()
+    page = (project.artefact(NAME, "page") / "index.html").read_text()
+    for part in ('id="penetration"', 'id="heatmaps"', 'id="track"', "in contact</text>", ">nan"):
+        assert part not in overview + page
+    assert "people alone" in overview and 'id="body"' in page
     summary = json.loads((project.results / "summary.json").read_text())
     assert summary["vertex_to_cloud"]["object_mm"] is None
     assert summary["penetration"]["share_le_5mm"] is None

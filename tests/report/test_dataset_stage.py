@@ -16,14 +16,15 @@ import pandas as pd
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import MetricsSettings, ReportSettings
+from intercap_core.config import ContactInterval, MetricsSettings, PageSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import CONTACT_REGIONS, HEATMAPS, METRICS
-from intercap_core.stage_list import SEQUENCE_STAGES
-from intercap_core.stages import dataset, metrics
+from intercap_core.stage_list import STAGES
+from intercap_core.stages import metrics, page
 from tests.helpers import fitted_capture as fitted
+from tests.helpers.site import merge, row, write_site, write_summaries
 
-STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
+MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
 
 
@@ -39,7 +40,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
             file["contact_probability"][:2, hands] = 0.9 if object_name == "football" else 0.1
             file["contact_probability"][3, hands] = 0.9 if object_name == "football" else 0.1
         metrics.run(
-            **made[name].inputs(*STAGES),
+            **made[name].inputs(*MEASURED),
             output=made[name].paths["metrics"],
             object_=made[name].object_,
             subject=fitted.SUBJECT,
@@ -52,21 +53,13 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
 
 
 def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Path:
-    dataset.run(
-        dataset="demo",
-        sequences={name: capture.inputs(*SEQUENCE_STAGES) for name, capture in captures.items()},
-        objects={capture.object_.name: capture.object_ for capture in captures.values()},
-        subjects={"p01": fitted.SUBJECT},
-        body_models=fitted.BODY_MODELS,
-        settings=ReportSettings(**settings),
-        report=out / "report.html",
-        summary=out / "summary.json",
-        heatmaps=out / "heatmaps.h5",
-        tables_folder=out / "tables",
+    return write_site(
+        captures,
+        out,
+        settings=PageSettings(**settings),
         failed=FAILED,
-        truths={name: capture.paths["truth"] for name, capture in captures.items()},
+        intents={"s01_o03": "use"},
     )
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -96,11 +89,24 @@ class _Reader(HTMLParser):
         self.text.append(data)
 
 
-@pytest.fixture(scope="module")
-def page(out: Path) -> _Reader:
+def _read(path: Path) -> _Reader:
     reader = _Reader()
-    reader.feed((out / "report.html").read_text())
+    reader.feed(path.read_text())
     return reader
+
+
+def _page(out: Path, name: str) -> Path:
+    return out / "site" / "sequences" / name / "index.html"
+
+
+@pytest.fixture(scope="module")
+def overview(out: Path) -> _Reader:
+    return _read(out / "site" / "index.html")
+
+
+@pytest.fixture(scope="module")
+def pages(out: Path, captures: dict[str, fitted.Capture]) -> dict[str, _Reader]:
+    return {name: _read(_page(out, name)) for name in captures}
 
 
 def test_all_files_are_there(out: Path) -> None:
@@ -130,52 +136,137 @@ def test_heatmaps_are_shares_of_frames(out: Path, captures: dict[str, fitted.Cap
     assert body[regions["right_hand"]].max() > 0 and body[regions["left_foot"]].max() == 0
 
 
-def test_page_needs_nothing_beside_itself(page: _Reader) -> None:
-    assert all(address.startswith(("data:", "#")) for address in page.addresses)
-    targets = {a[1:] for a in page.addresses if a.startswith("#")}
-    assert {"s-s01_o03", "s-s01_o09", "truth", "penetration"} <= targets
-    for image in page.images[:-1]:  # the last one is the empty enlargement
-        assert image["alt"]
-        data = base64.b64decode(str(image["src"]).split(";base64,")[1])
-        shape = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape
-        assert shape[:2] == (int(str(image["height"])), int(str(image["width"])))
+def test_tables_by_object_subject_intent_and_camera(
+    out: Path, captures: dict[str, fitted.Capture]
+) -> None:
+    tables = {path.stem: pd.read_csv(path) for path in (out / "tables").glob("*.csv")}
+    assert set(tables) == {"sequences", "frames", "cameras", "objects", "subjects", "intents"}
+    assert tables["objects"]["object"].tolist() == ["cup", "football"]
+    subject = tables["subjects"].iloc[0]
+    assert (subject["sequences"], subject["frames"]) == (2, 8)
+    assert tables["intents"][["intent", "frames"]].values.tolist() == [["use", 4]]
+    # a group of one sequence has that sequence's figures
+    by_name = tables["sequences"].set_index("sequence")
+    ball = tables["objects"].set_index("object").loc["football"]
+    for column in ("penetration.mean_mm", "vertex_to_cloud.body_mm", "joint.body_pve_mm"):
+        assert ball[column] == pytest.approx(by_name.loc["s01_o03", column], rel=1e-5)
+    cameras = tables["cameras"]
+    assert cameras.groupby("sequence")["camera"].nunique().tolist() == [3, 3]
+    assert (cameras["images"] == 4).all()
+    for name in tables:
+        read = pd.read_parquet(out / "tables" / f"{name}.parquet")
+        assert len(read) == len(tables[name]) and list(read) == list(tables[name])
 
 
-def test_page_shows_overlays_heatmaps_flags_and_failures(page: _Reader) -> None:
-    text = " ".join(" ".join(page.text).split())
-    captions = [str(image["alt"]) for image in page.images]
-    assert sum(c.startswith("camera ") for c in captions) == 2 * 2 * 4  # sequences, cameras, frames
+def test_pages_need_nothing_beside_the_site(
+    out: Path, overview: _Reader, pages: dict[str, _Reader]
+) -> None:
+    for folder, shown in (
+        (out / "site", overview),
+        *((_page(out, n).parent, pages[n]) for n in pages),
+    ):
+        for address in shown.addresses:
+            if not address.startswith(("data:", "#")):
+                target = (folder / address.partition("#")[0]).resolve()
+                assert target.is_relative_to((out / "site").resolve()) and target.is_file()
+        for image in shown.images[:-1]:  # the last one is the empty enlargement
+            assert image["alt"]
+            data = base64.b64decode(str(image["src"]).split(";base64,")[1])
+            shape = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape
+            assert shape[:2] == (int(str(image["height"])), int(str(image["width"])))
+    targets = {a[1:] for a in overview.addresses if a.startswith("#")}
+    assert {"sequences-table", "truth", "penetration", "heatmaps"} <= targets
+
+
+def test_pages_show_overlays_flags_and_failures(
+    overview: _Reader, pages: dict[str, _Reader]
+) -> None:
+    text = " ".join(" ".join(overview.text).split())
+    captions = [str(image["alt"]) for image in overview.images]
     assert {"front", "back", "left hand, palm", "right hand, back", "one side"} <= set(captions)
-    for name in ("s01_o03", "s01_o09"):
+    for part in (FAILED["s03_o01"], "object lost", "Against truth", "InterCap, as published"):
+        assert part in text
+    for name, shown in pages.items():
+        captions = [str(image["alt"]) for image in shown.images]
+        assert sum(c.startswith("camera ") for c in captions) == 3 * 4  # cameras, frames
         assert sum(c.startswith(f"{name}, frame ") for c in captions) == 6  # two sides, one slice
-    assert [c for c in captions if " hand, frames " in c] == [
+        text = " ".join(" ".join(shown.text).split())
+        for part in ("Over time", "Verdict", "Joint fit", "before (grey) and after (blue)"):
+            assert part in text
+    held = [str(image["alt"]) for image in pages["s01_o03"].images]
+    assert [c for c in held if " hand, frames " in c] == [
         "left hand, frames 0–1, drawn at 0",
         "right hand, frames 0–1, drawn at 0",
     ]  # of four holds the longest
-    for part in (FAILED["s03_o01"], "object lost", "Against truth", "InterCap, as published"):
-        assert part in text
+
+
+def test_what_is_annotated_is_beside_what_is_stated(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    capture = captures["s01_o03"]
+    page.run(
+        **capture.inputs(*STAGES["page"].reads),
+        sequence=row("s01_o03"), object_=capture.object_, subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS, settings=PageSettings(cameras=1, frames=1),
+        contact=[ContactInterval(part="right_hand", start=1, end=9)],
+        output=tmp_path / "page", truth=None,
+    )  # fmt: skip
+    text = (tmp_path / "page" / "index.html").read_text()
+    assert "right hand, annotated" in text and "1–3: annotated" in text
+    assert text.count("camera k") and "left hand, annotated" not in text
+
+
+def test_a_page_replaces_a_page_and_nothing_else(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    capture = captures["s01_o03"]
+    with pytest.raises(UserError, match="nor an earlier page"):
+        page.run(
+            **capture.inputs(*STAGES["page"].reads),
+            sequence=row("s01_o03"), object_=capture.object_, subject=fitted.SUBJECT,
+            body_models=fitted.BODY_MODELS, settings=PageSettings(), contact=None,
+            output=tmp_path, truth=None,
+        )  # fmt: skip
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_markup_in_words_is_shown_as_words(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    paths = write_summaries(captures, tmp_path)
+    with h5py.File(paths["s01_o03"], "r+") as file:
+        file["rig/note"][0] = "<script>alert(1)</script>"
+        file.attrs["intent"] = "<img src=x>"
+    text = merge(paths, captures, tmp_path / "out", failed={"<b>": "<i>"}).read_text()
+    assert "<img src=x>" not in text and "&lt;img src=x&gt;" in text
+    assert "<i>" not in text and "&lt;i&gt;" in text
+
+
+def test_a_summary_that_cannot_be_read_is_listed(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    paths = write_summaries(captures, tmp_path)
+    with h5py.File(paths["s01_o09"], "r+") as file:
+        file.attrs["schema_version"] = 99
+    paths["s05_o01"] = tmp_path / "never.h5"
+    text = merge(paths, captures, tmp_path / "out").read_text()
+    assert "1 sequence, 4 frames" in text and "2 failed" in text
+    assert "s01_o09.h5" in text and "never.h5" in text
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["sequences"] == 1
 
 
 def test_overlay_covers_the_person_in_the_image(
-    captures: dict[str, fitted.Capture], page: _Reader
+    pages: dict[str, _Reader],
 ) -> None:
     """The recorded person is red; the overlay turns it blue where the fit is right."""
-    image = next(i for i in page.images if str(i["alt"]).startswith("camera "))
+    image = next(i for i in pages["s01_o03"].images if str(i["alt"]).startswith("camera "))
     data = base64.b64decode(str(image["src"]).split(",")[1])
     blue, green, red = cv2.split(cv2.imdecode(np.frombuffer(data, np.uint8), 1).astype(int))
     uncovered = (red - blue > 60) & (red - green > 40)
     covered = blue - red > 25
     assert covered.sum() > 12 * uncovered.sum()
-
-
-def test_more_sequences_than_shown_leaves_the_worst(
-    captures: dict[str, fitted.Capture], tmp_path: Path
-) -> None:
-    text = (
-        _run(captures, tmp_path, max_sequences=1, cameras=1, frames=1) / "report.html"
-    ).read_text()
-    assert text.count('<section class="sequence"') == 1
-    assert "1 others are only in the tables" in text
 
 
 def test_same_input_same_bytes(
@@ -188,7 +279,7 @@ def test_same_input_same_bytes(
 
 def test_a_dataset_without_results_says_so(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no sequence has a result"):
-        _run({}, tmp_path)
+        merge({}, {}, tmp_path)
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
@@ -225,7 +316,10 @@ def test_page_in_a_browser_has_no_errors_and_asks_for_nothing(out: Path, tmp_pat
     printed, asked, _ = _browse(bad, tmp_path / "control")
     assert "CONSOLE" in printed and asked == {"http://127.0.0.1:9/x.png"}
 
-    printed, asked, image = _browse(out / "report.html", tmp_path)
-    assert "CONSOLE" not in printed, printed
-    assert asked == set()
-    assert image.shape[:2] == (2400, 1240) and image.std() > 10
+    for place in (out / "site" / "index.html", _page(out, "s01_o03")):
+        folder = tmp_path / place.parent.name
+        folder.mkdir()
+        printed, asked, image = _browse(place, folder)
+        assert "CONSOLE" not in printed, printed
+        assert asked == set()
+        assert image.shape[:2] == (2400, 1240) and image.std() > 10

@@ -225,8 +225,8 @@ def test_frame_table_has_a_row_a_frame(tmp_path: Path) -> None:
     assert frames["joint.object_translation_mm"][0] == pytest.approx(1)
     assert frames["joint.object_translation_mm"].isna().sum() == 4
     by_sequence = tables.sequence_table([_tracked(), sequence("b")], {})
-    tables.write(tmp_path / "one", by_sequence, frames)
-    tables.write(tmp_path / "two", by_sequence, frames)
+    for folder in ("one", "two"):
+        tables.write(tmp_path / folder, {"sequences": by_sequence, "frames": frames})
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
     read = pd.read_parquet(tmp_path / "one" / "frames.parquet")

@@ -10,15 +10,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from intercap_core.config import MetricsSettings, ReportSettings
+from intercap_core.config import MetricsSettings, PageSettings
 from intercap_core.evaluation.sequences import areas
 from intercap_core.metrics.figures import SequenceMetrics, flag_figures, truth_figures
 from intercap_core.metrics.heatmaps import collect
+from intercap_core.metrics.summary import SequenceSummary
 from intercap_core.object_track.absent import SOURCE, absent_track
 from intercap_core.schemas import CONTACT_REGIONS
-from intercap_core.stage_list import SEQUENCE_STAGES
-from intercap_core.stages import dataset, metrics
+from intercap_core.stages import metrics
 from tests.helpers import fitted_capture as fitted
+from tests.helpers.site import write_site
 
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 TOTAL = 4
@@ -69,20 +70,7 @@ def measured(captures: dict[str, fitted.Capture]) -> dict[str, SequenceMetrics]:
 @pytest.fixture(scope="module")
 def out(captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dataset")
-    dataset.run(
-        dataset="mixed",
-        sequences={name: made.inputs(*SEQUENCE_STAGES) for name, made in captures.items()},
-        objects={made.object_.name: made.object_ for made in captures.values()},
-        subjects={"p01": fitted.SUBJECT},
-        body_models=fitted.BODY_MODELS,
-        settings=ReportSettings(cameras=1, frames=1),
-        report=folder / "report.html",
-        summary=folder / "summary.json",
-        heatmaps=folder / "heatmaps.h5",
-        tables_folder=folder / "tables",
-        truths={name: made.paths["truth"] for name, made in captures.items()},
-    )
-    return folder
+    return write_site(captures, folder, name="mixed", settings=PageSettings(cameras=1, frames=1))
 
 
 def test_the_body_is_measured_alike(measured: dict[str, SequenceMetrics]) -> None:
@@ -122,9 +110,11 @@ def test_figures_of_a_mixed_dataset_are_those_of_its_parts(
     assert not [key for key in areas([alone])["joint"] if "object" in key or "contact" in key]
 
 
-def test_heatmaps_count_those_who_could_touch(captures: dict[str, fitted.Capture]) -> None:
-    paths = [captures[name].paths["metrics"] for name in (ALONE, HELD, MISSED)]
-    found, held = collect(paths), collect(paths[1:2])
+def test_heatmaps_count_those_who_could_touch(out: Path) -> None:
+    summaries = [
+        SequenceSummary.read(out / "summaries" / f"{name}.h5") for name in (ALONE, HELD, MISSED)
+    ]
+    found, held = collect(summaries), collect(summaries[1:2])
     assert found.body_frames == TOTAL and list(found.objects) == ["football"]
     np.testing.assert_array_equal(found.body, held.body)
     assert found.objects["football"].frames == TOTAL
@@ -146,20 +136,19 @@ def test_tables_have_gaps_and_no_zeros(out: Path) -> None:
     assert json.loads((out / "summary.json").read_text())["sequences"] == 3
 
 
-def test_the_page_shows_each_sequence_what_it_has(out: Path) -> None:
-    page = (out / "report.html").read_text()
-    assert "3 sequences, 12 frames" in page and "1 object<" in page.replace(
+def test_the_pages_show_each_sequence_what_it_has(out: Path) -> None:
+    overview = (out / "site" / "index.html").read_text()
+    assert "3 sequences, 12 frames" in overview and "1 object<" in overview.replace(
         "1 object\n", "1 object<"
     )
-    parts = {}
-    for name in (HELD, ALONE, MISSED):
-        parts[name] = page.split(f'id="s-{name}"')[1].split("</section>")[0]
-        assert "data:image/jpeg" in parts[name]
-    assert "in contact" in parts[HELD] and "touches the object" in parts[HELD]
+    parts = {
+        name: (out / "site" / "sequences" / name / "index.html").read_text()
+        for name in (HELD, ALONE, MISSED)
+    }
+    assert all("data:image/jpeg" in part for part in parts.values())
+    assert ">in contact<" in parts[HELD] and "touches the object" in parts[HELD]
     for name in (ALONE, MISSED):
-        assert "in contact" not in parts[name] and "touches" not in parts[name]
-    assert "p01, alone, 4 frames" in parts[ALONE]
-    tracks = page.split('id="tracks"')[1].split('id="bodies"')[0]
-    assert f'id="t-{ALONE}"' not in tracks
-    missed = tracks.split(f'id="t-{MISSED}"')[1].split("</details>")[0]
+        assert ">in contact<" not in parts[name]
+    assert "p01, alone, 4 frames" in parts[ALONE] and 'id="track"' not in parts[ALONE]
+    missed = parts[MISSED].split('id="track"')[1].split('id="body"')[0]
     assert WHY in missed and "found in no frame" in missed and "deviation of place" not in missed

@@ -17,19 +17,29 @@ from intercap_core.config import (
     JointSettings,
     MetricsSettings,
     ObjectTrackSettings,
+    PageSettings,
     PersonSettings,
-    ReportSettings,
     SubjectEntry,
 )
 from intercap_core.errors import UserError
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import body_fit, dataset, export, joint, metrics, object_track, person
+from intercap_core.stages import (
+    body_fit,
+    export,
+    joint,
+    metrics,
+    object_track,
+    page,
+    person,
+    summary,
+)
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.body_capture import ring, write_capture
 from tests.helpers.object_capture import ObjectCapture
 from tests.helpers.reduced_capture import Reduction
+from tests.helpers.site import merge, row
 from tests.rigid.conftest import catalogue
 from tests.stages.test_body_fit import motion
 
@@ -263,21 +273,16 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
         joint=paths["joint"], scene=paths["scene"], metrics=measured,
         output=tmp_path / "export", settings=ExportSettings(), **common,
     )  # fmt: skip
-    dataset.run(
-        dataset="small",
-        sequences={"cap": {"metrics": measured, **{s: paths[s] for s in STAGES["metrics"].reads}}},
-        objects={capture.object_.name: capture.object_},
-        subjects={"p01": fitted.SUBJECT},
-        body_models=fitted.BODY_MODELS,
-        settings=ReportSettings(frames=1, cameras=1),
-        report=tmp_path / "report.html",
-        summary=tmp_path / "summary.json",
-        heatmaps=tmp_path / "heatmaps.h5",
-        tables_folder=tmp_path / "tables",
-    )
+    inputs = {"metrics": measured, **{s: paths[s] for s in STAGES["metrics"].reads}}
+    summary.run(**inputs, sequence=row("cap"), output=tmp_path / "summary.h5")
+    page.run(
+        **inputs, **common, sequence=row("cap"), contact=None, truth=None,
+        settings=PageSettings(frames=1, cameras=1), output=tmp_path / "page",
+    )  # fmt: skip
+    first = merge({"cap": tmp_path / "summary.h5"}, {"cap": capture}, tmp_path)
     assert "NaN" not in (tmp_path / "summary.json").read_text()
-    page = (tmp_path / "report.html").read_text()
-    assert ">nan<" not in page.lower()
+    for written in (first, tmp_path / "page" / "index.html"):
+        assert ">nan<" not in written.read_text().lower()
 
 
 def test_the_joint_fit_needs_no_depth(people, objects, tmp_path):

@@ -54,11 +54,11 @@ def test_an_unreadable_recording_fails_alone(recorded: Flow, flow: Flow) -> None
 def test_the_report_is_made_of_the_others_and_says_so(recorded: Flow) -> None:
     told = recorded.transcript.read_text()
     assert f"the report leaves out {OTHER}" in told
-    assert str(recorded.results / "report.html") in told
+    assert str(recorded.results / "site" / "index.html") in told
     summary = json.loads((recorded.results / "summary.json").read_text())
     assert summary["sequences"] == 1
     assert summary["truth"] == {}
-    page = (recorded.results / "report.html").read_text()
+    page = (recorded.results / "site" / "index.html").read_text()
     assert OTHER in page
     assert "no camera in captures" in page
 

@@ -15,7 +15,8 @@ import yaml
 
 from tests.helpers.flow import ONE, OTHER, Flow
 
-AFTER_SCENE = {"scene", "person", "object_track", "body_fit", "joint", "metrics", "export"}
+AFTER_METRICS = {"summary", "page", "export"}
+AFTER_SCENE = {"scene", "person", "object_track", "body_fit", "joint", "metrics", *AFTER_METRICS}
 DATASET = ("", "dataset")
 CONTACT = "contact:\n- {part: right_hand, start: 1, end: 4}\n"
 FLOOR = "floor: [[0.0, 1.0, 2.0], [1.0, 1.0, 2.0], [0.0, 1.0, 3.0]]\n"
@@ -61,16 +62,16 @@ def test_touching_re_runs_nothing(flow: Flow) -> None:
 @pytest.mark.parametrize(
     ("text", "stages"),
     [
-        (CONTACT, {"joint", "metrics", "export"}),
+        (CONTACT, {"joint", "metrics", *AFTER_METRICS}),
         (FLOOR, AFTER_SCENE),
         (
             "object_pose: {rotation_vector: [0, 0, 0], translation: [0, 0, 2]}\n",
-            {"object_track", "joint", "metrics", "export"},
+            {"object_track", "joint", "metrics", *AFTER_METRICS},
         ),
         ("drop_frames: [2]\n", {"frames", "detections", *AFTER_SCENE}),
         (
             "subject: [{camera: k1, frame: 0, x: 612, y: 340}]\n",
-            {"person", "object_track", "body_fit", "joint", "metrics", "export"},
+            {"person", "object_track", "body_fit", "joint", "metrics", *AFTER_METRICS},
         ),
         ("# nothing yet\ncontact:\n", set()),
     ],
@@ -92,7 +93,7 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
         path.write_text("# a comment, and the same content\n" + FLOOR + CONTACT)
         assert flow.pending() == set()
         path.write_text(FLOOR + CONTACT.replace("end: 4", "end: 5"))
-        contact = {(OTHER, stage) for stage in ("joint", "metrics", "export")}
+        contact = {(OTHER, stage) for stage in {"joint", "metrics", *AFTER_METRICS}}
         assert flow.pending() == contact | {DATASET}
         path.write_text(CONTACT + FLOOR.replace("2.0", "2.1"))
         assert flow.pending() == {(OTHER, stage) for stage in AFTER_SCENE} | {DATASET}
@@ -113,7 +114,7 @@ def test_editing_an_energy_term_re_runs_what_reaches_it(
     path = flow.folder / "intercap_core" / "energy" / f"{term}.py"
     with edited(path, path.read_text() + "\nEDITED = 1\n"):
         pending = {rule for _, rule in flow.pending(anew=term == "ground")}
-    assert pending == stages | {"metrics", "export", "dataset"}
+    assert pending == stages | {"metrics", *AFTER_METRICS, "dataset"}
 
 
 def test_an_import_inside_a_function_counts(flow: Flow) -> None:
@@ -146,10 +147,11 @@ def test_rewording_a_docstring_re_runs_nothing(flow: Flow) -> None:
 def test_a_setting_re_runs_its_own_stage(flow: Flow) -> None:
     path = flow.folder / flow.settings
     settings = yaml.safe_load(path.read_text())
-    with edited(path, yaml.safe_dump({**settings, "report": {"frames": 2}})):
-        assert flow.pending() == {DATASET}
+    with edited(path, yaml.safe_dump({**settings, "page": {"frames": 2}})):
+        assert flow.pending() == {(name, "page") for name in (ONE, OTHER)}
     with edited(path, yaml.safe_dump({**settings, "joint": {"ground_weight": 2.0}})):
-        after = {(name, rule) for name in (ONE, OTHER) for rule in ("joint", "metrics", "export")}
+        rules = {"joint", "metrics", *AFTER_METRICS}
+        after = {(name, rule) for name in (ONE, OTHER) for rule in rules}
         assert flow.pending() == after | {DATASET}
 
 

@@ -191,6 +191,11 @@ def tracked_subject(wildcards):
     return digest(of_sequence(wildcards)[2])
 
 
+def intent_of(wildcards):
+    """Param: what the sequence's row says that the person was asked to do."""
+    return PROJECT.sequences[wildcards.sequence].intent
+
+
 def layout_of(wildcards):
     """Param: how the sequence's recordings are laid out, and what its row states of the
     calibration; the files themselves are inputs."""

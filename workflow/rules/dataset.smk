@@ -1,12 +1,9 @@
 rule dataset:
-    """Heatmaps, histograms, tables and the report over all sequences."""
+    """Heatmaps, histograms, tables and the site's first page."""
     input:
-        **{
-            stage: expand(f"{RESULTS}/{{sequence}}/{stage}.h5", sequence=SEQUENCES)
-            for stage in SEQUENCE_STAGES
-        },
+        summaries=expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES),
     output:
-        report=f"{RESULTS}/report.html",
+        site=report(f"{RESULTS}/site/index.html", category="Dataset"),
         summary=f"{RESULTS}/summary.json",
         heatmaps=f"{RESULTS}/heatmaps.h5",
         tables=directory(f"{RESULTS}/tables"),
@@ -21,11 +18,10 @@ rule dataset:
         mem_mb=memory(4000),
         runtime=60,
     params:
-        settings=settings_of("report"),
         sequences=SEQUENCES,
         entries=all_entries(),
         code=code_of("dataset"),
     message:
-        "the report over all sequences"
+        "the site's first page"
     script:
         "../scripts/dataset.py"

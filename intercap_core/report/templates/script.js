@@ -1,10 +1,16 @@
 "use strict";
 for (const table of document.querySelectorAll("table.sortable")) {
   table.tHead.rows[0].querySelectorAll("th").forEach((head, column) => {
+    head.tabIndex = 0;
+    head.addEventListener("keydown", (event) => {
+      if (event.key === "Enter") head.click();
+    });
     head.addEventListener("click", () => {
       const up = head.dataset.order === "down";
       table.querySelectorAll("th").forEach((other) => delete other.dataset.order);
       head.dataset.order = up ? "up" : "down";
+      table.querySelectorAll("th").forEach((other) => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", up ? "ascending" : "descending");
       const body = table.tBodies[0];
       const key = (row) => row.cells[column].dataset.value ?? row.cells[column].textContent.trim();
       const rows = [...body.rows];
@@ -19,9 +25,35 @@ for (const table of document.querySelectorAll("table.sortable")) {
     });
   });
 }
+for (const form of document.querySelectorAll("form.filters")) {
+  const rows = [...document.getElementById(form.dataset.filters).tBodies[0].rows];
+  const fields = [...form.querySelectorAll("[data-column]")];
+  const flagged = form.querySelector("[data-flagged]");
+  const update = () => {
+    let shown = 0;
+    for (const row of rows) {
+      const kept = fields.every((field) => {
+        const has = row.dataset[field.dataset.column].toLowerCase();
+        const wanted = field.value.trim().toLowerCase();
+        return !wanted || (field.type === "search" ? has.includes(wanted) : has === wanted);
+      });
+      row.hidden = !kept || (flagged.checked && !(parseFloat(row.dataset.flagged) > 0));
+      shown += row.hidden ? 0 : 1;
+    }
+    form.querySelector("output").textContent = `${shown} of ${rows.length}`;
+  };
+  form.addEventListener("input", update);
+  form.addEventListener("submit", (event) => event.preventDefault());
+  update();
+}
 const dialog = document.querySelector("dialog");
 const large = dialog.querySelector("img");
 for (const image of document.querySelectorAll("main img")) {
+  image.tabIndex = 0;
+  image.setAttribute("role", "button");
+  image.addEventListener("keydown", (event) => {
+    if (event.key === "Enter") image.click();
+  });
   image.addEventListener("click", () => {
     large.src = image.src;
     large.alt = image.alt;

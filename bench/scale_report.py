@@ -1,0 +1,150 @@
+"""The site of a large dataset: what merging 223 sequences of 300 frames costs, and one page.
+
+Sequences of the demo (run `make demo` first) are played forward and backward to 300 frames, and
+their summaries repeated under other names, subjects and objects' shares of the table. Each figure
+is of a process of its own: seconds of the clock, and its peak memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench.joint_long import lengthen
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.project import Project, load_project
+from intercap_core.schemas import SUMMARY
+from intercap_core.stage_list import STAGES
+
+SEQUENCES, FRAMES, SUBJECTS = 223, 300, 10
+MEGABYTE = 1e6
+
+
+def measure(settings: Path, output: Path, count: int) -> None:
+    """Print ``dataset.*`` and put them into the JSON ``output``.
+
+    Raises UserError where no sequence of the project has been computed to the end.
+    """
+    from bench.command import add_figures
+
+    project = load_project(settings)
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory(dir=project.results) as folder:
+        long = Path(folder) / "long"
+        names = [n for n in project.sequences if project.artefact(n, "metrics").is_file()]
+        if not names:
+            raise UserError(f"{project.results}: no sequence is computed; run `make demo` first")
+        for name in names:
+            _lengthen(project, name, long / name)
+        page = _timed("page", settings, names[0], long / names[0])
+        figures["page_s"] = page["seconds"]
+        folder_of_page = long / names[0] / "page"
+        figures["page_mb"] = (folder_of_page / "index.html").stat().st_size / MEGABYTE
+        viewer = sum(p.stat().st_size for p in folder_of_page.iterdir()) / MEGABYTE
+        figures["viewer_mb_300"] = viewer - figures["page_mb"]
+        summed = [_timed("summary", settings, name, long / name) for name in names]
+        figures["summary_s"] = max(one["seconds"] for one in summed)
+        many = Path(folder) / "many"
+        _repeat(project, [long / name / "summary.h5" for name in names], many, count)
+        merged = _timed("merge", settings, "", many)
+        figures[f"aggregate_s_{count}"] = merged["seconds"]
+        figures[f"aggregate_mb_{count}"] = merged["peak_mb"]
+        figures["overview_mb"] = (many / "site" / "index.html").stat().st_size / MEGABYTE
+        figures["one_more_s"] = figures["summary_s"] + merged["seconds"]
+    for key, value in figures.items():
+        print(f"dataset.{key} {value:.2f}")
+    add_figures(output, "dataset", figures)
+
+
+def _lengthen(project: Project, name: str, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for stage in STAGES["summary"].reads:
+        lengthen(project.artefact(name, stage), stage, folder / f"{stage}.h5", FRAMES)
+
+
+def _repeat(project: Project, summaries: list[Path], folder: Path, count: int) -> None:
+    """``count`` copies under other names, of ten subjects."""
+    import h5py
+
+    folder.mkdir()
+    for number in range(count):
+        source = summaries[number % len(summaries)]
+        path = folder / f"seq_{number:03d}.h5"
+        shutil.copyfile(source, path)
+        with h5py.File(path, "r+") as file:
+            file.attrs["sequence"] = path.stem
+            file.attrs["subject"] = f"s{1 + number % SUBJECTS:02d}"
+    with artefacts.read(path, SUMMARY) as last:  # what was changed is still a whole artefact
+        assert last.attributes["sequence"] == path.stem
+
+
+def _timed(what: str, settings: Path, sequence: str, folder: Path) -> dict[str, float]:
+    """Seconds and peak memory of one piece of work, in a process that does no more."""
+    command = [
+        sys.executable, "-m", "bench.scale_report", str(settings),
+        "--one", what, "--sequence", sequence, "--folder", str(folder),
+    ]  # fmt: skip
+    started = time.perf_counter()
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    seconds = time.perf_counter() - started
+    if done.returncode:
+        raise UserError(f"{folder}: {what} failed; see the lines above")
+    return {"seconds": seconds, **json.loads(done.stdout.splitlines()[-1])}
+
+
+def _work(what: str, settings: Path, sequence: str, folder: Path) -> None:
+    project = load_project(settings)
+    if what == "merge":
+        from intercap_core.stages import dataset
+
+        dataset.run(
+            dataset="scale",
+            summaries={path.stem: path for path in sorted(folder.glob("*.h5"))},
+            objects=project.objects,
+            body_models=project.config.body_models,
+            site=folder / "site",
+            summary=folder / "summary.json",
+            heatmaps=folder / "heatmaps" / "heatmaps.h5",
+            tables_folder=folder / "tables",
+        )
+    else:
+        from intercap_core.pipeline.step import run_step
+
+        row = project.sequences[sequence]  # the truth is of the frames that were recorded
+        project.sequences[sequence] = row.model_copy(update={"truth": None})
+        inputs = {stage: folder / f"{stage}.h5" for stage in STAGES[what].reads}
+        output = folder / (what if STAGES[what].writes_folder else f"{what}.h5")
+        run_step(what, project, sequence, inputs=inputs, output=output)
+    from bench.joint_long import peak_mb
+
+    print(json.dumps({"peak_mb": peak_mb()}))
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/demo/config.yaml"))
+    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
+    parser.add_argument("--sequences", type=int, default=SEQUENCES)
+    parser.add_argument("--one", choices=("page", "summary", "merge"), help=argparse.SUPPRESS)
+    parser.add_argument("--sequence", default="", help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    try:
+        if given.one:
+            _work(given.one, given.settings, given.sequence, given.folder)
+        else:
+            measure(given.settings, given.output, given.sequences)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,51 @@
+"""Folders that a stage writes: they appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from intercap_core.errors import UserError
+
+
+def check_replaceable(output: Path, *, marker: str, what: str) -> None:
+    """Raise UserError where ``output`` holds anything but an earlier ``what``, which has a file
+    ``marker``."""
+    if output.is_dir():
+        if any(output.iterdir()) and not (output / marker).is_file():
+            raise UserError(
+                f"{output}: the folder is neither empty nor an earlier {what} (it has no "
+                f"{marker}); name a new or empty folder, or clear this one yourself"
+            )
+    elif output.exists() or output.is_symlink():
+        raise UserError(f"{output}: is a file, expected a folder for the {what}; name another")
+
+
+@contextlib.contextmanager
+def replaced(output: Path) -> Iterator[Path]:
+    """An empty folder that takes the place of ``output`` when the block ends without an error.
+
+    It is filled under a temporary name beside its own, and what was there goes only when the new
+    one is complete.
+    """
+    output = output.resolve()
+    part = output.with_name(f".{output.name}.{os.getpid()}.part")
+    old = output.with_name(f".{output.name}.{os.getpid()}.old")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        yield part
+        if output.exists():
+            output.rename(old)
+        try:
+            part.rename(output)
+        except OSError:
+            if old.exists():
+                old.rename(output)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

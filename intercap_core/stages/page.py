@@ -1,0 +1,204 @@
+"""The sequence's page of the site: what was recorded, what was found, and how far it is to be
+trusted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts, schemas
+from intercap_core.artefacts import Artefact
+from intercap_core.body.artefact import load_model, read_parameters
+from intercap_core.camera.rig import Rig
+from intercap_core.capture.frames import Frames
+from intercap_core.config import (
+    BodyModels,
+    ContactInterval,
+    ObjectEntry,
+    PageSettings,
+    SequenceEntry,
+    SubjectEntry,
+)
+from intercap_core.detections.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.metrics.extrinsics import displacement
+from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.report.body import read_fit
+from intercap_core.report.capture import read_capture
+from intercap_core.report.closeups import CloseUp, closeup, holds, read_handling
+from intercap_core.report.overlays import Fit, Overlay, choose_cameras, choose_frames, overlays
+from intercap_core.report.sequence_page import SequenceContent, page
+from intercap_core.report.track import TrackFacts, read_track
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
+from intercap_core.stages.folders import check_replaceable, replaced
+
+log = logging.getLogger(__name__)
+
+PAGE = "index.html"
+_MAX_CLOSEUPS = 2  # holds drawn; `intercap closeups` draws all
+
+
+def run(
+    *,
+    frames: Path,
+    detections: Path,
+    scene: Path,
+    person: Path,
+    object_track: Path,
+    body_fit: Path,
+    joint: Path,
+    metrics: Path,
+    sequence: SequenceEntry,
+    object_: ObjectEntry | None,
+    subject: SubjectEntry,
+    body_models: BodyModels,
+    contact: Sequence[ContactInterval] | None,
+    settings: PageSettings,
+    output: Path,
+    truth: Path | None,
+) -> None:
+    """Write the page into the folder ``output``, replacing an earlier one there.
+
+    ``truth``, where known, is drawn beside close-ups of hands; ``contact`` is what the user
+    annotated. Raises UserError where an artefact or the object's mesh is missing or broken, and
+    where ``output`` holds anything but a page.
+    """
+    paths = {
+        "frames": frames, "detections": detections, "scene": scene, "person": person,
+        "object_track": object_track, "body_fit": body_fit, "joint": joint, "metrics": metrics,
+    }  # fmt: skip
+    output = Path(output)
+    check_replaceable(output, marker=PAGE, what="page")
+    measured = SequenceMetrics.read(metrics)
+    found = object_ if measured.has_object else None
+    with artefacts.read(joint, JOINT) as fit, artefacts.read(scene, SCENE) as setting:
+        model = load_model(body_models, subject.gender, fit)
+        mesh = None if found is None else ObjectMesh.load(found)
+        posed = Fit(model, read_parameters(fit), fit["rotation"], fit["translation"], mesh)
+        rig, image_of = Rig.from_artefact(setting), setting["image_of"]
+        master = rig.names.index(str(setting.attributes["master"]))
+        said, energies = _of_joint(fit, rig, master), _energies(fit)
+        rig = rig.moved(fit["master_from_colour"])
+    note, drawn = "", []
+    try:
+        drawn = _overlays(frames, measured, posed, rig, image_of, settings)
+    except UserError as error:  # one image that does not decode must not cost the page
+        note = str(error)
+        log.warning("%s: no overlays: %s", measured.name, error)
+    content = SequenceContent(
+        metrics=measured,
+        intent=sequence.intent or "",
+        overlays=drawn,
+        note=note,
+        joint=said,
+        energies=energies,
+        closeups=_closeups(paths, found, body_models, subject.gender, truth),
+        capture=read_capture(frames, scene),
+        track=None if object_ is None else _track(paths, object_),
+        body=read_fit(frames, scene, person, body_fit, body_models, subject.gender),
+        annotated=contact,
+        made_by=_made_by(paths),
+        body_file=model.path.name,
+    )
+    with replaced(output) as folder:
+        (folder / PAGE).write_text(page(content), encoding="utf-8")
+
+
+def _overlays(
+    frames: Path,
+    measured: SequenceMetrics,
+    fit: Fit,
+    rig: Rig,
+    image_of: np.ndarray,
+    settings: PageSettings,
+) -> list[Overlay]:
+    worst = "object_visible_to_cloud" if measured.has_object else "body_visible_to_cloud"
+    chosen = choose_frames(measured.values[worst], settings.frames)
+    cameras = sorted(choose_cameras(fit, rig, chosen, settings.cameras))
+    with Frames.open(frames) as images:
+        return overlays(images.showing(image_of), rig, fit, cameras, chosen)
+
+
+def _of_joint(joint: Artefact, rig: Rig, master: int) -> str:
+    """How the joint fit went, and by how much it has moved the cameras of ``rig``, in words."""
+    steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
+    settled = "settled" if joint.attributes["converged"] else "ended before it settled"
+    corrected = ""
+    if joint.attributes["cameras_corrected"]:
+        posed = np.isfinite(rig.master_from_colour).all((1, 2))
+        moved = np.full(len(rig), np.nan)
+        order = np.flatnonzero(posed)
+        moved[posed] = displacement(
+            joint["master_from_colour"][posed],
+            rig.master_from_colour[posed],
+            int(np.flatnonzero(order == master)[0]),
+        )
+        variance = np.einsum("cici->ci", joint["camera_covariance"])
+        sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # of the shift
+        cameras = ", ".join(
+            f"{rig.names[c]} {1e3 * moved[c]:.1f} (+- {1e3 * sigma[c]:.1f})"
+            for c in order
+            if sigma[c] > 0
+        )
+        corrected = f"; cameras corrected, mm over 2 m: {cameras}"
+    frames = joint["hand_undetermined"].sum(axis=0)
+    hands = "".join(
+        f" The {side} hand is undetermined in {count} frames (few views see it)."
+        for side, count in zip(("left", "right"), frames, strict=True)
+        if count
+    )
+    return f"Joint fit: {steps} steps taken, {refused} refused, {settled}{corrected}.{hands}"
+
+
+def _energies(joint: Artefact) -> list[tuple[str, float, float]]:
+    return [
+        (name, float(before), float(after))
+        for name, before, after in zip(
+            joint.text("energy_names"), joint["energy_before"], joint["energy_after"], strict=True
+        )
+    ]
+
+
+def _closeups(
+    paths: Mapping[str, Path],
+    entry: ObjectEntry | None,
+    body_models: BodyModels,
+    gender: str,
+    truth: Path | None,
+) -> list[CloseUp]:
+    """The longest holds of a sequence; none without an object."""
+    if entry is None:
+        return []
+    known = truth if truth is not None and truth.is_file() else None
+    handling = read_handling(
+        paths, entry=entry, body_models=body_models, gender=gender, truth=known
+    )
+    return [closeup(handling, hold) for hold in holds(handling.probability)[:_MAX_CLOSEUPS]]
+
+
+def _track(paths: Mapping[str, Path], entry: ObjectEntry) -> TrackFacts:
+    with artefacts.read(paths["scene"], SCENE) as scene:
+        moments = Detections.load(paths["detections"]).showing(scene["image_of"])
+    found = moments.with_candidates_of(paths["person"])
+    with artefacts.read(paths["object_track"], OBJECT_TRACK) as track:
+        candidate = track["candidate"]
+
+    def kept(t: int, c: int) -> bytes:
+        return found.candidates(t, c)[candidate[t, c]].rle if candidate[t, c] >= 0 else b""
+
+    mesh = ObjectMesh.load(entry)
+    return read_track(paths["frames"], paths["scene"], paths["object_track"], mesh, kept)
+
+
+def _made_by(paths: Mapping[str, Path]) -> dict[str, str]:
+    found = {}
+    for stage, path in paths.items():
+        schema = getattr(schemas, stage.upper())
+        with artefacts.read(path, schema) as artefact:
+            digest = artefact.attributes.get("settings_digest") or "-"
+            found[stage] = f"v{schema.version} {digest}"
+    return found

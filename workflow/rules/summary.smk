@@ -1,0 +1,23 @@
+rule summary:
+    """What the sequence adds to the dataset's tables, heatmaps and charts."""
+    input:
+        **artefacts_read("summary"),
+    output:
+        summary=f"{RESULTS}/{{sequence}}/summary.h5",
+    log:
+        f"{LOGS}/{{sequence}}/summary.log",
+    benchmark:
+        f"{BENCHMARKS}/{{sequence}}/summary.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=memory(1500),
+        runtime=10,
+    params:
+        intent=intent_of,
+        code=code_of("summary"),
+    message:
+        "{wildcards.sequence}: summing up"
+    script:
+        "../scripts/stage.py"
