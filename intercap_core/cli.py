@@ -224,6 +224,28 @@ def report(settings: Settings = DEFAULT_SETTINGS) -> None:
 
 
 @app.command(rich_help_panel=WHOLE)
+def compare(
+    old: Annotated[Path, typer.Argument(help="Results folder of the earlier version.")],
+    new: Annotated[Path, typer.Argument(help="Results folder of the later version.")],
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for the tables by sequence and by frame, CSV.")
+    ] = None,
+) -> None:
+    """Say what changed between two versions of a dataset, by sequence and frame.
+
+    By how much body, hands and object moved after the joint fit, which frames touch or are flagged
+    that were not, and what errors are stated. Keep a copy of the results before you fix an
+    annotation, and compare afterwards.
+
+    Example: intercap compare results/demo_before results/demo --output changes
+    """
+    from intercap_core.commands.compare import print_comparison
+
+    for path in print_comparison(old, new, output):
+        typer.echo(path)
+
+
+@app.command(rich_help_panel=WHOLE)
 def evaluate(
     settings: Annotated[
         list[Path],
