@@ -463,6 +463,34 @@ def keypoint_definition(
 
 
 @app.command(rich_help_panel=LOOK)
+def view(
+    settings: Settings,
+    sequence: SequenceName,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for the page; else view beside its artefacts.")
+    ] = None,
+    show: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open it in the default browser.")
+    ] = True,
+) -> None:
+    """Look at a sequence in 3D over time, in a browser: body, object, clouds, cameras, contact.
+
+    Shows what is computed, from body_fit on; where the joint fit is there, the sequential fits are
+    beside it, and the truth where it is known. The page needs no network and no server. Every page
+    of the site has the same viewer.
+
+    Example: intercap view config/demo/config.yaml cup_drink_s02
+    """
+    _prepare()
+    from intercap_core.commands.view import view as write_view
+    from intercap_core.project import load_project
+
+    project = load_project(settings)
+    name = _known(project.sequences, sequence)
+    typer.echo(write_view(project, name, output, show=show))
+
+
+@app.command(rich_help_panel=LOOK)
 def closeups(
     settings: Settings,
     sequences: Annotated[

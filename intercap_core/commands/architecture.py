@@ -31,6 +31,7 @@ LAYERS: tuple[Mapping[str, str], ...] = (
         "stages": "one thin file a stage: read artefacts, call the room, write one artefact",
         "project": "settings, tables and annotations, loaded and checked together",
     },
+    {"viewer": "a sequence in a browser: play, turn, compare; opens from disk"},
     {
         "report": "charts, pictures and the pages of the site",
         "export": "files for other tools: InterCap, AMASS, BOP, glb",

@@ -13,7 +13,8 @@ from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
-from intercap_core.schemas import PERSON
+from intercap_core.detections.read import Detections
+from intercap_core.schemas import OBJECT_TRACK, PERSON
 
 # Only depth pixels within this distance of the projected meshes are used: larger errors of a fit
 # need no exact figure.
@@ -129,3 +130,25 @@ class SegmentedClouds:
         if not person:
             return np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
         return np.concatenate(person), np.concatenate(object_)
+
+
+def read_clouds(
+    images: Frames,
+    rig: Rig,
+    depth_bias: np.ndarray,
+    image_of: np.ndarray,
+    detections: Path,
+    person: Path,
+    object_track: Path,
+) -> SegmentedClouds:
+    """Those of a sequence, from the artefacts of its detections, person and object track;
+    ``images`` and ``image_of`` (T, C) by the moment that they show."""
+    found = Detections.load(detections).showing(image_of).with_candidates_of(person)
+    with artefacts.read(object_track, OBJECT_TRACK) as track:
+        kept = track["candidate"]
+    total, cameras = kept.shape
+    candidates = [
+        [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
+        for t in range(total)
+    ]
+    return SegmentedClouds(images, rig, read_person_masks(person), candidates, depth_bias)

@@ -20,6 +20,9 @@ from intercap_core.report.overlays import Overlay
 from intercap_core.report.sheets import Sheet
 
 _TEMPLATES = Path(__file__).parent / "templates"
+_POLICY = (  # what a page may load: nothing but itself
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
 _LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "scipy")
 
 
@@ -32,6 +35,7 @@ def render(template: str, context: Mapping[str, Any]) -> str:
         trim_blocks=True,
     )
     own = {
+        "policy": _POLICY,
         "style": Markup((_TEMPLATES / "style.css").read_text(encoding="utf-8")),
         "script": Markup((_TEMPLATES / "script.js").read_text(encoding="utf-8")),
     }

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from intercap_core.config import ContactInterval
 from intercap_core.metrics import figures, flags
@@ -22,6 +23,17 @@ from intercap_core.report.track import TrackFacts
 from intercap_core.schemas import METRIC_REGIONS
 
 _LEAST_MM = 10.0  # top of a chart of distances, at the least
+
+
+@dataclass(frozen=True)
+class ViewerParts:
+    """What the page holds for the viewer, whose data lie in a file beside it: the policy of what
+    may be loaded, its style sheet, its element, and what loads the file. HTML, put in as it is."""
+
+    policy: str
+    style: str
+    element: str
+    load: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +59,7 @@ class SequenceContent:
     annotated: Sequence[ContactInterval] | None
     made_by: Mapping[str, str]
     body_file: str
+    viewer: ViewerParts | None = None
 
 
 def page(content: SequenceContent) -> str:
@@ -87,7 +100,13 @@ def page(content: SequenceContent) -> str:
         "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
         "made_by": list(content.made_by.items()),
         "versions": [*versions(), ("body file", content.body_file)],
+        "viewer": None,
     }
+    if content.viewer is not None:
+        parts = content.viewer
+        context["policy"] = parts.policy
+        context["viewer_style"] = Markup(parts.style)
+        context["viewer"] = {"element": Markup(parts.element), "load": Markup(parts.load)}
     return render("sequence.html.j2", context)
 
 

@@ -21,14 +21,13 @@ from intercap_core.config import (
     SubjectEntry,
     digest,
 )
-from intercap_core.detections.read import Detections
 from intercap_core.metrics import body, motion, object_pose
 from intercap_core.metrics import truth as truths
 from intercap_core.metrics.exchanged import exchanged
 from intercap_core.metrics.extrinsics import displacement
 from intercap_core.metrics.flags import merge_reasons
 from intercap_core.metrics.measurement import Handled, Measurement, Values
-from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
+from intercap_core.metrics.segmented import read_clouds
 from intercap_core.metrics.stage_errors import StageErrors
 from intercap_core.metrics.tracks import BodyTrack, read_body, read_object
 from intercap_core.rigid.mesh import ObjectMesh
@@ -99,7 +98,7 @@ def run(
         fitted = stack.enter_context(artefacts.read(joint, JOINT))
         images = images.showing(setting["image_of"])
         rig = Rig.from_artefact(setting).moved(fitted["master_from_colour"])
-        clouds = _clouds(
+        clouds = read_clouds(
             images, rig, fitted["depth_bias"], setting["image_of"], detections, person, object_track
         )
         known = None
@@ -146,32 +145,6 @@ def run(
             writer.put(key, values[key])
         for key in sorted(verdict):
             writer.put(f"verdict/{key}", verdict[key])
-
-
-def _clouds(
-    images: Frames,
-    rig: Rig,
-    depth_bias: np.ndarray,
-    image_of: np.ndarray,
-    detections: Path,
-    person: Path,
-    object_track: Path,
-) -> SegmentedClouds:
-    found = Detections.load(detections).showing(image_of).with_candidates_of(person)
-    with artefacts.read(object_track, OBJECT_TRACK) as track:
-        kept = track["candidate"]
-    total, cameras = kept.shape
-    candidates = [
-        [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
-        for t in range(total)
-    ]
-    return SegmentedClouds(
-        images,
-        rig,
-        read_person_masks(person),
-        candidates,
-        depth_bias,
-    )
 
 
 def _motion(body_track: BodyTrack, handled: Handled | None, fps: float) -> Values:

@@ -30,11 +30,12 @@ from intercap_core.report.body import read_fit
 from intercap_core.report.capture import read_capture
 from intercap_core.report.closeups import CloseUp, closeup, holds, read_handling
 from intercap_core.report.overlays import Fit, Overlay, choose_cameras, choose_frames, overlays
-from intercap_core.report.sequence_page import SequenceContent, page
+from intercap_core.report.sequence_page import SequenceContent, ViewerParts, page
 from intercap_core.report.track import TrackFacts, read_track
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
 from intercap_core.stages.folders import check_replaceable, replaced
+from intercap_core.viewer import page as viewer
 
 log = logging.getLogger(__name__)
 
@@ -103,9 +104,18 @@ def run(
         annotated=contact,
         made_by=_made_by(paths),
         body_file=model.path.name,
+        viewer=ViewerParts(viewer.POLICY, viewer.style(), viewer.element(), viewer.load()),
     )
     with replaced(output) as folder:
         (folder / PAGE).write_text(page(content), encoding="utf-8")
+        viewer.write_script(
+            folder / viewer.SCRIPT,
+            paths,
+            object_=found,
+            body_models=body_models,
+            gender=subject.gender,
+            truth=truth,
+        )
 
 
 def _overlays(

@@ -1,0 +1,244 @@
+"""The viewer in a real browser, from disk: loads, plays, seeks, shows what is there."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import apply, invert
+from intercap_core.schemas import JOINT, SCENE
+from intercap_core.viewer import page
+from intercap_core.viewer.content import gather
+from tests.helpers import fitted_capture as fitted
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+FRAMES, SIZE = 6, (900, 1000)
+NAME = "s01_o03"
+browser = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"
+)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+    return fitted.make_capture(tmp_path_factory.mktemp("capture"), name=NAME, total=FRAMES)
+
+
+def _write(capture: fitted.Capture, folder: Path, name: str = NAME, **without: bool) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {stage: path for stage, path in capture.paths.items() if stage not in without}
+    page.write_script(
+        folder / page.SCRIPT,
+        paths,
+        object_=capture.object_,
+        body_models=fitted.BODY_MODELS,
+        gender=fitted.SUBJECT.gender,
+        truth=None if "truth" in without else capture.paths["truth"],
+    )
+    (folder / "index.html").write_text(page.standalone(name))
+    return folder / "index.html"
+
+
+@pytest.fixture(scope="module")
+def shown(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _write(capture, tmp_path_factory.mktemp("page"))
+
+
+def _browse(shown: Path, folder: Path, script: str = "", address: str = "") -> dict[str, Any]:
+    """What the page's own ``script`` leaves in ``result`` when the viewer stands, what the console
+    printed, and a picture."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(shown.parent / page.SCRIPT, folder)
+    wait = """
+      <script>
+        const until = setInterval(async () => {
+          const root = document.querySelector(".viewer");
+          if (root.dataset.ready !== "yes") return;
+          clearInterval(until);
+          const viewer = window.intercapViewer, result = {};
+          const key = (name, more) => root.dispatchEvent(
+            new KeyboardEvent("keydown", { key: name, bubbles: true, ...more }));
+          const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+          %s
+          const text = document.createElement("pre");
+          text.id = "result";
+          text.textContent = JSON.stringify(result);
+          document.body.append(text);
+        }, 50);
+      </script>"""
+    text = shown.read_text().replace("</body>", (wait % script) + "</body>")
+    (folder / "index.html").write_text(text)
+    picture = folder / "page.png"
+    options = [
+        str(CHROMIUM), "--headless", "--no-sandbox", "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars",
+        "--no-first-run", "--disable-background-networking", "--enable-logging=stderr",
+        f"--window-size={SIZE[0]},{SIZE[1]}", "--virtual-time-budget=15000",
+        f"--user-data-dir={folder / 'profile'}", f"--screenshot={picture}", "--dump-dom",
+        (folder / "index.html").resolve().as_uri() + address,
+    ]  # fmt: skip
+    done = subprocess.run(options, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.S)
+    return {
+        "result": json.loads(html.unescape(found.group(1))) if found else None,
+        "console": [line for line in done.stderr.splitlines() if "CONSOLE" in line],
+        "dom": done.stdout,
+        "picture": cv2.imread(str(picture)),
+    }
+
+
+@browser
+def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> None:
+    found = _browse(
+        shown,
+        tmp_path,
+        """
+        result.first = viewer.state.frame;
+        key("ArrowRight"); result.right = viewer.state.frame; result.address = location.hash;
+        key("End"); result.end = viewer.state.frame;
+        key("Home"); result.home = viewer.state.frame;
+        location.hash = "#t=0.2"; await pause(200); result.sought = viewer.state.frame;
+        key(" "); result.playing = viewer.state.playing; await pause(1500);
+        result.played = viewer.state.frame; result.stopped = !viewer.state.playing;
+        const layers = [...root.querySelectorAll("[data-layer]")];
+        result.layers = layers.map((label) => label.dataset.layer);
+        key("2"); result.sequential = viewer.versions.sequential.group.visible;
+        key("1"); result.joint = viewer.versions.joint.group.visible;
+        result.images = viewer.header.cameras.length;
+        """,
+        "#t=0.14",
+    )
+    assert found["console"] == []
+    result = found["result"]
+    assert result["first"] == 2  # 0.14 s of 15 a second
+    assert (result["right"], result["end"], result["home"]) == (3, FRAMES - 1, 0)
+    assert result["address"] == "#t=0.20" and result["sought"] == 3
+    assert result["playing"] and result["played"] == FRAMES - 1 and result["stopped"]
+    assert result["layers"][:3] == ["joint", "sequential", "truth"]
+    assert {"object", "contact", "clouds", "cameras", "images"} <= set(result["layers"])
+    assert result["sequential"] and not result["joint"] and result["images"] == 3
+
+
+def _expected_pixels(
+    capture: fitted.Capture, box: dict[str, float], frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the first camera sees body vertices and the object's centre, on the page's canvas."""
+    with artefacts.read(capture.paths["joint"], JOINT) as joint:
+        poses, ball = joint["master_from_colour"], joint["translation"][frame]
+    with artefacts.read(capture.paths["scene"], SCENE) as scene:
+        camera = Rig.from_artefact(scene).moved(poses)[0]
+    with artefacts.read(capture.paths["joint"], JOINT) as joint:
+        joints = joint["joints"][frame]
+    to_camera = invert(camera.master_from_colour)
+    lens = camera.colour
+    scale = min(box["width"] / lens.width, box["height"] / lens.height)
+    middle = np.array([box["left"] + box["width"] / 2, box["top"] + box["height"] / 2])
+
+    def on_page(points: np.ndarray) -> np.ndarray:
+        local = apply(to_camera, points)
+        pinhole = local[:, :2] / local[:, 2:] * [lens.fx, lens.fy]
+        return middle + scale * pinhole
+
+    return on_page(joints[[0, 3, 6, 9]]), on_page(ball[None])[0]
+
+
+@browser
+def test_body_and_object_are_where_the_camera_sees_them(
+    capture: fitted.Capture, shown: Path, tmp_path: Path
+) -> None:
+    found = _browse(
+        shown,
+        tmp_path,
+        """
+        for (const name of ["contact", "cameras"])
+          root.querySelector(`[data-layer="${name}"] input`).click();
+        viewer.show(3); viewer.look(0); await pause(300); viewer.draw();
+        const box = root.querySelector("canvas").getBoundingClientRect();
+        result.box = { left: box.left, top: box.top, width: box.width, height: box.height };
+        result.plane = viewer.cameras[0].plane.visible;
+        """,
+    )
+    assert found["console"] == [] and found["result"]["plane"]
+    body, ball = _expected_pixels(capture, found["result"]["box"], 3)
+    picture = found["picture"][..., ::-1].astype(int)
+
+    def at(point: np.ndarray) -> np.ndarray:
+        x, y = np.rint(point).astype(int)
+        return np.median(picture[y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3), axis=0)
+
+    for point in body:  # along the spine: skin, which is blue
+        red, _, blue = at(point)
+        assert blue > red + 25, (point, at(point))
+    red, _, blue = at(ball)
+    assert not blue > red + 25
+
+
+@browser
+def test_layers_change_the_picture(shown: Path, tmp_path: Path) -> None:
+    off = 'root.querySelector(`[data-layer="joint"] input`).click(); await pause(100);'
+    pictures = [
+        _browse(shown, tmp_path / name, script)["picture"].astype(int)
+        for name, script in (("on", ""), ("off", off))
+    ]
+    assert (np.abs(pictures[0] - pictures[1]).max(2) > 40).mean() > 0.01
+
+
+@browser
+def test_words_from_files_are_words(capture: fitted.Capture, tmp_path: Path) -> None:
+    shutil.copy(capture.paths["joint"], tmp_path / "joint.h5")
+    with h5py.File(tmp_path / "joint.h5", "r+") as file:
+        reasons = file["flag_reason"][()].astype("S60")
+        reasons[0] = b"<img src=x onerror=alert(1)> </script>"
+        del file["flag_reason"]
+        file["flag_reason"] = reasons
+    changed = fitted.Capture(**{**capture.__dict__, "paths": {
+        **{k: v for k, v in capture.paths.items() if k != "metrics"},
+        "joint": tmp_path / "joint.h5",
+    }})  # fmt: skip
+    shown = _write(changed, tmp_path / "page", name='<b onclick="x">"name"</b>')
+    found = _browse(
+        shown,
+        tmp_path / "browser",
+        "result.flag = root.querySelector('[data-part=flag]').innerHTML;",
+    )
+    assert found["console"] == [] and "<b onclick" not in found["dom"]
+    assert found["result"]["flag"].startswith("flagged: &lt;img src=x")
+
+
+@browser
+def test_a_page_without_its_file_says_so(shown: Path, tmp_path: Path) -> None:
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / page.SCRIPT).write_text("")
+    (tmp_path / "none" / "index.html").write_text(shown.read_text())
+    found = _browse(tmp_path / "none" / "index.html", tmp_path / "browser")
+    assert "is not beside it" in found["dom"] and found["result"] is None
+
+
+def test_any_artefact_from_the_body_fit_on_is_enough(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    some = {stage: capture.paths[stage] for stage in ("frames", "scene", "body_fit")}
+    found = gather(some, object_=capture.object_, body_models=fitted.BODY_MODELS, gender="neutral")
+    assert list(found.header["versions"]) == ["sequential"] and found.header["object"] == ""
+    assert "clouds/person" not in found.arrays and found.header["frames"] == FRAMES
+    whole = gather(
+        capture.paths, object_=capture.object_, body_models=fitted.BODY_MODELS, gender="neutral",
+        truth=capture.paths["truth"],
+    )  # fmt: skip
+    assert list(whole.header["versions"]) == ["joint", "sequential", "truth"]
+    starts = whole.arrays["clouds/person_starts"]
+    assert len(starts) == len(whole.header["moments"]) + 1 and starts[-1] > 0
+    assert max(whole.header["error_mm"].values()) <= 1.0
