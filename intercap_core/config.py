@@ -264,17 +264,22 @@ class PageSettings(Model):
 class ExportSettings(Model):
     """Files for other people's tools."""
 
-    formats: tuple[Literal["intercap", "amass", "bop", "glb", "contact"], ...] = (
+    formats: tuple[Literal["intercap", "amass", "bop", "coco", "glb", "contact"], ...] = (
         "intercap",
         "amass",
         "bop",
+        "coco",
         "glb",
         "contact",
     )
     """Which exports are written; contact = its probability by frame, and a draft annotation."""
     frame: Literal["z-up", "camera"] = "z-up"
     """Frame of amass and glb: gravity-aligned with the ground at z = 0, or the master camera.
-    The intercap and bop layouts are in camera frames by definition."""
+    The intercap, bop and coco layouts are in camera frames by definition."""
+    masks: bool = True
+    """Draw the object's masks and boxes for bop, with what the body hides."""
+    images: bool = False
+    """Copy the recorded colour images into bop and coco: as recorded, lenses not straightened."""
 
 
 StudioFault = Literal[

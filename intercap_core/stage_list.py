@@ -99,8 +99,8 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "export",
-            "Files for other tools: InterCap, AMASS, BOP, glb.",
-            ("joint", "scene", "metrics"),
+            "Files for other tools: InterCap, AMASS, BOP, COCO, glb.",
+            ("frames", "joint", "scene", "metrics"),
             writes_folder=True,
         ),
     )

@@ -34,7 +34,7 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     {"viewer": "a sequence in a browser: play, turn, compare; opens from disk"},
     {
         "report": "charts, pictures and the pages of the site",
-        "export": "files for other tools: InterCap, AMASS, BOP, glb",
+        "export": "files for other tools: InterCap, AMASS, BOP, COCO, glb",
     },
     {
         "metrics": "distances, penetration, contact; errors against truth",

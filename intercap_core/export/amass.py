@@ -1,4 +1,8 @@
-"""Body motion as AMASS stores it (SMPL-X variant), with the object's poses beside it."""
+"""Body motion as AMASS stores it (SMPL-X variant), with the object's poses beside it.
+
+``surface_model_type`` names the mesh that was fitted: ``smplx`` of a licensed file alone, since the
+same parameters make another person of another mesh.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from intercap_core.export.about import About
 from intercap_core.export.motion import Motion
 
 
@@ -15,7 +20,6 @@ def body_arrays(motion: Motion) -> dict[str, np.ndarray]:
     poses = params.full_pose().reshape(total, 165).numpy().astype(np.float32)
     return {
         "gender": np.array(motion.gender),
-        "surface_model_type": np.array("smplx"),
         "mocap_frame_rate": np.array(motion.fps),
         "mocap_time_length": np.array(total / motion.fps),
         "trans": params.transl.numpy().astype(np.float32),
@@ -41,10 +45,12 @@ def object_arrays(motion: Motion) -> dict[str, np.ndarray]:
     }
 
 
-def write(folder: Path, motion: Motion) -> None:
+def write(folder: Path, motion: Motion, about: About) -> None:
     """Write ``body.npz`` and, where there is one, ``object.npz``; numpy dates their entries 1980,
     so bytes repeat."""
     folder.mkdir()
-    np.savez(folder / "body.npz", allow_pickle=False, **body_arrays(motion))
+    said = {k: v for k, v in about.arrays(motion.frame).items() if k not in ("gender", "num_betas")}
+    np.savez(folder / "body.npz", allow_pickle=False, **body_arrays(motion), **said)
     if motion.has_object:
-        np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion))
+        of_object = {"frame": said["frame"], "units": said["units"], "flagged": said["flagged"]}
+        np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion), **of_object)

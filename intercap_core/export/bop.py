@@ -5,35 +5,26 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 
 from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import rigid
+from intercap_core.export.about import About
 from intercap_core.export.motion import Motion
+from intercap_core.export.silhouettes import Exposures, Shown, images_of
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import moved, twists
+
+LEAST_VISIBLE = 0.1  # share of an object that is seen, of BOP's targets (BOP Challenge 2019)
 
 
 def object_id(mesh_path: Path) -> int:
     """BOP numbers its objects: the number that the mesh's file name starts with, or 1."""
     number = re.match(r"\d+", mesh_path.stem)
     return max(1, int(number.group())) if number else 1
-
-
-@dataclass(frozen=True)
-class Exposures:
-    """Which images show the motion's T frames, and when: ``image_of`` (T, C) the set whose image
-    of each camera shows each frame, -1 = none; ``times`` (T,) s of the frames; ``time_offset``
-    (C,) s by which each camera exposes later."""
-
-    image_of: np.ndarray
-    times: np.ndarray
-    time_offset: np.ndarray
 
 
 def write(
@@ -43,11 +34,15 @@ def write(
     mesh: ObjectMesh,
     obj_id: int,
     exposures: Exposures,
+    about: About,
+    bodies: np.ndarray | None,
+    poses: Sequence[dict[int, np.ndarray]],
 ) -> None:
-    """Write ``models/`` and one scene folder a camera, numbered in the rig's order.
+    """Write ``models/``, one scene folder a camera, numbered in the rig's order, and the targets.
 
-    Images are numbered by their frame set; each has the pose at its own exposure. ``motion`` is in
-    the master camera's frame.
+    Images are numbered by their frame set; each has the pose at its own exposure (``poses`` by
+    camera and image, see :func:`.silhouettes.object_poses`). With ``bodies`` (T, V, 3) masks and
+    boxes are drawn, with what the body hides. ``motion`` is in the master camera's frame.
     """
     models = folder / "models"
     models.mkdir(parents=True)
@@ -57,23 +52,61 @@ def write(
     scaled.export(models / f"obj_{obj_id:06d}.ply", vertex_normal=False)
     _dump(models / "models_info.json", {str(obj_id): model_info(mesh)})
     lenses: dict[str, Any] = {}
-    poses = rigid(motion.rotation, motion.translation)
-    twist = twists(poses, np.ones(len(motion), bool), exposures.times)
+    targets = []
     for number, camera in enumerate(rig):
         scene = folder / "scenes" / f"{number:06d}"
         scene.mkdir(parents=True)
-        seen = moved(poses, exposures.time_offset[number] * twist)
-        images = {int(image): t for t, image in enumerate(exposures.image_of[:, number])}
-        shown = {image: seen[t] for image, t in sorted(images.items()) if image >= 0}
+        shown = poses[number]
         _dump(scene / "scene_camera.json", scene_camera(camera, list(shown)))
         _dump(scene / "scene_gt.json", scene_gt(camera, shown, obj_id))
+        lens = camera.colour
         lenses[f"{number:06d}"] = {
             "camera": camera.name,
-            "width": camera.colour.width,
-            "height": camera.colour.height,
-            "distortion_k1_k2_p1_p2_k3_k4_k5_k6": camera.colour.distortion.tolist(),
+            "width": lens.width,
+            "height": lens.height,
+            "distortion_k1_k2_p1_p2_k3_k4_k5_k6": lens.distortion.tolist(),
         }
+        if number == 0:
+            _dump(folder / "camera.json", _camera(camera))
+        info: dict[str, Any] = {}
+        if bodies is not None:
+            images = images_of(camera, number, motion, bodies, mesh, shown, exposures)
+            info = {str(one.image): [_draw(scene, one, camera)] for one in images}
+            _dump(scene / "scene_gt_info.json", info)
+        targets += [
+            {"scene_id": number, "im_id": image, "obj_id": obj_id, "inst_count": 1}
+            for image in shown
+            if not info or info[str(image)][0]["visib_fract"] >= LEAST_VISIBLE
+        ]
+    _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)
+    _dump(folder / "about.json", about.told(motion.frame))
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    """BOP's camera.json holds one lens: the first camera's; each scene's own is in its scene."""
+    lens = camera.colour
+    return {
+        "fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy,
+        "width": lens.width, "height": lens.height, "depth_scale": 1.0,
+    }  # fmt: skip
+
+
+def _draw(scene: Path, shown: Shown, camera: Camera) -> dict[str, Any]:
+    """Write both masks of the object in an image; returns its entry of scene_gt_info."""
+    for name, mask in (("mask", shown.whole_object), ("mask_visib", shown.object_)):
+        (scene / name).mkdir(exist_ok=True)
+        path = scene / name / f"{shown.image:06d}_000000.png"
+        path.write_bytes(cv2.imencode(".png", mask.image(camera))[1].tobytes())
+    whole, visible = shown.whole_object.area, shown.object_.area
+    return {
+        "bbox_obj": shown.whole_object.box(),
+        "bbox_visib": shown.object_.box(),
+        "px_count_all": whole,
+        "px_count_valid": whole,
+        "px_count_visib": visible,
+        "visib_fract": visible / whole if whole else 0.0,
+    }
 
 
 def scene_camera(camera: Camera, images: Sequence[int]) -> dict[str, Any]:

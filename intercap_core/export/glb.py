@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_NAMES, PARENTS
 from intercap_core.camera.light import linear
+from intercap_core.export.about import About
 from intercap_core.export.motion import Motion
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.normals import vertex_normals
@@ -106,10 +107,11 @@ class _Document:
         )
 
 
-def write(path: Path, motion: Motion, mesh: ObjectMesh | None, *, z_up: bool) -> None:
+def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, z_up: bool) -> None:
     """Write the body, and the object unless ``mesh`` is None; ``z_up`` says whether the motion's
-    frame is z-up or a camera's."""
+    frame is z-up or a camera's. What ``about`` says is in the asset's extras."""
     document = _Document()
+    document.json["asset"]["extras"] = about.told("y up, turned by the root from: " + motion.frame)
     times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
     root = _YUP_FROM_ZUP if z_up else _YUP_FROM_CAMERA
     animation: dict[str, Any] = {"name": motion.sequence, "samplers": [], "channels": []}

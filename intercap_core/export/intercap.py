@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.export.about import About
 from intercap_core.export.motion import Motion
 
 NUM_HAND_COMPONENTS = 12  # of the release; SMPLify-X's number, with flat_hand_mean=False
@@ -74,7 +75,11 @@ class _OldNames(pickle._Pickler):  # the C pickler offers no hook for names
         self.memoize(obj)  # type: ignore[attr-defined]
 
 
-def write(path: Path, motion: Motion) -> None:
-    """Write the pickle, protocol 4; equal input gives equal bytes."""
+def write(path: Path, motion: Motion, about: About) -> None:
+    """Write the pickle, protocol 4, with ``about`` beside the release's keys, and the same as .npz;
+    equal input gives equal bytes."""
+    found = result(motion)
     with path.open("wb") as file:
-        _OldNames(file, protocol=4).dump(result(motion))
+        _OldNames(file, protocol=4).dump({**found, "about": about.told(motion.frame)})
+    arrays = {key: np.asarray(value) for key, value in found.items()}
+    np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays, **about.arrays(motion.frame))

@@ -238,7 +238,7 @@ def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray)
                 continue
             packet = b""
             try:
-                image = images.colour(int(t), c)
+                image = images.colour(int(t), c, reduction=4)
             except UserError:  # an image that does not decode is told by its stages
                 image = None
             if image is not None:

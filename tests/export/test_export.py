@@ -13,23 +13,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 import torch
 import trimesh
+from pycocotools.coco import COCO
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts, safe_pickle
+from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.camera.masks import decode
 from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import ExportSettings, MetricsSettings, Symmetry
 from intercap_core.errors import UserError
-from intercap_core.export import bop
+from intercap_core.export import bop, coco
+from intercap_core.export.about import About, BodyFile
 from intercap_core.export.motion import read_motion
+from intercap_core.export.silhouettes import Exposures, object_poses
 from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import METRICS, SCENE
-from intercap_core.stage_list import SEQUENCE_STAGES
+from intercap_core.stage_list import STAGES
 from intercap_core.stages import export, metrics
 from tests.helpers import fitted_capture as fitted
 
@@ -41,7 +47,7 @@ OBJECT_OFFSET = np.array([0, fitted.OBJECT_OFFSET_M / 2, 0])
 def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
     made = fitted.make_capture(tmp_path_factory.mktemp("capture"), object_name="cup")
     metrics.run(
-        **made.inputs(*SEQUENCE_STAGES[:-1]),
+        **made.inputs(*STAGES["metrics"].reads),
         output=made.paths["metrics"],
         object_=made.object_,
         subject=fitted.SUBJECT,
@@ -54,7 +60,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 def _run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
     export.run(
-        **capture.inputs("joint", "scene", "metrics"),
+        **capture.inputs(*STAGES["export"].reads),
         object_=capture.object_,
         subject=fitted.SUBJECT,
         body_models=fitted.BODY_MODELS,
@@ -127,7 +133,7 @@ def test_amass_in_the_camera_frame(capture: fitted.Capture, tmp_path: Path) -> N
     with np.load(out / "amass" / "body.npz") as arrays:
         found = _amass_vertices(capture, arrays)
     assert found == pytest.approx(capture.vertices + OFFSET, abs=1e-5)
-    assert sorted(p.name for p in out.iterdir()) == ["README.txt", "amass", "export.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["README.txt", "amass", "body", "export.json"]
 
 
 def test_moving_a_motion_forth_and_back(capture: fitted.Capture) -> None:
@@ -214,8 +220,10 @@ def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
     slip = np.zeros((total, 3), np.int32)
     slip[2:, 1] = 1
     image_of = images_of_moments(slip, np.ones((total, 3), bool))
-    exposures = bop.Exposures(image_of, times, late)
-    bop.write(tmp_path / "bop", motion, capture.rig, capture.mesh, 9, exposures)
+    exposures = Exposures(image_of, times, late)
+    poses = list(object_poses(motion, capture.rig, exposures))
+    about = About("cap", BodyFile.of(motion.model, "neutral"), [""] * total, None, [])
+    bop.write(tmp_path / "bop", motion, capture.rig, capture.mesh, 9, exposures, about, None, poses)
     path = tmp_path / "bop" / "scenes" / "000001"
     entries = json.loads((path / "scene_gt.json").read_text())
     assert sorted(entries) == sorted(json.loads((path / "scene_camera.json").read_text()))
@@ -225,6 +233,124 @@ def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
         there = capture.translation[0] + [1.5 * (times[moment] + 0.008), 0, 0]
         expected = 1e3 * (pose[:3, :3] @ there + pose[:3, 3])
         assert entries[image][0]["cam_t_m2c"] == pytest.approx(expected, abs=0.05)
+
+
+def test_no_file_claims_smplx_for_another_mesh(capture: fitted.Capture, folder: Path) -> None:
+    digest = hashlib.sha256(OPEN_BODY.read_bytes()).hexdigest()[:16]
+    told = [
+        json.loads((folder / "export.json").read_text())["body"],
+        safe_pickle.load(folder / "intercap" / "res.pkl")["about"]["body"],
+        json.loads((folder / "bop" / "about.json").read_text())["body"],
+        json.loads((folder / "coco" / "annotations.json").read_text())["info"]["body"],
+        _Gltf((folder / "glb" / "cap.glb").read_bytes()).json["asset"]["extras"]["body"],
+    ]
+    for path in (folder / "amass" / "body.npz", folder / "intercap" / "res.npz"):
+        with np.load(path) as arrays:
+            told.append({key: arrays[key].item() for key in told[0]})
+    for body in told:
+        assert body["surface_model_type"] == "intercap-open-body"
+        assert (body["body_file_digest"], body["gender"]) == (digest, "neutral")
+        assert body["num_vertices"] == capture.model.num_vertices
+    assert (folder / "body" / "open_body.npz").read_bytes() == OPEN_BODY.read_bytes()
+    assert "it is not SMPL-X" in (folder / "README.txt").read_text()
+    licensed = BodyFile(Path("SMPLX_MALE.npz"), "male", 10475, 10, 10)
+    assert licensed.surface_model == "smplx" and not licensed.is_open
+
+
+def test_flags_contact_and_stated_errors_go_with_the_numbers(
+    capture: fitted.Capture, folder: Path
+) -> None:
+    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
+        reasons = measured.text("flag_reason")
+        probability, regions = measured["contact_probability"], measured.text("region_names")
+    for path in (folder / "amass" / "body.npz", folder / "intercap" / "res.npz"):
+        with np.load(path) as arrays:
+            assert arrays["flag_reason"].tolist() == reasons
+            assert arrays["contact_probability"] == pytest.approx(probability)
+            assert arrays["contact_region"].tolist() == regions
+            assert "metres" in str(arrays["units"]) and str(arrays["frame"])
+            assert len(arrays["stated_error_mm"]) == len(arrays["stated_error_part"])
+    said = json.loads((folder / "bop" / "about.json").read_text())
+    assert set(said["flagged_frames"].values()) == {reason for reason in reasons if reason}
+    assert "contact" in said
+
+
+def test_bop_masks_are_what_the_body_leaves(capture: fitted.Capture, folder: Path) -> None:
+    hidden = 0
+    for number, camera in enumerate(capture.rig):
+        scene = folder / "bop" / "scenes" / f"{number:06d}"
+        info = json.loads((scene / "scene_gt_info.json").read_text())
+        assert info.keys() == json.loads((scene / "scene_gt.json").read_text()).keys()
+        for image, (entry,) in info.items():
+            whole, seen = (
+                cv2.imread(str(scene / name / f"{int(image):06d}_000000.png"), -1) > 0
+                for name in ("mask", "mask_visib")
+            )
+            assert whole.shape == (camera.colour.height, camera.colour.width)
+            assert not (seen & ~whole).any()
+            counts = (entry["px_count_all"], entry["px_count_visib"])
+            assert counts == (whole.sum(), seen.sum())
+            if whole.any():
+                assert entry["visib_fract"] == pytest.approx(seen.sum() / whole.sum())
+                x, y, width, height = entry["bbox_obj"]
+                assert cv2.boundingRect(whole.astype(np.uint8)) == (x, y, width, height)
+            hidden += int((whole & ~seen).sum())
+    assert hidden > 0  # the hand covers some of the cup
+    targets = json.loads((folder / "bop" / "test_targets_bop19.json").read_text())
+    assert targets and set(targets[0]) == {"scene_id", "im_id", "obj_id", "inst_count"}
+    lens = json.loads((folder / "bop" / "camera.json").read_text())
+    assert lens["fx"] == capture.rig[0].colour.fx
+
+
+def test_bop_mask_covers_the_projected_vertices(capture: fitted.Capture, folder: Path) -> None:
+    camera = capture.rig[0]
+    world = capture.mesh.vertices @ capture.rotation[2].T + capture.translation[2] + OBJECT_OFFSET
+    pose = camera.colour_from_master
+    pixels = camera.colour.project(world @ pose[:3, :3].T + pose[:3, 3])
+    mask = cv2.imread(str(folder / "bop" / "scenes" / "000000" / "mask" / "000002_000000.png"), -1)
+    near = cv2.dilate(mask, np.ones((3, 3)))
+    column, row = np.rint(pixels).astype(int).T
+    assert (near[row, column] > 0).mean() > 0.99
+
+
+def test_coco_is_read_by_its_own_library(capture: fitted.Capture, folder: Path) -> None:
+    read = COCO(str(folder / "coco" / "annotations.json"))
+    assert len(read.getImgIds()) == 3 * len(capture.vertices)
+    assert [c["name"] for c in read.loadCats(read.getCatIds())] == ["person", "cup"]
+    for image in read.loadImgs(read.getImgIds()):
+        camera = capture.rig[capture.rig.names.index(image["camera"])]
+        found = read.loadAnns(read.getAnnIds(imgIds=image["id"], catIds=[coco.PERSON]))
+        assert len(found) == 1
+        mask = read.annToMask(found[0]) > 0
+        assert mask.sum() == found[0]["area"]
+        counts = found[0]["segmentation"]["counts"].encode()
+        assert (decode(counts, image["height"], image["width"]) == mask).all()
+        points = np.reshape(found[0]["keypoints"], (17, 3))
+        assert found[0]["num_keypoints"] == (points[:, 2] > 0).sum()
+        pose = camera.colour_from_master
+        body = capture.vertices[image["frame"]] + OFFSET
+        pixels = camera.colour.project(body @ pose[:3, :3].T + pose[:3, 3])
+        low, high = pixels.min(0) - 3, pixels.max(0) + 3
+        kept = points[points[:, 2] > 0, :2]
+        assert (kept >= low).all() and (kept <= high).all()
+    shoulders = [coco.KEYPOINTS.index(f"{side}_shoulder") for side in ("left", "right")]
+    first = read.loadAnns(read.getAnnIds(catIds=[coco.PERSON]))[0]
+    points = np.reshape(first["keypoints"], (17, 3))
+    joints = capture.model.forward(capture.model.zeros(1)).joints  # order of sides is the model's
+    assert joints.shape[1] == 55 and (points[shoulders, 2] > 0).any()
+
+
+def test_images_go_along_where_they_are_asked_for(
+    capture: fitted.Capture, folder: Path, tmp_path: Path
+) -> None:
+    assert not list(folder.rglob("*.jpg"))
+    out = _run(capture, tmp_path / "out", formats=("bop", "coco"), images=True, masks=False)
+    read = COCO(str(out / "coco" / "annotations.json"))
+    for image in read.loadImgs(read.getImgIds()):
+        found = cv2.imread(str(out / "coco" / image["file_name"]))
+        assert found.shape[:2] == (image["height"], image["width"])
+    assert len(list((out / "bop").rglob("rgb/*.jpg"))) == 3 * len(capture.vertices)
+    assert not list(out.rglob("mask/*")) and not list(out.rglob("scene_gt_info.json"))
 
 
 def test_bop_states_symmetries(capture: fitted.Capture) -> None:

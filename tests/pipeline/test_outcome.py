@@ -16,8 +16,9 @@ from intercap_core.commands.inspect import print_summary
 from intercap_core.config import MetricsSettings
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
+from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
-from intercap_core.stage_list import SEQUENCE_STAGES
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from intercap_core.stages import metrics
 from tests.helpers import fitted_capture as fitted
 
@@ -30,6 +31,7 @@ SAYS = {
     "body_fit": "fitted in 5 of 5 frames",
     "joint": "3 steps, 0 refused, settled; contact in 0 of 5 frames, 2 not trusted",
     "metrics": "stated errors: body ",
+    "summary": "5 frames, 4 flagged, ",
 }
 
 
@@ -53,7 +55,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     path = fitted.write_project(folder, capture, "s01")
     made = load_project(path)
     metrics.run(
-        **capture.inputs(*SEQUENCE_STAGES[:-1]),
+        **capture.inputs(*STAGES["metrics"].reads),
         output=made.artefact("s01", "metrics"),
         object_=capture.object_,
         subject=fitted.SUBJECT,
@@ -63,6 +65,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     )
     for stage in ("joint", "scene"):
         made.artefact("s01", stage).write_bytes(capture.paths[stage].read_bytes())
+    inputs = {stage: made.artefact("s01", stage) for stage in STAGES["summary"].reads}
+    run_step("summary", made, "s01", inputs=inputs, output=made.artefact("s01", "summary"))
     return made
 
 

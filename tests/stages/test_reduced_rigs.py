@@ -270,7 +270,7 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
         assert seen.sum() == depth
         assert (found["truth/joint/body_pve"] < 0.02).all()
     export.run(
-        joint=paths["joint"], scene=paths["scene"], metrics=measured,
+        frames=paths["frames"], joint=paths["joint"], scene=paths["scene"], metrics=measured,
         output=tmp_path / "export", settings=ExportSettings(), **common,
     )  # fmt: skip
     inputs = {"metrics": measured, **{s: paths[s] for s in STAGES["metrics"].reads}}
