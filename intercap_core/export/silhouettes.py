@@ -85,9 +85,11 @@ class Shown:
 
 def object_poses(motion: Motion, rig: Rig, exposures: Exposures) -> Iterator[dict[int, np.ndarray]]:
     """For each camera, master_from_object (4, 4) of each of its images, by the image's number, when
-    it was exposed."""
+    it was exposed; NaN in frames without an object's pose."""
     poses = rigid(motion.rotation, motion.translation)
-    twist = twists(poses, np.ones(len(motion), bool), exposures.times)
+    known = np.isfinite(poses).all(axis=(1, 2))
+    twist = np.zeros((len(motion), 6))
+    twist[known] = twists(poses[known], np.ones(known.sum(), bool), exposures.times[known])
     for number in range(len(rig)):
         seen = moved(poses, exposures.time_offset[number] * twist)
         images = {int(image): t for t, image in enumerate(exposures.image_of[:, number])}

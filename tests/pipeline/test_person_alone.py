@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import pickle
 from pathlib import Path
@@ -97,14 +98,19 @@ def test_what_is_said_of_the_stages(project: Project) -> None:
 def test_files_for_other_tools_hold_the_body(project: Project) -> None:
     folder = project.artefact(NAME, "export")
     kinds = {path.name for path in folder.iterdir() if path.is_dir()}
-    assert kinds == {"amass", "glb", "intercap"}
+    assert kinds == {"amass", "body", "coco", "glb", "intercap"}
     assert [path.name for path in (folder / "amass").iterdir()] == ["body.npz"]
+    named = json.loads((folder / "coco" / "annotations.json").read_text())
+    people = {kind["id"] for kind in named["categories"] if kind["name"] == "person"}
+    assert named["annotations"]
+    assert {one["category_id"] for one in named["annotations"]} == people
     result = pickle.loads((folder / "intercap" / "res.pkl").read_bytes())
     assert len(result["transl"]) == 6 and not {"ob_pose", "ob_trans"} & result.keys()
     text = (folder / "README.txt").read_text()
-    assert "bop is left out" in text and "contact is left out" in text and "mesh" not in text
+    assert "bop is left out" in text and "contact is left out" in text
+    assert "object pose" not in text and "Object mesh" not in text
     told = json.loads((folder / "export.json").read_text())
-    assert (told["object"], told["formats"]) == ("", ["amass", "glb", "intercap"])
+    assert (told["object"], told["formats"]) == ("", ["amass", "coco", "glb", "intercap"])
     data = (folder / "glb" / f"{NAME}.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     assert [mesh["name"] for mesh in json.loads(data[20 : 20 + length])["meshes"]] == ["body"]
@@ -120,8 +126,8 @@ def test_the_report_leaves_objects_and_contact_out(project: Project) -> None:
     assert summary["vertex_to_cloud"]["object_mm"] is None
     assert summary["penetration"]["share_le_5mm"] is None
     assert "object_track" not in summary["truth"] or not summary["truth"]["object_track"]
-    row = (project.results / "tables" / "sequences.csv").read_text().splitlines()
-    values = dict(zip(row[0].split(","), row[1].split(","), strict=True))
+    with open(project.results / "tables" / "sequences.csv", newline="") as table:
+        (values,) = csv.DictReader(table)
     assert values["contact_frames"] == values["vertex_to_cloud.object_mm"] == ""
     assert float(values["joint.body_pve_mm"]) > 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,13 +100,14 @@ def test_the_true_error_is_that_of_frames_with_a_stated_one() -> None:
     sequence.values["truth/joint/body_pve"] = np.array([0.006, 0.008, 0.9])
     sequence.values["verdict/error_frame"] = np.array([[0.006, 0.006, np.nan]])
     assert stated_errors(sequence)[0].true == pytest.approx(7)
-    sequence.values["verdict/error_frame"][:] = np.nan  # of no frame: then of all
+    sequence = replace(sequence, values=dict(sequence.values))
+    sequence.values["verdict/error_frame"] = np.full((1, 3), np.nan)  # of no frame: then of all
     assert stated_errors(sequence)[0].true == pytest.approx(1e3 * (0.006 + 0.008 + 0.9) / 3)
 
 
 def test_no_figures_without_verdict_or_truth() -> None:
     bare = SequenceMetrics("a", "p", "cup", 30.0, False, {})
-    assert stated_errors(bare) == [] and verdict_figures([bare]) == {}
+    assert not stated_errors(bare) and verdict_figures([bare]) == {}
 
 
 def test_factors_are_found_again() -> None:

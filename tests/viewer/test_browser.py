@@ -71,6 +71,7 @@ def _browse(shown: Path, folder: Path, script: str = "", address: str = "") -> d
           const key = (name, more) => root.dispatchEvent(
             new KeyboardEvent("keydown", { key: name, bubbles: true, ...more }));
           const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+          const become = async (test) => { while (!test()) await pause(20); };
           %s
           const text = document.createElement("pre");
           text.id = "result";
@@ -110,9 +111,9 @@ def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> 
         key("ArrowRight"); result.right = viewer.state.frame; result.address = location.hash;
         key("End"); result.end = viewer.state.frame;
         key("Home"); result.home = viewer.state.frame;
-        location.hash = "#t=0.2"; await pause(200); result.sought = viewer.state.frame;
-        key(" "); result.playing = viewer.state.playing; await pause(1500);
-        result.played = viewer.state.frame; result.stopped = !viewer.state.playing;
+        location.hash = "#t=0.2"; await become(() => viewer.state.frame === 3);
+        key(" "); result.playing = viewer.state.playing; await become(() => !viewer.state.playing);
+        result.played = viewer.state.frame;
         const layers = [...root.querySelectorAll("[data-layer]")];
         result.layers = layers.map((label) => label.dataset.layer);
         key("2"); result.sequential = viewer.versions.sequential.group.visible;
@@ -123,10 +124,11 @@ def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> 
     )
     assert found["console"] == []
     result = found["result"]
+    assert result is not None, "the viewer did not come to an end of what it was asked"
     assert result["first"] == 2  # 0.14 s of 15 a second
     assert (result["right"], result["end"], result["home"]) == (3, FRAMES - 1, 0)
-    assert result["address"] == "#t=0.20" and result["sought"] == 3
-    assert result["playing"] and result["played"] == FRAMES - 1 and result["stopped"]
+    assert result["address"] == "#t=0.20"
+    assert result["playing"] and result["played"] == FRAMES - 1
     assert result["layers"][:3] == ["joint", "sequential", "truth"]
     assert {"object", "contact", "clouds", "cameras", "images"} <= set(result["layers"])
     assert result["sequential"] and not result["joint"] and result["images"] == 3
