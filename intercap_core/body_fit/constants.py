@@ -44,6 +44,7 @@ OUTLIER_VIEW_TRUST = 0.2
 
 # m in front of the background from which a pixel is the person's. Tuned on the studio.
 BEFORE_BACKGROUND_M = 0.04
+EVERY_PIXEL = 2  # of as many rows of a depth image is looked at: neighbours tell the same
 NORMAL_BASE_PX = 3  # half the base over which a normal is measured; tuned on the studio
 # A larger step between those pixels is an edge of the person. Tuned on the studio.
 DEPTH_EDGE_M = 0.04

@@ -12,19 +12,19 @@ from torch import Tensor
 from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
 from intercap_core.body.keypoints import BODY
-from intercap_core.body_fit import person_pixels_kernel
 from intercap_core.body_fit.constants import (
     BEFORE_BACKGROUND_M,
     DEPTH_EDGE_M,
     EDGE_TRUST,
     ENOUGH_KEYPOINTS,
+    EVERY_PIXEL,
     NEAR_START_S,
     NORMAL_BASE_PX,
     OUTLIER_VIEW_TRUST,
 )
 from intercap_core.body_fit.free_space import DepthWindow
 from intercap_core.body_fit.outlines import Outline, outline
-from intercap_core.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
+from intercap_core.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
@@ -198,10 +198,19 @@ def _fused(
             outlines += [] if rim is None else [rim]
         if depth is None:
             continue
-        window = _window(camera, mask, depth)
+        window = mask_window(depth, camera, mask)
         if window is None:
             continue
-        index = person_pixels(depth, camera, mask, seen.background[c], window)
+        # what stands before the background is all that can be the person, or cover it
+        index = mask_pixels(
+            depth,
+            camera,
+            mask,
+            window,
+            background=seen.background[c],
+            before_m=BEFORE_BACKGROUND_M,
+            every=EVERY_PIXEL,
+        )
         if len(index):
             seen_by.append((c, depth, index))
             rows, columns = window
@@ -233,41 +242,6 @@ def _runs(rle: bytes, camera: Camera) -> Runs | None:
     return Runs(rle, camera.colour.height, camera.colour.width) if rle else None
 
 
-def person_pixels(
-    depth: np.ndarray,
-    camera: Camera,
-    mask: Runs,
-    background: np.ndarray | None,
-    window: tuple[slice, slice],
-) -> np.ndarray:
-    """Flat pixels (M,) of one depth image (H,W), within ``window``, that show the person.
-
-    A depth pixel counts when the colour pixel that shows the same surface lies in the person's
-    mask, which is not empty, and the depth is clearly nearer than the background. What stands
-    before the background is all that can cover the person. Every second pixel of every second row
-    is used.
-    """
-    assert camera.depth is not None and camera.colour_from_depth is not None
-    colour, (rows, columns) = camera.colour, window
-    spacing = max(colour.fx / camera.depth.fx, colour.fy / camera.depth.fy, 1.0)
-    return person_pixels_kernel.person_pixels(
-        depth,
-        np.zeros((0, 0), np.uint16) if background is None else background,
-        int(1000 * BEFORE_BACKGROUND_M),
-        (rows.start, rows.stop),
-        (columns.start, columns.stop),
-        camera.depth.rays,
-        camera.colour_from_depth.astype(np.float32),
-        tuple(colour.parameters.astype(np.float32)),
-        (colour.height, colour.width),
-        mask.ends,
-        mask.box,
-        np.float32(CELL_SPACINGS * spacing),
-        # on the colour grid nothing hides: the pixels are the colour image's
-        np.float32(np.inf if camera.aligned else HIDDEN_BEHIND_M),
-    )
-
-
 def _placed(
     depth: np.ndarray, camera: Camera, index: np.ndarray, depth_bias: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -278,26 +252,6 @@ def _placed(
     master = camera.master_from_depth
     rotation = master[:3, :3].astype(np.float32)
     return apply(master, points), normals @ rotation.T, np.where(edge, EDGE_TRUST, 1.0)
-
-
-def _window(camera: Camera, mask: Runs, depth: np.ndarray) -> tuple[slice, slice] | None:
-    """The part of the depth image that can show the mask: its box, through both lenses."""
-    x, y, w, h = mask.box
-    if w == 0 or camera.depth is None or camera.colour_from_depth is None:
-        return None
-    corners = np.array([[x + i * w / 4, y + j * h / 4] for i in range(5) for j in range(5)])
-    rays = camera.colour.unproject(corners)
-    rays = rays[np.isfinite(rays).all(1)]
-    depth_from_colour = np.linalg.inv(camera.colour_from_depth)
-    placed = np.concatenate([apply(depth_from_colour, z * rays) for z in (0.7, 2.0, 6.0)])
-    pixels = camera.depth.project(placed)
-    height, width = depth.shape
-    margin = 6
-    x0, y0 = np.floor(pixels.min(0)).astype(int) - margin
-    x1, y1 = np.ceil(pixels.max(0)).astype(int) + margin
-    rows = slice(max(int(y0), 0), min(int(y1), height))
-    columns = slice(max(int(x0), 0), min(int(x1), width))
-    return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
 
 
 def _points_and_normals(

@@ -29,8 +29,8 @@ from intercap_core.body_fit.constants import (
     OUTLINE_POINTS,
     SHORTEST_OUTLINE_PX,
 )
-from intercap_core.body_fit.person_pixels_kernel import drawn
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.mask_pixels_kernel import drawn
 from intercap_core.camera.masks import Runs
 from intercap_core.energy.body_constants import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M
 from intercap_core.energy.body_samples import Samples

@@ -76,8 +76,25 @@ class Intrinsics:
         return projection.project_with_jacobian(points, self.parameters)
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the undistorted rays (..., 3), z = 1, of pixels (..., 2)."""
-        return projection.unproject(pixels, self.parameters)
+        """Return the undistorted rays (..., 3), z = 1, float64, of pixels (..., 2).
+
+        The exact inverse of :meth:`project` (to 1e-12 of the normalised plane), also beyond the
+        metric radius. NaN where the model has no inverse: a calibration whose image turns back
+        inside its own radius.
+        """
+        from intercap_core.camera import projection_kernels
+
+        pixels = np.asarray(pixels, np.float64)
+        flat = np.ascontiguousarray(pixels.reshape(-1, 2))
+        rays = np.ones((len(flat), 3))
+        rays[:, :2] = projection_kernels.unproject(
+            flat, tuple(self.parameters.tolist()), *self._radius_table
+        )
+        return rays.reshape(*pixels.shape[:-1], 3)
+
+    @cached_property
+    def _radius_table(self) -> tuple[np.ndarray, np.ndarray]:
+        return projection.radius_table(self.parameters)
 
     def inside_model(self, points: Any) -> Any:
         """Tell for points (..., 3) whether they are in front and within the metric radius."""

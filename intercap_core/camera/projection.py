@@ -25,10 +25,7 @@ import numpy as np
 
 NUM_PARAMETERS = 13
 MIN_DEPTH_M = 1e-3  # nearer (or behind) is projected as if at this depth
-_NEWTON_STEPS = 8
-_CONVERGED = 1e-12  # normalised image plane; 1e-9 px at f = 1000
-_BLOCK = 16384  # points a block: the temporaries of one Newton step stay in the cache
-_TABLE_SIZE = 1024  # radii tabulated for the start of Newton's iteration
+_TABLE_SIZE = 1024  # radii tabulated for the start of the inverse
 
 
 def _namespace(array: Any) -> Any:
@@ -143,46 +140,9 @@ def inside_model(points: Any, parameters: Any) -> Any:
     return (z > MIN_DEPTH_M) & (x * x + y * y <= (q[..., 12] * z) ** 2)
 
 
-def unproject(pixels: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Return the undistorted rays (..., 3), z = 1, float64, of pixels (..., 2).
-
-    The exact inverse of :func:`project` (Newton to 1e-12 in the normalised plane), also beyond the
-    metric radius. ``parameters`` is one camera's (13,). NaN where the model has no inverse: a
-    calibration whose image turns back inside its own radius.
-    """
-    pixels = np.asarray(pixels, np.float64)
+def radius_table(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Radii (N,) of the normalised plane up to the metric radius, ascending, and what the radial
+    distortion makes of them (N,): the start of the inverse."""
     q = np.asarray(parameters, np.float64)
-    flat = pixels.reshape(-1, 2)
-    rays = np.ones((len(flat), 3))
     radii = np.linspace(0.0, q[12], _TABLE_SIZE)
-    distorted_radii = np.maximum.accumulate(radii * _radial(radii * radii, q)[0])
-    for start in range(0, len(flat), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        xd, yd = ((flat[block] - q[2:4]) / q[0:2]).T
-        rays[block, 0], rays[block, 1] = _undistort(xd, yd, q, radii, distorted_radii)
-    return rays.reshape(*pixels.shape[:-1], 3)
-
-
-def _undistort(
-    xd: np.ndarray, yd: np.ndarray, q: np.ndarray, radii: np.ndarray, distorted_radii: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Invert the distortion of xd, yd (N,): the radial part from the table, then Newton."""
-    distance = np.hypot(xd, yd)
-    inverse = np.interp(distance, distorted_radii, radii)
-    beyond = distance > distorted_radii[-1]
-    inverse[beyond] = distance[beyond] * (radii[-1] / distorted_radii[-1])
-    scale = np.divide(inverse, distance, out=np.ones_like(distance), where=distance > 0)
-    x, y = xd * scale, yd * scale
-    for _ in range(_NEWTON_STEPS):
-        found_x, found_y, derivatives = _distort(x, y, q, np)
-        r_x, r_y = found_x - xd, found_y - yd
-        if np.maximum(np.abs(r_x), np.abs(r_y)).max(initial=0.0) < _CONVERGED:
-            return x, y
-        xx, xy, yx, yy = derivatives()
-        determinant = xx * yy - xy * yx
-        x = x - (yy * r_x - xy * r_y) / determinant
-        y = y - (xx * r_y - yx * r_x) / determinant
-    found_x, found_y, _ = _distort(x, y, q, np)
-    lost = ~(np.hypot(found_x - xd, found_y - yd) < 1e-9)
-    x[lost], y[lost] = np.nan, np.nan
-    return x, y
+    return radii, np.maximum.accumulate(radii * _radial(radii * radii, q)[0])

@@ -13,6 +13,10 @@ import numpy as np
 
 from intercap_core.camera.projection import MIN_DEPTH_M
 
+_NEWTON_STEPS = 8
+_CONVERGED = 1e-12  # normalised image plane; 1e-9 px at f = 1000
+_LOST = 1e-9  # a solution that is this far off after all steps is none
+
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def distort(x, y, distortion):
@@ -84,3 +88,37 @@ def project_point_with_jacobian(px, py, pz, parameters):
     if pz > MIN_DEPTH_M:
         uz, vz = -(ux * x + uy * y), -(vx * x + vy * y)
     return fx * xd + cx, fy * yd + cy, ux, uy, uz, vx, vy, vz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def unproject(pixels, parameters, radii, distorted_radii):
+    """X/Z and Y/Z (N, 2) of pixels (N, 2), all float64: the exact inverse of the projection, by
+    Newton's iteration from the radial part in the lens' :func:`.projection.radius_table`. NaN where
+    the model has no inverse."""
+    fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
+    found = np.empty_like(pixels)
+    for n in range(len(pixels)):
+        xd, yd = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
+        distance = np.sqrt(xd * xd + yd * yd)
+        scale = 1.0
+        if distance > distorted_radii[-1]:
+            scale = radii[-1] / distorted_radii[-1]
+        elif distance > 0:
+            scale = np.interp(distance, distorted_radii, radii) / distance
+        x, y = xd * scale, yd * scale
+        off = np.inf
+        for _ in range(_NEWTON_STEPS):
+            at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
+            rx, ry = at_x - xd, at_y - yd
+            off = max(abs(rx), abs(ry))
+            if off < _CONVERGED:
+                break
+            determinant = xx * yy - xy * yx
+            x -= (yy * rx - xy * ry) / determinant
+            y -= (xx * ry - yx * rx) / determinant
+        if not off < _CONVERGED:
+            at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
+            off = np.sqrt((at_x - xd) ** 2 + (at_y - yd) ** 2)
+        lost = not off < _LOST
+        found[n, 0], found[n, 1] = (np.nan, np.nan) if lost else (x, y)
+    return found

@@ -22,10 +22,11 @@ from intercap_core.errors import UserError
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import FRAMES
-from intercap_core.stage_list import SEQUENCE_STAGES
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 SAMPLE_SECONDS = 0.1
 EXTRACTIONS = 3
+JUDGEMENTS = 3
 MEGABYTE = 1 << 20
 
 
@@ -36,9 +37,10 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
 
     The recording is made before, if it is a virtual one. Then every stage from the recordings to
     the metrics is computed anew through the workflow: process starts count, the studio does not.
-    ``end_to_end.peak_memory_mb`` is the largest sum of resident memory over all processes of the
-    run; a stage's is its own process's. ``frames.fps`` is :func:`extraction`'s. Raises UserError
-    where a stage fails.
+    ``metrics.seconds_per_frame`` is of the whole stage, ``verdict.seconds_per_frame`` the part of
+    it that is :func:`judgement`'s. ``end_to_end.peak_memory_mb`` is the largest sum of resident
+    memory over all processes of the run; a stage's is its own process's. ``frames.fps`` is
+    :func:`extraction`'s. Raises UserError where a stage fails.
     """
     project = load_project(settings)
     sequence = next(iter(project.sequences))
@@ -54,6 +56,7 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
         "end_to_end.peak_memory_mb": round(peak / MEGABYTE, 1),
         **_stages(project, sequence, frames),
         **extraction(project, sequence, frames),
+        **judgement(settings, sequence, frames),
     }
     add_figures(output, figures)
     _print(figures, f"{sequence}: {frames} frame sets of {cameras} cameras")
@@ -153,6 +156,29 @@ def extraction(project: Project, sequence: str, frames: int) -> dict[str, float]
     }
 
 
+def judgement(settings: Path, sequence: str, frames: int) -> dict[str, float]:
+    """``verdict.seconds_per_frame``: what holding out adds to the metrics stage.
+
+    The stage with it less the stage without it, medians of ``JUDGEMENTS`` runs in turn within one
+    process whose imports are done.
+    """
+    seconds: dict[bool, list[float]] = {True: [], False: []}
+    projects = {
+        hold_out: load_project(settings, {"metrics": {"hold_out": hold_out}})
+        for hold_out in seconds
+    }
+    for _ in range(1 + JUDGEMENTS):  # the first one imports and compiles
+        for hold_out, project in projects.items():
+            inputs = {name: project.artefact(sequence, name) for name in STAGES["metrics"].reads}
+            with tempfile.TemporaryDirectory(dir=project.results) as folder:
+                start = time.perf_counter()
+                output = Path(folder) / "metrics.h5"
+                run_step("metrics", project, sequence, inputs=inputs, output=output)
+                seconds[hold_out].append(time.perf_counter() - start)
+    with_it, without = (statistics.median(seconds[hold_out][1:]) for hold_out in (True, False))
+    return {"verdict.seconds_per_frame": round((with_it - without) / frames, 4)}
+
+
 def _print(figures: dict[str, float], title: str) -> None:
     table = Table("stage", "seconds a frame", "peak memory, MB", title=title, box=None)
     for area in ("end_to_end", *SEQUENCE_STAGES):
@@ -169,5 +195,9 @@ def _print(figures: dict[str, float], title: str) -> None:
         f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "
         f"{figures['frames.recorded_bytes_per_set'] / 1e6:.2f} MB "
         f"(ratio {figures['frames.bytes_ratio']:.3f})",
+        highlight=False,
+    )
+    console.print(
+        f"of the metrics, the verdict: {figures['verdict.seconds_per_frame']:.3f} s a frame",
         highlight=False,
     )

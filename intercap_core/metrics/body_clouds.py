@@ -13,10 +13,11 @@ from intercap_core.body.model import BodyModel
 from intercap_core.camera.rig import Rig
 from intercap_core.capture.frames import Frames
 from intercap_core.metrics.clouds import Cloud, visible_to_cloud
-from intercap_core.metrics.proximity import Sight, distance_to_body, face_normals
+from intercap_core.metrics.proximity import DEEPEST_M, Sight, face_normals
 from intercap_core.metrics.segmented import SegmentedClouds, read_person_masks
 from intercap_core.metrics.truth import Truth
 from intercap_core.rigid.surface_samples import sample_surface
+from intercap_core.rigid.surface_tree import SurfaceTree
 from intercap_core.schemas import SCENE
 
 EVERY = 5  # one frame in so many is compared with its points: neighbours are redundant
@@ -43,6 +44,7 @@ class BodyClouds:
         self._clouds = SegmentedClouds(images, rig, masks, None, depth_bias)
         self._faces = model.faces.numpy()
         template = model.template.numpy().astype(np.float64)
+        self._tree = SurfaceTree(template, self._faces)
         self._samples = sample_surface(template, self._faces, SURFACE_SAMPLES)
 
     @classmethod
@@ -78,7 +80,7 @@ class BodyClouds:
         seen = self._seen(t, true, truth)
         found = {}
         for floor, surface in (("", fitted), ("_floor", true)):
-            to_mesh = np.abs(distance_to_body(chosen, surface, self._faces))
+            to_mesh = self._tree.shaped(surface).distance(chosen, DEEPEST_M)
             points = self._samples.of(surface, self._faces)
             found[f"cloud_to_mesh{floor}"] = float(to_mesh.mean())
             found[f"mesh_to_cloud_visible{floor}"] = visible_to_cloud(points, seen, cloud)

@@ -10,13 +10,14 @@ import numpy as np
 from intercap_core.camera.rig import Rig
 from intercap_core.metrics import contact, penetration
 from intercap_core.metrics.clouds import Cloud, vertex_to_cloud, visible_to_cloud
-from intercap_core.metrics.proximity import PosedObject, Sight, distance_to_body, face_normals
+from intercap_core.metrics.proximity import PosedBody, PosedObject, Sight, face_normals
 from intercap_core.metrics.segmented import SegmentedClouds
 from intercap_core.metrics.tracks import BodyTrack, ObjectTrack
 from intercap_core.metrics.truth import Truth
 from intercap_core.progress import Progress
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.surface_samples import sample_surface
+from intercap_core.rigid.surface_tree import SurfaceTree
 from intercap_core.schemas import CONTACT_REGIONS
 
 log = logging.getLogger(__name__)
@@ -75,6 +76,7 @@ class Measurement:
         self.threshold = threshold_m
         self.faces = body_track.model.faces.numpy()
         template = body_track.model.template.numpy().astype(np.float64)
+        self.tree = SurfaceTree(template, self.faces)
         self.body_samples = sample_surface(template, self.faces, BODY_SAMPLES)
 
     def over_frames(self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None) -> Values:
@@ -94,15 +96,16 @@ class Measurement:
         for t, vertices in enumerate(self.body.vertices()):
             vertices = vertices.astype(np.float64)
             row: Values = {"ground_penetration": penetration.ground_penetration(vertices, *floor)}
+            surface = PosedBody(vertices, self.faces, self.tree)
             if handled is not None:
-                between, touched = self._between(handled, t, vertices, floor)
+                between, touched = self._between(handled, t, vertices, surface, floor)
                 row |= between
                 counts += touched
             seen_body = seen_object = None
             if truth is not None and truth.visible is not None:
                 share = self.body_samples.of(truth.visible[t].astype(np.float32), self.faces)
                 seen_body, seen_object = share > 0.5, None if seen is None else seen[t]
-            cloud_row, clouds = self._to_clouds(t, vertices, seen_body, seen_object)
+            cloud_row, clouds = self._to_clouds(t, vertices, surface, seen_body, seen_object)
             row |= cloud_row
             if truth is not None:
                 row |= self._true_body(t, truth, clouds[0], seen_body)
@@ -131,13 +134,14 @@ class Measurement:
         handled: Handled,
         t: int,
         vertices: np.ndarray,
+        surface: PosedBody,
         floor: tuple[np.ndarray, np.ndarray],
     ) -> tuple[Values, np.ndarray]:
         """Distances between body and object in frame ``t``, and the object's points (N,) that the
         body touches."""
         object_vertices = handled.posed(t, handled.mesh.vertices)
         points = handled.posed(t, handled.points)
-        to_body = distance_to_body(np.concatenate([object_vertices, points]), vertices, self.faces)
+        to_body = surface.signed_distance(np.concatenate([object_vertices, points]))
         point_distance = to_body[len(object_vertices) :]
         track = handled.track
         to_object = handled.surface.signed_distance(
@@ -161,6 +165,7 @@ class Measurement:
         self,
         t: int,
         vertices: np.ndarray,
+        surface: PosedBody,
         seen_body: np.ndarray | None,
         seen_object: np.ndarray | None,
     ) -> tuple[Values, tuple[Cloud, Cloud]]:
@@ -183,11 +188,11 @@ class Measurement:
             seen_body = sight.seen(body_points, normals, self.rig.cameras)
         step = max(1, len(person.points) // CLOUD_POINTS)
         chosen = person.points[::step].astype(np.float64)
-        back = distance_to_body(chosen, vertices, self.faces)
+        back = surface.distance(chosen)
         row: Values = {
             "body_to_cloud": vertex_to_cloud(vertices, person),
             "body_visible_to_cloud": visible_to_cloud(body_points, seen_body, person),
-            "cloud_to_body": float(np.abs(back).mean()) if len(back) else np.nan,
+            "cloud_to_body": float(back.mean()) if len(back) else np.nan,
         }
         if handled is not None:
             object_points = handled.posed(t, handled.sample_points)

@@ -10,17 +10,21 @@ from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.open3d_core import o3d
+from intercap_core.rigid.surface_tree import ShapedSurface, SurfaceTree
 
-REACH_M = 0.25  # distances are capped here: no reported figure needs larger ones
+REACH_M = 0.10  # distances are capped here: no reported figure needs larger ones
+DEEPEST_M = 0.25  # and depths of what is inside here
 _LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own triangle
 
 
 class PosedObject:
-    """A rigid mesh (V, 3), (F, 3) in its own frame; its search tree is built once."""
+    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
-        self._field = DistanceField(vertices, faces, watertight=watertight)
-        self._low, self._high = vertices.min(0) - REACH_M, vertices.max(0) + REACH_M
+        self._solid = _Solid(
+            DistanceField(vertices, faces, watertight=watertight),
+            SurfaceTree(vertices, faces).shaped(vertices),
+        )
 
     def signed_distance(
         self,
@@ -30,31 +34,43 @@ class PosedObject:
     ) -> np.ndarray:
         """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
 
-        Negative inside, at most ``REACH_M``.
+        Negative inside; at most ``REACH_M``, at least -``DEEPEST_M``.
         """
-        return _within_reach(self._field, (points - translation) @ rotation, self._low, self._high)
+        return self._solid.signed_distance((points - translation) @ rotation)
 
 
-def distance_to_body(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Signed distance (N,) of points (N, 3) to a posed body (V, 3), (F, 3), as above."""
-    low, high = vertices.min(0) - REACH_M, vertices.max(0) + REACH_M
-    near = ((points > low) & (points < high)).all(1)
-    if not near.any():
-        return np.full(len(points), REACH_M)
-    return _within_reach(DistanceField(vertices, faces), points, low, high)
+class PosedBody:
+    """A body in one pose: vertices (V, 3), and the ``tree`` of its faces (F, 3)."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
+        self._surface = tree.shaped(vertices)
+        self._solid = _Solid(DistanceField(vertices, faces), self._surface)
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (N,) of points (N, 3), as of :class:`PosedObject`."""
+        return self._solid.signed_distance(points)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (N,) of points (N, 3) on either side, at most ``DEEPEST_M``."""
+        return self._surface.distance(points, DEEPEST_M)
 
 
-def _within_reach(
-    field: DistanceField,
-    points: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
-    result = np.full(len(points), REACH_M)
-    near = np.flatnonzero(((points > low) & (points < high)).all(1))
-    if len(near):
-        result[near] = np.clip(field.signed_distance(points[near]), -REACH_M, REACH_M)
-    return result
+class _Solid:
+    """What is inside a surface, and how far from it."""
+
+    def __init__(self, field: DistanceField, surface: ShapedSurface) -> None:
+        self._field, self._surface = field, surface
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        low, high = self._field.box + np.array([[-REACH_M], [REACH_M]])
+        found = np.full(len(points), REACH_M)
+        near = np.flatnonzero(((points > low) & (points < high)).all(1))
+        found[near] = self._surface.distance(points[near], REACH_M)
+        inside = near[self._field.inside(points[near])]
+        deep = inside[found[inside] >= REACH_M]
+        found[deep] = self._surface.distance(points[deep], DEEPEST_M)
+        found[inside] *= -1
+        return found
 
 
 class Sight:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.clouds import colour_lookup, depth_points
+from intercap_core.camera.clouds import depth_points
+from intercap_core.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
@@ -42,43 +43,70 @@ def segmented_points(
     depth pixels are looked at; ``bias_m`` is subtracted from the depth. A point belongs to the
     mask that covers the colour pixel showing it.
     """
-    nothing = np.empty((0, 3), np.float32)
-    if camera.depth is None or (masks.person is None and masks.object_ is None):
-        return nothing, nothing
-    index = _candidates(depth, camera, near)
-    if len(index) == 0:
-        return nothing, nothing
-    lookup = colour_lookup(depth, camera, index)
-    colour_index = np.where(lookup.hidden, -1, lookup.colour_index)
-    cloud = depth_points(depth, camera, lookup.depth_index)
-    points = cloud.points
+    shown = [np.zeros(0, np.int64), np.zeros(0, np.int64)]
+    space = _Space.around(depth, camera, near)
+    for place, runs in enumerate((masks.person, masks.object_)):
+        window = None if runs is None or space is None else mask_window(depth, camera, runs)
+        if window is not None:
+            assert runs is not None and space is not None
+            index = mask_pixels(depth, camera, runs, window)
+            shown[place] = index[space.holds(depth, index)]
+    return _placed(depth, camera, shown[0], bias_m), _placed(depth, camera, shown[1], bias_m)
+
+
+def _placed(depth: np.ndarray, camera: Camera, index: np.ndarray, bias_m: float) -> np.ndarray:
+    """Points (N, 3) float32, master frame, of flat depth pixels (N,)."""
+    if not len(index):
+        return np.empty((0, 3), np.float32)
+    points = depth_points(depth, camera, index).points
     if bias_m:
         points = points * (1 - np.float32(bias_m) / points[:, 2:])
-    points = apply(camera.master_from_depth, points)
-
-    def pick(runs: Runs | None) -> np.ndarray:
-        return nothing if runs is None else points[runs.sample_flat(colour_index)]
-
-    return pick(masks.person), pick(masks.object_)
+    return apply(camera.master_from_depth, points)
 
 
-def _candidates(depth: np.ndarray, camera: Camera, near: np.ndarray) -> np.ndarray:
-    """Flat depth pixels in the box of ``near`` (M, 3) and in its range of depths."""
-    lens = camera.depth
-    assert lens is not None
-    local = apply(camera.depth_from_master, near)
-    local = local[lens.inside_model(local)]
-    if len(local) == 0:
-        return np.empty(0, np.int64)
-    pixels = lens.project(local)
-    nearest, farthest = local[:, 2].min() - MARGIN_M, local[:, 2].max() + MARGIN_M
-    margin = lens.fx * MARGIN_M / max(float(local[:, 2].min()), MARGIN_M)
-    x0, y0 = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
-    x1, y1 = (int(np.ceil(v + margin)) + 1 for v in pixels.max(0))
-    window = depth[y0:y1, x0:x1]
-    wanted = (window > 1e3 * max(nearest, 0.0)) & (window < 1e3 * farthest)
-    rows, columns = np.nonzero(wanted)
-    return (rows + y0) * lens.width + columns + x0
+@dataclass(frozen=True)
+class _Space:
+    """A box of a depth image from ``low`` to before ``high`` (column, row), and a range of depths,
+    millimetres."""
+
+    low: tuple[int, int]
+    high: tuple[int, int]
+    nearest: float
+    farthest: float
+
+    @classmethod
+    def around(cls, depth: np.ndarray, camera: Camera, near: np.ndarray) -> _Space | None:
+        """That of points (M, 3), master frame, with ``MARGIN_M``; None where the camera sees none
+        of them."""
+        lens = camera.depth
+        if lens is None:
+            return None
+        local = apply(camera.depth_from_master, near)
+        local = local[lens.inside_model(local)]
+        if not len(local):
+            return None
+        pixels = lens.project(local)
+        margin = lens.fx * MARGIN_M / max(float(local[:, 2].min()), MARGIN_M)
+        low, high = np.floor(pixels.min(0) - margin), np.ceil(pixels.max(0) + margin) + 1
+        return cls(
+            (int(low[0]), int(low[1])),
+            (int(high[0]), int(high[1])),
+            1e3 * max(float(local[:, 2].min()) - MARGIN_M, 0.0),
+            1e3 * (float(local[:, 2].max()) + MARGIN_M),
+        )
+
+    def holds(self, depth: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Which flat pixels (N,) of the image (H, W) mm are in it: (N,) bool."""
+        row, column = np.divmod(index, depth.shape[1])
+        found = depth.ravel()[index]
+        return (
+            (column >= self.low[0])
+            & (column < self.high[0])
+            & (row >= self.low[1])
+            & (row < self.high[1])
+            & (found > self.nearest)
+            & (found < self.farthest)
+        )
 
 
 def read_person_masks(person: Path) -> list[list[bytes]]:

@@ -107,7 +107,9 @@ class DistanceField:
         query = np.asarray(points, np.float32).reshape(-1, 3)
         if self._open is not None:
             return self._open.inside(query)
-        asked = np.flatnonzero(self._odd(query, _DIRECTIONS[0]))
+        low, high = self.box.astype(np.float32)
+        asked = np.flatnonzero(((query >= low) & (query <= high)).all(1))
+        asked = asked[self._odd(query[asked], _DIRECTIONS[0])]
         votes = np.zeros(len(query), int)
         for direction in _DIRECTIONS:
             votes[asked] += self._odd(query[asked], direction)

@@ -9,8 +9,9 @@ from intercap_core.config import ContinuousSymmetry, Symmetry
 from intercap_core.metrics import body, contact, flags, motion, object_pose, penetration
 from intercap_core.metrics.clouds import Cloud, vertex_to_cloud, visible_to_cloud
 from intercap_core.metrics.extrinsics import displacement, rig_centre
-from intercap_core.metrics.proximity import PosedObject, Sight, distance_to_body, face_normals
+from intercap_core.metrics.proximity import PosedBody, PosedObject, Sight, face_normals
 from intercap_core.rigid.surface_samples import sample_surface
+from intercap_core.rigid.surface_tree import SurfaceTree
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -229,12 +230,21 @@ def test_distance_to_a_posed_box_both_ways() -> None:
     surface = PosedObject(vertices, faces)
     rotation, translation = _turn_z(90), np.array([1.0, 2, 3])
     points = translation + np.array([[0.0, 0, 0], [0.13, 0, 0], [0.05, 0, 0], [3, 0, 0]])
-    expected = [-0.1, 0.03, -0.05, 0.25]
+    expected = [-0.1, 0.03, -0.05, 0.10]
     assert surface.signed_distance(points, rotation, translation) == pytest.approx(
         expected, abs=1e-6
     )
     posed = vertices @ rotation.T + translation
-    assert distance_to_body(points, posed, faces) == pytest.approx(expected, abs=1e-6)
+    body = PosedBody(posed, faces, SurfaceTree(vertices, faces))
+    assert body.signed_distance(points) == pytest.approx(expected, abs=1e-6)
+    assert body.distance(points) == pytest.approx([0.1, 0.03, 0.05, 0.25], abs=1e-6)
+
+
+def test_depths_are_told_further_than_distances() -> None:
+    vertices, faces = _box(0.6)  # half a metre and more: deeper than REACH_M and DEEPEST_M
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.37, 0, 0], [0.45, 0, 0]])
+    found = PosedObject(vertices, faces).signed_distance(points, np.eye(3), np.zeros(3))
+    assert found == pytest.approx([-0.25, -0.2, -0.05, 0.07, 0.10], abs=1e-6)
 
 
 def test_sight_knows_occlusion_facing_and_image() -> None:

@@ -1,5 +1,5 @@
-"""Which depth pixels show the person, compiled: :mod:`intercap_core.camera.clouds`' look-up of one
-mask, without what does not reach it.
+"""Which depth pixels show a mask, compiled: :mod:`intercap_core.camera.clouds`' look-up without
+what does not reach the mask.
 
 Single precision throughout, as there.
 """
@@ -17,12 +17,13 @@ _ONE, _HALF = np.float32(1), np.float32(0.5)
 
 
 @numba.njit(cache=True, nogil=True)
-def person_pixels(
+def mask_pixels(
     depth,
     background,
     before_mm,
     rows,
     columns,
+    every,
     rays,
     pose,
     lens,
@@ -32,7 +33,7 @@ def person_pixels(
     cell,
     hidden_m,
 ):
-    """Flat pixels (M,), ascending, of every second column of every second row of a window.
+    """Flat pixels (M,), ascending, of every ``every``-th column of as many rows of a window.
 
     ``depth`` (H,W) uint16 mm, part ``rows`` (first, end), ``columns`` (first, end) of it;
     ``background`` (H,W) mm, or empty: pixels that are not ``before_mm`` nearer do not count, and
@@ -80,10 +81,10 @@ def person_pixels(
                 j = int(np.floor((u[r, c] + _HALF) / cell)) - left
                 if 0 <= i < bottom - top and 0 <= j < right - left:
                     nearest[i, j] = min(nearest[i, j], z[r, c])
-    index = np.empty(((height + 1) // 2) * ((width + 1) // 2), np.int64)
+    index = np.empty((-(-height // every)) * (-(-width // every)), np.int64)
     count = 0
-    for r in range(0, height, 2):
-        for c in range(0, width, 2):
+    for r in range(0, height, every):
+        for c in range(0, width, every):
             if not z[r, c] > 0:
                 continue
             x, y = int(np.rint(u[r, c])) - box[0], int(np.rint(v[r, c])) - box[1]

@@ -1,13 +1,13 @@
-"""The person's pixels are those that the plain look-up of the colour image finds."""
+"""The pixels of a mask are those that the plain look-up of the colour image finds."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from intercap_core.body_fit.observations import person_pixels
 from intercap_core.camera.clouds import colour_lookup
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.camera.masks import Runs, encode
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import rigid
@@ -44,11 +44,14 @@ def _mask(camera: Camera) -> Runs:
 
 
 @pytest.mark.parametrize("camera", [BESIDE, ALIGNED], ids=["beside", "aligned"])
-@pytest.mark.parametrize("with_background", [True, False])
-def test_pixels_are_those_of_the_plain_lookup(camera: Camera, with_background: bool) -> None:
+@pytest.mark.parametrize(("with_background", "every"), [(True, 2), (False, 2), (False, 1)])
+def test_pixels_are_those_of_the_plain_lookup(
+    camera: Camera, with_background: bool, every: int
+) -> None:
     depth, background = _scene()
     mask = _mask(camera)
-    found = person_pixels(depth, camera, mask, background if with_background else None, WINDOW)
+    behind = background if with_background else None
+    found = mask_pixels(depth, camera, mask, WINDOW, background=behind, before_m=0.04, every=every)
 
     before = np.zeros_like(depth)
     before[WINDOW] = depth[WINDOW]
@@ -56,10 +59,25 @@ def test_pixels_are_those_of_the_plain_lookup(camera: Camera, with_background: b
         nearer = depth.astype(int) < background.astype(int) - 40
         before[~nearer & (background > 0)] = 0
     chosen = np.zeros(depth.shape, bool)
-    chosen[20:271:2, 30:301:2] = True
+    chosen[20:271:every, 30:301:every] = True
     lookup = colour_lookup(before, camera, np.flatnonzero(chosen & (before > 0)))
     shown = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
     np.testing.assert_array_equal(found, lookup.depth_index[shown])
     assert len(found) > 3000
     if camera is BESIDE:
         assert (lookup.hidden & (depth.ravel()[lookup.depth_index] < 2200)).any()
+
+
+@pytest.mark.parametrize("camera", [BESIDE, ALIGNED], ids=["beside", "aligned"])
+def test_nothing_of_the_mask_is_outside_its_window(camera: Camera) -> None:
+    depth, _ = _scene()
+    mask = _mask(camera)
+    window = mask_window(depth, camera, mask)
+    assert window is not None
+    found = mask_pixels(depth, camera, mask, window)
+    lookup = colour_lookup(depth, camera)
+    shown = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
+    np.testing.assert_array_equal(found, lookup.depth_index[shown])
+    height, width = camera.colour.height, camera.colour.width
+    nothing = Runs(encode(np.zeros((height, width), bool)), height, width)
+    assert mask_window(depth, camera, nothing) is None
