@@ -42,6 +42,16 @@ app = typer.Typer(
 )
 
 
+class ReleasedKind(StrEnum):
+    """What `intercap release` lists."""
+
+    card = "card"
+    tables = "tables"
+    site = "site"
+    export = "export"
+    artefact = "artefact"
+
+
 class Part(StrEnum):
     """What `intercap evaluate` can be held to."""
 
@@ -243,6 +253,40 @@ def compare(
 
     for path in print_comparison(old, new, output):
         typer.echo(path)
+
+
+@app.command(rich_help_panel=WHOLE)
+def release(
+    settings: Settings = DEFAULT_SETTINGS,
+    only: Annotated[
+        list[ReleasedKind] | None,
+        typer.Option(help="Kinds of files to list; may repeat. Without it, all."),
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Compare this folder with the list in it; needs no settings."
+        ),
+    ] = None,
+) -> None:
+    """List the dataset's files with their digests, versions and settings, to give them away.
+
+    Writes release.json and release.sha256 beside the card (card.md, card.json, croissant.json),
+    whose texts the settings' section card holds. Who gets the files checks them by --check, or by
+    sha256sum -c release.sha256.
+
+    Examples: intercap release config/demo/config.yaml --only card --only tables --only export;
+    intercap release --check results/demo
+    """
+    _prepare()
+    from intercap_core.commands.release import check_release, write_release
+    from intercap_core.project import load_project
+    from intercap_core.release.manifest import KINDS
+
+    if check is not None:
+        raise typer.Exit(0 if check_release(check) else 1)
+    kinds = [kind.value for kind in only] if only else list(KINDS)
+    typer.echo(write_release(load_project(settings), kinds))
 
 
 @app.command(rich_help_panel=WHOLE)

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -282,6 +283,36 @@ class ExportSettings(Model):
     """Copy the recorded colour images into bop and coco: as recorded, lenses not straightened."""
 
 
+class CardSettings(Model):
+    """What the dataset's card says to whom it is given."""
+
+    title: str = ""
+    """Title; empty = the dataset's name."""
+    description: str = ""
+    """What was recorded, why and how; Markdown."""
+    version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")] = "1.0.0"
+    """Version of the dataset."""
+    published: date | None = None
+    """Day of this version."""
+    licence: str = ""
+    """Name of the licence, as CC-BY-4.0, or the address of its text; empty = not stated, which the
+    card says."""
+    creators: tuple[str, ...] = ()
+    """Who made the dataset."""
+    url: str = ""
+    """Where the dataset is found."""
+    citation: str = ""
+    """How to cite it, e.g. BibTeX."""
+    test_share: Annotated[float, Field(ge=0, le=0.9)] = 0.2
+    """Share of the frames that each split, by subject and by object, holds out for tests; 0 = no
+    splits."""
+    test_subjects: tuple[Name, ...] = ()
+    """Subjects that are held out; empty = chosen by share. Name them to keep a split when the
+    dataset grows."""
+    test_objects: tuple[Name, ...] = ()
+    """Objects that are held out; likewise."""
+
+
 StudioFault = Literal[
     "dead_half",
     "no_depth",
@@ -422,6 +453,8 @@ class Config(Model):
     """The HTML page."""
     export: ExportSettings = ExportSettings()
     """Files for other tools."""
+    card: CardSettings = CardSettings()
+    """The dataset's card."""
     studio: StudioSettings | None = None
     """Virtual recordings to make; absent for real ones."""
 

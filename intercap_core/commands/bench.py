@@ -28,6 +28,7 @@ SAMPLE_SECONDS = 0.1
 EXTRACTIONS = 3
 JUDGEMENTS = 3
 MEGABYTE = 1 << 20
+MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 
 
 def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
@@ -117,7 +118,7 @@ def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
 def _stages(project: Project, sequence: str, frames: int) -> dict[str, float]:
     """Each stage's own figures, from the workflow's benchmark files."""
     figures = {}
-    for stage in SEQUENCE_STAGES:
+    for stage in MEASURED:
         path = Path("benchmarks") / project.config.dataset / sequence / f"{stage}.tsv"
         with open(path, encoding="utf-8") as file:
             row = next(csv.DictReader(file, delimiter="\t"))
@@ -181,7 +182,7 @@ def judgement(settings: Path, sequence: str, frames: int) -> dict[str, float]:
 
 def _print(figures: dict[str, float], title: str) -> None:
     table = Table("stage", "seconds a frame", "peak memory, MB", title=title, box=None)
-    for area in ("end_to_end", *SEQUENCE_STAGES):
+    for area in ("end_to_end", *MEASURED):
         memory = figures.get(f"{area}.peak_memory_mb")
         table.add_row(
             area,

@@ -149,5 +149,8 @@ def run_dataset(project: Project) -> Path:
         summary=folder / "summary.json",
         heatmaps=folder / "heatmaps.h5",
         tables_folder=folder / "tables",
+        card=project.config.card,
+        formats=project.config.export.formats,
+        virtual=all(project.recordings_made(name) is not None for name in project.sequences),
         failed={name: reason for name, reason in reasons.items() if reason},
     )

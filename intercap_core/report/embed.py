@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,6 @@ _TEMPLATES = Path(__file__).parent / "templates"
 _POLICY = (  # what a page may load: nothing but itself
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
-_LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "scipy")
 
 
 def render(template: str, context: Mapping[str, Any]) -> str:
@@ -75,14 +72,3 @@ def tile(name: str, value: float | None, unit: str, note: str, digits: int = 1) 
 def span(first: int, last: int) -> str:
     """Frames ``first`` to ``last`` in words."""
     return f"{first}" if first == last else f"{first}–{last}"
-
-
-def versions() -> list[tuple[str, str]]:
-    """Of this program, Python and the libraries that decide numbers."""
-    rows = [("intercap-core", version("intercap-core")), ("Python", platform.python_version())]
-    for name in _LIBRARIES:
-        try:
-            rows.append((name, version(name)))
-        except PackageNotFoundError:
-            continue
-    return rows

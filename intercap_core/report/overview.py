@@ -14,8 +14,9 @@ from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.summary import SequenceSummary
 from intercap_core.metrics.verdict_figures import mean_stated
 from intercap_core.report import measures, verdict
-from intercap_core.report.embed import css, embedded, render, span, tile, versions
+from intercap_core.report.embed import css, embedded, render, span, tile
 from intercap_core.report.heat_pictures import COLOUR_STOPS, HeatPicture
+from intercap_core.versions import versions
 
 _MAX_RUNS = 400  # rows of the list of flagged frames
 _MAX_ANSWERS = 12  # values of a column that become a filter's choices in a row of their own

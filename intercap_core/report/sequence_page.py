@@ -17,10 +17,11 @@ from intercap_core.report import body, capture, charts, measures, track, verdict
 from intercap_core.report.body import BodyFacts
 from intercap_core.report.capture import CaptureFacts
 from intercap_core.report.closeups import CloseUp
-from intercap_core.report.embed import css, embedded, render, span, tile, versions
+from intercap_core.report.embed import css, embedded, render, span, tile
 from intercap_core.report.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
 from intercap_core.report.track import TrackFacts
 from intercap_core.schemas import METRIC_REGIONS
+from intercap_core.versions import versions
 
 _LEAST_MM = 10.0  # top of a chart of distances, at the least
 

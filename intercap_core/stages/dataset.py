@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +15,14 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
-from intercap_core.config import BodyModels, ObjectEntry
+from intercap_core.config import BodyModels, CardSettings, ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.metrics import figures
 from intercap_core.metrics.contact import CONTACT_M
 from intercap_core.metrics.heatmaps import Heatmaps, collect
 from intercap_core.metrics.summary import BodyFile, SequenceSummary
+from intercap_core.release.card import facts, markdown, split_table
+from intercap_core.release.croissant import croissant
 from intercap_core.report import overview, tables
 from intercap_core.report.heat_pictures import body_surfaces, highest, object_pictures
 from intercap_core.report.overview import DatasetContent, Heat
@@ -39,13 +42,17 @@ def run(
     summary: Path,
     heatmaps: Path,
     tables_folder: Path,
+    card: CardSettings,
+    formats: Sequence[str],
+    virtual: bool = False,
     failed: Mapping[str, str] | None = None,
 ) -> Path:
     """Merge the sequences' summaries; returns the site's first page.
 
-    ``summaries`` by name, in the order of the table; ``failed`` are sequences without a result,
-    with the reason. A summary that is missing or broken is told, left out and listed. Raises
-    UserError where no sequence is left.
+    ``summaries`` by name, in the order of the table; ``card`` and ``formats`` of the exports are
+    what the dataset's card says, which is written beside ``summary``; ``virtual``: the studio made
+    all recordings; ``failed`` are sequences without a result, with the reason. A summary that is
+    missing or broken is told, left out and listed. Raises UserError where no sequence is left.
     """
     found, broken = _read(summaries)
     unreported = {**(failed or {}), **broken}
@@ -65,18 +72,22 @@ def run(
         "subjects": tables.group_table(measured, "subject", {s.name: s.subject for s in measured}),
         "intents": tables.group_table(measured, "intent", intents),
     }
-    tables.write(
-        tables_folder,
-        {
-            "sequences": by_sequence,
-            "frames": tables.frame_table(measured),
-            "cameras": tables.camera_table(found),
-            **groups,
-        },
-    )
+    written = {
+        "sequences": by_sequence,
+        "frames": tables.frame_table(measured),
+        "cameras": tables.camera_table(found),
+        "splits": split_table(found, card),
+        **groups,
+    }
+    tables.write(tables_folder, written)
     heat = collect(found)
     _write_heatmaps(heatmaps, dataset, heat)
-    _replace(summary, json.dumps(figures.summary(dataset, measured), indent=2) + "\n")
+    _replace(summary, _json(figures.summary(dataset, measured)))
+    told = facts(dataset, card, found, groups, formats=formats, failed=unreported, virtual=virtual)
+    folder = summary.parent
+    _replace(folder / "card.md", markdown(told))
+    _replace(folder / "card.json", _json(told))
+    _replace(folder / "croissant.json", _json(croissant(told, tables_folder.parent, written)))
     content = DatasetContent(
         dataset=dataset,
         sequences=found,
@@ -156,6 +167,10 @@ def _write_heatmaps(path: Path, dataset: str, heat: Heatmaps) -> None:
         writer.put("object_offsets", np.concatenate([np.zeros(1, np.int64), ends]))
         writer.put("object_points", np.concatenate([np.zeros((0, 3)), *(f.points for f in found)]))
         writer.put("object_likelihood", np.concatenate([[], *(f.likelihood for f in found)]))
+
+
+def _json(values: Any) -> str:
+    return json.dumps(values, indent=2, ensure_ascii=False) + "\n"
 
 
 def _replace(path: Path, text: str) -> None:

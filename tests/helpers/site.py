@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from intercap_core.config import PageSettings, SequenceEntry
+from intercap_core.config import CardSettings, ExportSettings, PageSettings, SequenceEntry
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import dataset, page, summary
@@ -61,6 +61,7 @@ def merge(
     out: Path,
     name: str = "demo",
     failed: Mapping[str, str] | None = None,
+    card: CardSettings | None = None,
 ) -> Path:
     """The overview and what lies beside it; returns the page."""
     return dataset.run(
@@ -72,6 +73,8 @@ def merge(
         summary=out / "summary.json",
         heatmaps=out / "heatmaps.h5",
         tables_folder=out / "tables",
+        card=card or CardSettings(),
+        formats=ExportSettings().formats,
         failed=failed,
     )
 

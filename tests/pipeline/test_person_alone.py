@@ -14,11 +14,13 @@ import pytest
 from intercap_core.commands.check import faults_of_sequences
 from intercap_core.commands.closeups import draw_closeups
 from intercap_core.commands.inspect import print_summary
+from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError
 from intercap_core.pipeline.outcome import line, notes
 from intercap_core.pipeline.step import run_dataset, run_step, run_studio
 from intercap_core.posed import open_sequence
 from intercap_core.project import Project, load_project
+from intercap_core.release.manifest import KINDS
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 NAME = "alone"
@@ -181,3 +183,26 @@ def test_a_script_and_an_object_must_fit(project: Project, tmp_path: Path) -> No
     (tmp_path / "sequences.tsv").write_text(text)
     told = [str(fault) for fault in faults_of_sequences(load_project(tmp_path / "config.yaml"))]
     assert any("needs no object, the sequence has 'cup'" in line for line in told)
+
+
+def test_what_is_given_away_is_listed_and_checked(
+    project: Project, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_release(project, KINDS)
+    assert path == project.results / "release.json"
+    assert "no licence is stated" in caplog.text and "several" not in caplog.text
+    told = json.loads(path.read_text())
+    assert told["sequences"] == [NAME] and told["dataset"] == "trial"
+    kinds = {one["kind"] for one in told["files"]}
+    assert kinds == {"card", "tables", "site", "export", "artefact"}
+    assert not any("truth" in one["path"] or "mkv" in one["path"] for one in told["files"])
+    assert str(project.path.parent) not in path.read_text()  # no folder of this machine
+    assert set(told["inputs"]) >= {"sequences.tsv", "subjects.tsv", "objects.yaml"}
+    assert check_release(project.results)
+    card = project.results / "card.md"
+    text = card.read_text()
+    card.write_text(text + "more")
+    assert not check_release(project.results)
+    assert "changed: card.md" in capsys.readouterr().out
+    card.write_text(text)
+    assert "0 objects" in text and "The recordings are virtual" in text

@@ -140,7 +140,15 @@ def test_tables_by_object_subject_intent_and_camera(
     out: Path, captures: dict[str, fitted.Capture]
 ) -> None:
     tables = {path.stem: pd.read_csv(path) for path in (out / "tables").glob("*.csv")}
-    assert set(tables) == {"sequences", "frames", "cameras", "objects", "subjects", "intents"}
+    assert set(tables) == {
+        "sequences",
+        "frames",
+        "cameras",
+        "objects",
+        "splits",
+        "subjects",
+        "intents",
+    }
     assert tables["objects"]["object"].tolist() == ["cup", "football"]
     subject = tables["subjects"].iloc[0]
     assert (subject["sequences"], subject["frames"]) == (2, 8)

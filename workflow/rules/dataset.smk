@@ -1,5 +1,5 @@
 rule dataset:
-    """Heatmaps, histograms, tables and the site's first page."""
+    """Heatmaps, histograms, tables, the dataset's card and the site's first page."""
     input:
         summaries=expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES),
     output:
@@ -7,6 +7,9 @@ rule dataset:
         summary=f"{RESULTS}/summary.json",
         heatmaps=f"{RESULTS}/heatmaps.h5",
         tables=directory(f"{RESULTS}/tables"),
+        card=f"{RESULTS}/card.md",
+        card_json=f"{RESULTS}/card.json",
+        croissant=f"{RESULTS}/croissant.json",
     log:
         f"{LOGS}/dataset.log",
     benchmark:
@@ -20,6 +23,8 @@ rule dataset:
     params:
         sequences=SEQUENCES,
         entries=all_entries(),
+        card=settings_of("card"),
+        formats=SETTINGS.export.formats,
         code=code_of("dataset"),
     message:
         "the site's first page"

@@ -1,0 +1,139 @@
+"""`intercap release`: the list of a dataset's files with their digests, and its check."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from intercap_core import schemas
+from intercap_core.errors import UserError
+from intercap_core.metrics.summary import SequenceSummary
+from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.project import Project, tidy
+from intercap_core.release import manifest
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.versions import versions
+
+log = logging.getLogger(__name__)
+
+_PRINTED = 20  # paths of each kind of difference
+
+
+def write_release(project: Project, kinds: Sequence[str]) -> Path:
+    """List the files of what is computed; returns the path of the list.
+
+    Sequences whose results are of several versions or settings are told: what is given away had
+    better be of one. Raises UserError where nothing is computed.
+    """
+    reported = {
+        name: project.artefact(name, "summary")
+        for name in project.sequences
+        if project.artefact(name, "summary").is_file()
+    }
+    for name in sorted(set(project.sequences) - set(reported)):
+        log.warning("sequence %s is not released: it has no result", name)
+    summaries = [SequenceSummary.read(path) for path in reported.values()]
+    made = _made(summaries)
+    for stage, found in made.items():
+        if len(found) > 1:
+            few = min(found, key=lambda one: len(one["sequences"]))
+            log.warning(
+                "stage %s is of %d versions or settings: %s differ from the others; run the "
+                "project again before you release it",
+                stage, len(found), ", ".join(few["sequences"][:_PRINTED]),
+            )  # fmt: skip
+    if "export" in kinds:
+        for name in reported:
+            if not (project.artefact(name, "export") / "export.json").is_file():
+                log.warning("sequence %s is released without its export", name)
+    config = project.config
+    entries = manifest.write(
+        project.results,
+        {
+            "dataset": config.dataset,
+            "version": config.card.version,
+            "licence": config.card.licence,
+            "sequences": sorted(reported),
+            "software": dict(versions()),
+            "schemas": {name: getattr(schemas, name.upper()).version for name in SEQUENCE_STAGES},
+            "code": {name: code_digest(f"stages.{name}") for name in STAGES},
+            "made_by": made,
+            "settings": _without_folders(config.model_dump(mode="json", exclude={"studio"})),
+            "inputs": _inputs(project, list(reported)),
+        },
+        kinds=kinds,
+        sequences=list(reported),
+        threads=os.cpu_count() or 1,
+    )
+    total = sum(one.bytes for one in entries)
+    path = project.results / manifest.MANIFEST
+    log.info("%d files, %.1f MB", len(entries), total / 1e6)
+    if not config.card.licence:
+        log.warning("no licence is stated: set card.licence in %s", project.path)
+    return path
+
+
+def check_release(folder: Path) -> bool:
+    """Print how a folder differs from its list; True where nothing is missing or changed."""
+    count, found = manifest.check(folder, threads=os.cpu_count() or 1)
+    for what, paths in (
+        ("missing", found.missing),
+        ("changed", found.changed),
+        ("not in the list", found.unknown),
+    ):
+        for path in paths[:_PRINTED]:
+            print(f"{what}: {path}")
+        if len(paths) > _PRINTED:
+            print(f"{what}: {len(paths) - _PRINTED} more")
+    wrong = len(found.missing) + len(found.changed)
+    print(f"{folder}: {count - wrong} of {count} files are as released")
+    return not found
+
+
+def _made(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:
+    """By stage: each version and digest of settings, with the sequences that are of it."""
+    found: dict[str, dict[tuple[int, str], list[str]]] = {}
+    for summary in summaries:
+        for stage, made in summary.made_by.items():
+            found.setdefault(stage, {}).setdefault(made, []).append(summary.name)
+    return {
+        stage: [
+            {"version": version, "settings": digest, "sequences": names}
+            for (version, digest), names in by.items()
+        ]
+        for stage, by in found.items()
+    }
+
+
+def _without_folders(values: Any) -> Any:
+    """Settings without where files lie on this machine: their names alone."""
+    if isinstance(values, dict):
+        return {key: _without_folders(value) for key, value in values.items()}
+    if isinstance(values, str) and values.startswith("/"):
+        return Path(values).name
+    return values
+
+
+def _inputs(project: Project, names: Sequence[str]) -> dict[str, str]:
+    """SHA-256 of the tables, and of the sequences' annotations, by their names."""
+    config, folder = project.config, project.path.parent
+    found = {}
+    for name in ("sequences", "subjects", "objects"):
+        path = tidy(folder / getattr(config, name))
+        found[f"{name}{path.suffix}"] = _sha256(path)
+    for name in names:
+        path = project.annotation_path(name)
+        if path.is_file():
+            found[f"annotations/{name}.yaml"] = _sha256(path)
+    return found
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
