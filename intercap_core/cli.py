@@ -177,6 +177,12 @@ def tables(
     candidates: Annotated[
         Path | None, typer.Option(help="intercap: segmentations, a folder for each sequence.")
     ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            help="intercap: the release's own Res/, to measure and show in place of our joint fit."
+        ),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Write over files there.")] = False,
 ) -> None:
     """Write a project's settings, tables and annotations for a released data set.
@@ -185,12 +191,13 @@ def tables(
     stands as a remark in the tables: look through them before you run.
 
     Examples: intercap tables intercap ~/InterCap --output config/intercap;
-    intercap tables behave ~/BEHAVE --output config/behave
+    intercap tables intercap ~/InterCap --results ~/InterCap/Res --dataset theirs --output
+    config/theirs; intercap tables behave ~/BEHAVE --output config/behave
     """
     from intercap_core.commands.tables import write_tables
     from intercap_core.tables.intercap import Sources
 
-    sources = Sources(calibrations, annotations, meshes, keypoints, candidates)
+    sources = Sources(calibrations, annotations, meshes, keypoints, candidates, results)
     done = write_tables(
         layout, root, output, dataset=dataset, sources=sources, objects=objects, replace=replace
     )
@@ -244,8 +251,9 @@ def compare(
     """Say what changed between two versions of a dataset, by sequence and frame.
 
     By how much body, hands and object moved after the joint fit, which frames touch or are flagged
-    that were not, and what errors are stated. Keep a copy of the results before you fix an
-    annotation, and compare afterwards.
+    that were not, what errors are stated, and the figures of both. Keep a copy of the results
+    before you fix an annotation, and compare afterwards; or compare what another program made of
+    the same recordings (column results of sequences.tsv) with ours.
 
     Example: intercap compare results/demo_before results/demo --output changes
     """

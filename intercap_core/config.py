@@ -494,6 +494,10 @@ class SequenceEntry(Model):
     <camera>.json or <camera>/<image>.json in the manner of COCO-WholeBody; docs/detectors.md."""
     candidates: Path | None = None
     """Folder of <camera>.json files: instance segmentation in COCO's result format."""
+    results: Path | None = None
+    """Results that another program made of this sequence, as the InterCap release has them
+    (res.pkl, or its folder), in the master camera's frame: they are measured and shown in place of
+    the joint fit."""
     truth: Path | None = None
     """Truth of a virtual recording; read by the metrics alone."""
     annotation: Path | None = None

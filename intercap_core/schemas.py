@@ -308,6 +308,9 @@ JOINT = Schema(
         "converged": "the last steps changed little; contact, time offsets and cameras too",
         "cameras_corrected": "the cameras were corrected; else they are the scene's",
     },
+    optional_attributes={
+        "made_by": "whose results these are, where another program made them; absent of this one's",
+    },
     fields={
         **_body(one_shape=True),
         "rotation": Field(
@@ -449,6 +452,9 @@ METRICS = Schema(
         "fps": "frame sets a second",
         "has_truth": "errors against truth are in truth/",
     },
+    optional_attributes={
+        "made_by": "another program made the results that are measured; absent of this one's",
+    },
     fields={
         "body_to_object": Field(("T", "V"), "float32", "signed distance of each body vertex to the object's surface, negative inside, capped at 0.10, inside at -0.25", "m", optional=True),
         "object_sample_points": Field(("N", "3"), "float64", "points spread evenly over the object's surface", "m", "object", optional=True),
@@ -528,6 +534,7 @@ SUMMARY = Schema(
         "num_betas": "numbers of the body's shape",
         "num_expression": "numbers of the face's expression",
     },
+    optional_attributes=METRICS.optional_attributes,
     fields={
         **{key: declared for key, declared in METRICS.fields.items() if key not in PER_VERTEX_METRICS},
         "body_contact_frames": Field(("V",), "int32", "frames in which the body vertex is within 4.5 mm of the object", optional=True),

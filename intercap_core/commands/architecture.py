@@ -21,7 +21,9 @@ TEMPLATE = Path(__file__).parent / "data" / "architecture.md"
 LAYERS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command line's options, nothing else"},
     {"evaluation": "figures against truth over many recordings: `intercap evaluate`"},
-    {"commands": "the command line's verbs: run, check, tables, inspect, closeups, bench, docs"},
+    {
+        "commands": "the command line's verbs: run, check, report, view, compare, release, bench and others"
+    },
     {
         "tables": "a project's tables for released datasets",
         "pipeline": "runs one stage; decides, by digests of code and settings, what is run again",
@@ -35,12 +37,16 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     {
         "report": "charts, pictures and the pages of the site",
         "export": "files for other tools: InterCap, AMASS, BOP, COCO, glb",
+        "release": "what goes with a dataset that is given away: splits, card, list of files",
     },
     {
         "metrics": "distances, penetration, contact; errors against truth",
         "verdict": "a result judged without truth, by cameras held out; stated errors",
     },
-    {"joint": "body and object together over all frames, with contact (equation 6)"},
+    {
+        "joint": "body and object together over all frames, with contact (equation 6)",
+        "imports": "another program's results, in place of the joint fit",
+    },
     {
         "body_fit": "SMPL-X parameters in every frame (equation 2)",
         "object_track": "the object's pose in every frame (equation 1)",

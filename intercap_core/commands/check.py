@@ -329,7 +329,7 @@ def _look_at_files(row: SequenceEntry, settings: FramesSettings) -> Looked:
     from intercap_core.commands.check_recordings import Looked
 
     faults = []
-    for column in ("calibration", "keypoints", "candidates", "truth"):
+    for column in ("calibration", "keypoints", "candidates", "results", "truth"):
         path = getattr(row, column)
         if path is not None and not path.exists():
             faults.append(f"column {column} says {path}, which is not there")

@@ -32,6 +32,8 @@ def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[P
     found = compare(old, new)
     console = Console()
     console.print(_table(found))
+    if len(found.figures):
+        console.print(_figures(found))
     same = int((found.sequences["state"] == SAME).sum())
     differs = len(found.sequences) - same
     left = max(0, differs - ROWS)
@@ -65,6 +67,17 @@ def _table(found: Comparison) -> Table:
         stated = _pair(row["stated_body_mm_before"], row["stated_body_mm_after"], 1)
         state = ": ".join(filter(None, (row["state"], row["note"])))
         table.add_row(escape(str(row["sequence"])), escape(state), *cells, flagged, stated)
+    return table
+
+
+def _figures(found: Comparison) -> Table:
+    """The datasets' figures side by side."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("all frames")
+    for head in ("old", "new"):
+        table.add_column(head, justify="right")
+    for name, old, new in found.figures.itertuples(index=False):
+        table.add_row(escape(str(name)), f"{old:.4g}", f"{new:.4g}")
     return table
 
 

@@ -45,7 +45,7 @@ def write_tables(
             f"--dataset is {name!r}: a name has letters, digits, _ and - only, and does not start "
             "with -"
         ) from None
-    for path in (root, sources.calibrations, sources.annotations, sources.meshes):
+    for path in (root, sources.calibrations, sources.annotations, sources.meshes, sources.results):
         if path is not None and not path.is_dir():
             raise UserError(f"{path}: there is no such folder; correct the path")
     if layout == "intercap":
@@ -54,7 +54,8 @@ def write_tables(
         if sources != intercap.Sources():
             raise UserError(
                 "layout 'behave' has calibration, meshes and detections in places of its own; "
-                "leave out --calibrations, --annotations, --meshes, --keypoints and --candidates"
+                "leave out --calibrations, --annotations, --meshes, --keypoints, --candidates and "
+                "--results"
             )
         draft = behave.draft(root, dataset=name)
     else:

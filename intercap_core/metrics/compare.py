@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,10 +30,12 @@ SAME, CHANGED, ADDED, REMOVED, UNLIKE = "same", "changed", "added", "removed", "
 @dataclass(frozen=True)
 class Comparison:
     """``sequences`` has a row for each that either version has, the most changed first; ``frames``
-    a row for each changed frame. Millimetres and degrees."""
+    a row for each changed frame; ``figures`` of both datasets whole, "figure", "old" and "new", as
+    summary.json has them, empty where either has none. Millimetres and degrees."""
 
     sequences: pd.DataFrame
     frames: pd.DataFrame
+    figures: pd.DataFrame
 
 
 def compare(old: Path, new: Path) -> Comparison:
@@ -73,7 +77,30 @@ def compare(old: Path, new: Path) -> Comparison:
     return Comparison(
         table.reset_index(drop=True),
         pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=[NAME, FRAME]),
+        _figures(old, new),
     )
+
+
+def _figures(old: Path, new: Path) -> pd.DataFrame:
+    """Figures that both summaries have, by name."""
+    both = []
+    for folder in (old, new):
+        try:
+            told = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return pd.DataFrame(columns=["figure", "old", "new"])
+        both.append(dict(_numbers(told)))
+    before, after = both
+    rows = [(name, before[name], after[name]) for name in before if name in after]
+    return pd.DataFrame(rows, columns=["figure", "old", "new"])
+
+
+def _numbers(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, float]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{above}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{above}{name}", float(value)
 
 
 def _sequences(folder: Path) -> dict[str, Path]:
@@ -103,7 +130,7 @@ def _compare_one(name: str, old: Path, new: Path) -> tuple[dict[str, object], pd
             | (table["touches_no_more"] != "")
             | (table["flag_before"] != table["flag_after"])
         )
-        touching = [_touching(one).any(1) for one in (before, after)]
+        touching = [np.any(_touching(one), axis=1) for one in (before, after)]
     contact = (table["touches"] != "") | (table["touches_no_more"] != "")
     row: dict[str, object] = {
         "state": CHANGED if changed.any() else SAME,
@@ -141,6 +168,8 @@ def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
         turned[known] = np.degrees(Rotation.from_matrix(turn).magnitude())
     regions = np.array(before.text("region_names"))
     old, new = _touching(before), _touching(after)
+    if "made_by" in before.attributes or "made_by" in after.attributes:
+        new = old  # of another program's results contact is not stated, which is no change
     return pd.DataFrame(
         {
             NAME: name,

@@ -32,7 +32,8 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True, eq=False)
 class SequenceMetrics:
-    """One sequence's metrics artefact without its distances by vertex."""
+    """One sequence's metrics artefact without its distances by vertex; ``made_by`` names another
+    program that made what is measured, "" = this one."""
 
     name: str
     subject: str
@@ -40,6 +41,7 @@ class SequenceMetrics:
     fps: float
     has_truth: bool
     values: dict[str, np.ndarray] = field(repr=False)
+    made_by: str = ""
 
     @classmethod
     def read(cls, path: Path) -> SequenceMetrics:
@@ -59,6 +61,7 @@ class SequenceMetrics:
         return cls(
             str(told["sequence"]), str(told["subject"]), str(told["object"]),
             float(told["fps"]), bool(told["has_truth"]), values,
+            str(told.get("made_by", "")),
         )  # fmt: skip
 
     def __len__(self) -> int:

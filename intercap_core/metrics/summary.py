@@ -118,6 +118,7 @@ def write(output: Path, paths: Mapping[str, Path], *, intent: str) -> None:
     ):
         told = {
             **{name: metrics.attributes[name] for name in METRICS.attributes},
+            **{k: v for k, v in metrics.attributes.items() if k in METRICS.optional_attributes},
             **{name: joint.attributes[name] for name in ("gender", "body_model")},
             "num_betas": joint["betas"].shape[-1],
             "num_expression": joint["expression"].shape[-1],

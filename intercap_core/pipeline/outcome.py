@@ -143,6 +143,8 @@ def _body_fit(a: Artefact) -> str:
 
 
 def _joint(a: Artefact) -> str:
+    if "made_by" in a.attributes:
+        return f"made by {a.attributes['made_by']}; {_share(~a['flagged'])} frames have a result"
     settled = "settled" if a.attributes["converged"] else "ended before it settled"
     touching = int((a["contact_probability"] > _SURE).any(axis=1).sum())
     contact = f"contact in {touching} of {len(a['flagged'])} frames"

@@ -57,6 +57,7 @@ def run_step(
         "subject": project.subjects[row.subject],
         "body_models": project.config.body_models,
         "device": project.config.device,
+        "results": row.results,
         "truth": row.truth,
         "frames_to_drop": annotation.drop_frames,
         "floor": annotation.floor,

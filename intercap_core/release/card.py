@@ -97,6 +97,7 @@ def facts(
             "minutes": round(sum(len(s) / s.fps for s in measured) / 60, 2),
             "subjects": len({s.subject for s in measured}),
             "objects": len({s.object_ for s in measured} - {""}),
+            "of_another_program": sum(bool(s.made_by) for s in measured),
             "cameras": sorted({len(s.rig["camera_names"]) for s in summaries}),
             "frames_per_second": sorted({round(float(s.fps), 3) for s in measured}),
         },

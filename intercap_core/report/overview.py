@@ -107,6 +107,9 @@ def _headline(content: DatasetContent, measured: Sequence[SequenceMetrics]) -> s
         _counted(subjects, "subject"),
         _counted(objects, "object") if objects else "people alone",
     ]
+    imported = sum(bool(s.made_by) for s in measured)
+    if imported:
+        parts.append(f"{imported} with results of another program")
     if content.failed:
         parts.append(f"{len(content.failed)} failed")
     return ", ".join(parts)

@@ -243,7 +243,9 @@ def _chart(
 
 
 def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
-    """Each term's share of the joint fit's energy at the start and at the end."""
+    """Each term's share of the joint fit's energy at the start and at the end; "" of none."""
+    if not terms:
+        return ""
     whole = max(sum(before for _, before, _ in terms), 1e-12)
     return charts.bar_pairs(
         [

@@ -54,6 +54,7 @@ def sequence_table(
             "intent": (intents or {}).get(s.name, ""),
             "frames": len(s),
             "fps": s.fps,
+            "made_by": s.made_by,
             "flagged_frames": int(s.values["flagged"].sum()),
             "contact_frames": int(s.values["contact_frame"].sum()) if s.has_object else np.nan,
         }

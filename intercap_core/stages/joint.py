@@ -26,6 +26,7 @@ from intercap_core.config import (
     SubjectEntry,
     digest,
 )
+from intercap_core.imports.joint import import_joint
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.constants import FEW_HAND_VIEWS
 from intercap_core.joint.fit import JointFit, fit
@@ -65,14 +66,27 @@ def run(
     track_settings: ObjectTrackSettings,
     contact: Sequence[ContactInterval] | None = None,
     device: str = "cpu",
+    results: Path | None = None,
 ) -> None:
-    """Write joint.h5 from the sequential fits.
+    """Write joint.h5 from the sequential fits, or of another program's ``results``.
 
     ``body_settings`` say what the body fit had fitted, ``track_settings`` how the tracker compares
     images. ``contact`` are the annotated intervals, None where contact is to be detected from the
     geometry. Where ``object_`` is None, or its track is lost in all frames, the body's terms are
     minimised alone. Raises UserError where an artefact or the mesh cannot be used.
     """
+    if results is not None:
+        import_joint(
+            results,
+            scene=scene,
+            person=person,
+            output=output,
+            object_=object_,
+            subject=subject,
+            body_models=body_models,
+            settings_digest=digest(settings),
+        )
+        return
     with open_inputs(
         frames=frames,
         scene=scene,

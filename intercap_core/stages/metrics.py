@@ -74,7 +74,9 @@ def run(
     an input artefact is missing, broken or does not fit the others.
     """
     verdict = {}
-    if settings.hold_out:
+    with artefacts.read(joint, JOINT) as fitted:
+        made_by = {k: v for k, v in fitted.attributes.items() if k in JOINT.optional_attributes}
+    if settings.hold_out and not made_by:  # the verdict was fitted to errors of this program's
         verdict = Verdict.reach(
             frames=frames,
             scene=scene,
@@ -139,6 +141,7 @@ def run(
             "object": object_.name if object_ else "",
             "fps": images.fps,
             "has_truth": known is not None,
+            **made_by,
         }
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):

@@ -135,6 +135,11 @@ def _overlays(
 
 def _of_joint(joint: Artefact, rig: Rig, master: int) -> str:
     """How the joint fit went, and by how much it has moved the cameras of ``rig``, in words."""
+    if "made_by" in joint.attributes:
+        return (
+            f"Not fitted here: made by {joint.attributes['made_by']}, with the cameras as they "
+            "were given. The sequential fits are this program's."
+        )
     steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
     settled = "settled" if joint.attributes["converged"] else "ended before it settled"
     corrected = ""

@@ -35,7 +35,8 @@ class Sources:
     """Folders of the release beside the images; None = look for it, or do without.
 
     ``calibrations`` holds ``calibration_first``, ...; ``annotations`` a folder for each sequence;
-    ``meshes`` ``01.ply``, ...; ``keypoints`` and ``candidates`` a folder for each sequence.
+    ``meshes`` ``01.ply``, ...; ``keypoints``, ``candidates`` and ``results`` (what the release
+    itself found) a folder for each sequence.
     """
 
     calibrations: Path | None = None
@@ -43,6 +44,7 @@ class Sources:
     meshes: Path | None = None
     keypoints: Path | None = None
     candidates: Path | None = None
+    results: Path | None = None
 
 
 def stated_calibration(subject: int, thing: int) -> str | None:
@@ -146,7 +148,7 @@ def _row(key: Key, folder: Path, sources: Sources) -> Row:
         f"subject{subject:02d}_motion{thing:02d}_seg{segment}",
         f"subject{subject:02d}_motion{thing:02d}_seg{segment:02d}",
     )
-    for column in ("keypoints", "candidates"):
+    for column in ("keypoints", "candidates", "results"):
         above = getattr(sources, column)
         places = [above / place for place in usual] if above is not None else []
         there = next((place for place in places if place.is_dir()), None)

@@ -14,7 +14,7 @@ from intercap_core.errors import UserError
 
 COLUMNS = (
     "sequence", "subject", "object", "layout", "recordings", "calibration", "keypoints",
-    "candidates", "annotation",
+    "candidates", "results", "annotation",
 )  # fmt: skip
 REQUIRED = [name for name, info in SequenceEntry.model_fields.items() if info.is_required()]
 

@@ -39,6 +39,7 @@ MESH_FACES = 20000  # of an object; a scan with more is drawn with every n-th fa
 _JPEG_QUALITY = 70
 _SURVEY_STEP = 7  # of body vertices, to find the clouds near the meshes
 
+IMPORTED = "another program's"  # in place of the joint fit
 VERSIONS = {"joint": "joint fit", "sequential": "sequential fits", "truth": "truth"}
 
 
@@ -79,6 +80,7 @@ def gather(
         upright = z_up_frame(scene)
     bodies: dict[str, _Body] = {}
     flags: Sequence[str] = ()
+    imported = False
     if "joint" in there:
         with artefacts.read(there["joint"], JOINT) as joint:
             model = load_model(body_models, gender, joint)
@@ -87,8 +89,10 @@ def gather(
             )
             rig, bias = rig.moved(joint["master_from_colour"]), joint["depth_bias"]
             flags = joint.text("flag_reason")
+            imported = "made_by" in joint.attributes
             _add_stated_contact(content, joint, model)
     bodies["sequential"] = _sequential(paths["body_fit"], there, body_models, gender)
+    names = {**VERSIONS, "joint": IMPORTED} if imported else VERSIONS
     shown = next(iter(bodies.values()))
     total = shown.parameters.batch
     if "metrics" in there:
@@ -115,7 +119,7 @@ def gather(
             "frames": total,
             "frame": upright,
             "moments": moments.tolist(),
-            "versions": {name: VERSIONS[name] for name in bodies},
+            "versions": {name: names[name] for name in bodies},
             "object": "" if mesh is None else mesh.name,
             "flags": [[t, reason] for t, reason in enumerate(flags) if reason],
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -67,6 +68,35 @@ def test_a_change_is_measured_in_its_frames(versions: tuple[Path, Path]) -> None
     assert frames.loc[3, ["flag_before", "flag_after"]].tolist() == ["", "?"]
     back = compare(*reversed(versions)).frames.set_index("frame")
     assert back.loc[3, "touches"] == "right_hand"
+
+
+def test_figures_of_both_stand_side_by_side(
+    versions: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare(*versions).figures.empty
+    for folder, value in zip(versions, (1.5, 20.29), strict=True):
+        told = {"dataset": "x", "frames": 4, "vertex_to_cloud": {"body_mm": value, "other": None}}
+        (folder / "summary.json").write_text(json.dumps(told))
+    figures = compare(*versions).figures.set_index("figure")
+    assert figures.loc["vertex_to_cloud.body_mm"].tolist() == [1.5, 20.29]
+    assert set(figures.index) == {"frames", "vertex_to_cloud.body_mm"}
+    print_comparison(*versions)
+    assert "20.29" in capsys.readouterr().out
+    (versions[0] / "summary.json").write_text("{")
+    assert compare(*versions).figures.empty
+
+
+def test_contact_that_is_not_stated_is_no_change(versions: tuple[Path, Path]) -> None:
+    with h5py.File(versions[0] / "b" / "joint.h5", "r+") as file:
+        file["contact_probability"][:, HAND] = 0.9
+    with h5py.File(versions[1] / "b" / "joint.h5", "r+") as file:
+        file["contact_probability"][:] = np.nan
+    found = compare(*versions).sequences.set_index("sequence")
+    assert found.loc["b", "contact_changed_frames"] == 4
+    with h5py.File(versions[1] / "b" / "joint.h5", "r+") as file:
+        file.attrs["made_by"] = "another program"
+    found = compare(*versions).sequences.set_index("sequence")
+    assert found.loc["b", "contact_changed_frames"] == 0 and found.loc["b", "state"] == "same"
 
 
 def test_recordings_of_other_lengths_are_told(versions: tuple[Path, Path], tmp_path: Path) -> None:

@@ -165,6 +165,13 @@ def test_detections_are_found_by_any_usual_name_of_the_sequence(release, tmp_pat
     ]  # fmt: skip
 
 
+def test_the_releases_own_results_are_named_where_they_are_asked_for(release, tmp_path):
+    (tmp_path / "Res" / "01" / "09" / "Seg_0").mkdir(parents=True)
+    _, project = _write(release, results=tmp_path / "Res")
+    named = {name: row.results for name, row in project.sequences.items() if row.results}
+    assert named == {"s01_o09_seg0": tmp_path / "Res" / "01" / "09" / "Seg_0"}
+
+
 def test_nothing_is_written_over_unasked(release):
     write()
     table = Path("config/intercap/sequences.tsv")

@@ -7,6 +7,7 @@ from snakemake.exceptions import WorkflowError
 from intercap_core.capture.layouts import input_files
 from intercap_core.config import Annotation, digest
 from intercap_core.errors import UserError
+from intercap_core.imports.results import file_of
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.project import load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
@@ -194,6 +195,18 @@ def tracked_subject(wildcards):
 def intent_of(wildcards):
     """Param: what the sequence's row says that the person was asked to do."""
     return PROJECT.sequences[wildcards.sequence].intent
+
+
+def results_file(wildcards):
+    """Input function: another program's results of the sequence, where its row names them."""
+    named = PROJECT.sequences[wildcards.sequence].results
+    return [] if named is None else existing(file_of(named))
+
+
+def results_of(wildcards):
+    """Param: where another program's results of the sequence are; None = they are made here."""
+    named = PROJECT.sequences[wildcards.sequence].results
+    return None if named is None else named.as_posix()
 
 
 def layout_of(wildcards):

@@ -7,6 +7,7 @@ rule joint:
         pose_prior=pose_prior_file,
         motion_prior=motion_prior_files,
         annotation=ancient(annotation_input("contact")),
+        results=results_file,
     output:
         joint=f"{RESULTS}/{{sequence}}/joint.h5",
     log:
@@ -25,6 +26,7 @@ rule joint:
         object=tracked_object,
         subject=tracked_subject,
         device=SETTINGS.device,
+        results=results_of,
         code=code_of("joint"),
     message:
         "{wildcards.sequence}: refining body and object together"
