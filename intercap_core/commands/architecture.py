@@ -21,9 +21,7 @@ TEMPLATE = Path(__file__).parent / "data" / "architecture.md"
 LAYERS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command line's options, nothing else"},
     {"evaluation": "figures against truth over many recordings: `intercap evaluate`"},
-    {
-        "commands": "the command line's verbs: run, check, report, view, compare, release, bench and others"
-    },
+    {"commands": "the command line's verbs: run, check, report, view, compare, release and others"},
     {
         "tables": "a project's tables for released datasets",
         "pipeline": "runs one stage; decides, by digests of code and settings, what is run again",
