@@ -13,7 +13,7 @@ from intercap_core.errors import UserError
 from intercap_core.metrics.compare import SAME, Comparison, compare
 
 ROWS = 40  # sequences printed; all are in the tables
-TABLES = ("compare_sequences.csv", "compare_frames.csv")
+TABLES = ("compare_sequences.csv", "compare_frames.csv", "compare_figures.csv")
 _COLUMNS = (
     ("frames", "frames", 0), ("changed", "changed_frames", 0), ("body mm", "body_mm", 1),
     ("most", "body_max_mm", 1), ("hands mm", "hands_mm", 1), ("object mm", "object_mm", 1),
@@ -23,7 +23,7 @@ _COLUMNS = (
 
 
 def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[Path]:
-    """Print what changed, most first, and write both tables into the folder ``output``.
+    """Print what changed, most first, and write the tables into the folder ``output``.
 
     Returns the files written. Raises UserError where a folder holds no results.
     """
@@ -47,7 +47,7 @@ def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[P
         return []
     output.mkdir(parents=True, exist_ok=True)
     paths = [output / name for name in TABLES]
-    for path, table in zip(paths, (found.sequences, found.frames), strict=True):
+    for path, table in zip(paths, (found.sequences, found.frames, found.figures), strict=True):
         table.to_csv(path, index=False, float_format="%.6g")
     return paths
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from intercap_core.errors import UserError
 from intercap_core.metrics.summary import SequenceSummary
 
 
@@ -22,22 +21,25 @@ class SurfaceHeat:
 
 @dataclass(frozen=True, eq=False)
 class Heatmaps:
-    """``body`` (V,) share of ``body_frames`` in contact; one map an object by name."""
+    """``body`` (V,) share of ``body_frames`` in contact; one map an object by name. ``left_out``:
+    sequences that do not count in a map, by name, and why."""
 
     body: np.ndarray
     body_frames: int
     objects: dict[str, SurfaceHeat]
+    left_out: dict[str, list[str]] = field(default_factory=dict)
 
 
 def collect(summaries: Sequence[SequenceSummary]) -> Heatmaps:
     """Add up the sequences' counts at 4.5 mm.
 
-    Sequences without an object count in none of the maps. Bodies of another vertex count than the
-    first one's are left out of the body's map, which lies on one topology. Raises UserError where
-    an object was measured with two meshes.
+    Sequences without an object count in none of the maps. A map lies on one surface: bodies of
+    another vertex count than the first one's, and objects that were measured with another mesh
+    than the first one of their name, are left out and told.
     """
     body = np.zeros(0)
     body_frames = 0
+    left_out: dict[str, list[str]] = {}
     counts: dict[str, np.ndarray] = {}
     points: dict[str, np.ndarray] = {}
     frames: dict[str, int] = {}
@@ -51,13 +53,19 @@ def collect(summaries: Sequence[SequenceSummary]) -> Heatmaps:
         if len(contact) == len(body):
             body += contact
             body_frames += count
+        else:
+            left_out.setdefault(summary.name, []).append(
+                f"its body has {len(contact)} vertices where the sequences before have "
+                f"{len(body)}: not in the body's heatmap"
+            )
         if name not in counts:
             counts[name], points[name], frames[name] = np.zeros(len(found)), here, 0
         if not np.array_equal(points[name], here):
-            raise UserError(
-                f"sequence {summary.name!r}: object {name!r} was measured with another mesh than "
-                "in the sequences before; re-run stage 'metrics' for this sequence"
+            left_out.setdefault(summary.name, []).append(
+                f"object {name!r} was measured with another mesh than in the sequences before: not "
+                "in its heatmap; re-run stage 'metrics' of those that have the older mesh"
             )
+            continue
         counts[name] += found
         frames[name] += count
     return Heatmaps(
@@ -67,4 +75,5 @@ def collect(summaries: Sequence[SequenceSummary]) -> Heatmaps:
             name: SurfaceHeat(points[name], counts[name] / frames[name], frames[name])
             for name in sorted(counts)
         },
+        left_out,
     )

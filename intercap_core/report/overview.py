@@ -37,8 +37,8 @@ class DatasetContent:
     """All that the overview is made from.
 
     ``table`` has a row a sequence, ``groups`` the tables by object, subject, intent and camera, by
-    name. ``failed``: sequences without a result and why. ``page_of``: the address of each
-    sequence's page from the overview.
+    name. ``failed``: sequences without a result and why; ``remarks``: what the merge says of
+    others. ``page_of``: the address of each sequence's page from the overview.
     """
 
     dataset: str
@@ -50,6 +50,7 @@ class DatasetContent:
     body_frames: int
     page_of: Mapping[str, str]
     failed: Mapping[str, str] = field(default_factory=dict)
+    remarks: Mapping[str, str] = field(default_factory=dict)
 
 
 def page(content: DatasetContent) -> str:
@@ -77,6 +78,7 @@ def page(content: DatasetContent) -> str:
         },
         "page_of": content.page_of,
         "failed": sorted(content.failed.items()),
+        "remarks": sorted(content.remarks.items()),
         "counts": _counts(measured),
         "groups": [(name, _printed(table)) for name, table in content.groups.items()],
         "truth": measures.truth(measured),

@@ -1,4 +1,4 @@
-"""The dataset's tables: a row a sequence, a frame, an object, a subject, an intent, a camera."""
+"""The dataset's tables: a row a sequence, frame, object, subject, intent and camera."""
 
 from __future__ import annotations
 
@@ -155,6 +155,29 @@ def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
                         found = scale * _median(values[f"verdict/{key}{end}"][frames, place])
                         row[f"verdict.{key.removesuffix('_m')}{end}{unit}"] = found
             rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
+    """One row a camera over all its sequences: sums of images, means of the other numbers of
+    :func:`camera_table` weighted by frames, of those that know them; and how many have a note."""
+    if cameras.empty:
+        return pd.DataFrame(columns=["camera", "sequences", "frames", "images"])
+    rows = []
+    means = cameras.select_dtypes("float").columns
+    for name, own in cameras.groupby("camera", sort=True):
+        row: dict[str, object] = {
+            "camera": name,
+            "sequences": len(own),
+            "frames": int(own["frames"].sum()),
+            "images": int(own["images"].sum()),
+            "with_note": int((own["note"] != "").sum()),
+        }
+        for column in means:
+            known = own[np.isfinite(own[column])]
+            weights = known["frames"]
+            row[column] = np.average(known[column], weights=weights) if len(known) else np.nan
+        rows.append(row)
     return pd.DataFrame(rows)
 
 

@@ -52,7 +52,8 @@ def run(
     ``summaries`` by name, in the order of the table; ``card`` and ``formats`` of the exports are
     what the dataset's card says, which is written beside ``summary``; ``virtual``: the studio made
     all recordings; ``failed`` are sequences without a result, with the reason. A summary that is
-    missing or broken is told, left out and listed. Raises UserError where no sequence is left.
+    missing or broken is told, left out and listed, as is what a heatmap cannot take. Raises
+    UserError where no sequence is left.
     """
     found, broken = _read(summaries)
     unreported = {**(failed or {}), **broken}
@@ -72,15 +73,22 @@ def run(
         "subjects": tables.group_table(measured, "subject", {s.name: s.subject for s in measured}),
         "intents": tables.group_table(measured, "intent", intents),
     }
+    cameras = tables.camera_table(found)
+    rig = tables.camera_groups(cameras)
     written = {
         "sequences": by_sequence,
         "frames": tables.frame_table(measured),
-        "cameras": tables.camera_table(found),
+        "cameras": cameras,
         "splits": split_table(found, card),
+        "rig": rig,
         **groups,
     }
     tables.write(tables_folder, written)
     heat = collect(found)
+    surfaces, doubts = _body_heat(found, heat, body_models)
+    remarks = {name: "; ".join(reasons) for name, reasons in heat.left_out.items()} | doubts
+    for name, why in remarks.items():
+        log.warning("sequence %s: %s", name, why)
     _write_heatmaps(heatmaps, dataset, heat)
     _replace(summary, _json(figures.summary(dataset, measured)))
     told = facts(dataset, card, found, groups, formats=formats, failed=unreported, virtual=virtual)
@@ -92,12 +100,13 @@ def run(
         dataset=dataset,
         sequences=found,
         table=by_sequence,
-        groups={name: table for name, table in groups.items() if len(table)},
-        surfaces=_body_heat(found, heat, body_models),
+        groups={name: table for name, table in [*groups.items(), ("cameras", rig)] if len(table)},
+        surfaces=surfaces,
         objects=[_object_heat(name, heat, objects) for name in heat.objects],
         body_frames=heat.body_frames,
         page_of={s.name: f"sequences/{s.name}/index.html" for s in found},
         failed=unreported,
+        remarks=remarks,
     )
     first = site / "index.html"
     _replace(first, overview.page(content))
@@ -118,25 +127,29 @@ def _read(summaries: Mapping[str, Path]) -> tuple[list[SequenceSummary], dict[st
 
 def _body_heat(
     summaries: Sequence[SequenceSummary], heat: Heatmaps, body_models: BodyModels
-) -> list[Heat]:
-    """The body and both hands, on the body of the first sequence that counts in the map."""
+) -> tuple[list[Heat], dict[str, str]]:
+    """The body and both hands, on the body of the first sequence that counts in the map and whose
+    body file is there; and those whose file is another one than they were fitted with, and why."""
+    doubts: dict[str, str] = {}
     if not heat.body_frames:
-        return []
-    told = next(s.body for s in summaries if s.body_contact is not None)
-    model = _model(told, body_models)
-    return [
-        Heat(name, pictures, top, heat.body_frames)
-        for name, pictures, top in body_surfaces(model, heat.body)
-    ]
-
-
-def _model(told: BodyFile, body_models: BodyModels) -> BodyModel:
-    path = body_models.of(told.gender) or OPEN_BODY
-    if file_digest(path) != told.digest:
-        raise UserError(
-            f"{path}: is another body file than the sequences were fitted with (digest "
-            f"{told.digest}); name that file again in body_models, or run the project anew"
+        return [], doubts
+    for summary in summaries:
+        if summary.body_contact is None or len(summary.body_contact) != len(heat.body):
+            continue
+        path = body_models.of(summary.body.gender) or OPEN_BODY
+        if file_digest(path) == summary.body.digest:
+            model = _model(path, summary.body)
+            surfaces = body_surfaces(model, heat.body)
+            return [Heat(*surface, heat.body_frames) for surface in surfaces], doubts
+        doubts[summary.name] = (
+            f"{path} is another body file than it was fitted with (digest {summary.body.digest}): "
+            "the body's heatmap has no picture of it; name that file again in body_models, or run "
+            "the sequence anew"
         )
+    return [], doubts
+
+
+def _model(path: Path, told: BodyFile) -> BodyModel:
     return BodyModel.load(path, num_betas=told.num_betas, num_expression=told.num_expression)
 
 

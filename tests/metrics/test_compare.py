@@ -71,7 +71,7 @@ def test_a_change_is_measured_in_its_frames(versions: tuple[Path, Path]) -> None
 
 
 def test_figures_of_both_stand_side_by_side(
-    versions: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+    versions: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(*versions).figures.empty
     for folder, value in zip(versions, (1.5, 20.29), strict=True):
@@ -80,8 +80,10 @@ def test_figures_of_both_stand_side_by_side(
     figures = compare(*versions).figures.set_index("figure")
     assert figures.loc["vertex_to_cloud.body_mm"].tolist() == [1.5, 20.29]
     assert set(figures.index) == {"frames", "vertex_to_cloud.body_mm"}
-    print_comparison(*versions)
+    paths = print_comparison(*versions, tmp_path / "changes")
     assert "20.29" in capsys.readouterr().out
+    written = pd.read_csv(paths[-1]).set_index("figure")
+    assert written.loc["vertex_to_cloud.body_mm"].tolist() == [1.5, 20.29]
     (versions[0] / "summary.json").write_text("{")
     assert compare(*versions).figures.empty
 
@@ -121,7 +123,9 @@ def test_tables_and_words(
     written = print_comparison(*versions, tmp_path / "changes")
     told = capsys.readouterr().out
     assert "3 of 4 sequences differ, 1 frames; 1 are the same" in " ".join(told.split())
-    assert [path.name for path in written] == ["compare_sequences.csv", "compare_frames.csv"]
+    assert [path.name for path in written] == [
+        "compare_sequences.csv", "compare_frames.csv", "compare_figures.csv"
+    ]  # fmt: skip
     assert pd.read_csv(written[1])["frame"].tolist() == [1]
 
 

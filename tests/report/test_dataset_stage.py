@@ -145,6 +145,7 @@ def test_tables_by_object_subject_intent_and_camera(
         "frames",
         "cameras",
         "objects",
+        "rig",
         "splits",
         "subjects",
         "intents",
@@ -161,6 +162,9 @@ def test_tables_by_object_subject_intent_and_camera(
     cameras = tables["cameras"]
     assert cameras.groupby("sequence")["camera"].nunique().tolist() == [3, 3]
     assert (cameras["images"] == 4).all()
+    first, own = tables["rig"].iloc[0], cameras[cameras["camera"] == "k1"]
+    assert (first["camera"], first["sequences"], first["images"]) == ("k1", 2, 8)
+    assert first["depth_bias_mm"] == pytest.approx(own["depth_bias_mm"].mean(), abs=1e-6)
     for name in tables:
         read = pd.read_parquet(out / "tables" / f"{name}.parquet")
         assert len(read) == len(tables[name]) and list(read) == list(tables[name])
@@ -263,6 +267,34 @@ def test_a_summary_that_cannot_be_read_is_listed(
     assert "s01_o09.h5" in text and "never.h5" in text
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["sequences"] == 1
+
+
+def test_what_heatmaps_cannot_take_is_told_and_the_rest_counts(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    """Another object's mesh, another body's vertices, another body file: none ends the merge."""
+    paths = write_summaries(captures | {"s02_o03": captures["s01_o03"]}, tmp_path)
+    for name, key, count in (("s01_o09", "body_contact_frames", 11), ("s02_o03", "", 0)):
+        with h5py.File(paths[name], "r+") as file:
+            file.attrs["sequence"] = name
+            if key:
+                del file[key]
+                file.create_dataset(key, data=np.zeros(count, np.int32))
+            else:
+                file["object_sample_points"][0] += 0.1
+    with h5py.File(paths["s01_o03"], "r+") as file:
+        file.attrs["body_model"] = "0123456789abcdef"
+    text = merge(paths, captures, tmp_path / "out").read_text()
+    assert "3 sequences, 12 frames" in text and "What does not fit together" in text
+    for words in (
+        "its body has 11 vertices", "measured with another mesh", "(digest 0123456789abcdef)"
+    ):  # fmt: skip
+        assert words in text
+    with artefacts.read(tmp_path / "out" / "heatmaps.h5", HEATMAPS) as heat:
+        assert heat["object_frames"].tolist() == [4, 4]
+        assert heat.attributes["body_frames"] == 8
+    # the body is drawn with the first file that is there
+    assert "right hand, back" in text
 
 
 def test_overlay_covers_the_person_in_the_image(
