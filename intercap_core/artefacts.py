@@ -2,9 +2,10 @@
 
 An artefact is what one stage computed for one sequence. It is written under a temporary name in
 its own folder, synced and renamed, so a file under its final name is whole; its ``complete`` mark
-is set last all the same. Every dataset carries a fletcher32 checksum, its units and its frame.
-Nothing in the file depends on when, where or by whom it was written, so the same input gives the
-same bytes.
+is set last all the same. Every dataset carries a fletcher32 checksum, its units and its frame;
+attributes have texts of fixed length, which lie under the checksums of HDF5's own structures (texts
+of any length would lie in a heap that has none). Nothing in the file depends on when, where or by
+whom it was written, so the same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ import numpy as np
 
 from intercap_core.errors import UserError
 
+MADE_FROM = "made_from"  # attribute: what the artefact was made from, as pipeline.record writes it
+_LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
 
 
@@ -161,9 +164,9 @@ class Writer:
             track_times=False,
             **_filters(declared, dtype),
         )
-        dataset.attrs["units"] = declared.units
+        _set(dataset, "units", declared.units)
         if declared.frame:
-            dataset.attrs["frame"] = declared.frame
+            _set(dataset, "frame", declared.frame)
         return dataset
 
 
@@ -203,18 +206,63 @@ def write(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path if path.suffix == ".part" else part_of(path)
     try:
-        with h5py.File(temporary, "w", libver=("v110", "v110"), locking="best-effort") as file:
+        with h5py.File(temporary, "w", libver=_LIBVER, locking="best-effort") as file:
             writer = Writer(file, schema)
             writer.attributes.update(attributes)
             yield writer
             _finish(file, writer, schema, settings_digest)
-        with open(temporary, "rb") as handle:
-            os.fsync(handle.fileno())
+        _sync(temporary)
         os.replace(temporary, path)
-    finally:
+    except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
+
+
+def part_of(path: Path) -> Path:
+    """Where a file or folder is while it is being written: beside its place, named after who
+    writes it."""
+    job = os.environ.get("SLURM_JOB_ID")
+    writer = f"{socket.gethostname()}.{f'job{job}.' if job else ''}{os.getpid()}"
+    return path.with_name(f".{path.name}.{writer}.part")
+
+
+def put_made_from(path: Path, text: str) -> None:
+    """Set what a complete artefact was made from."""
+    with h5py.File(path, "r+", libver=_LIBVER, locking="best-effort") as file:
+        _set(file, MADE_FROM, text)
+    _sync(path)
+
+
+def made_from(path: Path) -> str:
+    """What an artefact says that it was made from, "" where it does not; raises Unreadable where it
+    is none."""
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            return _value(file.attrs.get(MADE_FROM, ""))
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+        raise Unreadable(f"{path}: cannot be read; delete it and re-run its stage") from None
+
+
+def _sync(path: Path) -> None:
+    with open(path, "rb") as handle:
+        os.fsync(handle.fileno())
+
+
+def _set(thing: h5py.File | h5py.Dataset, name: str, value: Any) -> None:
+    """An attribute; texts as fixed numbers of bytes."""
+    if isinstance(value, str):
+        encoded = value.encode()
+        value = np.array(encoded, dtype=f"S{max(1, len(encoded))}")
+    thing.attrs[name] = value
+
+
+def _value(found: Any) -> Any:
+    """An attribute's value as Python has it."""
+    if isinstance(found, bytes):
+        return found.decode()
+    return found.item() if isinstance(found, np.generic) else found
 
 
 def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: str) -> None:
@@ -227,14 +275,14 @@ def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: st
     unset = sorted(set(schema.attributes) ^ set_here)
     if missing or unset:
         raise ValueError(f"artefact {schema.name!r}: missing {missing}, attributes off: {unset}")
-    file.attrs["schema"] = schema.name
-    file.attrs["schema_version"] = schema.version
-    file.attrs["frame"] = schema.frame
-    file.attrs["units"] = schema.units
-    file.attrs["settings_digest"] = settings_digest
+    _set(file, "schema", schema.name)
+    _set(file, "schema_version", schema.version)
+    _set(file, "frame", schema.frame)
+    _set(file, "units", schema.units)
+    _set(file, "settings_digest", settings_digest)
     for key in sorted(writer.attributes):
-        file.attrs[key] = writer.attributes[key]
-    file.attrs["complete"] = True
+        _set(file, key, writer.attributes[key])
+    _set(file, "complete", True)
 
 
 class Artefact:
@@ -249,13 +297,8 @@ class Artefact:
         self._schema = schema
         self._found = dict(found)
         self.path = path
-
-    @cached_property
-    def attributes(self) -> dict[str, Any]:
-        """The root attributes as Python values."""
-        return {
-            k: v.item() if isinstance(v, np.generic) else v for k, v in self._file.attrs.items()
-        }
+        # the root attributes as Python values, but what the artefact was made from
+        self.attributes = {k: _value(v) for k, v in file.attrs.items() if k != MADE_FROM}
 
     def __contains__(self, key: str) -> bool:
         return key in self._found or key in self._file
@@ -302,8 +345,8 @@ class Artefact:
         return (
             dataset.shape,
             "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
-            str(dataset.attrs.get("units", "")),
-            str(dataset.attrs.get("frame", "")),
+            str(_value(dataset.attrs.get("units", ""))),
+            str(_value(dataset.attrs.get("frame", ""))),
         )
 
     def text(self, key: str) -> list[str]:
@@ -320,7 +363,7 @@ def schema_name(path: Path) -> str:
         raise Unreadable(f"{path}: there is no such file; check the path")
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
-            name = file.attrs["schema"]
+            name = _value(file.attrs["schema"])
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):
         raise Unreadable(
             f"{path}: not an artefact of this program, or cut or damaged; name an .h5 file that a "
@@ -350,15 +393,15 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
         ) from error
     with file:
         try:
-            found = _validate(file, path, schema, again)
+            artefact = Artefact(file, path, schema, _validate(file, path, schema, again))
         except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
             raise Unreadable(f"{path}: its contents are damaged; delete it and {again}") from error
-        yield Artefact(file, path, schema, found)
+        yield artefact
 
 
 def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> dict[str, h5py.Dataset]:
     """The declared datasets that are there, by key."""
-    found = str(file.attrs.get("schema", "none"))
+    found = str(_value(file.attrs.get("schema", "none")))
     if found != schema.name:
         raise Unreadable(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
     version = file.attrs.get("schema_version", 0)

@@ -227,6 +227,42 @@ def run(context: typer.Context, settings: Settings = DEFAULT_SETTINGS, cores: Co
 
 
 @app.command(rich_help_panel=WHOLE)
+def status(
+    settings: Settings = DEFAULT_SETTINGS,
+    every: Annotated[
+        bool, typer.Option("--all", help="Print sequences that are done too.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything for programs.")] = False,
+) -> None:
+    """Say which sequences are done, out of date and why, failed and why, running, or waiting.
+
+    Each result carries what it was made from: settings, annotation, files, code, libraries. What
+    differs now is named; a run would make exactly that anew. Nothing is computed.
+
+    Example: intercap status config/demo/config.yaml
+    """
+    from intercap_core.commands.status import print_status
+    from intercap_core.project import load_project
+
+    print_status(load_project(settings), every=every, as_json=as_json)
+
+
+@app.command(rich_help_panel=WHOLE)
+def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
+    """Read every result to its end and say which are damaged; status 1 where one is.
+
+    A damaged one is named with the way to make it again: delete it and run.
+
+    Example: intercap verify config/demo/config.yaml
+    """
+    _prepare()
+    from intercap_core.commands.status import print_verification
+    from intercap_core.project import load_project
+
+    raise typer.Exit(0 if print_verification(load_project(settings)) else 1)
+
+
+@app.command(rich_help_panel=WHOLE)
 def report(settings: Settings = DEFAULT_SETTINGS) -> None:
     """Write the site of what is computed: a page for each sequence, and tables, heatmaps and the
     overview of all.

@@ -149,15 +149,23 @@ def _user() -> int:
     return os.getuid() if hasattr(os, "getuid") else 0
 
 
+def cache_base() -> Path:
+    """The user's folder for what this package keeps from one start to the next.
+
+    Raises OSError where no such folder is known.
+    """
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if not os.path.isabs(caches):
+        raise OSError(f"no folder for caches is known ({caches})")
+    return Path(caches) / "intercap"
+
+
 def _chosen_base() -> Path:
     given = os.environ.get(VARIABLE)
     if given:
         # A process that this one was started by may have set it to a folder of its own code.
         return Path(given).parent if _NAME.fullmatch(Path(given).name) else Path(given)
-    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    if not os.path.isabs(caches):
-        raise OSError(f"no folder for caches is known ({caches})")
-    return Path(caches) / "intercap" / "kernels"
+    return cache_base() / "kernels"
 
 
 def _prepared(folder: Path) -> Path:

@@ -20,6 +20,10 @@ INPUTS: dict[LayoutName, tuple[str, ...]] = {
 }
 
 
+# Of what lies beside recordings: never a recording itself, and a truth least of all.
+_NO_RECORDINGS = {".h5", ".json", ".yaml", ".yml", ".toml", ".txt", ".tsv", ".part"}
+
+
 def input_files(sequence: SequenceEntry) -> list[Path]:
     """The files and folders whose change asks for the frames anew; empty without recordings."""
     folder = sequence.recordings
@@ -30,6 +34,7 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
             path
             for pattern in INPUTS[sequence.layout]
             for path in (folder.glob(pattern) if pattern else [folder])
+            if not path.name.startswith(".") and path.suffix.lower() not in _NO_RECORDINGS
         }
     )
 

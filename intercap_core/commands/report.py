@@ -16,25 +16,19 @@ _OF_THE_SITE = ("summary", "page")
 
 
 def write_site(project: Project) -> Path:
-    """Write summaries and pages that are missing or older than what they are made of, then the
-    site's first page, whose path is returned.
+    """Write summaries and pages that are missing or were made of other results than are there, then
+    the site's first page, whose path is returned.
 
     A sequence that cannot be reported is told and left out. Raises UserError where none is left.
     """
     for name in project.sequences:
         inputs = {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES}
         for stage in _OF_THE_SITE:
-            sources = [inputs[source] for source in STAGES[stage].reads]
-            output = project.artefact(name, stage)
-            if not all(path.is_file() for path in sources) or _newer(output, sources):
+            if not all(inputs[source].is_file() for source in STAGES[stage].reads):
                 continue
+            output = project.artefact(name, stage)
             try:
-                run_step(stage, project, name, inputs=inputs, output=output)
+                run_step(stage, project, name, inputs=inputs, output=output, keep=True)
             except UserError as error:
                 log.warning("sequence %s has no %s: %s", name, stage, error)
     return run_dataset(project)
-
-
-def _newer(output: Path, sources: list[Path]) -> bool:
-    made = output / "index.html" if output.is_dir() else output
-    return made.is_file() and made.stat().st_mtime >= max(p.stat().st_mtime for p in sources)

@@ -37,21 +37,35 @@ class _Statement:
 
 
 def code_digest(module: str, *, root: Path = ROOT) -> str:
-    """Digest of all code and data that ``module`` (e.g. "stages.joint") reaches.
+    """One digest of all that :func:`code_digests` has by room; raises as it does."""
+    found = code_digests(module, root=root)
+    return hashlib.sha256("".join(f"{k} {v}\n" for k, v in found.items()).encode()).hexdigest()[:16]
+
+
+def code_digests(module: str, *, root: Path = ROOT) -> dict[str, str]:
+    """Digests of all code and data that ``module`` (e.g. "stages.joint") reaches, by room: the
+    package's folder or file that it lies in.
 
     ``root`` is the package's folder. Raises FileNotFoundError where there is no such module.
     """
-    state = hashlib.sha256()
+    states: dict[str, hashlib._Hash] = {}
     reached = modules_reached(module, root=root)
     for name in sorted(reached):
+        state = states.setdefault(_room(name), hashlib.sha256())
         state.update(name.encode())
         for statement in _used(name, reached[name], root):
             state.update(statement.content)
     for folder in sorted({_path(name, root).parent for name in reached}):
         for path in _data_files(folder):
-            state.update(path.relative_to(root).as_posix().encode())
+            relative = path.relative_to(root)
+            state = states.setdefault(relative.parts[0], hashlib.sha256())
+            state.update(relative.as_posix().encode())
             state.update(_file_digest(path, path.stat().st_mtime_ns))
-    return state.hexdigest()[:16]
+    return {room: state.hexdigest()[:16] for room, state in sorted(states.items())}
+
+
+def _room(module: str) -> str:
+    return [*module.split("."), PACKAGE][1]
 
 
 def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[str]]:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import ctypes
 import importlib
-import inspect
 import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from intercap_core import artefacts, schemas
+from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.pipeline import outcome
-from intercap_core.pipeline.job import last_failure
+from intercap_core.pipeline import given, outcome
+from intercap_core.pipeline.claim import Claim, claim
+from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
+from intercap_core.pipeline.contents import Contents
+from intercap_core.pipeline.given import STUDIO
+from intercap_core.pipeline.plan import DATASET, dataset_record_of, failures, mark_of
+from intercap_core.pipeline.record import FILE, Record, add_record, read_record
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
@@ -31,46 +35,94 @@ def run_step(
     *,
     inputs: Mapping[str, Path],
     output: Path,
+    keep: bool = False,
 ) -> None:
     """Call ``intercap_core.stages.<stage>.run`` with what its signature asks for.
 
     ``inputs`` are the artefacts by the name of the stage that wrote them; ``output`` is an artefact
-    or, for the export, a folder. Raises UserError where an input is missing, unreadable or of
-    another sequence, and where the stage finds a fault in it.
+    or, for the export and the page, a folder. It is made by one process at a time: another one that
+    makes it is waited for. ``keep``: where the output is there by then and was made from the same,
+    it is kept. Raises UserError where an input is missing, unreadable or of another sequence, where
+    the stage finds a fault in it, and where another process took the output over.
     """
     annotation = project.annotation(sequence)
     _give_back_memory()
-    _check_inputs(stage, sequence, inputs)
-    if STAGES[stage].on_device:
-        check_device(project)
-    run = importlib.import_module(f"intercap_core.stages.{stage}").run
-    row = project.sequences[sequence]
-    known: dict[str, Any] = {
-        **inputs,
-        "output": output,
-        "settings": getattr(project.config, stage, None),  # not every stage has any
-        "body_settings": project.config.body_fit,
-        "track_settings": project.config.object_track,
-        "joint_settings": project.config.joint,
-        "sequence": row,
-        "object_": project.object_of(sequence),
-        "subject": project.subjects[row.subject],
-        "body_models": project.config.body_models,
-        "device": project.config.device,
-        "results": row.results,
-        "truth": row.truth,
-        "frames_to_drop": annotation.drop_frames,
-        "floor": annotation.floor,
-        "starts": annotation.stated_starts,
-        "initial": annotation.object_pose,
-        "contact": annotation.contact,
-        "subject_points": annotation.subject,
-    }
-    run(**{name: known[name] for name in inspect.signature(run).parameters})
+    with claim(output) as held:
+        made_from = _made_from(stage, project, sequence, annotation, inputs)
+        if keep and _is_made(output, made_from):
+            log.info("sequence %s, %s: was made meanwhile, and is kept", sequence, stage)
+        else:
+            _check_inputs(stage, sequence, inputs)
+            _make(stage, project, sequence, annotation, inputs, output, made_from, held)
+    mark_of(project, sequence, stage).unlink(missing_ok=True)
     if not STAGES[stage].writes_folder:
         for note in outcome.notes(stage, output):
             log.warning("sequence %s: %s", sequence, note)
         log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output))
+
+
+def _made_from(
+    stage: str,
+    project: Project,
+    sequence: str,
+    annotation: Annotation,
+    inputs: Mapping[str, Path],
+) -> Record:
+    """The record of what the output will be made from."""
+    records = {name: read_record(inputs[name]) for name in STAGES[stage].reads}
+    contents = Contents(project.results / sequence / CONTENTS_NAME)
+    found = given.record(
+        project,
+        sequence,
+        stage,
+        annotation,
+        artefacts={
+            name: "not recorded" if record is None else record.identity
+            for name, record in records.items()
+        },
+        contents=contents,
+    )
+    contents.keep()
+    return found
+
+
+def _is_made(output: Path, made_from: Record) -> bool:
+    before = read_record(output) if output.exists() else None
+    return before is not None and before.identity == made_from.identity
+
+
+def _make(
+    stage: str,
+    project: Project,
+    sequence: str,
+    annotation: Annotation,
+    inputs: Mapping[str, Path],
+    output: Path,
+    made_from: Record,
+    held: Claim,
+) -> None:
+    """Run the stage, and put its output in its place together with its record."""
+    if STAGES[stage].on_device:
+        check_device(project)
+    run = importlib.import_module(f"intercap_core.stages.{stage}").run
+    passed = given.arguments(project, sequence, stage, annotation)
+    passed |= {name: inputs[name] for name in STAGES[stage].reads}
+    if STAGES[stage].writes_folder:
+        run(output=output, **passed)
+        add_record(output, made_from)
+        return
+    part = artefacts.part_of(output)
+    try:
+        run(output=part, **passed)
+        add_record(part, made_from)
+        if not held.still_held():
+            raise UserError(
+                f"{output}: another process took over while this one stood still, and its result "
+                "stands; this one is dropped"
+            )
+        os.replace(part, output)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _give_back_memory() -> None:
@@ -121,13 +173,19 @@ def run_studio(project: Project, sequence: str) -> Path:
         )
     from intercap_core.studio.capture import make_capture
 
-    make_capture(
-        project.config.studio.captures[sequence],
-        project.config.studio,
-        sequence=sequence,
-        objects=project.object_of(sequence),
-        output=folder,
-    )
+    with claim(folder):
+        contents = Contents(project.results / sequence / CONTENTS_NAME)
+        made_from = given.studio_record(project, sequence, contents)
+        (folder / FILE).unlink(missing_ok=True)
+        make_capture(
+            project.config.studio.captures[sequence],
+            project.config.studio,
+            sequence=sequence,
+            objects=project.object_of(sequence),
+            output=folder,
+        )
+        add_record(folder, made_from)
+    mark_of(project, sequence, STUDIO).unlink(missing_ok=True)
     return folder
 
 
@@ -140,8 +198,14 @@ def run_dataset(project: Project) -> Path:
     from intercap_core.stages import dataset
 
     folder = project.results
-    reasons = {name: last_failure(project.logs / name) for name in project.config.exclude}
-    return dataset.run(
+    failed = failures(project)
+    records = {name: read_record(project.artefact(name, "summary")) for name in project.sequences}
+    made_from = given.dataset_record(
+        project,
+        {name: record.identity for name, record in records.items() if record is not None},
+        failed,
+    )
+    first = dataset.run(
         dataset=project.config.dataset,
         summaries={name: project.artefact(name, "summary") for name in project.sequences},
         objects=project.objects,
@@ -153,5 +217,8 @@ def run_dataset(project: Project) -> Path:
         card=project.config.card,
         formats=project.config.export.formats,
         virtual=all(project.recordings_made(name) is not None for name in project.sequences),
-        failed={name: reason for name, reason in reasons.items() if reason},
+        failed=failed,
     )
+    add_record(dataset_record_of(project), made_from)
+    mark_of(project, "", DATASET).unlink(missing_ok=True)
+    return first

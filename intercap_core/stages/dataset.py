@@ -189,6 +189,6 @@ def _json(values: Any) -> str:
 def _replace(path: Path, text: str) -> None:
     """Write a whole text file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = artefacts.part_of(path)
     part.write_text(text, encoding="utf-8")
     os.replace(part, path)

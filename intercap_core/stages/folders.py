@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from intercap_core.artefacts import part_of
 from intercap_core.errors import UserError
 
 
@@ -32,8 +32,8 @@ def replaced(output: Path) -> Iterator[Path]:
     one is complete.
     """
     output = output.resolve()
-    part = output.with_name(f".{output.name}.{os.getpid()}.part")
-    old = output.with_name(f".{output.name}.{os.getpid()}.old")
+    part = part_of(output)
+    old = part.with_suffix(".old")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:

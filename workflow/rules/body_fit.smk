@@ -1,10 +1,11 @@
 rule body_fit:
     """The body in every frame."""
     input:
-        **artefacts_read("body_fit"),
-        body=body_file,
-        pose_prior=pose_prior_file,
-        keypoint_definition=keypoint_definition_file,
+        unpack(artefacts_read("body_fit")),
+        body=ancient(body_file),
+        pose_prior=ancient(pose_prior_file),
+        keypoint_definition=ancient(keypoint_definition_file),
+        mark=out_of_date("body_fit"),
     output:
         body_fit=f"{RESULTS}/{{sequence}}/body_fit.h5",
     log:
@@ -17,11 +18,6 @@ rule body_fit:
     resources:
         mem_mb=memory(4000),
         runtime=120,
-    params:
-        settings=settings_of("body_fit"),
-        subject=tracked_subject,
-        device=SETTINGS.device,
-        code=code_of("body_fit"),
     message:
         "{wildcards.sequence}: fitting the body"
     script:

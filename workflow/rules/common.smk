@@ -1,14 +1,13 @@
-import functools
+import atexit
 import re
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 
 from intercap_core.capture.layouts import input_files
-from intercap_core.config import Annotation, digest
 from intercap_core.errors import UserError
 from intercap_core.imports.results import file_of
-from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.pipeline.plan import DATASET, Plan
 from intercap_core.project import load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
@@ -28,6 +27,9 @@ def _load():
 PROJECT = _load()
 SETTINGS = PROJECT.config
 SEQUENCES = list(PROJECT.sequences)
+PLAN = Plan(PROJECT)
+if workflow.is_main_process:
+    atexit.register(PLAN.keep)
 VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
 NOTHING = "(?!)"  # a pattern that no text matches
 RESULTS = PROJECT.results.as_posix()
@@ -74,46 +76,58 @@ def recorded(column):
     return files
 
 
-@functools.cache
-def annotation_sections(sequence):
-    """The filled sections of a sequence's annotation; None where the file is broken."""
-    if PROJECT.annotation_made(sequence):
-        made = digest(SETTINGS.studio.captures[sequence])
-        return {section: made for section in Annotation.model_fields}
+def annotation_broken(sequence):
+    """Whether the sequence's annotation cannot be read; the studio's own is not there yet."""
     try:
-        PROJECT.annotation(sequence)
-        return PROJECT.annotation_sections(sequence)
+        PROJECT.annotation(sequence, look_at_frames=False)
     except UserError:
-        return None
+        return not PROJECT.annotation_made(sequence)
+    return False
 
 
-def annotation_input(*sections):
-    """Input function: the annotation file where it fills one of the stage's own sections.
+def annotation_input(wildcards):
+    """Input function: where the annotation is broken, the output of a job that fails and says why.
 
-    A broken file is replaced by the output of a job that fails and says why: what was computed
-    before stays, and no other sequence is touched.
+    What was computed before stays, and no other sequence is touched. That an annotation has
+    changed is seen by what is recorded in the artefacts.
+    """
+    if not annotation_broken(wildcards.sequence):
+        return []
+    return [rules.broken_annotation.output.checked.format(sequence=wildcards.sequence)]
+
+
+def out_of_date(stage):
+    """Input function: a mark that is newer than the stage's output where that was made from other
+    settings, annotations, files, code or artefacts than it would be now.
+
+    This alone makes a job run again: all other inputs are ``ancient``.
+    """
+    return lambda wildcards: PLAN.mark(getattr(wildcards, "sequence", ""), stage)
+
+
+def artefacts_read(stage):
+    """Input function: the artefacts that a stage reads, by the stage that wrote each.
+
+    Where the stage's output is out of date, it runs when these are made anew; else what they come
+    to is as it was, and their dates do not count.
     """
 
     def files(wildcards):
-        filled = annotation_sections(wildcards.sequence)
-        if filled is None:
-            return [
-                rules.broken_annotation.output.checked.format(
-                    sequence=wildcards.sequence
-                )
-            ]
-        if not any(section in filled for section in sections):
-            return []
-        if PROJECT.annotation_made(wildcards.sequence):
-            return made_by_studio(wildcards, "manifest")
-        return [PROJECT.annotation_path(wildcards.sequence)]
+        paths = {
+            name: f"{RESULTS}/{wildcards.sequence}/{name}.h5"
+            for name in STAGES[stage].reads
+        }
+        if PLAN.is_stale(wildcards.sequence, stage):
+            return paths
+        return {name: ancient(path) for name, path in paths.items()}
 
     return files
 
 
-def artefacts_read(stage):
-    """Inputs: the artefacts that a stage reads, by the stage that wrote each."""
-    return {name: f"{RESULTS}/{{sequence}}/{name}.h5" for name in STAGES[stage].reads}
+def summaries(wildcards):
+    """Input function: every sequence's summary, which count by their dates as above."""
+    paths = expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES)
+    return paths if PLAN.is_stale("", DATASET) else ancient(paths)
 
 
 def object_files(wildcards):
@@ -143,84 +157,10 @@ def motion_prior_files(wildcards):
     return existing(*(SETTINGS.joint.lemo_files or ()))
 
 
-def settings_of(stage):
-    """Param: digest of one stage's settings."""
-    return digest(getattr(SETTINGS, stage))
-
-
-digest_of_code = functools.cache(code_digest)
-
-
-def code_of(stage):
-    """Param: digest of the core modules that the stage reaches; the same for every sequence."""
-    return lambda wildcards: digest_of_code(f"stages.{stage}")
-
-
-def annotation_of(*sections):
-    """Param: digest of the annotation's own sections; editing another one changes nothing here."""
-
-    def own(wildcards):
-        filled = annotation_sections(wildcards.sequence) or {}
-        return digest([filled.get(section) for section in sections])
-
-    return own
-
-
-def entry_of_object(name):
-    """An object's entry without its files, which are inputs; None of no object."""
-    if name is None:
-        return None
-    entry = PROJECT.objects[name]
-    return entry.model_dump(mode="json", exclude={"mesh", "contact_vertices"})
-
-
-def tracked_object(wildcards):
-    """Param: digest of the object's entry."""
-    return digest(entry_of_object(PROJECT.sequences[wildcards.sequence].object))
-
-
-def all_entries():
-    """Param: digest of every object's and subject's entry that the sequences use."""
-    subjects = {PROJECT.sequences[name].subject for name in SEQUENCES}
-    return digest(
-        [[entry_of_object(name) for name in PROJECT.objects_named()], sorted(subjects)]
-    )
-
-
-def tracked_subject(wildcards):
-    """Param: digest of the subject's row; its body file is an input."""
-    return digest(of_sequence(wildcards)[2])
-
-
-def intent_of(wildcards):
-    """Param: what the sequence's row says that the person was asked to do."""
-    return PROJECT.sequences[wildcards.sequence].intent
-
-
 def results_file(wildcards):
     """Input function: another program's results of the sequence, where its row names them."""
     named = PROJECT.sequences[wildcards.sequence].results
     return [] if named is None else existing(file_of(named))
-
-
-def results_of(wildcards):
-    """Param: where another program's results of the sequence are; None = they are made here."""
-    named = PROJECT.sequences[wildcards.sequence].results
-    return None if named is None else named.as_posix()
-
-
-def layout_of(wildcards):
-    """Param: how the sequence's recordings are laid out, and what its row states of the
-    calibration; the files themselves are inputs."""
-    row = PROJECT.sequences[wildcards.sequence]
-    stated = (row.calibration_scale, row.calibration_up, row.calibration_floor)
-    return row.layout if stated == (None, None, None) else [row.layout, *stated]
-
-
-def capture_of(wildcards):
-    """Param: everything that decides what the studio makes of one sequence."""
-    shared = SETTINGS.studio.model_dump(mode="json", exclude={"captures"})
-    return digest([shared, SETTINGS.studio.captures[wildcards.sequence]])
 
 
 def memory(megabytes):

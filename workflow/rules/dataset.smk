@@ -1,7 +1,8 @@
 rule dataset:
     """Heatmaps, histograms, tables, the dataset's card and the site's first page."""
     input:
-        summaries=expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES),
+        summaries=summaries,
+        mark=out_of_date("dataset"),
     output:
         site=report(f"{RESULTS}/site/index.html", category="Dataset"),
         summary=f"{RESULTS}/summary.json",
@@ -20,12 +21,6 @@ rule dataset:
     resources:
         mem_mb=memory(4000),
         runtime=60,
-    params:
-        sequences=SEQUENCES,
-        entries=all_entries(),
-        card=settings_of("card"),
-        formats=SETTINGS.export.formats,
-        code=code_of("dataset"),
     message:
         "the site's first page"
     script:

@@ -18,10 +18,11 @@ MODEL_THREADS = 8
 rule detections:
     """Keypoints and segmentation candidates, from files or from a model."""
     input:
-        **artefacts_read("detections"),
-        keypoints=recorded("keypoints"),
-        candidates=recorded("candidates"),
-        detectors=existing(*DETECTORS),
+        unpack(artefacts_read("detections")),
+        keypoints=ancient(recorded("keypoints")),
+        candidates=ancient(recorded("candidates")),
+        detectors=ancient(existing(*DETECTORS)),
+        mark=out_of_date("detections"),
     output:
         detections=f"{RESULTS}/{{sequence}}/detections.h5",
     log:
@@ -34,9 +35,6 @@ rule detections:
     resources:
         mem_mb=memory(4000 if WITH_MODEL else 1500),
         runtime=240 if WITH_MODEL else 30,
-    params:
-        settings=settings_of("detections"),
-        code=code_of("detections"),
     message:
         "{wildcards.sequence}: reading keypoints and candidates"
     script:

@@ -1,9 +1,10 @@
 rule export:
     """Files for other tools: InterCap, AMASS, BOP, COCO, glb."""
     input:
-        **artefacts_read("export"),
-        object=object_files,
-        body=body_file,
+        unpack(artefacts_read("export")),
+        object=ancient(object_files),
+        body=ancient(body_file),
+        mark=out_of_date("export"),
     output:
         folder=directory(f"{RESULTS}/{{sequence}}/export"),
     log:
@@ -16,11 +17,6 @@ rule export:
     resources:
         mem_mb=memory(3000),
         runtime=30,
-    params:
-        settings=settings_of("export"),
-        object=tracked_object,
-        subject=tracked_subject,
-        code=code_of("export"),
     message:
         "{wildcards.sequence}: exporting"
     script:

@@ -21,9 +21,10 @@ rule broken_annotation:
 rule frames:
     """Recordings to synchronised frame sets."""
     input:
-        recordings=recorded("recordings"),
-        calibration=recorded("calibration"),
-        annotation=ancient(annotation_input("drop_frames")),
+        recordings=ancient(recorded("recordings")),
+        calibration=ancient(recorded("calibration")),
+        annotation=ancient(annotation_input),
+        mark=out_of_date("frames"),
     output:
         frames=f"{RESULTS}/{{sequence}}/frames.h5",
     log:
@@ -36,11 +37,6 @@ rule frames:
     resources:
         mem_mb=memory(2000),
         runtime=60,
-    params:
-        settings=settings_of("frames"),
-        layout=layout_of,
-        annotation=annotation_of("drop_frames"),
-        code=code_of("frames"),
     message:
         "{wildcards.sequence}: reading and synchronising the recordings"
     script:

@@ -1,13 +1,14 @@
 rule joint:
     """Body and object together, over all frames."""
     input:
-        **artefacts_read("joint"),
-        object=object_files,
-        body=body_file,
-        pose_prior=pose_prior_file,
-        motion_prior=motion_prior_files,
-        annotation=ancient(annotation_input("contact")),
-        results=results_file,
+        unpack(artefacts_read("joint")),
+        object=ancient(object_files),
+        body=ancient(body_file),
+        pose_prior=ancient(pose_prior_file),
+        motion_prior=ancient(motion_prior_files),
+        annotation=ancient(annotation_input),
+        results=ancient(results_file),
+        mark=out_of_date("joint"),
     output:
         joint=f"{RESULTS}/{{sequence}}/joint.h5",
     log:
@@ -20,14 +21,6 @@ rule joint:
     resources:
         mem_mb=memory(6000),
         runtime=120,
-    params:
-        settings=settings_of("joint"),
-        annotation=annotation_of("contact"),
-        object=tracked_object,
-        subject=tracked_subject,
-        device=SETTINGS.device,
-        results=results_of,
-        code=code_of("joint"),
     message:
         "{wildcards.sequence}: refining body and object together"
     script:

@@ -1,10 +1,11 @@
 rule metrics:
     """Distances, penetration, and errors against truth where it is known."""
     input:
-        **artefacts_read("metrics"),
-        truth=recorded("truth"),
-        object=object_files,
-        body=body_file,
+        unpack(artefacts_read("metrics")),
+        truth=ancient(recorded("truth")),
+        object=ancient(object_files),
+        body=ancient(body_file),
+        mark=out_of_date("metrics"),
     output:
         metrics=f"{RESULTS}/{{sequence}}/metrics.h5",
     log:
@@ -17,11 +18,6 @@ rule metrics:
     resources:
         mem_mb=memory(4000),
         runtime=60,
-    params:
-        settings=settings_of("metrics"),
-        object=tracked_object,
-        subject=tracked_subject,
-        code=code_of("metrics"),
     message:
         "{wildcards.sequence}: measuring"
     script:

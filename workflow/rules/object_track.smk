@@ -1,9 +1,10 @@
 rule object_track:
     """The object's pose in every frame."""
     input:
-        **artefacts_read("object_track"),
-        object=object_files,
-        annotation=ancient(annotation_input("object_pose")),
+        unpack(artefacts_read("object_track")),
+        object=ancient(object_files),
+        annotation=ancient(annotation_input),
+        mark=out_of_date("object_track"),
     output:
         object_track=f"{RESULTS}/{{sequence}}/object_track.h5",
     log:
@@ -16,11 +17,6 @@ rule object_track:
     resources:
         mem_mb=memory(4000),
         runtime=120,
-    params:
-        settings=settings_of("object_track"),
-        annotation=annotation_of("object_pose"),
-        object=tracked_object,
-        code=code_of("object_track"),
     message:
         "{wildcards.sequence}: tracking the object"
     script:

@@ -1,11 +1,12 @@
 rule page:
     """The sequence's page of the site."""
     input:
-        **artefacts_read("page"),
-        object=object_files,
-        body=body_file,
-        truth=recorded("truth"),
-        annotation=ancient(annotation_input("contact")),
+        unpack(artefacts_read("page")),
+        object=ancient(object_files),
+        body=ancient(body_file),
+        truth=ancient(recorded("truth")),
+        annotation=ancient(annotation_input),
+        mark=out_of_date("page"),
     output:
         folder=report(
             directory(f"{RESULTS}/site/sequences/{{sequence}}"),
@@ -23,13 +24,6 @@ rule page:
     resources:
         mem_mb=memory(3000),
         runtime=30,
-    params:
-        settings=settings_of("page"),
-        annotation=annotation_of("contact"),
-        object=tracked_object,
-        subject=tracked_subject,
-        intent=intent_of,
-        code=code_of("page"),
     message:
         "{wildcards.sequence}: drawing the page"
     script:

@@ -1,8 +1,9 @@
 rule person:
     """The subject over views, and the triangulated keypoints."""
     input:
-        **artefacts_read("person"),
-        annotation=ancient(annotation_input("subject")),
+        unpack(artefacts_read("person")),
+        annotation=ancient(annotation_input),
+        mark=out_of_date("person"),
     output:
         person=f"{RESULTS}/{{sequence}}/person.h5",
     log:
@@ -15,11 +16,6 @@ rule person:
     resources:
         mem_mb=memory(2000),
         runtime=30,
-    params:
-        settings=settings_of("person"),
-        annotation=annotation_of("subject"),
-        object=tracked_object,
-        code=code_of("person"),
     message:
         "{wildcards.sequence}: finding the subject in all views"
     script:

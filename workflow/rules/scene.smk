@@ -1,8 +1,9 @@
 rule scene:
     """Refined extrinsics, ground plane and background."""
     input:
-        **artefacts_read("scene"),
-        annotation=ancient(annotation_input("floor", "starts", "starts_sigma")),
+        unpack(artefacts_read("scene")),
+        annotation=ancient(annotation_input),
+        mark=out_of_date("scene"),
     output:
         scene=f"{RESULTS}/{{sequence}}/scene.h5",
     log:
@@ -15,10 +16,6 @@ rule scene:
     resources:
         mem_mb=memory(3000),
         runtime=60,
-    params:
-        settings=settings_of("scene"),
-        annotation=annotation_of("floor", "starts", "starts_sigma"),
-        code=code_of("scene"),
     message:
         "{wildcards.sequence}: refining the cameras, finding the floor"
     script:

@@ -7,7 +7,8 @@ rule studio:
     Its files depend on the layout: the manifest, written last, stands for all of them.
     """
     input:
-        object=object_files,
+        object=ancient(object_files),
+        mark=out_of_date("studio"),
     output:
         truth=f"{_recordings}/truth.h5",
         manifest=f"{_recordings}/capture.json",
@@ -23,10 +24,6 @@ rule studio:
     resources:
         mem_mb=memory(3000),
         runtime=60,
-    params:
-        settings=capture_of,
-        object=tracked_object,
-        code=lambda wildcards: digest_of_code("studio.capture"),
     message:
         "{wildcards.sequence}: making a virtual recording"
     script:

@@ -1,7 +1,8 @@
 rule summary:
     """What the sequence adds to the dataset's tables, heatmaps and charts."""
     input:
-        **artefacts_read("summary"),
+        unpack(artefacts_read("summary")),
+        mark=out_of_date("summary"),
     output:
         summary=f"{RESULTS}/{{sequence}}/summary.h5",
     log:
@@ -14,9 +15,6 @@ rule summary:
     resources:
         mem_mb=memory(1500),
         runtime=10,
-    params:
-        intent=intent_of,
-        code=code_of("summary"),
     message:
         "{wildcards.sequence}: summing up"
     script:

@@ -21,4 +21,5 @@ with job(
             name: Path(path) for name, path in snakemake.input.items() if name in SEQUENCE_STAGES
         },
         output=Path(snakemake.output[0]),
+        keep=True,
     )

@@ -1,0 +1,94 @@
+"""Digests of the files that a stage is given, taken anew only where size or date has changed.
+
+A recording has gigabytes. What its digest was, and of which size and date, is kept beside the
+sequence's results: a touch or a copy costs one reading and re-runs nothing, and a start with
+nothing to do reads no recording. Folders are as their files; that a file of one was replaced is
+seen by the dates of the folders, a file that was overwritten in place is not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from pathlib import Path
+
+NAME = ".inputs.json"
+LARGE = 100_000_000  # bytes; where the size of such a file differs it is not read to know
+
+
+class Contents:
+    """Digests by path, with what is known of them in ``store``, a JSON file."""
+
+    def __init__(self, store: Path) -> None:
+        self._store = store
+        self._known: dict[str, list[str]] = {}
+        with contextlib.suppress(OSError, ValueError):
+            told = json.loads(store.read_text(encoding="utf-8"))
+            self._known = {
+                name: entry
+                for name, entry in told.items()
+                if isinstance(entry, list) and len(entry) == 2
+            }
+        self._changed = False
+
+    def digest(self, path: Path, *, was: str | None = None) -> str:
+        """Digest of a file or folder with its size, "missing" where there is none.
+
+        ``was``: the digest that it is to be compared with; a large file of another size is
+        "changed" without being read.
+        """
+        try:
+            stamp, size = _stamp(path)
+        except OSError:
+            return "missing"
+        known = self._known.get(str(path))
+        if known is not None and known[0] == stamp:
+            return known[1]
+        if was is not None and size > LARGE and was.rpartition(":")[2] != str(size):
+            return "changed"
+        found = f"{_folder_digest(path) if path.is_dir() else _file_digest(path)}:{size}"
+        if stamp == _stamp(path)[0]:  # it did not change while it was read
+            self._known[str(path)] = [stamp, found]
+            self._changed = True
+        return found
+
+    def keep(self) -> None:
+        """Write what was learned, whole or not at all; a store that cannot be written is none."""
+        if not self._changed or not self._store.parent.is_dir():
+            return
+        part = self._store.with_name(f"{self._store.name}.{os.getpid()}.part")
+        with contextlib.suppress(OSError):
+            part.write_text(json.dumps(self._known, indent=0, sort_keys=True), encoding="utf-8")
+            os.replace(part, self._store)
+            self._changed = False
+
+
+def _stamp(path: Path) -> tuple[str, int]:
+    """What tells that a file or folder has not changed, and its size; raises OSError of none."""
+    stat = path.stat()
+    if not path.is_dir():
+        return f"{stat.st_size} {stat.st_mtime_ns}", stat.st_size
+    state, count = hashlib.sha256(), 0
+    for folder, folders, names in os.walk(path):
+        folders.sort()
+        state.update(f"{os.stat(folder).st_mtime_ns} {len(names)}\n".encode())
+        count += len(names)
+    return state.hexdigest()[:16], count
+
+
+def _file_digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def _folder_digest(path: Path) -> str:
+    state = hashlib.sha256()
+    for folder, folders, names in os.walk(path):
+        folders.sort()
+        for name in sorted(names):
+            file = Path(folder, name)
+            if file.is_file():
+                state.update(f"{file.relative_to(path).as_posix()} {_file_digest(file)}\n".encode())
+    return state.hexdigest()[:16]

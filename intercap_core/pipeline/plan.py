@@ -1,0 +1,235 @@
+"""What is done, missing or out of date, and why: the one decision on what a run computes.
+
+It compares each output's record with what the output would be made from now. Nothing else counts:
+no file's date, no bookkeeping beside the results, so it holds wherever these lie.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+
+from intercap_core.errors import UserError
+from intercap_core.pipeline import given
+from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
+from intercap_core.pipeline.contents import Contents
+from intercap_core.pipeline.given import STUDIO
+from intercap_core.pipeline.job import last_failure
+from intercap_core.pipeline.record import FILE, Record, read_record
+from intercap_core.project import Project
+from intercap_core.stage_list import STAGES
+
+DATASET = "dataset"
+MARKS = Path(".snakemake") / "out_of_date"
+_KNOWN = ".records.json"  # of all outputs, by place, size and date: to open each once
+_LATER_S = 1.0
+
+
+class Kind(StrEnum):
+    """State of one output."""
+
+    done = "done"
+    missing = "missing"
+    stale = "stale"
+
+
+@dataclass(frozen=True)
+class State:
+    """One output: why it is not done, in words, and the identity that it is to have, which its
+    successors are made from."""
+
+    kind: Kind
+    reasons: tuple[str, ...]
+    identity: str
+    made_on: str = ""  # another machine or device than this, where it is done
+
+
+class Plan:
+    """States of a project's outputs, looked at when asked for."""
+
+    def __init__(self, project: Project) -> None:
+        self.project = project
+        self._sequences: dict[str, dict[str, State]] = {}
+        self._records = _Records(project.results)
+
+    def states(self, sequence: str) -> dict[str, State]:
+        """By stage, the studio first where it makes the recordings."""
+        if sequence not in self._sequences:
+            self._sequences[sequence] = dict(self._decide(sequence))
+        return self._sequences[sequence]
+
+    @cached_property
+    def dataset(self) -> State:
+        """Of tables, card and the site's first page."""
+        path = self.project.site / "index.html"
+        wanted = given.dataset_record(
+            self.project,
+            {name: self.states(name)["summary"].identity for name in self.project.sequences},
+            failures(self.project),
+        )
+        return _compared(path, self._records.of(dataset_record_of(self.project)), wanted)
+
+    def output(self, sequence: str, stage: str) -> Path:
+        """Where a stage of a sequence writes."""
+        made = self.project.recordings_made(sequence)
+        if stage == STUDIO and made is not None:
+            return made
+        return self.project.artefact(sequence, stage)
+
+    def is_stale(self, sequence: str, stage: str) -> bool:
+        """Whether an output is there that was made from something else than it would be now."""
+        return self._state(sequence, stage).kind is Kind.stale
+
+    def mark(self, sequence: str, stage: str) -> list[Path]:
+        """A file newer than the stage's output where that is out of date, else nothing.
+
+        It makes Snakemake run the job: of other inputs it is told to ignore the dates.
+        """
+        path = mark_of(self.project, sequence, stage)
+        if not self.is_stale(sequence, stage):
+            return []
+        state = self._state(sequence, stage)
+        output = self.project.site / "index.html"
+        if stage != DATASET:
+            output = self.output(sequence, stage)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        newest = max(time.time(), *(one.stat().st_mtime for one in _dated(output)))
+        if not path.is_file() or path.stat().st_mtime < newest:
+            told = [*state.reasons, uuid.uuid4().hex]  # as no earlier mark, whatever is compared
+            path.write_text("\n".join(told) + "\n", encoding="utf-8")
+            os.utime(path, (newest + _LATER_S, newest + _LATER_S))
+        return [path]
+
+    def _state(self, sequence: str, stage: str) -> State:
+        return self.dataset if stage == DATASET else self.states(sequence)[stage]
+
+    def keep(self) -> None:
+        """Write what was read of records, for the next start."""
+        self._records.keep()
+
+    def _decide(self, sequence: str) -> Iterator[tuple[str, State]]:
+        contents = Contents(self.project.results / sequence / CONTENTS_NAME)
+        made_anew = ""
+        if self.project.recordings_made(sequence) is not None:
+            wanted = given.studio_record(self.project, sequence, contents)
+            path = self.output(sequence, STUDIO)
+            state = _compared(path / "capture.json", self._records.of(path), wanted)
+            if state.kind is not Kind.done:
+                made_anew = "its recording is made anew"
+            yield STUDIO, state
+        try:
+            annotation = self.project.annotation(sequence, look_at_frames=False)
+        except UserError as error:
+            for stage in STAGES:
+                there = _exists(self.output(sequence, stage))
+                yield stage, State(Kind.stale if there else Kind.missing, (str(error),), "")
+            return
+        identities: dict[str, str] = {}
+        for stage, declared in STAGES.items():
+            path = self.output(sequence, stage)
+            before = self._records.of(path)
+            wanted = given.record(
+                self.project,
+                sequence,
+                stage,
+                annotation,
+                artefacts={name: identities[name] for name in declared.reads},
+                contents=contents,
+                before=before,
+            )
+            state = _compared(path, before, wanted)
+            if made_anew:  # of what its recordings will be nothing is known
+                kind = Kind.missing if state.kind is Kind.missing else Kind.stale
+                state = State(kind, (made_anew,), f"{wanted.identity}+")
+            identities[stage] = state.identity
+            yield stage, state
+        contents.keep()
+
+
+def failures(project: Project) -> dict[str, str]:
+    """Why the sequences failed that the settings exclude, of those that did."""
+    found = {name: last_failure(project.logs / name) for name in project.config.exclude}
+    return {name: why for name, why in found.items() if why}
+
+
+def mark_of(project: Project, sequence: str, stage: str) -> Path:
+    """Where the mark of a stage that is out of date would be."""
+    name = f"{sequence}.{stage}" if sequence else stage
+    return MARKS / project.config.dataset / name
+
+
+def dataset_record_of(project: Project) -> Path:
+    """The folder that holds the record of what is made of all sequences."""
+    return project.results
+
+
+def _compared(path: Path, before: Record | None, wanted: Record) -> State:
+    if not _exists(path):
+        return State(Kind.missing, (), wanted.identity)
+    if before is None:
+        why = "what it was made from is not recorded, or the file is damaged"
+        return State(Kind.stale, (why,), wanted.identity)
+    if before.identity == wanted.identity:
+        machines = [f"{one.machine.get('device', 'cpu')}, {one.machine.get('cpu', 'unknown')}"
+                    for one in (before, wanted)]  # fmt: skip
+        other = machines[0] if machines[0] != machines[1] else ""
+        return State(Kind.done, (), wanted.identity, other)
+    reasons = wanted.differences(before) or [f"made as stage {before.stage} of {before.sequence}"]
+    return State(Kind.stale, tuple(reasons), wanted.identity)
+
+
+def _exists(path: Path) -> bool:
+    return path.is_dir() or path.is_file()
+
+
+def _dated(output: Path) -> list[Path]:
+    """What may carry an output's date."""
+    found = [output, output / ".snakemake_timestamp", output / "capture.json", output / "truth.h5"]
+    return [path for path in found if path.exists()]
+
+
+class _Records:
+    """Records of outputs, each opened once as long as its size and date stay."""
+
+    def __init__(self, results: Path) -> None:
+        self._path = results / _KNOWN
+        self._results = results
+        try:
+            told = json.loads(self._path.read_text(encoding="utf-8"))
+            self._known: dict[str, list[str]] = told if isinstance(told, dict) else {}
+        except (OSError, ValueError):
+            self._known = {}
+        self._changed = False
+
+    def of(self, output: Path) -> Record | None:
+        """The output's record; None where it has none."""
+        file = output if output.suffix == ".h5" else output / FILE
+        try:
+            stat = file.stat()
+        except OSError:
+            return None
+        key, stamp = str(output), f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ino}"
+        known = self._known.get(key)
+        if isinstance(known, list) and len(known) == 2 and known[0] == stamp:
+            return Record.from_text(known[1])
+        found = read_record(output)
+        self._known[key] = [stamp, "" if found is None else found.to_text()]
+        self._changed = True
+        return found
+
+    def keep(self) -> None:
+        if not self._changed or not self._results.is_dir():
+            return
+        part = self._path.with_name(f"{_KNOWN}.{os.getpid()}.part")
+        try:
+            part.write_text(json.dumps(self._known), encoding="utf-8")
+            os.replace(part, self._path)
+        except OSError:
+            part.unlink(missing_ok=True)
