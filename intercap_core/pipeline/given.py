@@ -31,13 +31,16 @@ STUDIO = "studio"
 
 
 def row_of(stage: str, row: SequenceEntry) -> SequenceEntry:
-    """The row with those columns alone that the stage may read."""
+    """The row with its name and those columns alone that the stage may read; of others it has no
+    attribute."""
     names = COLUMNS.get(stage, ())
     if stage == "detections" and row.layout == "behave":
         names += _OF_BEHAVE
-    return SequenceEntry.model_construct(
-        {"sequence", *names}, sequence=row.sequence, **{name: getattr(row, name) for name in names}
-    )
+    kept = {name: getattr(row, name) for name in ("sequence", *names)}
+    narrow = SequenceEntry.model_construct({*kept}, **kept)
+    for name in narrow.__dict__.keys() - kept.keys():  # which have their defaults
+        del narrow.__dict__[name]
+    return narrow
 
 
 def arguments(

@@ -64,12 +64,12 @@ def _open(project: Project, stage: str) -> h5py.File:
 
 def test_no_stage_says_anything_of_an_object(project: Project) -> None:
     with _open(project, "object_track") as track, _open(project, "joint") as joint:
-        assert (track.attrs["object"], track.attrs["seed_source"]) == ("", "none")
-        assert "names no object" in track.attrs["doubts"]
+        assert (track.attrs["object"], track.attrs["seed_source"]) == (b"", b"none")
+        assert b"names no object" in track.attrs["doubts"]
         assert track["lost"][()].all() and (track["candidate"][()] == -1).all()
         for file in (track, joint):
             assert np.isnan(file["rotation"]).all() and np.isnan(file["translation"]).all()
-        assert joint.attrs["object"] == "" and np.isnan(joint["contact_probability"]).all()
+        assert joint.attrs["object"] == b"" and np.isnan(joint["contact_probability"]).all()
     with _open(project, "metrics") as metrics:
         told = {*metrics, *metrics["truth"], *metrics["truth/joint"]}
         told.discard("ground_penetration")
@@ -153,7 +153,7 @@ def test_the_truth_has_no_object(project: Project) -> None:
     recordings = project.recordings_made(NAME)
     assert recordings is not None
     with h5py.File(recordings / "truth.h5") as truth:
-        assert truth.attrs["object"] == "" and not truth["region_contact"][()].any()
+        assert truth.attrs["object"] == b"" and not truth["region_contact"][()].any()
         assert "rotation" not in truth and "object_vertices" not in truth
         steps = np.linalg.norm(np.diff(truth["joints"][()], axis=0), axis=-1) * 15
         assert steps.max() < 4.5  # m/s

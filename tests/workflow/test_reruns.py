@@ -6,13 +6,17 @@ Most questions go to a Snakemake that has started already; some start it as a us
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
+from intercap_core import artefacts
+from intercap_core.pipeline.record import Record, add_record
 from tests.helpers.flow import ONE, OTHER, Flow
 
 AFTER_METRICS = {"summary", "page", "export"}
@@ -88,8 +92,7 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
     """The run has contact and floor annotated; then one of the two is edited or both touched."""
     path = flow.annotation(OTHER)
     with edited(path, CONTACT + FLOOR):
-        made = flow.ask("--touch")  # as if all had run with this file
-        assert made.returncode == 0, made.stderr
+        flow.as_if_made_now()
         path.write_text("# a comment, and the same content\n" + FLOOR + CONTACT)
         assert flow.pending() == set()
         path.write_text(FLOOR + CONTACT.replace("end: 4", "end: 5"))
@@ -97,7 +100,8 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
         assert flow.pending() == contact | {DATASET}
         path.write_text(CONTACT + FLOOR.replace("2.0", "2.1"))
         assert flow.pending() == {(OTHER, stage) for stage in AFTER_SCENE} | {DATASET}
-    assert flow.ask("--touch").returncode == 0  # back to no annotation
+    flow.as_if_made_now()  # back to no annotation
+    assert flow.pending() == set()
 
 
 @pytest.mark.parametrize(
@@ -130,11 +134,11 @@ def test_an_import_inside_a_function_counts(flow: Flow) -> None:
             "    return hidden_term\n",
         ),
     ):
-        assert flow.ask("--touch").returncode == 0
+        flow.as_if_made_now()
         assert flow.pending() == set()
         term.write_text("WEIGHT = 2\n")
         pending = {rule for _, rule in flow.pending()}
-    assert flow.ask("--touch").returncode == 0
+    flow.as_if_made_now()
     assert pending == AFTER_SCENE - {"scene"} | {"dataset"}
 
 
@@ -163,11 +167,75 @@ def test_another_model_re_runs_the_detections(flow: Flow) -> None:
     expected = {(name, rule) for name in (ONE, OTHER) for rule in {"detections", *AFTER_SCENE}}
     with edited(model, "one"), edited(path, text):
         assert flow.pending() == expected | {DATASET}
-        assert flow.ask("--touch").returncode == 0  # as if all had run with this model
+        flow.as_if_made_now()
         assert flow.pending() == set()
         model.write_text("another")
         assert flow.pending() == expected | {DATASET}
-    assert flow.ask("--touch").returncode == 0
+    flow.as_if_made_now()
+
+
+def test_results_in_another_place_know_what_they_were_made_from(flow: Flow) -> None:
+    """No bookkeeping beside the results, files of another date: an edit is seen all the same."""
+    bookkeeping, aside = flow.folder / ".snakemake", flow.folder / "aside"
+    bookkeeping.rename(aside)
+    elsewhere = flow.folder / "elsewhere"
+    shutil.copytree(flow.results, elsewhere, copy_function=shutil.copy)
+    flow.results.rename(flow.folder / "here")
+    elsewhere.rename(flow.results)
+    try:
+        assert flow.pending() == set()
+        path = flow.folder / flow.settings
+        settings = yaml.safe_load(path.read_text())
+        with edited(path, yaml.safe_dump({**settings, "page": {"frames": 3}})):
+            assert flow.pending() == {(name, "page") for name in (ONE, OTHER)}
+        with edited(flow.annotation(OTHER), CONTACT):
+            stages = {"joint", "metrics", *AFTER_METRICS}
+            assert flow.pending() == {(OTHER, stage) for stage in stages} | {DATASET}
+    finally:
+        shutil.rmtree(flow.results)
+        shutil.rmtree(bookkeeping, ignore_errors=True)
+        (flow.folder / "here").rename(flow.results)
+        aside.rename(bookkeeping)
+
+
+def test_what_is_gone_is_made_again_though_what_follows_is_there(flow: Flow) -> None:
+    path = flow.artefact(OTHER, "metrics")
+    aside = path.with_name("aside")
+    path.rename(aside)
+    pending = flow.pending()
+    aside.rename(path)
+    assert (OTHER, "metrics") in pending
+    assert pending <= {(OTHER, stage) for stage in {"metrics", *AFTER_METRICS}}
+    assert flow.pending() == set()
+
+
+def test_a_result_of_other_settings_that_is_put_back_is_seen(flow: Flow) -> None:
+    """As by a job that outlived its run, or by a copy: the file is newer than all that follows."""
+    path = flow.artefact(ONE, "scene")
+    whole = path.read_bytes()
+    text = artefacts.made_from(path)
+    record = Record.from_text(text)
+    assert record is not None
+    settings = {**record.given["settings"], "voxel_mm": 0.5}
+    add_record(path, replace(record, given={**record.given, "settings": settings}))
+    assert (ONE, "scene") in flow.pending()
+    said = flow.intercap("status", flow.settings).stdout
+    assert f"scene out of date in {ONE}: settings: voxel_mm 0.5 → none" in said
+    path.write_bytes(whole)
+    assert flow.pending() == set()
+
+
+def test_another_processor_is_told_and_runs_nothing(flow: Flow) -> None:
+    path = flow.artefact(ONE, "joint")
+    whole = path.read_bytes()
+    record = Record.from_text(artefacts.made_from(path))
+    assert record is not None
+    add_record(path, replace(record, machine={"device": "cuda", "cpu": "another"}))
+    assert flow.pending() == set()
+    said = flow.intercap("status", flow.settings).stdout
+    assert "2 done of 2 sequences" in said
+    assert "1 results were made on another machine or device (cuda, another)" in said
+    path.write_bytes(whole)
 
 
 def test_another_seed_makes_another_recording(flow: Flow) -> None:

@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from intercap_core.config import Annotation
+from intercap_core.pipeline import given
+from intercap_core.pipeline.contents import Contents
+from intercap_core.project import load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,40 +26,37 @@ RULES = dict(re.findall(r"^rule (\w+):\n(.*?)(?=^rule |\Z)", TEXT, re.DOTALL | r
 def test_a_rule_s_inputs_are_what_its_stage_reads(stage: str) -> None:
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
     reads = set(inspect.signature(run).parameters) & set(SEQUENCE_STAGES)
-    asked = re.findall(r"\*\*artefacts_read\(\"(\w+)\"\)", RULES[stage])
-    assert {name for listed in asked for name in STAGES[listed].reads} == reads
+    assert set(STAGES[stage].reads) == reads
+    assert f'unpack(artefacts_read("{stage}"))' in RULES[stage] or not reads
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_rule_depends_on_all_that_its_stage_is_given(stage: str) -> None:
+def test_all_that_a_stage_is_given_is_in_its_record(stage: str) -> None:
+    """Every argument but artefacts and output is recorded, and the device as one of a machine."""
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
-    names = set(inspect.signature(run).parameters)
-    sections = {
-        "frames_to_drop": "drop_frames",
-        "floor": "floor",
-        "starts": 'starts", "starts_sigma',
-        "initial": "object_pose",
-        "contact": "contact",
-        "subject_points": "subject",
-    }
-    annotated = ", ".join(f'"{sections[name]}"' for name in sections if name in names)
-    found = re.search(r"annotation=annotation_of\((.*)\)", RULES[stage])
-    assert (found.group(1) if found else "") == annotated
-    entries = {
-        "object_": "object=tracked_object",
-        "subject": "subject=tracked_subject",
-        "device": "device=SETTINGS.device",
-        "body_models": "body=body_file",
-    }
-    for name, param in entries.items():
-        assert (param in RULES[stage]) == (name in names), name
+    names = set(inspect.signature(run).parameters) - set(SEQUENCE_STAGES) - {"output"}
+    project = load_project(ROOT / "config/test/config.yaml")
+    sequence = next(iter(project.sequences))
+    made_from = given.record(
+        project, sequence, stage, Annotation(),
+        artefacts=dict.fromkeys(STAGES[stage].reads, "made"), contents=Contents(ROOT / "none"),
+    )  # fmt: skip
+    assert set(made_from.given) == names - {"device"}
+    assert set(made_from.artefacts) == set(STAGES[stage].reads)
+
+
+def test_a_stage_cannot_read_a_column_that_is_not_recorded() -> None:
+    row = next(iter(load_project(ROOT / "config/test/config.yaml").sequences.values()))
+    with pytest.raises(AttributeError):
+        _ = given.row_of("frames", row).intent
+    assert given.row_of("summary", row).sequence == row.sequence
 
 
 @pytest.mark.parametrize("rule", sorted(RULES))
 def test_every_rule_says_what_it_needs(rule: str) -> None:
     for part in ('"""', "output:", "log:", "benchmark:", "mem_mb=", "runtime=", "message:"):
         assert part in RULES[rule], part
-    assert rule == "broken_annotation" or "code=" in RULES[rule]
+    assert rule == "broken_annotation" or f'mark=out_of_date("{rule}")' in RULES[rule]
 
 
 def snakemake(*arguments: str) -> subprocess.CompletedProcess[str]:
