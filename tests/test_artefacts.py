@@ -81,7 +81,7 @@ def test_every_dataset_has_checksum_and_units(tmp_path: Path) -> None:
         assert len(found) == 6
         assert all(dataset.fletcher32 for dataset in found)
         assert all(dataset.attrs["units"] for dataset in found)
-        assert file["points"].attrs["frame"] == "master"
+        assert file["points"].attrs["frame"] == b"master"
 
 
 @pytest.mark.parametrize(
