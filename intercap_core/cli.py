@@ -247,6 +247,24 @@ def status(
     print_status(load_project(settings), every=every, as_json=as_json)
 
 
+@app.command(rich_help_panel=LOOK)
+def doctor(
+    settings: Annotated[
+        Path | None, typer.Argument(metavar="SETTINGS", help="A project, to look at its needs too.")
+    ] = None,
+) -> None:
+    """Say what this machine has of what a run needs: versions, GPU, body files, disk, file system,
+    locks, scheduler, browser. Status 1 where something will not do.
+
+    Example: intercap doctor config/demo/config.yaml
+    """
+    from intercap_core.commands.doctor import print_findings
+    from intercap_core.project import load_project
+
+    project = None if settings is None else load_project(settings)
+    raise typer.Exit(0 if print_findings(project) else 1)
+
+
 @app.command(rich_help_panel=WHOLE)
 def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
     """Read every result to its end and say which are damaged; status 1 where one is.

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
@@ -21,11 +21,14 @@ from rich.table import Table
 from intercap_core.commands.check import check_bodies
 from intercap_core.commands.closing import print_remarks
 from intercap_core.errors import UserError
+from intercap_core.pipeline.claim import Claim, path_of, try_claim
 from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
 POLL_SECONDS = 0.5
+ROWS = 24  # of the table that is redrawn: what a terminal shows
+ENDED = "finished"
 SAID_EVERY_S = 30.0  # between two lines of progress where no terminal redraws a table
 COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
@@ -52,9 +55,57 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
     project = load_project(settings)
     check_bodies(project)
     console = Console(stderr=True)
-    command = snakemake_command(settings, cores=cores, arguments=arguments)
     if DRY_RUN & set(arguments):
-        return subprocess.call(command)
+        return subprocess.call(snakemake_command(settings, cores=cores, arguments=arguments))
+    with _alone(project, settings, console):
+        return _run(project, settings, cores, arguments, console)
+
+
+@contextmanager
+def _alone(project: Project, settings: Path, console: Console) -> Iterator[None]:
+    """Hold the project's results against another run, and clear what a killed one left locked.
+
+    Raises UserError where a run is going on, naming it.
+    """
+    held = try_claim(path_of(project.results / "run"))
+    if not isinstance(held, Claim):
+        raise UserError(
+            f"{project.results}: another run is going on ({held}); wait for its end, or end it"
+        )
+    try:
+        if held.left_by is not None:
+            going_on = _snakemake_here()
+            if going_on:
+                raise UserError(
+                    f"{project.results}: the run by {held.left_by} was killed, but its jobs go on "
+                    f"(process {going_on} is their Snakemake); wait for its end, or end it"
+                )
+            console.print(f"the run by {held.left_by} was killed: going on where it stopped")
+            subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
+        yield
+    finally:
+        held.release()
+
+
+def _snakemake_here() -> int | None:
+    """A Snakemake that works in this folder."""
+    import psutil
+
+    for process in psutil.process_iter(["pid", "cmdline", "cwd"]):
+        words = process.info["cmdline"] or []
+        if "snakemake" in words and process.info["cwd"] == str(Path.cwd()):
+            return int(process.info["pid"])
+    return None
+
+
+def _run(
+    project: Project,
+    settings: Path,
+    cores: int,
+    arguments: Sequence[str],
+    console: Console,
+) -> int:
+    command = snakemake_command(settings, cores=cores, arguments=arguments)
     watcher = Watcher(project, console)
     status = run_watched(command, watcher, console)
     failures = watcher.failures()
@@ -142,16 +193,32 @@ class Watcher:
             if job.state != "finished"
         }
 
-    def table(self) -> Table:
-        """One row a sequence, one column a stage."""
+    def table(self) -> Group:
+        """One row a sequence at which something runs or failed, one column a stage, and counts."""
         jobs = self.jobs()
+        of_sequence: dict[str, list[str]] = {name: [] for name in self._project.sequences}
+        for name, job in jobs.items():
+            if name.partition(":")[0] in of_sequence:
+                of_sequence[name.partition(":")[0]].append(job.state)
+        ended = {name for name, states in of_sequence.items() if states and set(states) == {ENDED}}
+        order = {"running": 0, "failed": 1}
+        shown = sorted(
+            (name for name, states in of_sequence.items() if set(states) & set(order)),
+            key=lambda name: min(order.get(state, 2) for state in of_sequence[name]),
+        )
+        waiting = sum(not states for states in of_sequence.values())
+        counts = (
+            f"{self._steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} have ended, "
+            f"{waiting} wait or are kept"
+        )
         table = Table("sequence", *COLUMNS, box=None, header_style="bold")
-        for sequence in self._project.sequences:
+        for sequence in shown[:ROWS]:
             making = jobs.get(f"{sequence}: studio")
             first = f"{sequence} (recording)" if making and making.state == "running" else sequence
             cells = [self._cell(sequence, stage, jobs) for stage in COLUMNS]
             table.add_row(first, *cells)
-        return table
+        more = f", and {len(shown) - ROWS} more at work or failed" if len(shown) > ROWS else ""
+        return Group(table, counts + more)
 
     def _cell(self, sequence: str, stage: str, jobs: dict[str, JobState]) -> str:
         job = jobs.get(f"{sequence}: {stage}")
@@ -183,14 +250,18 @@ class Watcher:
 
     def progress(self) -> str:
         """How many jobs are done of how many, and the last words of those that run."""
-        said = self.transcript.read_text(encoding="utf-8", errors="replace")
-        done, of = (STEPS.findall(said) or [("0", "?")])[-1]
         running = [
             f"{name} ({last_words(job.log)})"
             for name, job in self.jobs().items()
             if job.state == "running"
         ]
-        return f"{done} of {of} jobs done; {len(running)} run: {', '.join(running) or 'none'}"
+        words = ", ".join(running) or "none"
+        return f"{self._steps()} jobs done; {len(running)} run: {words}"
+
+    def _steps(self) -> str:
+        said = self.transcript.read_text(encoding="utf-8", errors="replace")
+        done, of = (STEPS.findall(said) or [("0", "?")])[-1]
+        return f"{done} of {of}"
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:
@@ -226,5 +297,5 @@ def _display(watcher: Watcher, console: Console) -> Iterator[Callable[[], None]]
     if not console.is_terminal:
         yield watcher.tell
         return
-    with Live(watcher.table(), console=console, refresh_per_second=4) as live:
+    with Live(watcher.table(), console=console, refresh_per_second=2) as live:
         yield lambda: live.update(watcher.table())

@@ -70,10 +70,11 @@ class Owner:
 
 
 class Claim:
-    """A claim that is held; made by :func:`claim` and :func:`claim_or_say`."""
+    """A claim that is held; made by :func:`claim` and :func:`try_claim`. ``left_by``: who held it
+    until death."""
 
-    def __init__(self, path: Path, owner: Owner) -> None:
-        self._path, self._owner = path, owner
+    def __init__(self, path: Path, owner: Owner, left_by: Owner | None = None) -> None:
+        self._path, self._owner, self.left_by = path, owner, left_by
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._beat, daemon=True)
         self._thread.start()
@@ -126,7 +127,7 @@ def claim(output: Path) -> Iterator[Claim]:
 
 def try_claim(path: Path) -> Claim | Owner:
     """The claim, or who holds it. Raises UserError where no file can be written there."""
-    own = Owner.this()
+    own, dead = Owner.this(), None
     with contextlib.suppress(OSError):  # told below
         path.parent.mkdir(parents=True, exist_ok=True)
     while True:
@@ -139,6 +140,7 @@ def try_claim(path: Path) -> Claim | Owner:
             if held is None and (_age_s(path) or 0.0) < _LOOK_S:
                 time.sleep(_LOOK_S)  # it is being written
                 continue
+            dead = held
             _bury(path)
             continue
         except OSError as error:
@@ -148,7 +150,7 @@ def try_claim(path: Path) -> Claim | Owner:
             ) from None
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             json.dump(own.__dict__, file)
-        return Claim(path, own)
+        return Claim(path, own, dead)
 
 
 def living_owner(output: Path) -> Owner | None:
