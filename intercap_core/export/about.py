@@ -3,6 +3,7 @@ far they are to be trusted."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,6 +92,10 @@ class About:
                 for part, start, end in self.contact.intervals()
             ]
         return found | {"by_frame": self._by_frame()}
+
+    def text(self, coordinates: Coordinates) -> str:
+        """The same as a file of JSON."""
+        return json.dumps(self.told(coordinates), separators=(",", ":")) + "\n"
 
     def arrays(self, coordinates: Coordinates) -> dict[str, np.ndarray]:
         """The same as arrays."""

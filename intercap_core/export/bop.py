@@ -83,7 +83,8 @@ def write(
         ]
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)
-    _dump(folder / "about.json", about.told(Coordinates.of(motion, UNITS)))
+    text = about.text(Coordinates.of(motion, UNITS))
+    (folder / "about.json").write_text(text, encoding="utf-8")
 
 
 def _write_model(folder: Path, mesh: ObjectMesh, obj_id: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
@@ -53,8 +52,7 @@ def write(
         object_ = trimesh.Trimesh(placed, mesh.faces, vertex_colors=mesh.colours, process=False)
         path = files / f"{t:05d}_second_obj.{kind}"
         _save(path, object_, touching.object_.at(t) if touching else None, lines, kind)
-    text = json.dumps(about.told(coordinates), indent=1) + "\n"
-    (folder / "about.json").write_text(text, encoding="utf-8")
+    (folder / "about.json").write_text(about.text(coordinates), encoding="utf-8")
 
 
 def _save(

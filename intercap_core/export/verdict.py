@@ -64,7 +64,13 @@ class Verdict:
 
     def whole(self) -> dict[str, Any]:
         """All of it, with what the words mean: a file of its own."""
-        return {**self.told(), "meaning": MEANING, "by_frame": self.by_frame_told()}
+        return {
+            **self.told(),
+            "meaning": MEANING,
+            "by_frame": self.by_frame_told(),
+            "frame": "none: sizes of errors",
+            "units": "as each name or entry says",
+        }
 
     def arrays(self) -> dict[str, np.ndarray]:
         """As arrays, by the names that go with every export."""
