@@ -27,6 +27,12 @@ def everything(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture(scope="session")
+def lively(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+    """The capture with a body and an object that turn, and a face that moves."""
+    return exported.lively(capture, tmp_path_factory.mktemp("lively"))
+
+
+@pytest.fixture(scope="session")
 def zup_from_master(capture: fitted.Capture) -> np.ndarray:
     with artefacts.read(capture.paths["scene"], SCENE) as scene:
         return scene["zup_from_master"]

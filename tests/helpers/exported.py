@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import read_parameters
@@ -58,8 +59,8 @@ def changed(capture: fitted.Capture, stage: str, folder: Path) -> tuple[fitted.C
 
 
 def lively(capture: fitted.Capture, folder: Path) -> fitted.Capture:
-    """The capture with another joint result: every joint turned, a face that moves, and hands
-    within the first components of their pose space."""
+    """The capture with another joint result: every joint turned, a face that moves, hands within
+    the first components of their pose space, and an object that turns."""
     made, path = changed(capture, "joint", folder)
     rng = np.random.default_rng(4)
     model = capture.model
@@ -73,6 +74,7 @@ def lively(capture: fitted.Capture, folder: Path) -> fitted.Capture:
             code = rng.normal(0, 0.5, (total, NUM_COMPONENTS))
             basis = model.hand_components[side, :NUM_COMPONENTS].numpy()
             file[name][...] = model.hand_mean[side].numpy() + code @ basis
+        file["rotation"][...] = Rotation.random(total, random_state=5).as_matrix()
     with artefacts.read(path, JOINT) as joint:
         joints = posed(model, joint)[1]
     with h5py.File(path, "r+") as file:
