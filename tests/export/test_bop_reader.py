@@ -14,7 +14,6 @@ import pytest
 import trimesh
 
 from tests.helpers import exported
-from tests.helpers import fitted_capture as fitted
 
 POINTS = 4000  # spread over the object's surface
 BORDER_PX = 3  # a mask's border and a point on the silhouette differ by rounding
@@ -68,9 +67,11 @@ def _images(folder: Path) -> Iterator[Image]:
 
 
 @pytest.fixture(scope="module")
-def turning(lively: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An object that turns from frame to frame."""
-    return exported.run(lively, tmp_path_factory.mktemp("bop") / "out", formats=("bop",)) / "bop"
+def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A suitcase that turns from frame to frame: large enough for its outline to show how."""
+    folder = tmp_path_factory.mktemp("suitcase")
+    capture = exported.lively(exported.measured_capture(folder, "suitcase"), folder / "joint")
+    return exported.run(capture, folder / "out", formats=("bop",)) / "bop"
 
 
 @pytest.fixture(scope="module")

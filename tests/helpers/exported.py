@@ -24,9 +24,9 @@ from tests.helpers import fitted_capture as fitted
 NUM_COMPONENTS = 12  # of a hand's pose, as the InterCap release has them
 
 
-def measured_capture(folder: Path) -> fitted.Capture:
-    """A capture of a person with a cup, up to metrics."""
-    made = fitted.make_capture(folder, object_name="cup")
+def measured_capture(folder: Path, object_name: str = "cup") -> fitted.Capture:
+    """A capture of a person with an object, up to metrics."""
+    made = fitted.make_capture(folder, object_name=object_name)
     metrics.run(
         **made.inputs(*STAGES["metrics"].reads),
         output=made.paths["metrics"],
@@ -54,6 +54,7 @@ def run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
 
 def changed(capture: fitted.Capture, stage: str, folder: Path) -> tuple[fitted.Capture, Path]:
     """The capture with a copy of one artefact in ``folder``, to be changed."""
+    folder.mkdir(exist_ok=True)
     path = Path(shutil.copy(capture.paths[stage], folder / f"{stage}.h5"))
     return replace(capture, paths=capture.paths | {stage: path}), path
 
