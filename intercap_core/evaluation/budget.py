@@ -50,9 +50,10 @@ def stages_to(last: str) -> list[str]:
 
 def expected_seconds(project: Project, stage: str, frames: int) -> float:
     """CPU seconds of one job: a recording's stage, or ``STUDIO``, on a machine as above."""
-    views = len(project.config.frames.cameras) or VIEWS
-    share = 1.0 if stage == STUDIO else views / VIEWS
     studio = project.config.studio
+    made = VIEWS if studio is None else studio.cameras
+    views = made if stage == STUDIO else len(project.config.frames.cameras) or made
+    share = views / VIEWS
     if stage == STUDIO and studio is not None and studio.colour_mode != "720P":
         share *= STUDIO_1080P
     return SECONDS_PER_START + SECONDS_PER_FRAME.get(stage, 0.3) * share * frames

@@ -47,13 +47,28 @@ def test_projects_wait_for_those_that_make_their_recordings(
 ) -> None:
     orders = orders_of(wanted, _frames(wanted))
     by_name = {order.project.config.dataset: order for order in orders}
-    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 4 + 7
+    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 5 + 7
     assert orders[0] is by_name["object"]  # what most wait for comes first
     stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
     assert by_name["object"].stages == stages
     for name in ("object_no_detector", "body_two_view"):
         assert by_name[name].after == [by_name["object"]]
     assert by_name["object_noise2"].after == []
+
+
+def test_a_smaller_ring_is_expected_to_take_less() -> None:
+    """Of the studio what it records counts, of a stage what it is given."""
+    four, six = (load_project(Path(f"config/field/{name}.yaml")) for name in ("rates", "shoes"))
+    for stage in ("studio", "scene"):
+        some, every = (
+            budget.expected_seconds(project, stage, 60) - budget.SECONDS_PER_START
+            for project in (four, six)
+        )
+        assert some == pytest.approx(4 / 6 * every)
+    of_six = load_project(Path("config/body/four_view.yaml"))
+    made = {stage: budget.expected_seconds(of_six, stage, 60) for stage in ("studio", "scene")}
+    assert made["scene"] == budget.expected_seconds(four, "scene", 60)
+    assert made["studio"] >= budget.expected_seconds(six, "studio", 60)
 
 
 def test_each_part_is_expected_to_keep_to_its_budget(
