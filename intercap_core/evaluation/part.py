@@ -25,6 +25,7 @@ from intercap_core.project import Project, load_project
 
 Errors = TypeVar("Errors")
 Figures = dict[str, float]
+Targets = Sequence[tuple[str, Project]]  # the last stage of each project
 Columns = Mapping[str, tuple[str, int]]  # of a table: heading to a figure's key and its digits
 
 SPREAD = "_spread"
@@ -56,7 +57,8 @@ class Part(Generic[Errors]):
     stands for what it computes. ``kept`` is the dataclass of errors that are stored because
     measuring takes long; None where they are read at once. ``flat`` gives the keys ``area.measure``
     of all projects, ``print_tables`` prints them, ``rig`` describes a project's settings;
-    ``has`` (project, sequence) says whether a recording has what is measured.
+    ``has`` (project, sequence) says whether a recording has what is measured. ``last`` (project) is
+    the stage to which a project's recordings are taken where that is beyond ``stage``.
     """
 
     name: str
@@ -69,6 +71,11 @@ class Part(Generic[Errors]):
     rig: Callable[[Project], str] = lambda _: ""
     kept: type[Errors] | None = None
     has: Callable[[Project, str], bool] = lambda _project, _sequence: True
+    last: Callable[[Project], str | None] = lambda _: None
+
+    def targets(self, projects: Sequence[Project]) -> Targets:
+        """Each project with the stage that its recordings are taken to."""
+        return [(self.last(project) or self.stage, project) for project in projects]
 
     def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
         """Measure every recording whose artefact is there, several at a time.
