@@ -81,7 +81,7 @@ def evaluate(
         part = PARTS[name]
         measured = part.measure_all(some, workers=workers)
         part.print_tables(measured)
-        found |= part.flat(measured)
+        found |= part.flat(measured) | part.time_one(some)
     minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
     passed = (time.monotonic() - begin) / 60
     budget.print_minutes(list(projects), minutes, passed)

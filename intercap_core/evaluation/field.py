@@ -19,12 +19,13 @@ from rich.table import Table
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.bench import judgement
 from intercap_core.evaluation.part import Figures, Measured, Part, console_of, keyed, number
 from intercap_core.metrics import figures, subject_right
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.verdict_figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
-from intercap_core.schemas import JOINT, TRUTH
+from intercap_core.schemas import FRAMES, JOINT, TRUTH
 from intercap_core.stages.export import MANIFEST
 from intercap_core.studio.subjects import Subject
 
@@ -89,6 +90,13 @@ def exported_alone(folder: Path) -> bool:
 def last_stage(project: Project) -> str | None:
     """People alone are taken to the export; what else there is ends with the metrics."""
     return "export" if project.config.dataset == ALONE else None
+
+
+def seconds(project: Project, sequence: str) -> Figures:
+    """``verdict.seconds_per_frame`` of one recording, as `intercap bench` has it."""
+    with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
+        frames = len(recorded["times"])
+    return judgement(project.path, sequence, frames)
 
 
 def _lengths(joints: np.ndarray) -> np.ndarray:
@@ -196,4 +204,5 @@ PART = Part(
     flat,
     print_field,
     last=last_stage,
+    timed=seconds,
 )
