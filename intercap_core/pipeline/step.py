@@ -58,7 +58,7 @@ def run_step(
     if not STAGES[stage].writes_folder:
         for note in outcome.notes(stage, output):
             log.warning("sequence %s: %s", sequence, note)
-        log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output))
+    log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output, inputs))
 
 
 def _made_from(
@@ -221,4 +221,5 @@ def run_dataset(project: Project) -> Path:
     )
     add_record(dataset_record_of(project), made_from)
     mark_of(project, "", DATASET).unlink(missing_ok=True)
+    log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first

@@ -1,5 +1,5 @@
 rule export:
-    """Files for other tools: InterCap, AMASS, BOP, COCO, glb."""
+    """Files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes."""
     input:
         unpack(artefacts_read("export")),
         object=ancient(object_files),
