@@ -20,6 +20,8 @@
 # make report    the site of the demo from what is computed
 # make scale-report  what 223 sequences of 300 frames cost the site, of the demo's (run that first):
 #                into results/bench.json
+# make scale     223 sequences: a start with nothing to do, a check, the jobs of an edit, into
+#                results/bench.json
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -30,7 +32,7 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench ablation oracle report scale-report docs environment clean
+    evaluate evaluate-quick bench ablation oracle report scale-report scale docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -88,6 +90,10 @@ report: $(STAMP)
 
 scale-report: $(STAMP)
 	$(BIN)/python -m bench.scale_report
+
+scale: $(STAMP)
+	$(BIN)/intercap run config/test/config.yaml --cores $(CORES)
+	$(BIN)/python -m bench.scale
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

@@ -22,13 +22,14 @@ def from_command_line(
     description: str,
     count: int,
     counted: str = "frames",
+    settings: Path = Path("config/bench/config.yaml"),
 ) -> None:
     """Read the command line and ``measure(settings, output, count)``.
 
-    ``counted`` names the option that sets ``count``.
+    ``counted`` names the option that sets ``count``; ``settings`` are used where none are named.
     """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
+    parser.add_argument("settings", type=Path, nargs="?", default=settings)
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
     parser.add_argument(f"--{counted}", type=int, default=count)
     arguments = parser.parse_args()

@@ -120,7 +120,7 @@ def _disk(project: Project) -> Iterator[Finding]:
     share = 100 * usual["frames"] / max(sum(usual.values()), 1)
     yield Finding(
         "what may go", NOTE,
-        f"frames.h5 ({share:.0f} % of a sequence) when a dataset is finished: the next run makes it "
+        f"frames.h5 ({share:.0f} % of a sequence) when a dataset is done: the next run makes it "
         "again; nothing else is worth it",
     )  # fmt: skip
 

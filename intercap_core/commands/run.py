@@ -23,6 +23,7 @@ from intercap_core.commands.closing import print_remarks
 from intercap_core.errors import UserError
 from intercap_core.pipeline.claim import Claim, path_of, try_claim
 from intercap_core.pipeline.job import last_words, read_state
+from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
@@ -105,6 +106,14 @@ def _run(
     arguments: Sequence[str],
     console: Console,
 ) -> int:
+    plan = Plan(project)
+    done = not arguments and plan.all_done()
+    plan.keep()
+    if done:
+        count = len(project.sequences)
+        console.print(f"nothing to do: all {count} sequences are done", highlight=False)
+        _print_report(project, console)
+        return 0
     command = snakemake_command(settings, cores=cores, arguments=arguments)
     watcher = Watcher(project, console)
     status = run_watched(command, watcher, console)
@@ -125,11 +134,15 @@ def _run(
         )
         run_watched(command, Watcher(project, console), console)
     print_remarks(project, console)
+    _print_report(project, console)
+    return status
+
+
+def _print_report(project: Project, console: Console) -> None:
     report = project.site / "index.html"
     if report.is_file():
         words = f"report: {report.resolve()}"
         console.print(words, highlight=False, markup=False, soft_wrap=True)
-    return status
 
 
 def snakemake_command(

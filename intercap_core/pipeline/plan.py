@@ -83,6 +83,16 @@ class Plan:
             return made
         return self.project.artefact(sequence, stage)
 
+    def all_done(self) -> bool:
+        """Whether every output of every sequence, and what is made of all, is there and as it would
+        be made now."""
+        done = all(
+            state.kind is Kind.done
+            for name in self.project.sequences
+            for state in self.states(name).values()
+        )
+        return done and self.dataset.kind is Kind.done
+
     def is_stale(self, sequence: str, stage: str) -> bool:
         """Whether an output is there that was made from something else than it would be now."""
         return self._state(sequence, stage).kind is Kind.stale
@@ -125,7 +135,7 @@ class Plan:
                 made_anew = "its recording is made anew"
             yield STUDIO, state
         try:
-            annotation = self.project.annotation(sequence, look_at_frames=False)
+            annotation = self.project.annotation(sequence)
         except UserError as error:
             for stage in STAGES:
                 there = _exists(self.output(sequence, stage))

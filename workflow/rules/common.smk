@@ -79,7 +79,7 @@ def recorded(column):
 def annotation_broken(sequence):
     """Whether the sequence's annotation cannot be read; the studio's own is not there yet."""
     try:
-        PROJECT.annotation(sequence, look_at_frames=False)
+        PROJECT.annotation(sequence)
     except UserError:
         return not PROJECT.annotation_made(sequence)
     return False
