@@ -220,7 +220,7 @@ def _counts(measured: Sequence[SequenceMetrics]) -> dict[str, Any]:
 
 def _printed(table: pd.DataFrame) -> dict[str, Any]:
     """Heads, each with its unit, and cells as text, of the columns that a reader looks for."""
-    shown = [name for name in table if "." not in name or name in _FIGURES]
+    shown = [str(name) for name in table if "." not in str(name) or name in _FIGURES]
     cells = [
         ["–" if _unknown(value) else _text(value) for value in row]
         for row in table[shown].itertuples(index=False, name=None)
