@@ -71,7 +71,7 @@ CAPTURE_SETTINGS = [
 ]
 FIELD_SCENE_SETTINGS = [
     Path(f"config/field/{name}.yaml")
-    for name in ("starts_15", "starts_30", "starts_60", "floor", "beam")
+    for name in ("starts_15", "starts_30", "starts_60", "rates", "floor", "beam")
 ]
 FIELD_SETTINGS = [
     Path("config/evaluation/config.yaml"),

@@ -265,7 +265,7 @@ class PageSettings(Model):
 class ExportSettings(Model):
     """Files for other people's tools."""
 
-    formats: tuple[Literal["intercap", "amass", "bop", "coco", "glb", "contact"], ...] = (
+    formats: tuple[Literal["intercap", "amass", "bop", "coco", "glb", "contact", "meshes"], ...] = (
         "intercap",
         "amass",
         "bop",
@@ -273,10 +273,15 @@ class ExportSettings(Model):
         "glb",
         "contact",
     )
-    """Which exports are written; contact = its probability by frame, and a draft annotation."""
+    """Which exports are written; contact = its probability by frame, the vertices that touch, and a
+    draft annotation; meshes = body and object of each frame as mesh files, half a megabyte each."""
     frame: Literal["z-up", "camera"] = "z-up"
-    """Frame of amass and glb: gravity-aligned with the ground at z = 0, or the master camera.
-    The intercap, bop and coco layouts are in camera frames by definition."""
+    """Frame of amass, glb and meshes: gravity-aligned with the ground at z = 0, or the master
+    camera. The intercap, bop and coco layouts are in camera frames by definition."""
+    mesh_format: Literal["ply", "obj"] = "ply"
+    """What the meshes are; ply alone can say which vertices touch."""
+    mesh_every: Annotated[int, Field(ge=1)] = 1
+    """Meshes of every so many frames, from the first on."""
     masks: bool = True
     """Draw the object's masks and boxes for bop, with what the body hides."""
     images: bool = False

@@ -4,6 +4,11 @@ Axes: T frame sets, C cameras, J=55 joints, K=135 keypoints, R contact regions, 
 Vo object vertices. "master" is the frame of the master colour camera (x right, y down, z forward).
 A rotation matrix or transform ``a_from_b`` maps b's coordinates to a's. Change a schema's meaning
 and its version goes up: older files are then refused with the stage to re-run.
+
+``betas`` are T x S after body_fit, whose setting ``shape`` may free the shape in every frame, and S
+after joint, which has one shape for all. ``numpy.atleast_2d(betas)`` makes (T, S) or (1, S) of them,
+which broadcast over the frames alike; ``intercap_core.body.artefact.read_parameters`` reads either
+so, and ``intercap_core.posed.open_sequence`` gives vertices and joints of the same shapes of both.
 """
 
 from __future__ import annotations

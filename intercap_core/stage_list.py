@@ -99,8 +99,8 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "export",
-            "Files for other tools: InterCap, AMASS, BOP, COCO, glb.",
-            ("frames", "joint", "scene", "metrics"),
+            "Files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes.",
+            ("frames", "joint", "scene", "metrics", "body_fit", "object_track"),
             writes_folder=True,
         ),
     )

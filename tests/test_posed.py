@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from intercap_core import artefacts
+from intercap_core.body.artefact import read_parameters
 from intercap_core.camera.transforms import apply
 from intercap_core.errors import UserError
 from intercap_core.posed import open_sequence
+from intercap_core.schemas import BODY_FIT, JOINT
 from tests.helpers import fitted_capture as fitted
 
 
@@ -42,6 +45,20 @@ def test_points_are_where_the_artefacts_have_them(capture, settings, stage, shar
     np.testing.assert_allclose(found.bodies(slice(1, 5, 2))[1], joints[1:5:2], atol=1e-6)
     with pytest.raises(IndexError, match="frame 5 of 5"):
         found.at(5)
+
+
+def test_shapes_of_both_stages_are_read_alike(capture):
+    """One row for all frames after the joint fit, a row a frame before: they broadcast alike."""
+    with artefacts.read(capture.paths["joint"], JOINT) as file:
+        one, joint = file["betas"], read_parameters(file)
+    with artefacts.read(capture.paths["body_fit"], BODY_FIT) as file:
+        each, body_fit = file["betas"], read_parameters(file)
+    assert one.ndim == 1 and each.shape == (5, *one.shape)
+    for betas, read in ((one, joint), (each, body_fit)):
+        np.testing.assert_array_equal(np.atleast_2d(betas), read.betas.numpy())
+        assert read.batch == 5 and read.vector().shape == joint.vector().shape
+        spread = np.broadcast_to(np.atleast_2d(betas), each.shape)
+        np.testing.assert_array_equal(read.frames(slice(0, 5)).betas.numpy(), spread)
 
 
 def test_frames_are_those_of_scene_and_cameras(capture, settings):

@@ -21,7 +21,10 @@ TEMPLATE = Path(__file__).parent / "data" / "architecture.md"
 LAYERS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command line's options, nothing else"},
     {"evaluation": "figures against truth over many recordings: `intercap evaluate`"},
-    {"commands": "the command line's verbs: run, check, report, view, compare, release and others"},
+    {
+        "commands": "the command line's verbs: run, check, report, view, compare, release, bench "
+        "and others"
+    },
     {
         "tables": "a project's tables for released datasets",
         "pipeline": "runs one stage; decides, by digests of code and settings, what is run again",
@@ -34,7 +37,7 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     {"viewer": "a sequence in a browser: play, turn, compare; opens from disk"},
     {
         "report": "charts, pictures and the pages of the site",
-        "export": "files for other tools: InterCap, AMASS, BOP, COCO, glb",
+        "export": "files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes",
         "release": "what goes with a dataset that is given away: splits, card, list of files",
     },
     {

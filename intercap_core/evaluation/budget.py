@@ -9,9 +9,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from intercap_core.evaluation.part import Figures
+from intercap_core.evaluation.part import Figures, Targets
 from intercap_core.project import Project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.stage_list import STAGES
 
 # Minutes on two cores that a part may add to `make evaluate`: of the recordings that it makes and
 # of the stages that no earlier part computes. What is added later states its own here; the whole
@@ -45,14 +45,15 @@ def stages_to(last: str) -> list[str]:
         if stage not in wanted:
             wanted.add(stage)
             pending += [name for name in STAGES[stage].reads if name in STAGES]
-    return [stage for stage in SEQUENCE_STAGES if stage in wanted]
+    return [stage for stage in STAGES if stage in wanted]
 
 
 def expected_seconds(project: Project, stage: str, frames: int) -> float:
     """CPU seconds of one job: a recording's stage, or ``STUDIO``, on a machine as above."""
-    views = len(project.config.frames.cameras) or VIEWS
-    share = 1.0 if stage == STUDIO else views / VIEWS
     studio = project.config.studio
+    made = VIEWS if studio is None else studio.cameras
+    views = made if stage == STUDIO else len(project.config.frames.cameras) or made
+    share = views / VIEWS
     if stage == STUDIO and studio is not None and studio.colour_mode != "720P":
         share *= STUDIO_1080P
     return SECONDS_PER_START + SECONDS_PER_FRAME.get(stage, 0.3) * share * frames
@@ -70,7 +71,7 @@ def frames_of(projects: Sequence[Project]) -> dict[Path, int]:
 
 def jobs_of(project: Project, stages: Sequence[str]) -> Jobs:
     """Every job that the given last stages of a project need, its recordings included."""
-    wanted = [stage for stage in SEQUENCE_STAGES if any(stage in stages_to(s) for s in stages)]
+    wanted = [stage for stage in STAGES if any(stage in stages_to(s) for s in stages)]
     found: Jobs = []
     for name in project.sequences:
         made = project.recordings_made(name) is not None
@@ -78,14 +79,14 @@ def jobs_of(project: Project, stages: Sequence[str]) -> Jobs:
     return found
 
 
-def jobs_by_part(parts: Mapping[str, tuple[str, Sequence[Project]]]) -> dict[str, Jobs]:
-    """The jobs that each part adds; ``parts``: name to its stage and projects. Shared ones count
-    in the first part that needs them."""
+def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, Jobs]:
+    """The jobs that each part adds, by its name; ``parts``: the last stages of its projects. Shared
+    ones count in the first part that needs them."""
     known: set[tuple[Path, str, str]] = set()
     found: dict[str, Jobs] = {}
-    for part, (stage, projects) in parts.items():
+    for part, targets in parts.items():
         found[part] = []
-        for project in projects:
+        for stage, project in targets:
             for job in jobs_of(project, [stage]):
                 key = (project.results.resolve(), job[1], job[2])
                 if key not in known:

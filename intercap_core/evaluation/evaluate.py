@@ -53,11 +53,12 @@ def evaluate(
     ``settings``: for each part of ``PARTS`` the settings files of its recordings: ``sequences`` are
     taken to the metrics, ``captures`` to the scene alone, ``objects`` to the object's track,
     ``bodies`` to the body's fit, ``field_scenes`` and ``field``, recordings as outside a studio, to
-    the scene and to the metrics. ``output`` is flat JSON with keys ``area.measure`` and, where a
-    figure has one, ``area.measure_spread``: areas of annotated recordings end in ``_annotated``,
-    those of ``captures`` have their dataset's name, that of ``objects`` is ``object``, that of
-    ``bodies`` is ``body``, those of both parts of the field are ``field`` and ``verdict``; ``time``
-    holds minutes. The figures are compared with those of ``reference`` where one is given.
+    the scene and to the metrics (people alone to the exports). ``output`` is flat JSON with keys
+    ``area.measure`` and, where a figure has one, ``area.measure_spread``: areas of annotated
+    recordings end in ``_annotated``, those of ``captures`` have their dataset's name, that of
+    ``objects`` is ``object``, that of ``bodies`` is ``body``, those of both parts of the field are
+    ``field`` and ``verdict``; ``time`` holds minutes. The figures are compared with those of
+    ``reference`` where one is given.
     ``seed`` draws all recordings anew (:mod:`.seeds`). Returns 1 where a stage failed; recordings
     that failed are left out of the figures and named. Raises UserError where a project's settings
     are wrong, or none of its sequences has a result.
@@ -68,7 +69,7 @@ def evaluate(
     projects = {
         name: [load_project(path) for path in paths] for name, paths in settings.items() if paths
     }  # faults are told before any work
-    wanted = {name: (PARTS[name].stage, some) for name, some in projects.items()}
+    wanted = {name: PARTS[name].targets(some) for name, some in projects.items()}
     for some in projects.values():
         for project in some:
             require_truth(project)
@@ -80,7 +81,7 @@ def evaluate(
         part = PARTS[name]
         measured = part.measure_all(some, workers=workers)
         part.print_tables(measured)
-        found |= part.flat(measured)
+        found |= part.flat(measured) | part.time_one(some)
     minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
     passed = (time.monotonic() - begin) / 60
     budget.print_minutes(list(projects), minutes, passed)

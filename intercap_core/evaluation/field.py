@@ -1,4 +1,4 @@
-"""The field's part of `intercap evaluate` that ends with the metrics.
+"""The field's part of `intercap evaluate` that ends with the metrics, of people alone with exports.
 
 No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam,
 somebody else in the room;
@@ -7,8 +7,10 @@ what the verdict without truth tells of them.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,12 +19,14 @@ from rich.table import Table
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.bench import judgement
 from intercap_core.evaluation.part import Figures, Measured, Part, console_of, keyed, number
 from intercap_core.metrics import figures, subject_right
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.verdict_figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
-from intercap_core.schemas import JOINT, TRUTH
+from intercap_core.schemas import FRAMES, JOINT, TRUTH
+from intercap_core.stages.export import MANIFEST
 from intercap_core.studio.subjects import Subject
 
 NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
@@ -38,12 +42,13 @@ _WIDTH = 122
 class FieldSequence:
     """What stage ``metrics`` has measured; the relative errors (B,) of the limbs' lengths, and the
     error of the person's height, metres; of all images with a chosen person the share in which it
-    is the subject."""
+    is the subject; whether there is an export of a body and of no object."""
 
     metrics: SequenceMetrics
     bones: np.ndarray
     height_m: float
     subject_right: float
+    exported_alone: bool
 
 
 FieldSequences = Measured[FieldSequence]
@@ -68,7 +73,30 @@ def measure(project: Project, sequence: str) -> FieldSequence:
     metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
     chosen, scene = (project.artefact(sequence, stage) for stage in ("person", "scene"))
     right = subject_right.measure(chosen, scene, row.truth)
-    return FieldSequence(metrics, own / known - 1, height, right)
+    alone = exported_alone(project.artefact(sequence, "export"))
+    return FieldSequence(metrics, own / known - 1, height, right, alone)
+
+
+def exported_alone(folder: Path) -> bool:
+    """Whether ``folder`` is a whole export that moves a body and knows of no object."""
+    if not (folder / MANIFEST).is_file():
+        return False
+    told = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    there = all((folder / name).is_file() for name in told["files"])
+    named = {Path(name).name for name in told["files"]}
+    return there and "body.npz" in named and "object.npz" not in named and not told["object"]
+
+
+def last_stage(project: Project) -> str | None:
+    """People alone are taken to the export; what else there is ends with the metrics."""
+    return "export" if project.config.dataset == ALONE else None
+
+
+def seconds(project: Project, sequence: str) -> Figures:
+    """``verdict.seconds_per_frame`` of one recording, as `intercap bench` has it."""
+    with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
+        frames = len(recorded["times"])
+    return judgement(project.path, sequence, frames)
 
 
 def _lengths(joints: np.ndarray) -> np.ndarray:
@@ -113,7 +141,7 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
             found["field.passer_by_pve_mm"] = figures.truth_figures(every, "joint")["body_pve_mm"]
     alone = [found for found in evaluations if found.dataset == ALONE]
     if alone:
-        whole = [_of_a_person_alone(e.metrics) for some in alone for e in some.errors]
+        whole = [_of_a_person_alone(e) for some in alone for e in some.errors]
         count = len(whole) + sum(len(some.missing) for some in alone)
         found["field.people_alone_share"] = sum(whole) / count
     return found
@@ -130,10 +158,12 @@ def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
     }
 
 
-def _of_a_person_alone(metrics: SequenceMetrics) -> bool:
-    """Whether there are figures of the body, and none of an object that is not there."""
-    has = figures.truth_figures([metrics], "joint")
-    return "body_pve_mm" in has and not any(name.startswith("object") for name in has)
+def _of_a_person_alone(sequence: FieldSequence) -> bool:
+    """Whether there are figures and an export of the body, and none of an object that is not
+    there."""
+    has = figures.truth_figures([sequence.metrics], "joint")
+    measured = "body_pve_mm" in has and not any(name.startswith("object") for name in has)
+    return measured and sequence.exported_alone
 
 
 def print_field(evaluations: Sequence[FieldSequences]) -> None:
@@ -173,4 +203,6 @@ PART = Part(
     measure,
     flat,
     print_field,
+    last=last_stage,
+    timed=seconds,
 )

@@ -1,6 +1,7 @@
 """The field's part of `intercap evaluate` that ends with the scene.
 
-Cameras that started apart, rooms whose measured surface is mostly floor, a person on a beam.
+Cameras that started apart or have unequal rates, rooms whose measured surface is mostly floor, a
+person on a beam.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]
 # What datasets of each cause begin with
-STARTS, FLOOR, BEAM = "field_starts", "field_floor", "field_beam"
+STARTS, RATES, FLOOR, BEAM = "field_starts", "field_rates", "field_floor", "field_beam"
 _WIDTH = 128
 
 
@@ -30,9 +31,10 @@ def measure(project: Project, sequence: str) -> FieldScene:
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
-    """Keys ``field.<measure>``; those of starts also by dataset."""
+    """Keys ``field.<measure>``; those of starts also by dataset, of unequal rates apart."""
     found = keyed("field.", field.floor_figures(_of(evaluations, FLOOR)))
     found |= keyed("field.", field.start_figures(_of(evaluations, STARTS)))
+    found |= keyed("field.rates_", field.start_figures(_of(evaluations, RATES)))
     found |= keyed("field.", field.beam_figures(_of(evaluations, BEAM)))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):

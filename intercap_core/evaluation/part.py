@@ -25,6 +25,7 @@ from intercap_core.project import Project, load_project
 
 Errors = TypeVar("Errors")
 Figures = dict[str, float]
+Targets = Sequence[tuple[str, Project]]  # the last stage of each project
 Columns = Mapping[str, tuple[str, int]]  # of a table: heading to a figure's key and its digits
 
 SPREAD = "_spread"
@@ -56,7 +57,9 @@ class Part(Generic[Errors]):
     stands for what it computes. ``kept`` is the dataclass of errors that are stored because
     measuring takes long; None where they are read at once. ``flat`` gives the keys ``area.measure``
     of all projects, ``print_tables`` prints them, ``rig`` describes a project's settings;
-    ``has`` (project, sequence) says whether a recording has what is measured.
+    ``has`` (project, sequence) says whether a recording has what is measured. ``last`` (project) is
+    the stage to which a project's recordings are taken where that is beyond ``stage``, ``timed``
+    (project, sequence) measures how long something takes, once an evaluation.
     """
 
     name: str
@@ -69,6 +72,23 @@ class Part(Generic[Errors]):
     rig: Callable[[Project], str] = lambda _: ""
     kept: type[Errors] | None = None
     has: Callable[[Project, str], bool] = lambda _project, _sequence: True
+    last: Callable[[Project], str | None] = lambda _: None
+    timed: Callable[[Project, str], Figures] | None = None
+
+    def targets(self, projects: Sequence[Project]) -> Targets:
+        """Each project with the stage that its recordings are taken to."""
+        return [(self.last(project) or self.stage, project) for project in projects]
+
+    def time_one(self, projects: Sequence[Project]) -> Figures:
+        """What ``timed`` says of the first recording that has come to the stage; empty without."""
+        there = (
+            (project, name)
+            for project in projects
+            for name in project.sequences
+            if project.artefact(name, self.stage).is_file()
+        )
+        first = next(there, None)
+        return {} if self.timed is None or first is None else self.timed(*first)
 
     def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
         """Measure every recording whose artefact is there, several at a time.

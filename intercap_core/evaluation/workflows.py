@@ -27,6 +27,7 @@ from intercap_core.commands.check import check_bodies
 from intercap_core.commands.run import LAST_LINES, POLL_SECONDS, Watcher, snakemake_command
 from intercap_core.errors import UserError
 from intercap_core.evaluation.budget import FRAMES, Jobs, expected_seconds, jobs_of
+from intercap_core.evaluation.part import Targets
 from intercap_core.project import Project
 
 SIDE_BY_SIDE = 2
@@ -87,12 +88,12 @@ class Order:
 
 
 def bring_up_to_date(
-    wanted: Mapping[str, tuple[str, Sequence[Project]]],
+    wanted: Mapping[str, Targets],
     frames: Mapping[Path, int],
     *,
     cores: int = 0,
 ) -> int:
-    """Run the workflows of all projects to the wanted stages; ``wanted``: part to stage, projects.
+    """Run the workflows of all projects to the stages that are ``wanted`` of them, by part.
 
     What failed is named; returns 1 where anything did. A run that was killed goes on from the jobs
     that were done: no lock of Snakemake's is left behind, one of the system's keeps two evaluations
@@ -128,14 +129,12 @@ def bring_up_to_date(
     return max((1 if order.status else 0 for order in orders), default=0)
 
 
-def orders_of(
-    wanted: Mapping[str, tuple[str, Sequence[Project]]], frames: Mapping[Path, int]
-) -> list[Order]:
+def orders_of(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list[Order]:
     """One order a project, whatever parts want it, in the order in which they are to start."""
     stages: dict[Path, list[str]] = {}
     projects: dict[Path, Project] = {}
-    for stage, some in wanted.values():
-        for project in some:
+    for targets in wanted.values():
+        for stage, project in targets:
             key = project.path.resolve()
             projects[key] = project
             stages.setdefault(key, []).append(stage)

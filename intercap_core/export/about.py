@@ -3,6 +3,7 @@ far they are to be trusted."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,13 @@ from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.export.contact import StatedContact
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.metrics.verdict_figures import StatedError, stated_errors
+from intercap_core.export.coordinates import Coordinates
+from intercap_core.export.deviations import Deviations
+from intercap_core.export.numbers import listed
+from intercap_core.export.touching import TouchingSurfaces
+from intercap_core.export.verdict import Verdict
 
 SMPLX, OPEN = "smplx", "intercap-open-body"  # names of surface models
-UNITS = "metres, radians, seconds"
 
 
 @dataclass(frozen=True)
@@ -60,53 +63,55 @@ class BodyFile:
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """``flags`` (T,) reasons, empty = trusted; ``contact`` None without an object."""
+    """``flags`` (T,) reasons, empty = trusted; ``contact`` and ``touching`` None without an object,
+    ``deviations`` None where another program made the result, of which nothing is stated."""
 
     sequence: str
     body: BodyFile
     flags: Sequence[str]
     contact: StatedContact | None
-    stated: Sequence[StatedError]
+    verdict: Verdict
+    touching: TouchingSurfaces | None = None
+    deviations: Deviations | None = None
+    made_by: str = ""
 
-    @classmethod
-    def read(cls, metrics: SequenceMetrics, body: BodyFile, contact: StatedContact | None) -> About:
-        flags = [str(reason) for reason in metrics.values["flag_reason"]]
-        return cls(metrics.name, body, flags, contact, stated_errors(metrics))
-
-    def told(self, frame: str) -> dict[str, Any]:
-        """In the words of JSON, for numbers in a ``frame``."""
+    def told(self, coordinates: Coordinates) -> dict[str, Any]:
+        """In the words of JSON, for numbers in these ``coordinates``."""
         found: dict[str, Any] = {
             "sequence": self.sequence,
             "body": self.body.told(),
-            "frame": frame,
-            "units": UNITS,
+            **coordinates.told(),
             "flagged_frames": {str(t): reason for t, reason in enumerate(self.flags) if reason},
-            "stated_error_mm": {
-                error.part: {"mean": round(error.stated, 2), "factor": round(error.factor, 2)}
-                for error in self.stated
-                if not error.silent
-            },
-            "nothing_is_stated_of": {e.part: e.silent for e in self.stated if e.silent},
+            **self.verdict.told(),
         }
+        if self.made_by:
+            found["made_by"] = self.made_by
         if self.contact is not None:
             found["contact"] = [
                 {"part": part, "start": start, "end": end}
                 for part, start, end in self.contact.intervals()
             ]
-        return found
+        return found | {"by_frame": self._by_frame()}
 
-    def arrays(self, frame: str) -> dict[str, np.ndarray]:
-        """The same as arrays, with every frame's probability of contact."""
-        said = [error for error in self.stated if not error.silent]
-        found = {
+    def text(self, coordinates: Coordinates) -> str:
+        """The same as a file of JSON."""
+        return json.dumps(self.told(coordinates), separators=(",", ":")) + "\n"
+
+    def arrays(self, coordinates: Coordinates) -> dict[str, np.ndarray]:
+        """The same as arrays."""
+        return {
             **{key: np.array(value) for key, value in self.body.told().items()},
-            "frame": np.array(frame),
-            "units": np.array(UNITS),
+            **coordinates.arrays(),
+            **({"made_by": np.array(self.made_by)} if self.made_by else {}),
+            **self.by_frame_arrays(),
+        }
+
+    def by_frame_arrays(self) -> dict[str, np.ndarray]:
+        """What is known of every frame: flags, contact, deviations and the verdict."""
+        found = {
             "flagged": np.array([bool(reason) for reason in self.flags]),
             "flag_reason": np.array(list(self.flags)),
-            "stated_error_part": np.array([error.part for error in said]),
-            "stated_error_mm": np.array([error.stated for error in said]),
-            "stated_error_factor": np.array([error.factor for error in said]),
+            **self.verdict.arrays(),
         }
         if self.contact is not None:
             found |= {
@@ -114,4 +119,22 @@ class About:
                 "contact_probability": self.contact.probability,
                 "contact_annotated": self.contact.annotated,
             }
+        if self.touching is not None:
+            found |= self.touching.arrays()
+        if self.deviations is not None:
+            found |= self.deviations.arrays()
+        return found
+
+    def _by_frame(self) -> dict[str, Any]:
+        found = self.verdict.by_frame_told()
+        if self.contact is not None:
+            found |= {
+                "contact_region": list(self.contact.regions),
+                "contact_probability": listed(self.contact.probability, 4),
+                "contact_annotated": self.contact.annotated.tolist(),
+            }
+        if self.touching is not None:
+            found |= self.touching.told()
+        if self.deviations is not None:
+            found |= self.deviations.told()
         return found

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.export.about import About
+from intercap_core.export.coordinates import Coordinates
 from intercap_core.export.motion import Motion
 
 
@@ -49,8 +50,12 @@ def write(folder: Path, motion: Motion, about: About) -> None:
     """Write ``body.npz`` and, where there is one, ``object.npz``; numpy dates their entries 1980,
     so bytes repeat."""
     folder.mkdir()
-    said = {k: v for k, v in about.arrays(motion.frame).items() if k not in ("gender", "num_betas")}
-    np.savez(folder / "body.npz", allow_pickle=False, **body_arrays(motion), **said)
+    coordinates = Coordinates.of(motion)
+    np.savez(
+        folder / "body.npz",
+        allow_pickle=False,
+        **{**about.arrays(coordinates), **body_arrays(motion)},
+    )
     if motion.has_object:
-        of_object = {"frame": said["frame"], "units": said["units"], "flagged": said["flagged"]}
+        of_object = {**about.by_frame_arrays(), **coordinates.arrays()}
         np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion), **of_object)

@@ -14,10 +14,13 @@ import trimesh
 
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.export.about import About
+from intercap_core.export.coordinates import Coordinates
+from intercap_core.export.meshes import ply
 from intercap_core.export.motion import Motion
-from intercap_core.export.silhouettes import Exposures, Shown, images_of
+from intercap_core.export.silhouettes import Exposures, Shown, frames_of, images_of
 from intercap_core.rigid.mesh import ObjectMesh
 
+UNITS = "millimetres, radians, pixels; rotations are matrices row by row"
 LEAST_VISIBLE = 0.1  # share of an object that is seen, of BOP's targets (BOP Challenge 2019)
 
 
@@ -44,13 +47,7 @@ def write(
     camera and image, see :func:`.silhouettes.object_poses`). With ``bodies`` (T, V, 3) masks and
     boxes are drawn, with what the body hides. ``motion`` is in the master camera's frame.
     """
-    models = folder / "models"
-    models.mkdir(parents=True)
-    scaled = trimesh.Trimesh(
-        mesh.vertices * 1e3, mesh.faces, vertex_colors=mesh.colours, process=False
-    )
-    scaled.export(models / f"obj_{obj_id:06d}.ply", vertex_normal=False)
-    _dump(models / "models_info.json", {str(obj_id): model_info(mesh)})
+    _write_model(folder / "models", mesh, obj_id)
     lenses: dict[str, Any] = {}
     targets = []
     for number, camera in enumerate(rig):
@@ -73,6 +70,12 @@ def write(
             images = images_of(camera, number, motion, bodies, mesh, shown, exposures)
             info = {str(one.image): [_draw(scene, one, camera)] for one in images}
             _dump(scene / "scene_gt_info.json", info)
+        frame_of = frames_of(exposures, number)
+        shows = {
+            str(image): {"frame": frame_of[image], "flagged": about.flags[frame_of[image]]}
+            for image in shown
+        }
+        _dump(scene / "scene_about.json", {"camera": camera.name, "images": shows})
         targets += [
             {"scene_id": number, "im_id": image, "obj_id": obj_id, "inst_count": 1}
             for image in shown
@@ -80,7 +83,18 @@ def write(
         ]
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)
-    _dump(folder / "about.json", about.told(motion.frame))
+    text = about.text(Coordinates.of(motion, UNITS))
+    (folder / "about.json").write_text(text, encoding="utf-8")
+
+
+def _write_model(folder: Path, mesh: ObjectMesh, obj_id: int) -> None:
+    folder.mkdir(parents=True)
+    scaled = trimesh.Trimesh(
+        mesh.vertices * 1e3, mesh.faces, vertex_colors=mesh.colours, process=False
+    )
+    lines = [f"object {mesh.name}", "frame: the object's own", "units: millimetres"]
+    (folder / f"obj_{obj_id:06d}.ply").write_bytes(ply(scaled, lines))
+    _dump(folder / "models_info.json", {str(obj_id): model_info(mesh)})
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import torch
 from intercap_core.camera.rig import Camera, Rig
 from intercap_core.camera.transforms import apply
 from intercap_core.export.about import About
+from intercap_core.export.coordinates import Coordinates
 from intercap_core.export.motion import Motion
 from intercap_core.export.silhouettes import Exposures, Shown, images_of
 from intercap_core.rigid.mesh import ObjectMesh
@@ -29,6 +30,7 @@ _SKELETON = [
     [16, 14], [14, 12], [17, 15], [15, 13], [12, 13], [6, 12], [7, 13], [6, 7], [6, 8], [7, 9],
     [8, 10], [9, 11], [2, 3], [1, 2], [1, 3], [2, 4], [3, 5], [4, 6], [5, 7],
 ]  # fmt: skip
+UNITS = "pixels of the images as recorded, x right and y down, seconds"
 _INSIDE_M = 0.15  # how far below the skin that is seen a point of the body may lie
 _UNSEEN, _HIDDEN, _SEEN = 0, 1, 2
 
@@ -73,7 +75,10 @@ def write(
     if mesh is not None:
         categories.append({"id": OBJECT, "name": mesh.name, "supercategory": "object"})
     content = {
-        "info": {"description": motion.sequence, **about.told(motion.frame)},
+        "info": {
+            "description": motion.sequence,
+            **about.told(Coordinates.of(motion, UNITS)),
+        },
         "images": images,
         "annotations": annotations,
         "categories": categories,

@@ -1,4 +1,5 @@
-"""Contact as the joint stage states it: a table by frame, and a draft of the annotation."""
+"""Contact as the joint stage states it, a table by frame and a draft of the annotation; and by the
+meshes, vertex by vertex."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.export.touching import TouchingSurfaces
 from intercap_core.schemas import JOINT
 
 TOUCHING = 0.5  # a region is said to touch where this or more is its probability
@@ -50,9 +52,17 @@ class StatedContact:
         return found
 
 
-def write(folder: Path, stated: StatedContact) -> None:
-    """Write ``contact.tsv`` and ``annotation_draft.yaml`` into the new ``folder``."""
+def write(folder: Path, stated: StatedContact, touching: TouchingSurfaces) -> None:
+    """Write ``contact.tsv``, ``annotation_draft.yaml`` and ``contact_vertices.npz``, which says by
+    frame which vertices ``touching`` has, into the new ``folder``."""
     folder.mkdir()
+    np.savez(
+        folder / "contact_vertices.npz",
+        allow_pickle=False,
+        **touching.arrays(),
+        frame=np.array("none: numbers of vertices, and signed distances"),
+        units=np.array("metres"),
+    )
     (folder / "contact.tsv").write_text(table(stated), encoding="utf-8")
     (folder / "annotation_draft.yaml").write_text(draft(stated), encoding="utf-8")
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_NAMES, PARENTS
 from intercap_core.camera.light import linear
 from intercap_core.export.about import About
+from intercap_core.export.coordinates import Coordinates
 from intercap_core.export.motion import Motion
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.normals import vertex_normals
@@ -111,9 +112,9 @@ def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, 
     """Write the body, and the object unless ``mesh`` is None; ``z_up`` says whether the motion's
     frame is z-up or a camera's. What ``about`` says is in the asset's extras."""
     document = _Document()
-    document.json["asset"]["extras"] = about.told("y up, turned by the root from: " + motion.frame)
-    times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
     root = _YUP_FROM_ZUP if z_up else _YUP_FROM_CAMERA
+    document.json["asset"]["extras"] = about.told(coordinates(motion, z_up=z_up))
+    times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
     animation: dict[str, Any] = {"name": motion.sequence, "samplers": [], "channels": []}
     skeleton, body = _body(document, motion, animation, times)
     children = [skeleton]
@@ -124,6 +125,15 @@ def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, 
     document.json["scenes"][0]["nodes"] = [document.add("nodes", world), body]
     document.add("animations", animation)
     path.write_bytes(document.bytes())
+
+
+def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
+    """Those of the scene, which the root turns."""
+    if z_up:
+        frame = f"y up, turned by the node world from: {motion.frame}"
+        return Coordinates(frame, _YUP_FROM_ZUP.apply(motion.up))
+    frame = f"y up as the camera was held, turned by the node world from: {motion.frame}"
+    return Coordinates(frame, _YUP_FROM_CAMERA.apply(motion.up))
 
 
 def rest_pose(motion: Motion) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.export.about import About
+from intercap_core.export.coordinates import Coordinates
 from intercap_core.export.motion import Motion
 
 NUM_HAND_COMPONENTS = 12  # of the release; SMPLify-X's number, with flat_hand_mean=False
@@ -77,9 +78,10 @@ class _OldNames(pickle._Pickler):  # the C pickler offers no hook for names
 
 def write(path: Path, motion: Motion, about: About) -> None:
     """Write the pickle, protocol 4, with ``about`` beside the release's keys, and the same as .npz;
-    equal input gives equal bytes."""
-    found = result(motion)
+    equal input gives equal bytes. What ``about`` has of every frame are arrays in both."""
+    found, coordinates = result(motion), Coordinates.of(motion)
+    told = about.told(coordinates) | {"by_frame": about.by_frame_arrays()}
     with path.open("wb") as file:
-        _OldNames(file, protocol=4).dump({**found, "about": about.told(motion.frame)})
+        _OldNames(file, protocol=4).dump({**found, "about": told})
     arrays = {key: np.asarray(value) for key, value in found.items()}
-    np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays, **about.arrays(motion.frame))
+    np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays, **about.arrays(coordinates))

@@ -23,7 +23,8 @@ class Motion:
 
     ``parameters`` are those of the body, ``pelvis`` (3,) its pelvis joint in the shaped rest pose;
     ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are frame_from_object. ``frame`` says in words
-    which frame both are in.
+    which frame both are in, ``up`` (3,) is the unit vector up in it, NaN = not known. ``made_by``
+    names another program that found it, "" = this one.
     """
 
     sequence: str
@@ -37,6 +38,8 @@ class Motion:
     rotation: np.ndarray
     translation: np.ndarray
     frame: str
+    up: np.ndarray
+    made_by: str = ""
 
     def __len__(self) -> int:
         return len(self.rotation)
@@ -69,11 +72,21 @@ class Motion:
             rotation=turn @ self.rotation,
             translation=self.translation @ turn.T + shift,
             frame=frame,
+            up=turn @ self.up,
         )
 
 
-def read_motion(joint: Path, fps: float, body_models: BodyModels, gender: str) -> Motion:
-    """Read a joint artefact in the master camera's frame; raises UserError as reading does."""
+def read_motion(
+    joint: Path,
+    fps: float,
+    body_models: BodyModels,
+    gender: str,
+    zup_from_master: np.ndarray | None = None,
+) -> Motion:
+    """Read a joint artefact in the master camera's frame; raises UserError as reading does.
+
+    ``zup_from_master`` (4, 4) says where up is there, None = nobody does.
+    """
     with artefacts.read(joint, JOINT) as artefact:
         single = read_parameters(artefact)
         rotation, translation = artefact["rotation"], artefact["translation"]
@@ -97,4 +110,6 @@ def read_motion(joint: Path, fps: float, body_models: BodyModels, gender: str) -
         rotation=rotation,
         translation=translation,
         frame="master colour camera: x right, y down, z forward, metres",
+        up=np.full(3, np.nan) if zup_from_master is None else zup_from_master[2, :3].copy(),
+        made_by=str(told.get("made_by", "")),
     )

@@ -92,8 +92,13 @@ def object_poses(motion: Motion, rig: Rig, exposures: Exposures) -> Iterator[dic
     twist[known] = twists(poses[known], np.ones(known.sum(), bool), exposures.times[known])
     for number in range(len(rig)):
         seen = moved(poses, exposures.time_offset[number] * twist)
-        images = {int(image): t for t, image in enumerate(exposures.image_of[:, number])}
-        yield {image: seen[t] for image, t in sorted(images.items()) if image >= 0}
+        yield {image: seen[t] for image, t in sorted(frames_of(exposures, number).items())}
+
+
+def frames_of(exposures: Exposures, camera: int) -> dict[int, int]:
+    """Which frame each image of a camera shows, by the image's number."""
+    shown = enumerate(exposures.image_of[:, camera])
+    return {int(image): t for t, image in shown if image >= 0}
 
 
 def body_vertices(motion: Motion) -> np.ndarray:
@@ -123,7 +128,7 @@ def images_of(
     The object is where it was when the image was exposed; the body is that of the frame, which is
     some milliseconds earlier or later.
     """
-    frame_of = {int(image): t for t, image in enumerate(exposures.image_of[:, number])}
+    frame_of = frames_of(exposures, number)
     faces = motion.model.faces.numpy()
     for image, pose in poses.items():
         t = frame_of[image]

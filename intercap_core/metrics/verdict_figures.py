@@ -26,7 +26,9 @@ TRUE = {
 class StatedError:
     """Of a sequence's ``part``: the ``stated`` error, millimetres, within ``factor`` of which four
     of five true errors are, and the ``true`` one over the frames of which it is stated; NaN where
-    it is not known. ``silent``: why nothing is stated."""
+    it is not known. ``silent``: why nothing is stated. ``repeated``: by how much the part is
+    elsewhere where only the frames beside it are seen, odd from even and even from odd, in the mean
+    over the same frames, millimetres; NaN where nothing was held out."""
 
     sequence: str
     part: str
@@ -34,6 +36,7 @@ class StatedError:
     factor: float
     true: float
     silent: str = ""
+    repeated: float = float("nan")
 
 
 def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
@@ -59,6 +62,7 @@ def _stated(sequence: SequenceMetrics) -> tuple[StatedError, ...]:
             float(values["verdict/error_factor"][place]),
             _true(sequence, str(part), np.isfinite(values["verdict/error_frame"][place])),
             str(values["verdict/silent"][place]),
+            _repeated(sequence, place),
         )
         for place, part in enumerate(values["verdict/part_names"])
     )
@@ -78,6 +82,17 @@ def _true(sequence: SequenceMetrics, part: str, stated: np.ndarray) -> float:
         }
         judged = replace(sequence, values=some)
     return figures.truth_figures([judged], "joint").get(TRUE[part], float("nan"))
+
+
+def _repeated(sequence: SequenceMetrics, place: int) -> float:
+    """The mean of ``verdict/repeated`` of the part at ``place``, millimetres, over the frames of
+    which an error is stated, all where it is stated of none; NaN where it was not measured."""
+    if "verdict/repeated" not in sequence.values:
+        return float("nan")
+    moved = sequence.values["verdict/repeated"][place]
+    stated = np.isfinite(sequence.values["verdict/error_frame"][place])
+    known = moved[np.isfinite(moved) & (stated if stated.any() else True)]
+    return 1e3 * float(known.mean()) if len(known) else float("nan")
 
 
 def mean_stated(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:

@@ -1,12 +1,13 @@
 """What a stage has come to, in one line that a person understands, and what it could not do well.
 
-Both are read back from the artefact, so that what is said of kept results and of new ones is the
-same.
+Both are read back from what was written, so that what is said of kept results and of new ones is
+the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,31 @@ _CHOSEN_BY = {
     "middle": ", the subject is seen most",
 }
 _SURE = 0.5  # contact that is likelier than not
+_NAMED = 5  # sequences that a line names, of those that are left out
 
 
-def line(stage: str, path: Path) -> str:
-    """One line on what ``stage`` wrote; raises UserError where the artefact cannot be read."""
+def line(stage: str, path: Path, inputs: Mapping[str, Path] | None = None) -> str:
+    """One line on what ``stage`` wrote, an artefact or a folder, from its ``inputs`` by stage.
+
+    Raises UserError where an artefact cannot be read.
+    """
+    if stage in _FOLDER_LINES:
+        return _FOLDER_LINES[stage](path, inputs or {})
     with artefacts.read(path, getattr(schemas, stage.upper())) as artefact:
         return _LINES[stage](artefact)
+
+
+def dataset_line(results: Path) -> str:
+    """One line on what was merged of a dataset's sequences, from the card in its ``results``."""
+    card = json.loads((results / "card.json").read_text(encoding="utf-8"))
+    counts, failed = card["counts"], [entry["sequence"] for entry in card["failed"]]
+    merged = int(counts["sequences"])
+    words = f"{merged} of {merged + len(failed)} sequences merged, {counts['frames']:,} frames"
+    if failed:
+        named = ", ".join(failed[:_NAMED])
+        more = len(failed) - _NAMED
+        words += f"; left out: {named}" + (f" and {more} more" if more > 0 else "")
+    return words
 
 
 def notes(stage: str, path: Path) -> list[str]:
@@ -179,6 +199,34 @@ def _summary(summary: Artefact) -> str:
         words += f", {_share(summary['contact_frame'])} in contact"
     return words
 
+
+def _page(folder: Path, inputs: Mapping[str, Path]) -> str:
+    pictures = (folder / "index.html").read_text(encoding="utf-8").count("data:image/")
+    words = f"{pictures} pictures, {_megabytes(folder)} with the viewer"
+    if "frames" not in inputs:
+        return words
+    with artefacts.read(inputs["frames"], schemas.FRAMES) as recorded:
+        return f"{_share(recorded['present'])} cameras, {words}"
+
+
+def _export(folder: Path, _: Mapping[str, Path]) -> str:
+    told = json.loads((folder / "export.json").read_text(encoding="utf-8"))
+    files = sum(path.is_file() for path in folder.rglob("*"))
+    return (
+        f"{', '.join(told['formats']) or 'no format'}: {told['frames']} frames in {files} files, "
+        f"{_megabytes(folder)}"
+    )
+
+
+def _megabytes(folder: Path) -> str:
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return f"{size / 1e6:.1f} MB"
+
+
+_FOLDER_LINES: dict[str, Callable[[Path, Mapping[str, Path]], str]] = {
+    "page": _page,
+    "export": _export,
+}
 
 _LINES: dict[str, Callable[[Artefact], str]] = {
     "frames": _frames,

@@ -70,7 +70,7 @@ def run_step(
     if not STAGES[stage].writes_folder:
         for note in outcome.notes(stage, output):
             log.warning("sequence %s: %s", sequence, note)
-        log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output))
+    log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output, inputs))
 
 
 def _give_back_memory() -> None:
@@ -142,7 +142,7 @@ def run_dataset(project: Project) -> Path:
 
     folder = project.results
     reasons = {name: last_failure(project.logs / name) for name in project.config.exclude}
-    return dataset.run(
+    page = dataset.run(
         dataset=project.config.dataset,
         summaries={name: project.artefact(name, "summary") for name in project.sequences},
         objects=project.objects,
@@ -157,3 +157,5 @@ def run_dataset(project: Project) -> Path:
         failed={name: reason for name, reason in reasons.items() if reason},
         changed=changed(project.config),
     )
+    log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
+    return page

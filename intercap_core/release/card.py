@@ -40,8 +40,8 @@ CONVENTIONS = {
     "length": "metres; tables say millimetres in their columns' names",
     "angle": "radians; rotations are 3x3 matrices or rotation vectors, applied on the left",
     "artefacts": "the master colour camera's frame: x right, y down, z forward",
-    "exports": "amass and glb as export.json says, z up with the ground at z = 0 unless it says "
-    "otherwise; intercap, bop and coco in camera frames",
+    "exports": "amass, glb and meshes as export.json says, z up with the ground at z = 0 unless it "
+    "says otherwise; intercap, bop and coco in camera frames",
     "frames": "numbered from 0, the frame sets of the recording; images of a camera may have "
     "slipped, image_of in scene.h5 and the exports' own numbers say which shows which frame",
     "body": "parameters in SMPL-X's order for the body file named; another file with the same "
@@ -57,7 +57,8 @@ FORMATS = {
     "bop": "*/export/bop: the object's poses, masks and lenses as BOP has them",
     "coco": "*/export/coco/annotations.json: masks, boxes and keypoints of person and object",
     "glb": "*/export/glb: animated body and object",
-    "contact": "*/export/contact: contact by frame and region",
+    "contact": "*/export/contact: contact by frame and region, and the vertices that touch",
+    "meshes": "*/export/meshes: body and object of each frame as mesh files",
 }
 
 

@@ -42,6 +42,7 @@ _FILES = {  # formats of the exports: glob patterns and media type
     "coco": ("*/export/coco/annotations.json", "application/json"),
     "glb": ("*/export/glb/*.glb", "model/gltf-binary"),
     "contact": ("*/export/contact/*.tsv", "text/tab-separated-values"),
+    "meshes": ("*/export/meshes/Mesh/*", "application/octet-stream"),
 }
 
 

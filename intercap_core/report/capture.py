@@ -24,6 +24,7 @@ from intercap_core.schemas import FRAMES, SCENE
 
 _MAX_PAIRS = 45
 _LEAST_PROFILE_MM = 10.0
+_BIAS = 6  # of a camera's rows of camera_covariance, after its turn and its shift
 _GAP = 1.5  # frame periods between two sets that are more than one step apart
 STATES = ("recorded", "part", "slipped", "missing", "dropped")
 _WORDS = {
@@ -40,7 +41,8 @@ class CameraFacts:
     """One camera of a capture; seconds, metres, NaN = not known.
 
     ``state`` (T,) of STATES; ``slip`` (T,) whole frames; ``turned_deg`` and ``moved`` by
-    refinement, ``slide`` the deviation of the pose in the direction in which it is least known.
+    refinement, ``slide`` the deviation of the pose in the direction in which it is least known,
+    ``depth_bias_sigma`` that of the depth bias.
     """
 
     name: str
@@ -51,6 +53,7 @@ class CameraFacts:
     offset: float
     offset_sigma: float
     depth_bias: float
+    depth_bias_sigma: float
     moved: float
     turned_deg: float
     slide: float
@@ -178,6 +181,8 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
         refined[key] for key in ("time_offset", "time_offset_sigma", "depth_bias")
     )
     has_depth = refined["depth_size"][:, 0] > 0
+    variance = np.einsum("cici->ci", refined["camera_covariance"])[:, _BIAS]
+    bias_sigma = np.sqrt(np.maximum(variance, 0))  # 0 = none is stated
     notes = zip(recorded.text("note"), refined.text("note"), strict=True)
     # artefacts from before each camera was judged by itself have neither
     told = "camera_verdict" in refined
@@ -197,6 +202,7 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
                 offset=float(offset[c]),
                 offset_sigma=float(sigma[c]),
                 depth_bias=float(bias[c]) if has_depth[c] else float("nan"),
+                depth_bias_sigma=float(bias_sigma[c]) if bias_sigma[c] > 0 else float("nan"),
                 moved=float(np.linalg.norm(end[c, :3, 3] - start[c, :3, 3])),
                 turned_deg=float(np.degrees(np.arccos(cosine[c]))),
                 slide=float(slides[c]) if slides[c] > 0 else float("nan"),
@@ -304,6 +310,15 @@ def _offset(camera: CameraFacts) -> str:
     return f"{1e3 * camera.offset:+.1f} ± {1e3 * camera.offset_sigma:.1f}"
 
 
+def _bias(camera: CameraFacts) -> str:
+    """Millimetres, with its deviation where one is stated; "" of a camera without depth."""
+    if not np.isfinite(camera.depth_bias):
+        return ""
+    words = f"{1e3 * camera.depth_bias:.1f}"
+    sigma = camera.depth_bias_sigma
+    return f"{words} ± {1e3 * sigma:.1f}" if np.isfinite(sigma) else words
+
+
 def _row(camera: CameraFacts, master: str) -> dict[str, Any]:
     states = list(camera.state)
     return {
@@ -312,7 +327,7 @@ def _row(camera: CameraFacts, master: str) -> dict[str, Any]:
         "recorded": camera.recorded,
         "counts": [states.count(state) for state in ("missing", "slipped")],
         "offset": _offset(camera),
-        "bias": 1e3 * camera.depth_bias,
+        "bias": _bias(camera),
         "moved": 1e3 * camera.moved,
         "turned": camera.turned_deg,
         "slide": 1e3 * camera.slide,

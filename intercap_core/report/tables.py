@@ -63,6 +63,7 @@ def sequence_table(
             row[f"verdict.{error.part}_mm"] = error.stated
             row[f"verdict.{error.part}_factor"] = error.factor
             row[f"verdict.{error.part}_silent"] = error.silent
+            row[f"verdict.{error.part}_odd_even_mm"] = error.repeated
         before, after = residuals.get(s.name, (np.nan, np.nan))
         row["extrinsics_residual_before_mm"] = 1e3 * before
         row["extrinsics_residual_after_mm"] = 1e3 * after

@@ -53,10 +53,13 @@ def _row(name: str, parts: Sequence[str], errors: Sequence[StatedError]) -> dict
 
 
 def _cell(error: StatedError | None) -> dict[str, Any]:
-    if error is None or not np.isfinite(error.stated):
-        return {"stated": None, "range": "", "true": None if error is None else error.true}
+    if error is None:
+        return {"stated": None, "range": "", "true": None, "repeated": None}
+    known = {"true": error.true, "repeated": error.repeated}
+    if not np.isfinite(error.stated):
+        return {"stated": None, "range": "", **known}
     low, high = error.stated / error.factor, error.stated * error.factor
-    return {"stated": error.stated, "range": f"{low:.1f}–{high:.1f}", "true": error.true}
+    return {"stated": error.stated, "range": f"{low:.1f}–{high:.1f}", **known}
 
 
 def _cameras(s: SequenceMetrics) -> list[dict[str, Any]]:

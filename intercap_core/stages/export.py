@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,21 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, ExportSettings, ObjectEntry, SubjectEntry
-from intercap_core.export import amass, bop, coco, contact, glb, intercap
+from intercap_core.errors import UserError
+from intercap_core.export import amass, body_files, bop, coco, contact, glb, intercap, meshes
 from intercap_core.export.about import About, BodyFile
+from intercap_core.export.body_files import Written
+from intercap_core.export.coordinates import Coordinates
+from intercap_core.export.deviations import Deviations
 from intercap_core.export.motion import Motion, read_motion
 from intercap_core.export.readme import needs_object, readme
 from intercap_core.export.silhouettes import Exposures, body_vertices, object_poses
+from intercap_core.export.touching import TouchingSurfaces
 from intercap_core.export.upright import z_up_frame
+from intercap_core.export.verdict import Verdict
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, SCENE
@@ -32,6 +38,7 @@ log = logging.getLogger(__name__)
 MANIFEST = "export.json"
 _OF_IMAGES = {"bop", "coco"}  # formats that say what is in each image
 _OF_BODIES = {"intercap", "amass"}  # formats of parameters, which say nothing without the mesh
+_NO_FRAME = "none: numbers of vertices and regions, distances in metres"
 
 
 def run(
@@ -40,6 +47,8 @@ def run(
     joint: Path,
     scene: Path,
     metrics: Path,
+    body_fit: Path,
+    object_track: Path,
     object_: ObjectEntry | None,
     subject: SubjectEntry,
     body_models: BodyModels,
@@ -52,7 +61,8 @@ def run(
     an earlier export goes only when the new one is complete. README.txt says what ``metrics``
     state of the errors, and what is left out without an object (``object_`` is None, or it was
     found in no frame). Raises UserError where an artefact or the object's mesh is missing or
-    broken, and where ``output`` holds anything but an export.
+    broken, where the metrics are of another body, object or number of frames than the joint result,
+    and where ``output`` holds anything but an export.
     """
     output = Path(output)
     check_replaceable(output, marker=MANIFEST, what="export")
@@ -65,22 +75,19 @@ def run(
     with artefacts.read(joint, JOINT) as fit:
         rig = given.moved(fit["master_from_colour"])
         exposures = Exposures(image_of, times, fit["time_offset"])
-    motion = read_motion(joint, fps, body_models, subject.gender)
+    motion = read_motion(joint, fps, body_models, subject.gender, zup_from_master)
     if not motion.has_object:
         mesh = None
     z_up = settings.frame == "z-up"
+    viewed_from_master = zup_from_master if z_up else np.eye(4)
     viewed = motion.moved(zup_from_master, upright) if z_up else motion
     named = sorted(set(settings.formats))
     formats = [name for name in named if mesh is not None or not needs_object(name)]
     for name in set(named) - set(formats):
         log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
-    stated_contact = contact.StatedContact.read(joint)
-    about = About.read(
-        SequenceMetrics.read(metrics),
-        BodyFile.of(motion.model, motion.gender),
-        None if mesh is None else stated_contact,
-    )
-    bodies = body_vertices(motion) if set(formats) & _OF_IMAGES else np.zeros((0, 0, 3))
+    about = _about(joint, metrics, body_fit, object_track, motion, mesh)
+    posed = set(formats) & (_OF_IMAGES | {"meshes"})
+    bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
     poses = list(object_poses(motion, rig, exposures))
     with replaced(output) as folder:
         for name in formats:
@@ -100,19 +107,62 @@ def run(
                     folder / "coco" / "annotations.json", motion, rig, mesh, exposures, about,
                     bodies, poses,
                 )  # fmt: skip
-            elif name == "contact":
-                contact.write(folder / "contact", stated_contact)
-            else:
+            elif name == "contact" and about.contact is not None and about.touching is not None:
+                contact.write(folder / "contact", about.contact, about.touching)
+            elif name == "meshes":
+                some = (apply(viewed_from_master, b) for b in bodies[:: settings.mesh_every])
+                meshes.write(
+                    folder / "meshes", viewed, some, mesh, about,
+                    kind=settings.mesh_format, every=settings.mesh_every,
+                )  # fmt: skip
+            elif name == "glb":
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
-        if about.body.is_open and set(formats) & _OF_BODIES:
-            (folder / "body").mkdir()
-            shutil.copyfile(about.body.path, folder / "body" / about.body.path.name)
+        files: Sequence[Written] = ()
+        if set(formats) & _OF_BODIES:
+            files = body_files.write(folder / "body", about.body)
         if settings.images and set(formats) & _OF_IMAGES:
             _copy_images(folder, frames, rig, exposures, formats)
-        text = readme(motion, viewed, mesh, named, about)
+        if about.verdict.stated:
+            _dump(folder / "verdict.json", {"sequence": motion.sequence, **about.verdict.whole()})
+        text = readme(motion, viewed, mesh, named, about, files, kind=settings.mesh_format)
         (folder / "README.txt").write_text(text, encoding="utf-8")
-        _write_manifest(folder, motion, viewed, formats, about)
+        coordinates = {
+            **dict.fromkeys(("amass", "meshes"), Coordinates.of(viewed)),
+            "intercap": Coordinates.of(motion),
+            "bop": Coordinates.of(motion, bop.UNITS),
+            "coco": Coordinates.of(motion, coco.UNITS),
+            "glb": glb.coordinates(viewed, z_up=z_up),
+            "contact": Coordinates(_NO_FRAME, np.full(3, np.nan)),
+        }
+        _write_manifest(folder, motion, formats, about, coordinates, files)
+
+
+def _about(
+    joint: Path,
+    metrics: Path,
+    body_fit: Path,
+    object_track: Path,
+    motion: Motion,
+    mesh: ObjectMesh | None,
+) -> About:
+    """What goes with the numbers; of another program's result no deviation is known."""
+    measured = SequenceMetrics.read(metrics)
+    if len(measured) != len(motion):
+        raise UserError(
+            f"{metrics}: holds {len(measured)} frames, but the joint result of sequence "
+            f"{motion.sequence!r} {len(motion)}: it was measured on another; re-run stage 'metrics'"
+        )
+    return About(
+        motion.sequence,
+        BodyFile.of(motion.model, motion.gender),
+        [str(reason) for reason in measured.values["flag_reason"]],
+        None if mesh is None else contact.StatedContact.read(joint),
+        Verdict.of(measured),
+        None if mesh is None else TouchingSurfaces.read(metrics, motion, mesh),
+        None if motion.made_by else Deviations.read(body_fit, object_track, motion),
+        motion.made_by,
+    )
 
 
 def _copy_images(
@@ -138,9 +188,10 @@ def _copy_images(
 def _write_manifest(
     output: Path,
     motion: Motion,
-    viewed: Motion,
     formats: Sequence[str],
     about: About,
+    coordinates: Mapping[str, Coordinates],
+    body: Sequence[Written],
 ) -> None:
     files = sorted(path for path in output.rglob("*") if path.is_file())
     content: dict[str, Any] = {
@@ -151,19 +202,25 @@ def _write_manifest(
         "frames": len(motion),
         "fps": motion.fps,
         "formats": list(formats),
-        "frame": {
-            **dict.fromkeys(("intercap", "bop", "coco"), motion.frame),
-            "amass": viewed.frame,
-            "glb": "y-up, turned by the root node from: " + viewed.frame,
-        },
+        "frame": {name: place.frame for name, place in coordinates.items()},
+        "up": {name: place.told()["up"] for name, place in coordinates.items()},
+        "up_axis": {name: place.up_axis for name, place in coordinates.items()},
+        "units": {name: place.units for name, place in coordinates.items()},
         "body": about.body.told(),
-        "stated_error_mm": about.told("")["stated_error_mm"],
+        "body_files": {
+            file.name: {k: v for k, v in vars(file).items() if k != "name"} for file in body
+        },
+        **about.verdict.told(),
         "files": {
             path.relative_to(output).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in files
         },
-    }  # fmt: skip
-    text = json.dumps(content, indent=1, sort_keys=True) + "\n"
+    }
     part = output / f".{MANIFEST}.part"
-    part.write_text(text, encoding="utf-8")
+    _dump(part, content)
     part.replace(output / MANIFEST)
+
+
+def _dump(path: Path, content: Mapping[str, Any]) -> None:
+    text = json.dumps(content, indent=1, sort_keys=True) + "\n"
+    path.write_text(text, encoding="utf-8")

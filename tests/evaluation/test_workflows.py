@@ -16,9 +16,10 @@ from intercap_core.cli import (
 )
 from intercap_core.evaluation import budget
 from intercap_core.evaluation.evaluate import PARTS
+from intercap_core.evaluation.part import Targets
 from intercap_core.evaluation.reference import worse
 from intercap_core.evaluation.workflows import Order, orders_of, progress
-from intercap_core.project import Project, load_project
+from intercap_core.project import load_project
 
 SETTINGS = {
     "sequences": SEQUENCE_SETTINGS,
@@ -31,23 +32,23 @@ SETTINGS = {
 
 
 @pytest.fixture(scope="module")
-def wanted() -> dict[str, tuple[str, list[Project]]]:
+def wanted() -> dict[str, Targets]:
     return {
-        name: (PARTS[name].stage, [load_project(path) for path in paths])
+        name: PARTS[name].targets([load_project(path) for path in paths])
         for name, paths in SETTINGS.items()
     }
 
 
-def _frames(wanted: dict[str, tuple[str, list[Project]]]) -> dict[Path, int]:
-    return budget.frames_of([project for _, some in wanted.values() for project in some])
+def _frames(wanted: dict[str, Targets]) -> dict[Path, int]:
+    return budget.frames_of([project for targets in wanted.values() for _, project in targets])
 
 
 def test_projects_wait_for_those_that_make_their_recordings(
-    wanted: dict[str, tuple[str, list[Project]]],
+    wanted: dict[str, Targets],
 ) -> None:
     orders = orders_of(wanted, _frames(wanted))
     by_name = {order.project.config.dataset: order for order in orders}
-    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 4 + 7
+    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 5 + 7
     assert orders[0] is by_name["object"]  # what most wait for comes first
     stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
     assert by_name["object"].stages == stages
@@ -56,8 +57,34 @@ def test_projects_wait_for_those_that_make_their_recordings(
     assert by_name["object_noise2"].after == []
 
 
+def test_people_alone_are_taken_to_the_export_and_nobody_else(wanted: dict[str, Targets]) -> None:
+    orders = orders_of(wanted, _frames(wanted))
+    to_export = [order for order in orders if "export" in order.stages]
+    assert [order.project.config.dataset for order in to_export] == ["field_alone"]
+    assert to_export[0].stages == ["export"]
+    jobs = [(name, stage) for _, name, stage in budget.jobs_of(to_export[0].project, ["export"])]
+    for name in to_export[0].project.sequences:
+        own = [stage for of, stage in jobs if of == name]
+        assert own[0] == "studio" and own[-2:] == ["metrics", "export"] and len(own) == 10
+
+
+def test_a_smaller_ring_is_expected_to_take_less() -> None:
+    """Of the studio what it records counts, of a stage what it is given."""
+    four, six = (load_project(Path(f"config/field/{name}.yaml")) for name in ("rates", "shoes"))
+    for stage in ("studio", "scene"):
+        some, every = (
+            budget.expected_seconds(project, stage, 60) - budget.SECONDS_PER_START
+            for project in (four, six)
+        )
+        assert some == pytest.approx(4 / 6 * every)
+    of_six = load_project(Path("config/body/four_view.yaml"))
+    made = {stage: budget.expected_seconds(of_six, stage, 60) for stage in ("studio", "scene")}
+    assert made["scene"] == budget.expected_seconds(four, "scene", 60)
+    assert made["studio"] >= budget.expected_seconds(six, "studio", 60)
+
+
 def test_each_part_is_expected_to_keep_to_its_budget(
-    wanted: dict[str, tuple[str, list[Project]]],
+    wanted: dict[str, Targets],
 ) -> None:
     frames = _frames(wanted)
     minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)

@@ -27,16 +27,17 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.camera.masks import decode
 from intercap_core.capture.synchronise import images_of_moments
-from intercap_core.config import ExportSettings, MetricsSettings, Symmetry
+from intercap_core.config import Symmetry
 from intercap_core.errors import UserError
 from intercap_core.export import bop, coco
 from intercap_core.export.about import About, BodyFile
 from intercap_core.export.motion import read_motion
 from intercap_core.export.silhouettes import Exposures, object_poses
+from intercap_core.export.verdict import Verdict
 from intercap_core.rigid.symmetry import SymmetryGroup
-from intercap_core.schemas import METRICS, SCENE
-from intercap_core.stage_list import STAGES
-from intercap_core.stages import export, metrics
+from intercap_core.schemas import METRICS
+from intercap_core.stages import export
+from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
 
 OFFSET = np.array([0, fitted.BODY_OFFSET_M, 0])
@@ -44,41 +45,8 @@ OBJECT_OFFSET = np.array([0, fitted.OBJECT_OFFSET_M / 2, 0])
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    made = fitted.make_capture(tmp_path_factory.mktemp("capture"), object_name="cup")
-    metrics.run(
-        **made.inputs(*STAGES["metrics"].reads),
-        output=made.paths["metrics"],
-        object_=made.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
-        settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
-    )
-    return made
-
-
-def _run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
-    export.run(
-        **capture.inputs(*STAGES["export"].reads),
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
-        settings=ExportSettings(**settings),
-        output=output,
-    )
-    return output
-
-
-@pytest.fixture(scope="module")
 def folder(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _run(capture, tmp_path_factory.mktemp("export") / "out")
-
-
-@pytest.fixture(scope="module")
-def zup_from_master(capture: fitted.Capture) -> np.ndarray:
-    with artefacts.read(capture.paths["scene"], SCENE) as scene:
-        return scene["zup_from_master"]
+    return exported.run(capture, tmp_path_factory.mktemp("export") / "out")
 
 
 def _pose(capture: fitted.Capture, **values: np.ndarray) -> np.ndarray:
@@ -129,11 +97,12 @@ def test_amass_body_and_object_stand_on_the_ground(
 
 
 def test_amass_in_the_camera_frame(capture: fitted.Capture, tmp_path: Path) -> None:
-    out = _run(capture, tmp_path / "out", formats=("amass",), frame="camera")
+    out = exported.run(capture, tmp_path / "out", formats=("amass",), frame="camera")
     with np.load(out / "amass" / "body.npz") as arrays:
         found = _amass_vertices(capture, arrays)
     assert found == pytest.approx(capture.vertices + OFFSET, abs=1e-5)
-    assert sorted(p.name for p in out.iterdir()) == ["README.txt", "amass", "body", "export.json"]
+    names = ["README.txt", "amass", "body", "export.json", "verdict.json"]
+    assert sorted(p.name for p in out.iterdir()) == names
 
 
 def test_moving_a_motion_forth_and_back(capture: fitted.Capture) -> None:
@@ -222,7 +191,8 @@ def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
     image_of = images_of_moments(slip, np.ones((total, 3), bool))
     exposures = Exposures(image_of, times, late)
     poses = list(object_poses(motion, capture.rig, exposures))
-    about = About("cap", BodyFile.of(motion.model, "neutral"), [""] * total, None, [])
+    nothing = Verdict((), np.zeros((0, total)), ())
+    about = About("cap", BodyFile.of(motion.model, "neutral"), [""] * total, None, nothing)
     bop.write(tmp_path / "bop", motion, capture.rig, capture.mesh, 9, exposures, about, None, poses)
     path = tmp_path / "bop" / "scenes" / "000001"
     entries = json.loads((path / "scene_gt.json").read_text())
@@ -344,7 +314,7 @@ def test_images_go_along_where_they_are_asked_for(
     capture: fitted.Capture, folder: Path, tmp_path: Path
 ) -> None:
     assert not list(folder.rglob("*.jpg"))
-    out = _run(capture, tmp_path / "out", formats=("bop", "coco"), images=True, masks=False)
+    out = exported.run(capture, tmp_path / "out", formats=("bop", "coco"), images=True, masks=False)
     read = COCO(str(out / "coco" / "annotations.json"))
     for image in read.loadImgs(read.getImgIds()):
         found = cv2.imread(str(out / "coco" / image["file_name"]))
@@ -516,7 +486,7 @@ def test_without_a_floor_it_is_said_what_turned_the_export_upright(
         file.attrs["ground_found"] = False
         if hint:
             file.attrs["up_source"] = hint
-    out = _run(replace(capture, paths=capture.paths | {"scene": scene}), tmp_path / "out")
+    out = exported.run(replace(capture, paths=capture.paths | {"scene": scene}), tmp_path / "out")
     manifest = json.loads((out / export.MANIFEST).read_text())["frame"]
     for told in (manifest["amass"], manifest["glb"], (out / "README.txt").read_text()):
         assert words in told and "no floor is known" in told and "gravity-aligned" not in told
@@ -529,7 +499,7 @@ def test_same_input_same_bytes_and_old_files_go(
     out.mkdir()
     (out / "old.txt").write_text("left by an earlier version")
     (out / export.MANIFEST).write_text("{}")
-    _run(capture, out)
+    exported.run(capture, out)
     assert [p.name for p in tmp_path.iterdir()] == ["again"]
     names = sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
@@ -544,7 +514,7 @@ def test_only_an_export_is_replaced(capture: fitted.Capture, tmp_path: Path) -> 
         path.write_text("years of work")
     for path, words in ((home, "neither empty nor an earlier export"), (file, "is a file")):
         with pytest.raises(UserError, match=words) as caught:
-            _run(capture, path)
+            exported.run(capture, path)
         assert str(path) in str(caught.value)
     assert file.read_text() == (home / "thesis.txt").read_text() == "years of work"
 
@@ -561,6 +531,6 @@ def test_an_export_that_fails_leaves_the_earlier_one(
 
     monkeypatch.setattr(export.intercap, "write", full)
     with pytest.raises(OSError, match="no space"):
-        _run(capture, out, formats=("intercap",))
+        exported.run(capture, out, formats=("intercap",))
     assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MANIFEST]
     assert (out / export.MANIFEST).read_text() == "earlier"

@@ -15,6 +15,7 @@ from intercap_core.errors import UserError
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.pipeline.outcome import line
 from intercap_core.schemas import JOINT, SCENE
+from intercap_core.stage_list import STAGES
 from intercap_core.stages import export, joint, metrics
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.site import write_site
@@ -47,7 +48,7 @@ def _measure(capture: fitted.Capture) -> None:
 def results(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export") / "files"
     export.run(
-        **capture.inputs("frames", "joint", "scene", "metrics"),
+        **capture.inputs(*STAGES["export"].reads),
         object_=capture.object_,
         subject=fitted.SUBJECT,
         body_models=fitted.BODY_MODELS,

@@ -89,6 +89,36 @@ def test_who_touches_the_object_is_the_subject_wherever_they_stand(tmp_path):
     assert subject_of(detections, touches=of_another).chosen_by == "middle"
 
 
+def with_other_in(own: list, other: list, cameras: tuple[int, ...], when: slice) -> list:
+    """One person an image: ``other`` in some ``cameras`` as long as ``when`` says, else ``own``."""
+    wrong = np.zeros((len(own), VIEWS), bool)
+    wrong[when, list(cameras)] = True
+    return [[(other if wrong[t, c] else own)[t][c] for c in range(VIEWS)] for t in range(len(own))]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "when"),
+    [
+        ((2,), slice(14, 15)),
+        ((2,), slice(8, 20)),
+        ((2,), slice(0, 12)),
+        ((2,), slice(0, SETS)),
+        ((1, 4), slice(8, 20)),  # which agree on whom they see
+    ],
+    ids=["one frame", "a while", "from the start on", "always", "two cameras"],
+)
+def test_another_person_costs_a_camera_its_frames_as_long_as_it_is_returned(
+    tmp_path, cameras, when
+):
+    """A detector of one person an image, which takes somebody else nearer to the camera."""
+    own, other = (people_of(walking(SETS, at, np.zeros(2))) for at in (MIDDLE, ASIDE))
+    found = subject_of(detections_of(tmp_path, with_other_in(own, other, cameras, when)))
+    expected = np.zeros((SETS, VIEWS), int)
+    expected[when, list(cameras)] = -1
+    np.testing.assert_array_equal(found.people, expected)
+    assert not found.doubts
+
+
 def point_on(people: list, person: int, t: int, c: int, **change) -> SubjectPoint:
     x, y = people[t][c][person][8, :2]
     values = {"camera": RIG.names[c], "frame": t, "x": x + 6, "y": y - 8} | change

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -16,7 +17,7 @@ from intercap_core.commands.inspect import print_summary
 from intercap_core.config import MetricsSettings
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
-from intercap_core.pipeline.step import run_step
+from intercap_core.pipeline.step import run_dataset, run_step
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from intercap_core.stages import metrics
@@ -70,6 +71,48 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     return made
 
 
+def _logged(caplog: pytest.LogCaptureFixture) -> str:
+    """The last thing that was said."""
+    said = [r.getMessage() for r in caplog.records if r.name.startswith("intercap_core.pipeline")]
+    return said[-1]
+
+
+def _of_folder(folder: Path) -> tuple[int, float]:
+    """Its files, and their size in MB."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return len(files), sum(path.stat().st_size for path in files) / 1e6
+
+
+def test_page_export_and_dataset_say_one_line_too(
+    project: Project, caplog: pytest.LogCaptureFixture
+) -> None:
+    inputs = {stage: project.artefact("s01", stage) for stage in SEQUENCE_STAGES}
+    folders = {stage: project.artefact("s01", stage) for stage in ("page", "export")}
+    with caplog.at_level(logging.INFO, "intercap_core"):
+        run_step("export", project, "s01", inputs=inputs, output=folders["export"])
+        files, size = _of_folder(folders["export"])
+        assert _logged(caplog) == (
+            "sequence s01, export: amass, bop, coco, contact, glb, intercap: 5 frames in "
+            f"{files} files, {size:.1f} MB"
+        )
+        run_step("page", project, "s01", inputs=inputs, output=folders["page"])
+        html = (folders["page"] / "index.html").read_text()
+        pictures, (_, size) = html.count('<img src="data:'), _of_folder(folders["page"])
+        assert pictures > 3 and _logged(caplog) == (
+            f"sequence s01, page: 3 of 3 cameras, {pictures} pictures, {size:.1f} MB with the "
+            "viewer"
+        )
+        run_dataset(project)
+        assert _logged(caplog) == "dataset trial: 1 of 1 sequences merged, 5 frames"
+        there = project.sequences["s01"]
+        lacking = {f"s{n:02d}": there for n in range(1, 9)}
+        run_dataset(replace(project, sequences=lacking))
+        assert _logged(caplog) == (
+            "dataset trial: 1 of 8 sequences merged, 5 frames; left out: s02, s03, s04, s05, s06 "
+            "and 2 more"
+        )
+
+
 @pytest.mark.parametrize("stage", SEQUENCE_STAGES)
 def test_a_stage_says_one_line(project: Project, stage: str) -> None:
     said = outcome.line(stage, project.artefact("s01", stage))
@@ -88,7 +131,10 @@ def test_flagged_frames_with_their_reasons(project: Project) -> None:
     assert reasons[0] == ("object lost, filled in", 2)
 
 
-def test_a_run_ends_with_remarks_worst_first(project: Project) -> None:
+def test_a_run_ends_with_remarks_worst_first(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # logs are where one works
     (found,) = remarks(project)
     assert found.share == pytest.approx(4 / 5)
     assert found.texts[0].startswith("4 of 5 frames flagged: object lost, filled in (2)")
@@ -116,6 +162,63 @@ def test_what_was_only_logged_is_repeated_once(
     (found,) = remarks(project)
     said = [text for text in found.texts if text.startswith("scene: ")]
     assert said == ["scene: camera k2: its pose is as given", "scene: the floor is a guess"]
+
+
+def _warn(log: Path, *texts: str) -> None:
+    with job(log.stem, log):
+        for text in texts:
+            logging.getLogger("intercap_core").warning(text)
+
+
+def _printed(project: Project) -> list[str]:
+    stream = io.StringIO()
+    print_remarks(project, Console(file=stream, width=80))
+    return stream.getvalue().splitlines()
+
+
+def test_warnings_of_page_export_and_dataset_are_repeated(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what several stages warn of, each that opens a mesh, is said once."""
+    monkeypatch.chdir(tmp_path)
+    for stage in ("page", "export"):
+        folder = project.artefact("s01", stage)
+        folder.mkdir(parents=True, exist_ok=True)
+    holes = "cup.ply: 9 % of its edges are open"
+    _warn(project.logs / "s01" / "object_track.log", holes)
+    _warn(project.logs / "s01" / "page.log", holes, "s01: no overlays: an image does not decode")
+    _warn(project.logs / "s01" / "export.log", holes, "sequence s01: no licence")
+    _warn(project.logs / "dataset.log", "sequence s07 is left out: its summary is broken")
+    (found,) = remarks(project)
+    assert [text for text in found.texts if holes in text] == [f"object_track: {holes}"]
+    assert "page: no overlays: an image does not decode" in found.texts
+    assert "export: no licence" in found.texts
+    printed = _printed(project)
+    assert printed[:2] == ["the dataset", "  sequence s07 is left out: its summary is broken"]
+    assert printed[-1] == f"all remarks: {project.logs / 'remarks.txt'}"
+    assert (project.logs / "remarks.txt").read_text().splitlines() == printed[:-1]
+
+
+def test_remarks_beyond_twenty_sequences_are_in_a_file(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = [f"t{n:02d}" for n in range(23)]
+    many = replace(project, sequences=dict.fromkeys(names, project.sequences["s01"]))
+    for name in names:
+        many.artefact(name, "page").mkdir(parents=True)
+        _warn(many.logs / name / "page.log", f"{name}: [red]no overlays")
+    printed = _printed(many)
+    assert printed[0] == "23 of 23 sequences have remarks, worst first:"
+    assert len(printed) == 1 + 2 * 20 + 1
+    assert printed[-1] == f"3 more sequences, and all remarks: {many.logs / 'remarks.txt'}"
+    kept = (many.logs / "remarks.txt").read_text().splitlines()
+    assert kept[:-6] == printed[:-1]
+    assert [line for line in kept if line.startswith("  ")] == ["  page: [red]no overlays"] * 23
+    for name in names:
+        (many.logs / name / "page.log").unlink()
+    assert _printed(many) == []
+    assert (many.logs / "remarks.txt").read_text() == "no remarks\n"
 
 
 def test_texts_are_printed_as_they_are(

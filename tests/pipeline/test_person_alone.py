@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -16,6 +17,8 @@ from intercap_core.commands.closeups import draw_closeups
 from intercap_core.commands.inspect import print_summary
 from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError
+from intercap_core.evaluation import field
+from intercap_core.evaluation.part import Measured
 from intercap_core.pipeline.outcome import line, notes
 from intercap_core.pipeline.step import run_dataset, run_step, run_studio
 from intercap_core.posed import open_sequence
@@ -116,6 +119,39 @@ def test_files_for_other_tools_hold_the_body(project: Project) -> None:
     data = (folder / "glb" / f"{NAME}.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     assert [mesh["name"] for mesh in json.loads(data[20 : 20 + length])["meshes"]] == ["body"]
+
+
+def test_a_person_alone_counts_who_has_come_to_the_export(project: Project) -> None:
+    def share() -> float:
+        found = field.measure(project, NAME)
+        return field.flat([Measured(field.ALONE, [found])])["field.people_alone_share"]
+
+    folder = project.artefact(NAME, "export")
+    assert field.exported_alone(folder) and share() == 1
+    missing = field.flat([Measured(field.ALONE, [field.measure(project, NAME)], ["another"])])
+    assert missing["field.people_alone_share"] == 0.5
+    away = folder.with_name("away")
+    folder.rename(away)
+    try:
+        assert not field.exported_alone(folder) and share() == 0
+    finally:
+        away.rename(folder)
+    body = folder / "amass" / "body.npz"
+    kept = body.rename(folder / "body.npz")
+    try:
+        assert not field.exported_alone(folder)
+    finally:
+        kept.rename(body)
+
+
+def test_the_evaluation_times_the_verdict(project: Project) -> None:
+    """The stage with it less the stage without it, of the first recording that has come so far."""
+    nowhere = replace(project, sequences={"nobody": project.sequences[NAME]})
+    assert field.PART.time_one([nowhere]) == {}
+    assert replace(field.PART, timed=None).time_one([project]) == {}
+    found = field.PART.time_one([nowhere, project])
+    assert list(found) == ["verdict.seconds_per_frame"]
+    assert abs(found["verdict.seconds_per_frame"]) < 60  # of 6 frames, beside whatever else runs
 
 
 def test_the_report_leaves_objects_and_contact_out(project: Project) -> None:

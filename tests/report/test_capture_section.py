@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +59,27 @@ def test_facts_of_cameras_and_pairs(made: fitted.Capture) -> None:
     assert [camera.turned_deg for camera in facts.cameras] == pytest.approx([0, 0, 0], abs=1e-4)
     assert [pair.name for pair in facts.pairs] == ["k1–k2", "k2–k3", "k3–k1"]
     assert "1,000 points" in facts.ground and "4.0 mm" in facts.ground
+
+
+def test_a_depth_bias_is_told_with_its_deviation(made: fitted.Capture, tmp_path: Path) -> None:
+    scene = Path(shutil.copy(made.paths["scene"], tmp_path / "scene.h5"))
+    with h5py.File(scene, "r+") as file:
+        file["depth_bias"][...] = [0.0021, -0.004, 0.001]
+        covariance = np.zeros((3, 7, 3, 7))
+        covariance[0, 6, 0, 6], covariance[1, 6, 1, 6] = 0.0003**2, 0.0012**2
+        covariance[2, 3:6, 2, 3:6] = 1e-6 * np.eye(3)  # of the pose alone
+        file["camera_covariance"][...] = covariance
+        file["depth_size"][2] = 0
+    facts = capture.read_capture(made.paths["frames"], scene)
+    assert [camera.depth_bias_sigma for camera in facts.cameras[:2]] == pytest.approx(
+        [0.0003, 0.0012]
+    )
+    rows = capture.context(facts)["cameras"]
+    assert [row["bias"] for row in rows] == ["2.1 ± 0.3", "-4.0 ± 1.2", ""]
+    (third,) = [
+        replace(camera, depth_bias=0.001) for camera in facts.cameras if camera.name == "k3"
+    ]
+    assert capture.context(replace(facts, cameras=[third]))["cameras"][0]["bias"] == "1.0"
 
 
 REDUCTIONS = {

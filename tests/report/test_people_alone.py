@@ -129,6 +129,10 @@ def test_tables_have_gaps_and_no_zeros(out: Path) -> None:
         assert row[[*columns, "contact_frames", "acceleration_object_mm"]].isna().all()
         assert row["vertex_to_cloud.body_mm"] > 0
     assert sorted(table["rank"]) == [1, 2, 3]
+    assert (table[[f"verdict.{part}_odd_even_mm" for part in ("body", "hands")]] > 0).all().all()
+    assert table["verdict.object_odd_even_mm"].notna().tolist() == [
+        name == HELD for name in table.index
+    ]
     frames = pd.read_parquet(out / "tables" / "frames.parquet").set_index("sequence")
     region = f"contact_probability.{CONTACT_REGIONS[0]}"
     assert frames.loc[ALONE, ["contact", region, "object_to_cloud_mm"]].isna().all().all()
@@ -149,6 +153,13 @@ def test_the_pages_show_each_sequence_what_it_has(out: Path) -> None:
     assert ">in contact<" in parts[HELD] and "touches the object" in parts[HELD]
     for name in (ALONE, MISSED):
         assert ">in contact<" not in parts[name]
+    table = pd.read_csv(out / "tables" / "sequences.csv").set_index("sequence")
+    for name, part in parts.items():
+        section = part.split('id="verdict"')[1].split("</table>")[0]
+        judged = ["body", "hands", *(["object"] if name == HELD else [])]
+        assert section.count("<small>odd against even, mm</small>") == len(judged)
+        for of in judged:
+            assert f"<td>{table.loc[name, f'verdict.{of}_odd_even_mm']:.1f}</td>" in section
     assert "p01, alone, 4 frames" in parts[ALONE] and 'id="track"' not in parts[ALONE]
     missed = parts[MISSED].split('id="track"')[1].split('id="body"')[0]
     assert WHY in missed and "found in no frame" in missed and "deviation of place" not in missed

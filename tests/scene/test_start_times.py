@@ -92,6 +92,29 @@ def test_somebody_who_stands_by_does_not_put_cameras_out_of_step(apart):
     assert np.abs(found.late - late).max() < 0.5 / fps
 
 
+@pytest.mark.parametrize("apart", [False, True], ids=["together", "apart"])
+def test_a_detector_that_returns_another_person_for_a_while_costs_those_images_alone(apart):
+    """One person an image; the third camera's is somebody else in two of five seconds, who passes
+    behind the subject: some of those images look late. No other image and no offset is touched."""
+    fps, rng = 15.0, np.random.default_rng(12)
+    late = np.r_[0.0, rng.uniform(-1, 1, len(RIG) - 1)] * apart
+    seen = walk(late, fps, 5.0)
+    times = np.arange(seen.num_sets) / fps
+    usual = find_moments(seen, RIG, times, fps, seen.available, master=0)
+    other = seen_by(walking(seen.num_sets, np.array([0.9, -0.7]), np.array([-0.01, 0])), RIG, UP)
+    other[..., :2] += rng.normal(0, 2, other[..., :2].shape)
+    wrong = np.zeros((seen.num_sets, len(RIG)), bool)
+    wrong[20:50, 2] = True
+    for t in range(20, 50):
+        seen.images[t][2] = [other[t, 2]]
+    found = find_moments(seen, RIG, times, fps, seen.available, master=0)
+    assert found.starts.apart == apart and not found.starts.in_doubt.any()
+    of_subject = (usual.image_of >= 0) & ~wrong[usual.image_of, np.arange(len(RIG))]
+    np.testing.assert_array_equal(found.image_of[of_subject], usual.image_of[of_subject])
+    left = found.starts.sets / fps - found.timing.offset - late
+    assert np.abs(left).max() < 0.005
+
+
 @dataclass
 class Slower:
     """What ``seen`` shows, in every ``every[c]``-th set of camera c."""

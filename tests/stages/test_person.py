@@ -145,6 +145,32 @@ def test_masks_follow_the_points_not_the_label_or_the_order(tmp_path, detected):
     assert chosen[3] == b"" and chosen[4] == b""
 
 
+def test_a_camera_that_shows_another_person_is_missed_for_as_long(tmp_path, detected):
+    """The detector returns one person an image; its keypoints and its mask in the third camera are
+    somebody else's in three sets. They are in nothing, and the other views lose nothing."""
+    other = seen_by(walking(T, np.array([0.9, 0.7]), np.zeros(2)), RIG, UP)
+    wrong = np.zeros((T, 6), bool)
+    wrong[2:5, 2] = True
+    seen = np.where(wrong[..., None, None], other, detected)
+    people = [[[seen[t, c]] for c in range(6)] for t in range(T)]
+    candidates = {
+        (t, c): [("person", masks.encode(silhouette(seen[t, c])))]
+        for t, c in np.argwhere(wrong | np.roll(wrong, 3, axis=0)).tolist()
+    }
+    with artefacts.read(run(tmp_path, people, candidates), PERSON) as found:
+        np.testing.assert_array_equal(found["person"], np.where(wrong, -1, 0))
+        assert (found["keypoints"][wrong] == 0).all() and not found["inlier"][wrong].any()
+        np.testing.assert_allclose(found["keypoints"][~wrong], detected[~wrong].astype(np.float32))
+        body = found["joint_views"][:, :25]
+        assert (np.median(body, axis=1) == np.where(wrong.any(1), 5, 6)).all()
+        truth = apply(invert(UP), BODY.reshape(-1, 3)).reshape(T, 135, 3)
+        error = np.linalg.norm(found["joints"] - truth, axis=-1)
+        assert error.max() < 0.03 and not found["missing"].any()
+        chosen = artefacts.unpack_ragged(found["mask_offsets"], found["mask_rle"])
+    for t, c in candidates:
+        assert chosen[t * 6 + c] == (b"" if wrong[t, c] else candidates[t, c][0][1])
+
+
 def test_slipped_images_count_where_their_moment_is(tmp_path, detected):
     """From set 3 on the fourth camera's images are two sets old: only moments 6 and 7 lack them."""
     slip = np.zeros((T, 6), np.int32)

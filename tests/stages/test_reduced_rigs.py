@@ -271,6 +271,7 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
         assert (found["truth/joint/body_pve"] < 0.02).all()
     export.run(
         frames=paths["frames"], joint=paths["joint"], scene=paths["scene"], metrics=measured,
+        body_fit=paths["body_fit"], object_track=paths["object_track"],
         output=tmp_path / "export", settings=ExportSettings(), **common,
     )  # fmt: skip
     inputs = {"metrics": measured, **{s: paths[s] for s in STAGES["metrics"].reads}}

@@ -105,6 +105,15 @@ def test_the_true_error_is_that_of_frames_with_a_stated_one() -> None:
     assert stated_errors(sequence)[0].true == pytest.approx(1e3 * (0.006 + 0.008 + 0.9) / 3)
 
 
+def test_odd_against_even_is_of_frames_with_a_stated_error() -> None:
+    sequence = _sequence("a", 6, 6)
+    assert np.isnan(stated_errors(sequence)[0].repeated)  # older metrics, or nothing held out
+    sequence = replace(sequence, values=dict(sequence.values))
+    sequence.values["verdict/repeated"] = np.array([[0.001, 0.003, 0.5]])
+    sequence.values["verdict/error_frame"] = np.array([[0.006, 0.006, np.nan]])
+    assert stated_errors(sequence)[0].repeated == pytest.approx(2)
+
+
 def test_no_figures_without_verdict_or_truth() -> None:
     bare = SequenceMetrics("a", "p", "cup", 30.0, False, {})
     assert not stated_errors(bare) and verdict_figures([bare]) == {}

@@ -1,5 +1,5 @@
 rule export:
-    """Files for other tools: InterCap, AMASS, BOP, COCO, glb."""
+    """Files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes."""
     input:
         **artefacts_read("export"),
         object=object_files,
