@@ -137,6 +137,7 @@ def run_dataset(project: Project) -> Path:
     Sequences that the project excludes because they failed are named in it, and those whose
     summary is missing or broken. Raises UserError where none is left.
     """
+    from intercap_core.report.settings import changed
     from intercap_core.stages import dataset
 
     folder = project.results
@@ -154,6 +155,7 @@ def run_dataset(project: Project) -> Path:
         formats=project.config.export.formats,
         virtual=all(project.recordings_made(name) is not None for name in project.sequences),
         failed={name: reason for name, reason in reasons.items() if reason},
+        changed=changed(project.config),
     )
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return page

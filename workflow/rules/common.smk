@@ -10,6 +10,7 @@ from intercap_core.errors import UserError
 from intercap_core.imports.results import file_of
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.project import load_project
+from intercap_core.report.settings import changed
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 

@@ -25,6 +25,7 @@ rule dataset:
         entries=all_entries(),
         card=settings_of("card"),
         formats=SETTINGS.export.formats,
+        changed=changed(SETTINGS),
         code=code_of("dataset"),
     message:
         "the site's first page"
