@@ -166,10 +166,11 @@ def test_detections_are_found_by_any_usual_name_of_the_sequence(release, tmp_pat
 
 
 def test_the_releases_own_results_are_named_where_they_are_asked_for(release, tmp_path):
-    (tmp_path / "Res" / "01" / "09" / "Seg_0").mkdir(parents=True)
-    _, project = _write(release, results=tmp_path / "Res")
+    (tmp_path / "Res" / "03" / "09" / "Seg_0").mkdir(parents=True)
+    write("--results", "Res")
+    project = load_project(Path("config/intercap/config.yaml"))
     named = {name: row.results for name, row in project.sequences.items() if row.results}
-    assert named == {"s01_o09_seg0": tmp_path / "Res" / "01" / "09" / "Seg_0"}
+    assert named == {"s03_o09_seg0": Path("Res/03/09/Seg_0")}
 
 
 def test_nothing_is_written_over_unasked(release):
