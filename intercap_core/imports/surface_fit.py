@@ -33,7 +33,7 @@ from intercap_core.solve.levenberg_marquardt import NormalEquations, minimise
 from intercap_core.solve.robust import geman_mcclure_weight
 
 _REST = slice(66, 75)  # jaw and eyes, which stay
-_FREE, _FINGERS = slice(0, 3), slice(75, 165)  # the pelvis' turn, which nothing holds
+_ROOT, _FINGERS = slice(0, 3), slice(75, 165)  # the pelvis' turn, and the hands' joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class _Surfaces:
     def _stiffness(self, fingers: bool) -> Tensor:
         """(n,) 1/rad^2 of the pose about where it starts; none of the pelvis' turn and place."""
         found = torch.full((len(self.columns),), constants.POSE_SIGMA**-2)
-        found[: _FREE.stop] = 0.0
+        found[_ROOT] = 0.0
         found[(self.columns >= _FINGERS.start) & (self.columns < _FINGERS.stop)] = (
             constants.FINGER_SIGMA if fingers else constants.HELD_SIGMA
         ) ** -2
@@ -171,9 +171,7 @@ class _Surfaces:
         )
         ones = torch.ones(len(target.points), dtype=samples.dtype)
         none = torch.zeros(len(samples), dtype=samples.dtype)
-        mean, count = body_cloud.gather(
-            matches, ones, none, len(samples), huber=constants.FAR_M
-        )  # fmt: skip
+        mean, count = body_cloud.gather(matches, ones, none, len(samples), huber=constants.FAR_M)
         both = torch.stack([facing, along], 1)
         away = torch.stack([(facing * (samples - there)).sum(1), -mean], 1)
         valid = torch.stack([agrees, count > 0.5], 1)
@@ -260,9 +258,8 @@ class _Problem:
         hessian = own.new_zeros(len(own), n + m, n + m)
         for at in _chunks(len(own)):
             rows = _Rows(*(part[index[at]] for part in self.rows))
-            linear = self.model.linearise(
-                self.model.parameters(vectors[at]), vertex_ids=self.ids
-            )  # fmt: skip
+            params = self.model.parameters(vectors[at])
+            linear = self.model.linearise(params, vertex_ids=self.ids)
             away = (rows.normal * linear.vertices[:, :, None]).sum(3) - rows.target
             whole, by = linear.normal_equations(rows.normal, rows.weight, away)
             gradient[at] = by[:, columns]

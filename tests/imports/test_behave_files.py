@@ -20,6 +20,7 @@ from intercap_core.imports.behave_files import (
     read_person_pose,
     read_skin,
 )
+from intercap_core.imports.file_names import PERSON_MESH, files_of
 from tests.helpers.behave_results import write_30_fps, write_mesh
 
 # SMPL-H's joints as its publishers list them: the body, then the hands
@@ -97,6 +98,18 @@ def test_the_object_is_found_under_the_name_of_its_kind(tmp_path: Path) -> None:
     named.touch()
     (tmp_path / "k0.color.jpg").touch()
     assert object_fits(tmp_path) == [named]
+
+
+def test_the_workflow_watches_the_folder_and_not_the_files_in_frames(tmp_path: Path) -> None:
+    frame = tmp_path / "t0003.000" / PERSON_MESH
+    frame.parent.mkdir(parents=True)
+    frame.touch()
+    assert files_of(tmp_path) == [tmp_path]
+    (tmp_path / "object_fit_all.npz").touch()
+    assert files_of(tmp_path) == [tmp_path, tmp_path / "object_fit_all.npz"]
+    (tmp_path / "res.pkl").touch()  # InterCap's own name for results goes first
+    assert files_of(tmp_path) == [tmp_path / "res.pkl"]
+    assert files_of(tmp_path / "res.pkl") == [tmp_path / "res.pkl"]
 
 
 class _Evil:
