@@ -180,7 +180,9 @@ def tables(
     results: Annotated[
         Path | None,
         typer.Option(
-            help="intercap: the release's own Res/, to measure and show in place of our joint fit."
+            help="Results to measure and show in place of our joint fit, a folder for each "
+            "sequence: InterCap's own Res/; of behave the data set's own folder, or that of its "
+            "parameters at 30 fps with meshes beside them."
         ),
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Write over files there.")] = False,
@@ -192,7 +194,8 @@ def tables(
 
     Examples: intercap tables intercap ~/InterCap --output config/intercap;
     intercap tables intercap ~/InterCap --results ~/InterCap/Res --dataset theirs --output
-    config/theirs; intercap tables behave ~/BEHAVE --output config/behave
+    config/theirs; intercap tables behave ~/BEHAVE --output config/behave; intercap tables behave
+    ~/BEHAVE --results ~/BEHAVE --dataset theirs --output config/theirs
     """
     from intercap_core.commands.tables import write_tables
     from intercap_core.tables.intercap import Sources

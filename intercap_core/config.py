@@ -500,9 +500,9 @@ class SequenceEntry(Model):
     candidates: Path | None = None
     """Folder of <camera>.json files: instance segmentation in COCO's result format."""
     results: Path | None = None
-    """Results that another program made of this sequence, as the InterCap release has them
-    (res.pkl, or its folder), in the master camera's frame: they are measured and shown in place of
-    the joint fit."""
+    """Results that another program made of this sequence, measured and shown in place of the joint
+    fit: as the InterCap release has them (res.pkl, or its folder), or the sequence's folder of
+    BEHAVE with its registrations; in the master camera's frame. See docs/recordings.md."""
     truth: Path | None = None
     """Truth of a virtual recording; read by the metrics alone."""
     annotation: Path | None = None

@@ -363,6 +363,13 @@ JOINT = Schema(
         ),
         "flagged": Field(("T",), "bool", "body or object of this frame should not be trusted"),
         "flag_reason": Field(("T",), "str", "why, in words; empty = not flagged"),
+        "surface_distance": Field(
+            ("T", "2"),
+            "float64",
+            "mean and 95th percentile of how far the skin is from an imported one of another mesh that it was fitted to; NaN = there is none; absent otherwise",
+            "m",
+            optional=True,
+        ),
     },
 )
 

@@ -123,6 +123,18 @@ class Frames:
         return self._by_moment(self._artefact["skew"], np.nan)
 
     @cached_property
+    def first_set_s(self) -> float:
+        """When the first set was, by the recordings' own clock, seconds; NaN without images."""
+        index, skew = self._artefact["colour_index"], self._artefact["skew"].astype(float)
+        for c, name in enumerate(self.rig.names):
+            seen = np.flatnonzero(index[:, c] >= 0)
+            if len(seen):
+                t = seen[0]
+                taken = self._artefact[f"cameras/{name}/colour_time"]
+                return float(taken[index[t, c]]) * 1e-6 - skew[t, c] - float(self.time_s[t])
+        return float("nan")
+
+    @cached_property
     def first_image_s(self) -> np.ndarray:
         """(C,) when each camera's first image was taken by its own times, seconds since the first
         set, NaN = it has no image in any set."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from dataclasses import replace as changed
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -51,13 +52,12 @@ def write_tables(
     if layout == "intercap":
         draft = intercap.draft(root, sources, dataset=name, objects=objects)
     elif layout == "behave":
-        if sources != intercap.Sources():
+        if changed(sources, results=None) != intercap.Sources():
             raise UserError(
                 "layout 'behave' has calibration, meshes and detections in places of its own; "
-                "leave out --calibrations, --annotations, --meshes, --keypoints, --candidates and "
-                "--results"
+                "leave out --calibrations, --annotations, --meshes, --keypoints and --candidates"
             )
-        draft = behave.draft(root, dataset=name)
+        draft = behave.draft(root, dataset=name, results=sources.results)
     else:
         raise UserError(f"layout {layout!r} is not known, expected intercap or behave")
     written = write_project(draft, output, replace=replace)

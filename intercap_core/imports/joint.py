@@ -15,9 +15,11 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, invert
+from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
-from intercap_core.imports.results import Results, read_results
+from intercap_core.imports.releases import read_results
+from intercap_core.imports.results import Recording, Results
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON, SCENE
 
 log = logging.getLogger(__name__)
@@ -32,27 +34,32 @@ _POSE = ("global_orient", "transl", "body_pose", "jaw_pose", "leye_pose", "reye_
 def import_joint(
     results: Path,
     *,
+    frames: Path,
     scene: Path,
     person: Path,
     output: Path,
     object_: ObjectEntry | None,
     subject: SubjectEntry,
     body_models: BodyModels,
+    betas: int,
     settings_digest: str,
 ) -> None:
     """Write joint.h5 of what another program found, in place of a fit.
 
     Cameras are those that were given, which the results belong to, with depth as measured; contact
     is what the meshes say, so that no probability is stated, nor is any energy. Frames without a
-    result are filled from the nearest one and flagged. Raises UserError where the results are of
+    result are filled from the nearest one and flagged. ``betas``: numbers of the shape, where
+    results are of another body and ours is fitted to it. Raises UserError where the results are of
     another number of frames, or of more numbers than the body file has.
     """
-    found = read_results(results)
     path = body_models.of(subject.gender) or OPEN_BODY
     with artefacts.read(scene, SCENE) as setting:
         total, sequence = len(setting["times"]), str(setting.attributes["sequence"])
         rig = Rig.from_artefact(setting).moved(setting["master_from_colour_start"])
         offsets, offset_sigma = setting["time_offset"], setting["time_offset_sigma"]
+    with Frames.open(frames) as recorded:
+        times = recorded.first_set_s + recorded.time_s
+    found = read_results(results, Recording(sequence, times, object_, path, betas))
     if len(found) != total:
         raise UserError(
             f"{found.path}: holds {len(found)} frames, sequence {sequence!r} has {total}; name the "
@@ -67,13 +74,14 @@ def import_joint(
     fill = np.arange(total)
     places = np.flatnonzero(known)
     fill[~known] = places[np.abs(places[None] - fill[~known, None]).argmin(axis=1)]
-    betas = np.median(found.betas[known], axis=0)
-    params = _parameters(found, model, fill, betas)
+    shape = np.median(found.betas[known], axis=0)
+    params = _parameters(found, model, fill, shape)
     with torch.no_grad():
         posed = model.forward(params, vertex_ids=model.keypoint_map.vertex_ids)
         keypoints = model.keypoints(posed).double().numpy()
-    reasons = np.where(known, "", "no result in the imported file").astype(object)
-    varies = _shape_varies(model, found.betas[known], betas)
+    nothing_told = np.where(known, "", "no result in the imported file")
+    reasons = list(found.reasons) or list(nothing_told)
+    varies = _shape_varies(model, found.betas[known], shape)
     if varies > _SHAPE_VARIES_M:
         log.warning(
             "sequence %s: the shape in %s varies by frame; its median was taken, up to %.0f mm "
@@ -101,9 +109,9 @@ def import_joint(
         refused=0,
         converged=True,
         cameras_corrected=False,
-        made_by=f"another program: {found.path.name}",
+        made_by=f"another program: {found.source}",
     ) as writer:
-        writer.put("betas", betas.astype(np.float32))
+        writer.put("betas", shape.astype(np.float32))
         writer.put("expression", params.expression.numpy())
         for name in _POSE:
             writer.put(name, getattr(params, name).numpy())
@@ -125,8 +133,10 @@ def import_joint(
         writer.put("energy_before", np.zeros(0))
         writer.put("energy_after", np.zeros(0))
         writer.put("hand_undetermined", np.zeros((total, 2), bool))
-        writer.put("flagged", ~known)
-        writer.put("flag_reason", list(reasons))
+        writer.put("flagged", np.array([bool(reason) for reason in reasons]))
+        writer.put("flag_reason", reasons)
+        if found.surface_distance is not None:
+            writer.put("surface_distance", found.surface_distance)
 
 
 def _parameters(

@@ -1,23 +1,32 @@
-"""What another program found of a sequence: bodies in SMPL-X's order and poses of the object."""
+"""What another program found of a sequence, in the form that every release is brought to."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from intercap_core import safe_pickle
+from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.imports.constants import MOST_M, MOST_RAD
 
-NAMES = ("res.pkl", "res.npz", "res_2.pkl", "res_1.pkl")  # of the release, the newest first
-_HANDS = 45  # numbers of a hand's full pose; fewer are components
-_TURNS = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
-_MOST_M = 100.0  # a translation beyond this is in other units
-_MOST_RAD = 100.0
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The sequence that results are asked for.
+
+    ``times`` (T,): of its frame sets, seconds on the clock of the recordings themselves (not from
+    the first on). ``object_``: None = a person alone. ``body``: the body file whose surface is
+    fitted where results are of another body, with ``betas`` numbers of the shape.
+    """
+
+    sequence: str
+    times: np.ndarray
+    object_: ObjectEntry | None
+    body: Path
+    betas: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +36,10 @@ class Results:
     ``turns``: rotation vectors by SMPL-X's names, (T, 3) or (T, 63); ``hands``: left and right,
     (T, 45) full poses, or (T, n) components over the hand's mean pose; ``transl`` (T, 3), ``betas``
     and ``expression`` (T, n). ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are
-    master_from_object, NaN throughout where there is no object.
+    master_from_object, NaN throughout where there is no object. ``source``: what they are, in
+    words. ``reasons`` (T,): why a frame has no result, or should not be trusted; empty = neither is
+    told. ``surface_distance`` (T, 2): mean and 95th percentile of how far a body that was converted
+    is from the surface that the results have; None where nothing was converted.
     """
 
     path: Path
@@ -38,6 +50,9 @@ class Results:
     expression: np.ndarray
     rotation: np.ndarray
     translation: np.ndarray
+    source: str
+    reasons: Sequence[str] = ()
+    surface_distance: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.transl)
@@ -52,104 +67,18 @@ class Results:
         return np.all(parts, axis=0)
 
 
-def read_results(path: Path) -> Results:
-    """Results as the InterCap release has them: a file, or a folder that holds one of ``NAMES``.
-
-    ``body_pose`` may be (1, 63 T) as released or (T, 63), shapes one for all or one a frame, hands
-    components or full poses. Nothing that the file says is executed. Raises UserError naming file
-    and entry where something is missing, of another shape, or not in metres.
-    """
-    path = file_of(Path(path))
-    if path.is_dir():
-        raise UserError(f"{path}: holds none of {', '.join(NAMES)}; name the file of results")
-    values = _stacked(_load(path), path)
-    transl = _array(values, "transl", path, 3)
-    total = len(transl)
-    turns = {name: _array(values, name, path, size, total) for name, size in _TURNS.items()}
-    hands = tuple(_hand(values, side, path, total) for side in ("left", "right"))
-    betas, expression = (_shape(values, name, path, total) for name in ("betas", "expression"))
-    rotation = np.full((total, 3, 3), np.nan)
-    translation = np.full((total, 3), np.nan)
-    if values.get("ob_pose") is not None and len(values["ob_pose"]):
-        vectors = _array(values, "ob_pose", path, 3, total)
-        translation = _array(values, "ob_trans", path, 3, total)
-        some = np.isfinite(vectors).all(axis=1)
-        rotation[some] = Rotation.from_rotvec(vectors[some]).as_matrix()
-    for name, found_values, most in (
-        ("transl", transl, _MOST_M), ("ob_trans", translation, _MOST_M),
-        *((name, turn, _MOST_RAD) for name, turn in turns.items()),
-    ):  # fmt: skip
-        if (np.abs(found_values[np.isfinite(found_values)]) > most).any():
-            raise UserError(
-                f"{path}: {name} reaches {np.nanmax(np.abs(found_values)):.0f}; expected metres "
-                "and radians"
-            )
-    hand_poses = hands[0], hands[1]
-    return Results(path, turns, hand_poses, transl, betas, expression, rotation, translation)
+def check_range(path: Path, name: str, values: np.ndarray, most: float) -> None:
+    """Raise UserError where finite ``values`` are so large that their unit is another one."""
+    finite = np.abs(values[np.isfinite(values)])
+    if (finite > most).any():
+        raise UserError(f"{path}: {name} reaches {finite.max():.0f}; expected metres and radians")
 
 
-def file_of(path: Path) -> Path:
-    """The file of results in a folder, the folder itself where it has none; a file as it is."""
-    return next((path / name for name in NAMES if (path / name).is_file()), path)
+def check_metres(path: Path, name: str, values: np.ndarray) -> None:
+    """The same for places in metres."""
+    check_range(path, name, values, MOST_M)
 
 
-def _load(path: Path) -> Any:
-    if path.suffix == ".npz":
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path}: cannot be read as .npz ({error})") from None
-    return safe_pickle.load(path)
-
-
-def _stacked(loaded: Any, path: Path) -> dict[str, Any]:
-    """The entries of all frames; of a list of frames, ``res_1.pkl``, put together."""
-    if isinstance(loaded, list) and loaded and all(isinstance(frame, dict) for frame in loaded):
-        names = set.intersection(*(set(frame) for frame in loaded))
-        return {name: [np.ravel(frame[name]) for frame in loaded] for name in names}
-    if isinstance(loaded, dict):
-        return loaded
-    raise UserError(
-        f"{path}: holds {type(loaded).__name__}, expected the results of all frames by name, or a "
-        "list of frames"
-    )
-
-
-def _array(
-    values: Mapping[str, Any], name: str, path: Path, size: int, total: int | None = None
-) -> np.ndarray:
-    """An entry as (T, size) float64."""
-    if name not in values:
-        raise UserError(f"{path}: has no entry {name!r}; expected the InterCap release's results")
-    try:
-        found = np.asarray(values[name], np.float64)
-    except (TypeError, ValueError):
-        raise UserError(f"{path}: {name} is no array of numbers") from None
-    if found.size == 0 or found.size % size or (total is not None and found.size != total * size):
-        expected = f"({total or 'frames'}, {size})"
-        raise UserError(f"{path}: {name} is {found.shape}, expected {expected}")
-    return found.reshape(-1, size)
-
-
-def _hand(values: Mapping[str, Any], side: str, path: Path, total: int) -> np.ndarray:
-    """The full pose where it is told, else components."""
-    full = f"{side}_hand_pose_axis_angle"
-    if full in values:
-        return _array(values, full, path, _HANDS, total)
-    name = f"{side}_hand_pose"
-    size = np.size(values[name]) // total if name in values else 1
-    if size > _HANDS:
-        raise UserError(f"{path}: {name} has {size} numbers a frame, expected {_HANDS} or fewer")
-    return _array(values, name, path, max(size, 1), total)
-
-
-def _shape(values: Mapping[str, Any], name: str, path: Path, total: int) -> np.ndarray:
-    """(T, n), of one for all frames too."""
-    if name not in values:
-        raise UserError(f"{path}: has no entry {name!r}; expected the InterCap release's results")
-    found = np.atleast_2d(np.asarray(values[name], np.float64))
-    found = found.reshape(-1, found.shape[-1])
-    if len(found) not in (1, total) or not found.size:
-        raise UserError(f"{path}: {name} is {found.shape}, expected ({total}, n) or (1, n)")
-    return np.broadcast_to(found, (total, found.shape[1]))
+def check_radians(path: Path, name: str, values: np.ndarray) -> None:
+    """The same for rotation vectors."""
+    check_range(path, name, values, MOST_RAD)

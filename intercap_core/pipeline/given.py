@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from intercap_core.capture.layouts import input_files
 from intercap_core.config import Annotation, BodyModels, Config, SequenceEntry
+from intercap_core.imports.file_names import intercap_file
 from intercap_core.pipeline.code_cache import stage_code
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.record import Record, libraries, plain, processor
@@ -87,6 +88,8 @@ def record(
     """
     given = arguments(project, sequence, stage, annotation)
     device = given.pop("device", "cpu")
+    if given.get("results") is not None:
+        given["results"] = intercap_file(given["results"])  # of a folder its newest
     if "body_models" in given:
         given["body_models"] = _body_files(project.config, given["subject"].gender)
     return _record(
@@ -124,6 +127,7 @@ def dataset_record(
             for name in project.objects_named()
         },
         "failed": dict(failed),
+        "changed": changed(project.config),
     }
     code = stage_code("dataset").digests
     return Record("dataset", "", plain(given), {}, dict(summaries), code, libraries())

@@ -164,7 +164,7 @@ def _body_fit(a: Artefact) -> str:
 
 def _joint(a: Artefact) -> str:
     if "made_by" in a.attributes:
-        return f"made by {a.attributes['made_by']}; {_share(~a['flagged'])} frames have a result"
+        return f"made by {a.attributes['made_by']}; {_share(~a['flagged'])} frames are not flagged"
     settled = "settled" if a.attributes["converged"] else "ended before it settled"
     touching = int((a["contact_probability"] > _SURE).any(axis=1).sum())
     contact = f"contact in {touching} of {len(a['flagged'])} frames"

@@ -195,6 +195,7 @@ def run_dataset(project: Project) -> Path:
     Sequences that the project excludes because they failed are named in it, and those whose
     summary is missing or broken. Raises UserError where none is left.
     """
+    from intercap_core.report.settings import changed
     from intercap_core.stages import dataset
 
     folder = project.results
@@ -218,6 +219,7 @@ def run_dataset(project: Project) -> Path:
         formats=project.config.export.formats,
         virtual=all(project.recordings_made(name) is not None for name in project.sequences),
         failed=failed,
+        changed=changed(project.config),
     )
     add_record(dataset_record_of(project), made_from)
     mark_of(project, "", DATASET).unlink(missing_ok=True)

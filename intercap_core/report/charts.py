@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
 from intercap_core.metrics import flags
 
-_WIDTH, _HEIGHT = 520, 300
+_WIDTH, _HEIGHT = 440, 290  # of a line chart: read on a phone without being made larger
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 34, 44
 _ROW = 22
 _LABEL = 150
 _LETTER = 6.6  # width of a letter of a legend, on average
+_LEGEND_ROW = 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,79 +42,121 @@ def line_chart(
     marks: Sequence[tuple[float, str]] = (),
 ) -> str:
     """Lines with axes, a grid and a legend; ``marks`` are labelled vertical lines."""
-    inner_width, inner_height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+    named = [line for line in series if line.name]
+    legend = _legend([line.name for line in named])
+    top = _TOP + _LEGEND_ROW * max((row for _, row in legend), default=0)
+    height = _HEIGHT + top - _TOP
+    inner_width, inner_height = _WIDTH - _LEFT - _RIGHT, height - top - _BOTTOM
 
     def at_x(value: float) -> float:
         return _LEFT + inner_width * (value - x_range[0]) / (x_range[1] - x_range[0])
 
     def at_y(value: float) -> float:
-        return _TOP + inner_height * (1 - (value - y_range[0]) / (y_range[1] - y_range[0]))
+        return top + inner_height * (1 - (value - y_range[0]) / (y_range[1] - y_range[0]))
 
-    parts = [_open(_WIDTH, _HEIGHT, f"{y_label} by {x_label}")]
+    parts = [_open(_WIDTH, height, f"{y_label} by {x_label}")]
     for tick in ticks(*y_range):
         y = at_y(tick)
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" {_same("y", y)}/>')
         parts.append(_text(_LEFT - 6, y + 4, _number(tick), "tick", "end"))
     for tick in ticks(*x_range):
         x = at_x(tick)
-        parts.append(_text(x, _HEIGHT - _BOTTOM + 16, _number(tick), "tick", "middle"))
-        parts.append(f'<line class="grid" {_same("x", x)} y1="{_TOP}" y2="{_TOP + inner_height}"/>')
+        parts.append(_text(x, height - _BOTTOM + 16, _number(tick), "tick", "middle"))
+        parts.append(f'<line class="grid" {_same("x", x)} y1="{top}" y2="{top + inner_height}"/>')
     for value, label in marks:
         x = at_x(value)
-        parts.append(f'<line class="mark" {_same("x", x)} y1="{_TOP}" y2="{_TOP + inner_height}"/>')
-        parts.append(_text(x + 3, _TOP + 10, label, "tick", "start"))
+        parts.append(f'<line class="mark" {_same("x", x)} y1="{top}" y2="{top + inner_height}"/>')
+        parts.append(_text(x + 3, top + 10, label, "tick", "start"))
     for line in series:
         points = " ".join(
             f"{at_x(float(x)):.1f},{at_y(float(y)):.1f}"
             for x, y in zip(line.x, line.y, strict=True)
         )
         parts.append(f'<polyline {_stroke(line.colour)} points="{points}"/>')
-    x = _LEFT
-    for line in (line for line in series if line.name):
-        parts.append(f'<line {_stroke(line.colour)} x1="{x}" x2="{x + 20}" {_same("y", 14)}/>')
-        parts.append(_text(x + 26, 18, line.name, "legend", "start"))
-        x += max(100, 44 + _LETTER * len(line.name))
-    parts.append(_text(_LEFT + inner_width / 2, _HEIGHT - 8, x_label, "label", "middle"))
+    for line, (x, row) in zip(named, legend, strict=True):
+        y = 14 + _LEGEND_ROW * row
+        ends = f'x1="{x:.1f}" x2="{x + 20:.1f}"'
+        parts.append(f"<line {_stroke(line.colour)} {ends} {_same('y', y)}/>")
+        parts.append(_text(x + 26, y + 4, line.name, "legend", "start"))
+    parts.append(_text(_LEFT + inner_width / 2, height - 8, x_label, "label", "middle"))
     parts.append(
         f'<text class="label" text-anchor="middle" transform="translate(14 '
-        f'{_TOP + inner_height / 2:.1f}) rotate(-90)">{escape(y_label)}</text>'
+        f'{top + inner_height / 2:.1f}) rotate(-90)">{escape(y_label)}</text>'
     )
     return "".join([*parts, "</svg>"])
 
 
-@dataclass(frozen=True)
+def _legend(names: Sequence[str]) -> list[tuple[float, int]]:
+    """Where each name's line begins, and in which row: those that fit stand side by side."""
+    places, x, row = [], float(_LEFT), 0
+    for name in names:
+        wide = max(100, 44 + _LETTER * len(name))
+        if x > _LEFT and x + wide > _WIDTH:
+            x, row = float(_LEFT), row + 1
+        places.append((x, row))
+        x += wide
+    return places
+
+
+@dataclass(frozen=True, eq=False)
 class Band:
-    """One row of a timeline: ``runs`` are (first, last, what it says on hovering)."""
+    """One row of a timeline: ``runs`` are (first, last, what it says on hovering).
+
+    With ``levels``, of each frame in 0..1, the row is filled up to them, in place of bars.
+    """
 
     name: str
     colour: str
     runs: Sequence[tuple[int, int, str]]
+    levels: np.ndarray | None = None
 
 
 def timeline(bands: Sequence[Band], total: int) -> str:
     """Rows of bars over ``total`` frames."""
-    width = 860
+    width, tall = 860, _ROW - 7
     inner = width - _LABEL - _RIGHT
     height = _ROW * len(bands) + 24
-    parts = [_open(width, height, "timeline")]
+    parts = [_open(width, height, f"frames: {', '.join(band.name for band in bands)}")]
+
+    def at_x(frame: float) -> float:
+        return _LABEL + inner * frame / total
+
     for row, band in enumerate(bands):
         y = _ROW * row + 4
         parts.append(_text(_LABEL - 8, y + 12, band.name, "tick", "end"))
         parts.append(
-            f'<rect class="track" x="{_LABEL}" y="{y}" width="{inner}" height="{_ROW - 7}" rx="3"/>'
+            f'<rect class="track" x="{_LABEL}" y="{y}" width="{inner}" height="{tall}" rx="3"/>'
         )
-        for first, last, says in band.runs:
-            x = _LABEL + inner * first / total
-            long = max(1.5, inner * (last + 1 - first) / total)
+        if band.levels is not None:
+            ends = [(at_x(t), y + tall * (1 - one)) for t, one in _steps(band.levels)]
+            line = "".join(f"H{x:.1f}V{down:.1f}" for x, down in ends)
             parts.append(
-                f'<rect class="fill {band.colour}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
-                f'height="{_ROW - 7}" rx="2"><title>{escape(says)}</title></rect>'
+                f'<path class="fill {band.colour}" d="M{_LABEL} {y + tall}{line}'
+                f'H{at_x(total):.1f}V{y + tall}Z"/>'
+            )
+            parts.append(
+                f'<line class="half" x1="{_LABEL}" x2="{_LABEL + inner}" '
+                f"{_same('y', y + tall / 2)}/>"
+            )
+        for first, last, says in band.runs:
+            x = at_x(first)
+            long = max(1.5, inner * (last + 1 - first) / total)
+            kind = f"fill {band.colour}" if band.levels is None else "hover"
+            parts.append(
+                f'<rect class="{kind}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
+                f'height="{tall}" rx="2"><title>{escape(says)}</title></rect>'
             )
     for tick in ticks(0, total, 8):
         if tick < total:
-            x = _LABEL + inner * (tick + 0.5) / total
-            parts.append(_text(x, height - 6, _number(tick), "tick", "middle"))
+            parts.append(_text(at_x(tick + 0.5), height - 6, _number(tick), "tick", "middle"))
     return "".join([*parts, "</svg>"])
+
+
+def _steps(levels: np.ndarray) -> list[tuple[int, float]]:
+    """The frames from which a level (T,) is another, in fiftieths; unknown ones are 0."""
+    rounded = np.rint(50 * np.nan_to_num(levels)) / 50
+    changed = np.flatnonzero(np.diff(rounded, prepend=-1.0))
+    return [(int(t), float(rounded[t])) for t in changed]
 
 
 @dataclass(frozen=True)
@@ -136,7 +179,7 @@ def state_timeline(
     """
     left, inner, bottom = _room_for([row.name for row in rows]), 560, _ROW * len(rows)
     width, height = left + inner + 330, bottom + 24
-    parts = [_open(width, height, "timeline of every camera's frames")]
+    parts = [_open(width, height, f"frames: {', '.join(row.name for row in rows)}")]
 
     def at_x(frame: float) -> float:
         return left + inner * frame / max(total, 1)
@@ -286,8 +329,8 @@ def ticks(low: float, high: float, count: int = 6) -> list[float]:
 
 def _open(width: int, height: int, name: str) -> str:
     return (
-        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}" '
-        f'style="max-width:{width}px">'
+        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label={quoteattr(name)} '
+        f'style="--width:{width}px">'
     )
 
 

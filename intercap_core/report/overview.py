@@ -21,6 +21,32 @@ from intercap_core.versions import versions
 _MAX_RUNS = 400  # rows of the list of flagged frames
 _MAX_ANSWERS = 12  # values of a column that become a filter's choices in a row of their own
 
+# columns of the tables by object, subject, intent and camera with a word for readers, and the unit
+_FIGURES = {
+    "acceleration_body_mm": ("acceleration, body", "mm/frame²"),
+    "acceleration_object_mm": ("acceleration, object", "mm/frame²"),
+    "penetration.mean_mm": ("penetration", "mean, mm"),
+    "penetration.p98_mm": ("penetration", "p98, mm"),
+    "vertex_to_cloud.body_visible_mm": ("body to cloud", "visible, mm"),
+    "vertex_to_cloud.object_visible_mm": ("object to cloud", "visible, mm"),
+    "verdict.body_mm": ("body", "stated, mm"),
+    "verdict.hands_mm": ("hands", "stated, mm"),
+    "verdict.object_mm": ("object", "stated, mm"),
+    "joint.body_pve_mm": ("body PVE", "mm, truth"),
+    "joint.hand_mpjpe_mm": ("hands", "mm, truth"),
+    "joint.object_translation_mm": ("object", "mm, truth"),
+    "joint.object_rotation_deg": ("object", "deg, truth"),
+    "joint.contact_region_f1": ("contact", "F1, truth"),
+    "verdict.keypoint_px": ("keypoints", "px"),
+    "verdict.keypoint_px_held_out": ("keypoints", "held out, px"),
+    "verdict.person_mm": ("person's points", "mm"),
+    "verdict.person_held_out_mm": ("person's points", "held out, mm"),
+    "verdict.overlap": ("object's mask", "IoU"),
+    "verdict.overlap_held_out": ("object's mask", "held out, IoU"),
+    "verdict.object_depth_mm": ("object's depth", "mm"),
+    "verdict.object_depth_held_out_mm": ("object's depth", "held out, mm"),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Heat:
@@ -38,7 +64,8 @@ class DatasetContent:
 
     ``table`` has a row a sequence, ``groups`` the tables by object, subject, intent and camera, by
     name. ``failed``: sequences without a result and why; ``remarks``: what the merge says of
-    others. ``page_of``: the address of each sequence's page from the overview.
+    others. ``page_of``: the address of each sequence's page from the overview. ``changed``: name,
+    value and default of each setting that is not the program's own.
     """
 
     dataset: str
@@ -51,6 +78,7 @@ class DatasetContent:
     page_of: Mapping[str, str]
     failed: Mapping[str, str] = field(default_factory=dict)
     remarks: Mapping[str, str] = field(default_factory=dict)
+    changed: Sequence[tuple[str, str, str]] = ()
 
 
 def page(content: DatasetContent) -> str:
@@ -92,6 +120,7 @@ def page(content: DatasetContent) -> str:
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
         "flagged_frames": sum(int(s.values["flagged"].sum()) for s in measured),
         "versions": versions(),
+        "changed": content.changed,
         "made_by": _made_by(content.sequences),
     }
     return render("overview.html.j2", context)
@@ -105,7 +134,7 @@ def _headline(content: DatasetContent, measured: Sequence[SequenceMetrics]) -> s
     parts = [
         _counted(len(measured), "sequence"),
         _counted(frames, "frame"),
-        f"{seconds / 60:.1f} minutes" if seconds >= 120 else f"{seconds:.0f} seconds",
+        f"{seconds / 60:.1f} minutes" if seconds >= 120 else f"{seconds:.1f} seconds",
         _counted(subjects, "subject"),
         _counted(objects, "object") if objects else "people alone",
     ]
@@ -190,13 +219,27 @@ def _counts(measured: Sequence[SequenceMetrics]) -> dict[str, Any]:
 
 
 def _printed(table: pd.DataFrame) -> dict[str, Any]:
-    """A table's heads and cells as text."""
+    """Heads, each with its unit, and cells as text, of the columns that a reader looks for."""
+    shown = [str(name) for name in table if "." not in str(name) or name in _FIGURES]
     cells = [
         ["–" if _unknown(value) else _text(value) for value in row]
-        for row in table.itertuples(index=False, name=None)
+        for row in table[shown].itertuples(index=False, name=None)
     ]
-    heads = [str(name).replace("_", " ").replace(".", ", ") for name in table.columns]
-    return {"heads": heads, "rows": cells}
+    return {
+        "heads": [_head(name) for name in shown],
+        "rows": cells,
+        "left_out": len(table.columns) - len(shown),
+    }
+
+
+def _head(column: str) -> tuple[str, str]:
+    """What a column holds, and its unit."""
+    if column in _FIGURES:
+        return _FIGURES[column]
+    for ending, unit in (("_mm", "mm"), ("_ms", "ms"), ("_percent", "%")):
+        if column.endswith(ending):
+            return column.removesuffix(ending).replace("_", " "), unit
+    return column.replace("_", " "), ""
 
 
 def _unknown(value: object) -> bool:
@@ -204,7 +247,9 @@ def _unknown(value: object) -> bool:
 
 
 def _text(value: object) -> str:
-    return f"{value:.1f}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.2f}" if abs(value) < 1 else f"{value:.1f}"  # shares as well
 
 
 def _heat(content: DatasetContent) -> dict[str, Any]:

@@ -163,9 +163,10 @@ def _bands(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> l
         if region in stated_by_user:
             bands.append(charts.Band(f"{says}, annotated", "said", stated_by_user[region]))
         stated = s.values["contact_probability"][:, names.index(region)]
-        if (stated >= 0.5).any():
-            bands.append(charts.Band(f"{says}, stated", "touch", _stated_runs(stated)))
         touching = s.values["region_contact"][:, names.index(region)]
+        if (stated >= 0.5).any() or touching.any() or region in stated_by_user:
+            runs = _stated_runs(stated)
+            bands.append(charts.Band(f"{says}, stated", "touch", runs, levels=stated))
         if touching.any():
             bands.append(charts.Band(f"{says}, meshes", "any", _runs(touching)))
     return bands
@@ -181,7 +182,7 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
                 ("object to cloud", "c2", "object_visible_to_cloud"),
                 ("penetration", "c3", "penetration_mean"),
             ),
-            "mm",
+            "distance, mm",
             "Distance of the visible surfaces to the clouds, and how deep the body is inside the "
             "object.",
         ),
@@ -191,7 +192,7 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
                 ("body", "c1", "acceleration_body"),
                 ("object", "c2", "acceleration_object"),
             ),
-            "mm/frame²",
+            "acceleration, mm/frame²",
             "Second differences at 30 frames a second: what jitters stands out.",
         ),
     ]

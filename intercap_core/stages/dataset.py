@@ -46,14 +46,16 @@ def run(
     formats: Sequence[str],
     virtual: bool = False,
     failed: Mapping[str, str] | None = None,
+    changed: Sequence[tuple[str, str, str]] = (),
 ) -> Path:
     """Merge the sequences' summaries; returns the site's first page.
 
     ``summaries`` by name, in the order of the table; ``card`` and ``formats`` of the exports are
     what the dataset's card says, which is written beside ``summary``; ``virtual``: the studio made
-    all recordings; ``failed`` are sequences without a result, with the reason. A summary that is
-    missing or broken is told, left out and listed, as is what a heatmap cannot take. Raises
-    UserError where no sequence is left.
+    all recordings; ``failed`` are sequences without a result, with the reason; ``changed``: name,
+    value and default of the settings that are not the program's own. A summary that is missing or
+    broken is told, left out and listed, as is what a heatmap cannot take. Raises UserError where no
+    sequence is left.
     """
     found, broken = _read(summaries)
     unreported = {**(failed or {}), **broken}
@@ -107,6 +109,7 @@ def run(
         page_of={s.name: f"sequences/{s.name}/index.html" for s in found},
         failed=unreported,
         remarks=remarks,
+        changed=changed,
     )
     first = site / "index.html"
     _replace(first, overview.page(content))

@@ -78,12 +78,14 @@ def run(
     if results is not None:
         import_joint(
             results,
+            frames=frames,
             scene=scene,
             person=person,
             output=output,
             object_=object_,
             subject=subject,
             body_models=body_models,
+            betas=body_settings.betas,
             settings_digest=digest(settings),
         )
         return

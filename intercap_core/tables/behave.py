@@ -9,6 +9,7 @@ from typing import Any
 
 from intercap_core.capture.behave import frame_folders
 from intercap_core.errors import UserError
+from intercap_core.imports.file_names import PERSON_MESH
 from intercap_core.tables.project_files import Draft, Row
 
 SEQUENCE = re.compile(r"(Date\d{1,4})_(Sub\d{1,4})_([A-Za-z0-9]+)(?:_[A-Za-z0-9_-]+)?")
@@ -16,9 +17,12 @@ LONGEST_NAME = 80  # of config.Name
 GENDERS = ("female", "male", "neutral")
 
 
-def draft(root: Path, *, dataset: str) -> Draft:
+def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
     """List the sequences of ``root``, which holds ``sequences``, ``calibs`` and ``objects``.
 
+    ``results`` (what the data set itself found) holds a folder for each sequence, or
+    ``sequences`` with these: ``root`` itself, whose folders of frames hold registrations, or the
+    parameters at 30 fps.
     Sequences without frames or calibration, and objects without a mesh, are left out with a remark.
     Raises UserError where nothing is left.
     """
@@ -43,6 +47,8 @@ def draft(root: Path, *, dataset: str) -> Draft:
         elif gender != known:
             row.remarks.append(f"info.json says {gender}, another sequence of {subject} {known}")
         meshes[thing] = {"mesh": mesh, "labels": [thing]}
+        if results is not None:
+            _name_results(row, results)
         result.rows.append(row)
     if not result.rows:
         raise UserError(
@@ -75,6 +81,18 @@ def _row(root: Path, path: Path, date: str, subject: str, thing: str) -> tuple[R
     if not calibration.is_dir():
         return row, f"there is no calibs/{date}/config"
     return row, ""
+
+
+def _name_results(row: Row, results: Path) -> None:
+    """Name the results of the row's sequence, or remark that there are none."""
+    name = str(row.columns["sequence"])
+    places = [results / "sequences" / name, results / name]
+    meshes = f"t*/{PERSON_MESH.as_posix()}"
+    there = next((place for place in places if any(place.glob(meshes))), None)
+    if there is None:
+        row.remarks.append(f"{results} holds no {name}/{meshes}: our joint fit is made")
+        return
+    row.columns["results"] = there
 
 
 def _mesh(root: Path, thing: str) -> Path | None:

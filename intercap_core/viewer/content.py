@@ -96,7 +96,7 @@ def gather(
     shown = next(iter(bodies.values()))
     total = shown.parameters.batch
     if "metrics" in there:
-        flags = _add_measured(content, there["metrics"])
+        flags = _add_measured(content, there["metrics"], shown.model.num_vertices)
     mesh = None
     known = np.isfinite(shown.translation).all(1)
     if object_ is not None and any(np.isfinite(b.translation).any() for b in bodies.values()):
@@ -162,11 +162,17 @@ def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> 
     content.arrays["contact/region"] = region
 
 
-def _add_measured(content: Content, metrics: Path) -> Sequence[str]:
+def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequence[str]:
     """Which vertices touch, a bit each (T, ceil(V / 8)); returns the reasons of flags."""
     with artefacts.read(metrics, METRICS) as measured:
         if "body_to_object" in measured:
             touching = measured["body_to_object"] <= CONTACT_M
+            if touching.shape[1] != num_vertices:
+                raise UserError(
+                    f"{metrics}: sequence {measured.attributes['sequence']!r} was measured on a "
+                    f"body of {touching.shape[1]} vertices, and its fitted body has "
+                    f"{num_vertices}; re-run stage 'metrics'"
+                )
             content.arrays["contact/touching"] = np.packbits(touching, axis=1, bitorder="little")
         return measured.text("flag_reason")
 

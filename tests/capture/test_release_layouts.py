@@ -132,6 +132,17 @@ def test_behave_images_times_and_cameras(behave):
         assert np.allclose(apply(camera.master_from_colour, points), apply(truth, points))
 
 
+def test_behave_sets_stand_on_the_clock_of_the_folders(behave):
+    """What was found elsewhere for these folders is told by it, also where the first is dropped."""
+    with Frames.open(run(behave)) as frames:
+        assert frames.first_set_s == pytest.approx(3.0)
+    output = behave.recordings.parent / "dropped.h5"
+    stage.run(sequence=behave, output=output, settings=FramesSettings(), frames_to_drop=[0, 2])
+    with Frames.open(output) as frames:
+        times = frames.first_set_s + frames.time_s
+        assert times == pytest.approx([float(text) for text in TIMES])
+
+
 def test_behave_times_at_thirty_frames_a_second(tmp_path):
     rig, _ = rig_of(2)
     times = [f"{2 + i / 30:08.3f}" for i in range(6)]

@@ -5,11 +5,51 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from intercap_core.config import CardSettings, ExportSettings, PageSettings, SequenceEntry
+import h5py
+
+from intercap_core.config import (
+    CardSettings,
+    ExportSettings,
+    MetricsSettings,
+    PageSettings,
+    SequenceEntry,
+)
 from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import dataset, page, summary
+from intercap_core.stages import dataset, metrics, page, summary
 from tests.helpers import fitted_capture as fitted
+
+MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
+FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
+
+
+def two_captures(folder: Path) -> dict[str, fitted.Capture]:
+    """One sequence with truth, whose ball is held, and one without, whose cup is not; measured."""
+    made = {}
+    for name, object_name in (("s01_o03", "football"), ("s01_o09", "cup")):
+        (folder / name).mkdir(parents=True)
+        made[name] = fitted.make_capture(folder / name, name=name, object_name=object_name, total=4)
+        with h5py.File(made[name].paths["joint"], "r+") as file:
+            hands = [CONTACT_REGIONS.index(f"{side}_hand") for side in ("left", "right")]
+            file["contact_probability"][:2, hands] = 0.9 if object_name == "football" else 0.1
+            file["contact_probability"][3, hands] = 0.9 if object_name == "football" else 0.1
+        measure(made[name], truth=object_name == "football")
+    return made
+
+
+def measure(capture: fitted.Capture, *, truth: bool = False) -> None:
+    """The capture's metrics."""
+    metrics.run(
+        **capture.inputs(*MEASURED),
+        output=capture.paths["metrics"],
+        object_=capture.object_,
+        subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS,
+        settings=MetricsSettings(),
+        **fitted.OTHER_SETTINGS,
+        truth=capture.paths["truth"] if truth else None,
+    )
 
 
 def write_summaries(

@@ -1,11 +1,9 @@
-"""The dataset stage: files, the page's content, and the page in a real browser."""
+"""The dataset stage: files and the pages' content."""
 
 from __future__ import annotations
 
 import base64
 import json
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,40 +14,18 @@ import pandas as pd
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import ContactInterval, MetricsSettings, PageSettings
+from intercap_core.config import ContactInterval, PageSettings
 from intercap_core.errors import UserError
-from intercap_core.schemas import CONTACT_REGIONS, HEATMAPS, METRICS
+from intercap_core.schemas import HEATMAPS, METRICS
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import metrics, page
+from intercap_core.stages import page
 from tests.helpers import fitted_capture as fitted
-from tests.helpers.site import merge, row, write_site, write_summaries
-
-MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
-FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
+from tests.helpers.site import FAILED, merge, row, two_captures, write_site, write_summaries
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Capture]:
-    """One sequence with truth, one without."""
-    made = {}
-    for name, object_name in (("s01_o03", "football"), ("s01_o09", "cup")):
-        folder = tmp_path_factory.mktemp(name)
-        made[name] = fitted.make_capture(folder, name=name, object_name=object_name, total=4)
-        with h5py.File(made[name].paths["joint"], "r+") as file:  # the ball is held, the cup is not
-            hands = [CONTACT_REGIONS.index(f"{side}_hand") for side in ("left", "right")]
-            file["contact_probability"][:2, hands] = 0.9 if object_name == "football" else 0.1
-            file["contact_probability"][3, hands] = 0.9 if object_name == "football" else 0.1
-        metrics.run(
-            **made[name].inputs(*MEASURED),
-            output=made[name].paths["metrics"],
-            object_=made[name].object_,
-            subject=fitted.SUBJECT,
-            body_models=fitted.BODY_MODELS,
-            settings=MetricsSettings(),
-            **fitted.OTHER_SETTINGS,
-            truth=made[name].paths["truth"] if object_name == "football" else None,
-        )
-    return made
+    return two_captures(tmp_path_factory.mktemp("captures"))
 
 
 def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Path:
@@ -320,50 +296,3 @@ def test_same_input_same_bytes(
 def test_a_dataset_without_results_says_so(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no sequence has a result"):
         merge({}, {}, tmp_path)
-
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
-
-
-def _browse(page: Path, folder: Path) -> tuple[str, set[str], np.ndarray, str]:
-    """What the browser printed, the addresses that the page itself asked for, a picture, and the
-    page as it stands in the end."""
-    log, shot = folder / "net.json", folder / "page.png"
-    done = subprocess.run(
-        [
-            str(CHROMIUM), "--headless", "--no-sandbox", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-quic",
-            "--no-first-run", "--disable-background-networking", "--disable-component-update",
-            "--disable-sync", "--enable-logging=stderr", "--window-size=1240,2400",
-            f"--user-data-dir={folder / 'profile'}", f"--log-net-log={log}",
-            "--virtual-time-budget=10000", "--dump-dom", f"--screenshot={shot}",
-            page.resolve().as_uri(),
-        ],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    asked = set()
-    for event in json.loads(log.read_text())["events"]:
-        values = event.get("params", {})
-        # the browser's own errands (updates, accounts) have no origin for an initiator
-        if "url" in values and values.get("initiator", "not an origin") != "not an origin":
-            asked.add(values["url"])
-    return done.stderr, asked, cv2.imread(str(shot)), done.stdout
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium")
-def test_page_in_a_browser_has_no_errors_and_asks_for_nothing(out: Path, tmp_path: Path) -> None:
-    bad = tmp_path / "bad.html"
-    bad.write_text('<img src="http://127.0.0.1:9/x.png"><script>console.error("wrong")</script>')
-    (tmp_path / "control").mkdir()
-    printed, asked, _, _ = _browse(bad, tmp_path / "control")
-    assert "CONSOLE" in printed and asked == {"http://127.0.0.1:9/x.png"}
-
-    for place in (out / "site" / "index.html", _page(out, "s01_o03")):
-        folder = tmp_path / place.parent.name
-        folder.mkdir()
-        printed, asked, image, dom = _browse(place, folder)
-        assert "CONSOLE" not in printed, printed
-        assert not [address for address in asked if not address.startswith("blob:")]
-        assert ('data-ready="yes"' in dom) == (place.parent.name == "s01_o03")
-        assert image.shape[:2] == (2400, 1240) and image.std() > 10

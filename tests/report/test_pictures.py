@@ -40,6 +40,34 @@ def test_charts_are_well_formed_and_escape_what_they_are_given() -> None:
     assert bells.count("<circle") == 2
 
 
+def test_a_band_is_filled_to_its_level_in_every_frame() -> None:
+    levels = np.array([0.0, 0.9, 0.9, 0.2, np.nan])
+    band = charts.Band("hand", "touch", [(1, 2, "1–2: 90 %")], levels=levels)
+    found = ElementTree.fromstring(charts.timeline([band], 5))
+    path = found.find(".//path").get("d")
+    track = found.find(".//rect[@class='track']")
+    left, wide, low = (float(track.get(key)) for key in ("x", "width", "height"))
+    bottom = float(track.get("y")) + low
+    steps = [tuple(map(float, step.split("V"))) for step in path.split("Z")[0].split("H")[1:]]
+    heights = {round(5 * (x - left) / wide): (bottom - y) / low for x, y in steps[:-1]}
+    assert heights == pytest.approx({0: 0, 1: 0.9, 3: 0.2, 4: 0}, abs=0.01)
+    assert found.find(".//title").text == "1–2: 90 %"
+
+
+def test_a_legend_that_is_too_long_takes_another_row() -> None:
+    x = np.array([0.0, 1.0])
+    lines = [charts.Series(f"a name of some length {i}", "c1", x, x) for i in range(3)]
+    found = ElementTree.fromstring(
+        charts.line_chart(lines, x_label="x", y_label="y", x_range=(0, 1), y_range=(0, 1))
+    )
+    width = float(found.get("viewBox").split()[2])
+    places = [
+        (float(t.get("x")), float(t.get("y"))) for t in found.findall(".//text[@class='legend']")
+    ]
+    assert len({y for _, y in places}) == 3
+    assert all(x + 6 * len(lines[0].name) < width for x, _ in places)
+
+
 def test_pictures_hide_what_is_behind_and_keep_colours() -> None:
     ball = trimesh.creation.icosphere(3, 0.3)
     lens = Intrinsics(120, 100, 100.0, 100.0, 59.5, 49.5)

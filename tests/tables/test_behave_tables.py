@@ -16,6 +16,7 @@ from intercap_core.camera.rig import Rig
 from intercap_core.cli import app
 from intercap_core.commands.check import faults_of_sequences
 from intercap_core.errors import UserError
+from intercap_core.imports.file_names import PERSON_MESH
 from intercap_core.project import load_project
 from intercap_core.stages import frames as frames_stage
 from tests.helpers.release_folders import write_behave
@@ -95,6 +96,27 @@ def test_the_project_written_is_ready_to_run(release):
     assert [str(fault) for fault in faults_of_sequences(project)] == []
     for name, entry in project.sequences.items():
         frames_stage.run(sequence=entry, output=Path(f"{name}.h5"), settings=project.config.frames)
+
+
+def test_the_data_sets_own_results_are_named_where_they_are_asked_for(release):
+    folder = release / "sequences" / SEQUENCES[0]
+    registered = folder / "t0002.000" / PERSON_MESH
+    registered.parent.mkdir(parents=True)
+    registered.touch()
+    done = write("--results", "BEHAVE")
+    assert f"{SEQUENCES[1]}: BEHAVE holds no {SEQUENCES[1]}/t*/person" in done.output
+    project = load_project(Path("config/behave/config.yaml"))
+    named = {name: row.results for name, row in project.sequences.items() if row.results}
+    assert named == {SEQUENCES[0]: Path("BEHAVE/sequences") / SEQUENCES[0]}
+    shutil.move(folder, release.parent / SEQUENCES[0])
+    # elsewhere, as the parameters at 30 fps with meshes beside them would be
+    shutil.copytree(release / "sequences" / SEQUENCES[2], folder)
+    assert write("--results", ".", "--replace").exit_code == 0
+    project = load_project(Path("config/behave/config.yaml"))
+    assert project.sequences[SEQUENCES[0]].results == Path(SEQUENCES[0])
+    assert [str(fault) for fault in faults_of_sequences(project)] == []
+    done = write("--results", "nowhere", "--replace")
+    assert isinstance(done.exception, UserError) and "no such folder" in str(done.exception)
 
 
 def test_what_is_not_whole_is_left_out_and_told(release):

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import html
-import json
-import re
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -22,13 +17,10 @@ from intercap_core.schemas import JOINT, SCENE
 from intercap_core.viewer import page
 from intercap_core.viewer.content import gather
 from tests.helpers import fitted_capture as fitted
+from tests.helpers.browser import PHONE, Visit, needs_chromium, visit
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 FRAMES, SIZE = 6, (900, 1000)
 NAME = "s01_o03"
-browser = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"
-)
 
 
 @pytest.fixture(scope="module")
@@ -56,56 +48,34 @@ def shown(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> 
     return _write(capture, tmp_path_factory.mktemp("page"))
 
 
-def _browse(shown: Path, folder: Path, script: str = "", address: str = "") -> dict[str, Any]:
-    """What the page's own ``script`` leaves in ``result`` when the viewer stands, what the console
-    printed, and a picture."""
-    folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy(shown.parent / page.SCRIPT, folder)
-    wait = """
-      <script>
-        const until = setInterval(async () => {
-          const root = document.querySelector(".viewer");
-          if (root.dataset.ready !== "yes") return;
-          clearInterval(until);
-          const viewer = window.intercapViewer, result = {};
-          const key = (name, more) => root.dispatchEvent(
-            new KeyboardEvent("keydown", { key: name, bubbles: true, ...more }));
-          const pause = (ms) => new Promise((done) => setTimeout(done, ms));
-          const become = async (test) => { while (!test()) await pause(20); };
-          %s
-          const text = document.createElement("pre");
-          text.id = "result";
-          text.textContent = JSON.stringify(result);
-          document.body.append(text);
-        }, 50);
-      </script>"""
-    text = shown.read_text().replace("</body>", (wait % script) + "</body>")
-    (folder / "index.html").write_text(text)
-    picture = folder / "page.png"
-    options = [
-        str(CHROMIUM), "--headless", "--no-sandbox", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars",
-        "--no-first-run", "--disable-background-networking", "--enable-logging=stderr",
-        f"--window-size={SIZE[0]},{SIZE[1]}", "--virtual-time-budget=15000",
-        f"--user-data-dir={folder / 'profile'}", f"--screenshot={picture}", "--dump-dom",
-        (folder / "index.html").resolve().as_uri() + address,
-    ]  # fmt: skip
-    done = subprocess.run(options, capture_output=True, text=True, timeout=180)
-    assert done.returncode == 0, done.stderr
-    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.S)
-    return {
-        "result": json.loads(html.unescape(found.group(1))) if found else None,
-        "console": [line for line in done.stderr.splitlines() if "CONSOLE" in line],
-        "dom": done.stdout,
-        "picture": cv2.imread(str(picture)),
-    }
+_AT_HAND = """
+  const root = document.querySelector(".viewer");
+  const viewer = window.intercapViewer, result = {};
+  const key = (name, more) => root.dispatchEvent(
+    new KeyboardEvent("keydown", { key: name, bubbles: true, ...more }));
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  const become = async (test) => { while (!test()) await pause(20); };
+"""
 
 
-@browser
+def _browse(shown: Path, script: str = "", address: str = "") -> dict[str, Any]:
+    """What ``script`` leaves in ``result`` when the viewer stands, what the console printed, the
+    page's text and a picture."""
+    with visit(shown, size=SIZE, address=address) as visited:
+        visited.wait()
+        result = visited.page.evaluate("async () => {" + _AT_HAND + script + "\nreturn result; }")
+        return {
+            "result": result,
+            "console": visited.console,
+            "dom": visited.page.content(),
+            "picture": visited.picture(),
+        }
+
+
+@needs_chromium
 def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> None:
     found = _browse(
         shown,
-        tmp_path,
         """
         result.first = viewer.state.frame;
         key("ArrowRight"); result.right = viewer.state.frame; result.address = location.hash;
@@ -157,13 +127,12 @@ def _expected_pixels(
     return on_page(joints[[0, 3, 6, 9]]), on_page(ball[None])[0]
 
 
-@browser
+@needs_chromium
 def test_body_and_object_are_where_the_camera_sees_them(
     capture: fitted.Capture, shown: Path, tmp_path: Path
 ) -> None:
     found = _browse(
         shown,
-        tmp_path,
         """
         for (const name of ["contact", "cameras"])
           root.querySelector(`[data-layer="${name}"] input`).click();
@@ -188,17 +157,72 @@ def test_body_and_object_are_where_the_camera_sees_them(
     assert not blue > red + 25
 
 
-@browser
+@needs_chromium
 def test_layers_change_the_picture(shown: Path, tmp_path: Path) -> None:
     off = 'root.querySelector(`[data-layer="joint"] input`).click(); await pause(100);'
     pictures = [
-        _browse(shown, tmp_path / name, script)["picture"].astype(int)
-        for name, script in (("on", ""), ("off", off))
+        _browse(shown, script)["picture"].astype(int) for name, script in (("on", ""), ("off", off))
     ]
     assert (np.abs(pictures[0] - pictures[1]).max(2) > 40).mean() > 0.01
 
 
-@browser
+def _far(visited: Visit) -> tuple[float, np.ndarray]:
+    """How far the eye is from the body's middle, and the direction in which it is."""
+    found = visited.page.evaluate(
+        """() => {
+          const { eye, versions, state } = intercapViewer;
+          return [eye.position.toArray(), versions.joint.centre(state.frame).toArray()];
+        }"""
+    )
+    away = np.subtract(*found)
+    return float(np.linalg.norm(away)), away / np.linalg.norm(away)
+
+
+@needs_chromium
+def test_fingers_turn_come_nearer_play_seek_and_switch(shown: Path) -> None:
+    with visit(shown, size=PHONE, phone=True) as visited:
+        visited.wait()
+        page = visited.page
+        assert page.evaluate("document.documentElement.scrollWidth") == PHONE[0]
+        box = page.locator("[data-part=canvas]").bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+        far, before = _far(visited)
+        visited.touch("touchStart", (x, y))
+        for by in range(10, 101, 10):
+            visited.touch("touchMove", (x + by, y))
+        visited.touch("touchEnd")
+        same, after = _far(visited)
+        assert same == pytest.approx(far, rel=0.02)
+        assert np.degrees(np.arccos(before @ after)) > 20
+        assert page.evaluate("scrollY") == 0  # the page stays, the scene turns
+
+        visited.touch("touchStart", (x - 30, y), (x + 30, y))
+        for by in range(40, 91, 10):
+            visited.touch("touchMove", (x - by, y), (x + by, y))
+        visited.touch("touchEnd")
+        near, _ = _far(visited)
+        assert near < 0.6 * far
+        page.get_by_role("button", name="Overview").tap()
+        assert _far(visited)[0] == pytest.approx(far, rel=0.05)
+
+        bar = page.get_by_label("Frame").bounding_box()
+        assert bar is not None and bar["height"] >= 30
+        page.touchscreen.tap(bar["x"] + 0.99 * bar["width"], bar["y"] + bar["height"] / 2)
+        assert page.evaluate("intercapViewer.state.frame") == FRAMES - 1
+        page.get_by_role("button", name="Play").tap()  # from the start, as it stood at the end
+        visited.wait("!intercapViewer.state.playing")
+        assert page.evaluate("location.hash") == f"#t={(FRAMES - 1) / fitted.FPS:.2f}"
+        page.get_by_label("truth").tap()
+        assert page.evaluate("intercapViewer.versions.truth.group.visible")
+        for control in page.locator(".viewer :is(button, select, label)").all():
+            at = control.bounding_box()
+            assert at is not None and at["height"] >= 40, control.inner_text()
+        assert visited.console == []
+
+
+@needs_chromium
 def test_words_from_files_are_words(capture: fitted.Capture, tmp_path: Path) -> None:
     shutil.copy(capture.paths["joint"], tmp_path / "joint.h5")
     with h5py.File(tmp_path / "joint.h5", "r+") as file:
@@ -213,20 +237,22 @@ def test_words_from_files_are_words(capture: fitted.Capture, tmp_path: Path) -> 
     shown = _write(changed, tmp_path / "page", name='<b onclick="x">"name"</b>')
     found = _browse(
         shown,
-        tmp_path / "browser",
         "result.flag = root.querySelector('[data-part=flag]').innerHTML;",
     )
     assert found["console"] == [] and "<b onclick" not in found["dom"]
     assert found["result"]["flag"].startswith("flagged: &lt;img src=x")
 
 
-@browser
+@needs_chromium
 def test_a_page_without_its_file_says_so(shown: Path, tmp_path: Path) -> None:
     (tmp_path / "none").mkdir()
     (tmp_path / "none" / page.SCRIPT).write_text("")
     (tmp_path / "none" / "index.html").write_text(shown.read_text())
-    found = _browse(tmp_path / "none" / "index.html", tmp_path / "browser")
-    assert "is not beside it" in found["dom"] and found["result"] is None
+    with visit(tmp_path / "none" / "index.html") as visited:
+        assert visited.page.get_by_role("status").inner_text() == (
+            "This page's file viewer.js is not beside it."
+        )
+        assert visited.page.evaluate("window.intercapViewer") is None
 
 
 def test_any_artefact_from_the_body_fit_on_is_enough(

@@ -6,7 +6,7 @@ from snakemake.exceptions import WorkflowError
 
 from intercap_core.capture.layouts import input_files
 from intercap_core.errors import UserError
-from intercap_core.imports.results import file_of
+from intercap_core.imports.file_names import files_of
 from intercap_core.pipeline.plan import DATASET, Plan
 from intercap_core.project import load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
@@ -158,9 +158,10 @@ def motion_prior_files(wildcards):
 
 
 def results_file(wildcards):
-    """Input function: another program's results of the sequence, where its row names them."""
+    """Input function: what stands for another program's results, where the sequence's row names
+    them."""
     named = PROJECT.sequences[wildcards.sequence].results
-    return [] if named is None else existing(file_of(named))
+    return [] if named is None else existing(*files_of(named))
 
 
 def memory(megabytes):

@@ -1,25 +1,26 @@
 "use strict";
 for (const table of document.querySelectorAll("table.sortable")) {
-  table.tHead.rows[0].querySelectorAll("th").forEach((head, column) => {
-    head.tabIndex = 0;
-    head.addEventListener("keydown", (event) => {
-      if (event.key === "Enter") head.click();
-    });
-    head.addEventListener("click", () => {
-      const up = head.dataset.order === "down";
-      table.querySelectorAll("th").forEach((other) => delete other.dataset.order);
-      head.dataset.order = up ? "up" : "down";
-      table.querySelectorAll("th").forEach((other) => other.removeAttribute("aria-sort"));
+  const heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, column) => {
+    const words = column === 0 || head.classList.contains("left");
+    const button = document.createElement("button");
+    button.type = "button";
+    button.append(...head.childNodes);
+    head.append(button);
+    button.addEventListener("click", () => {
+      const now = head.getAttribute("aria-sort");
+      const up = now ? now === "descending" : words; // figures begin with the highest
+      heads.forEach((other) => other.removeAttribute("aria-sort"));
       head.setAttribute("aria-sort", up ? "ascending" : "descending");
       const body = table.tBodies[0];
-      const key = (row) => row.cells[column].dataset.value ?? row.cells[column].textContent.trim();
+      const key = (row) => row.cells[column].textContent.trim();
       const rows = [...body.rows];
       rows.sort((a, b) => {
         const [x, y] = [key(a), key(b)];
+        if (words) return (up ? 1 : -1) * x.localeCompare(y, "en", { numeric: true });
         const [p, q] = [parseFloat(x), parseFloat(y)];
-        if (Number.isNaN(p) !== Number.isNaN(q)) return Number.isNaN(p) ? 1 : -1;
-        const order = Number.isNaN(p) ? x.localeCompare(y) : p - q;
-        return up ? order : -order;
+        if (Number.isNaN(p) || Number.isNaN(q)) return Number.isNaN(p) - Number.isNaN(q); // last
+        return up ? p - q : q - p;
       });
       body.append(...rows);
     });
@@ -46,18 +47,42 @@ for (const form of document.querySelectorAll("form.filters")) {
   form.addEventListener("submit", (event) => event.preventDefault());
   update();
 }
+
+/* What scrolls can be reached by the keyboard; what does not is no stop on its way. */
+const watched = new ResizeObserver((entries) => {
+  for (const { target } of entries) {
+    const area = target.closest(".scroll");
+    const more = area.scrollWidth > area.clientWidth || area.scrollHeight > area.clientHeight;
+    if (more) area.tabIndex = 0;
+    else area.removeAttribute("tabindex");
+  }
+});
+for (const area of document.querySelectorAll(".scroll")) {
+  watched.observe(area);
+  watched.observe(area.firstElementChild);
+}
+
 const dialog = document.querySelector("dialog");
 const large = dialog.querySelector("img");
-for (const image of document.querySelectorAll("main img")) {
-  image.tabIndex = 0;
-  image.setAttribute("role", "button");
-  image.addEventListener("keydown", (event) => {
-    if (event.key === "Enter") image.click();
-  });
-  image.addEventListener("click", () => {
-    large.src = image.src;
-    large.alt = image.alt;
-    dialog.showModal();
-  });
+const enlarge = (image) => {
+  large.src = image.src;
+  large.alt = image.alt;
+  dialog.querySelector("p").textContent = image.alt;
+  dialog.showModal();
+  // as large as the window, and no smaller than it is: what is wider is scrolled
+  const room = [dialog.clientWidth - 8, dialog.clientHeight - 48];
+  const [wide, tall] = [Number(image.getAttribute("width")), Number(image.getAttribute("height"))];
+  const scale = Math.max(1, Math.min(room[0] / wide, room[1] / tall));
+  large.width = Math.round(scale * wide);
+  large.height = Math.round(scale * tall);
+};
+for (const image of document.querySelectorAll("main figure > img")) {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.className = "zoom";
+  button.setAttribute("aria-haspopup", "dialog");
+  image.replaceWith(button);
+  button.append(image);
+  button.addEventListener("click", () => enlarge(image));
 }
 dialog.addEventListener("click", () => dialog.close());

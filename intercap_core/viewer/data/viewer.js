@@ -45,7 +45,7 @@ async function showInterCap(payload) {
   // ------------------------------------------------------------------ bodies and objects
   const COLOURS = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78], truth: [0.45, 0.74, 0.5] };
   const TOUCHING = [0.86, 0.2, 0.26];
-  const STATED = [0.95, 0.62, 0.2];
+  const STATED = [[0.97, 0.84, 0.62], [0.93, 0.5, 0.06]]; // likelier than not, and certain
   const names = Object.keys(header.versions);
   const versions = {};
   for (const name of names) {
@@ -285,7 +285,7 @@ async function showInterCap(payload) {
       if (touching && (touching[frame * width + (v >> 3)] >> (v & 7)) & 1) colour = TOUCHING;
       else if (region && region[v] < 255) {
         const share = arrays["contact/probability"][frame * count + region[v]] / 255;
-        if (share >= 0.5) colour = base.map((value, k) => value + 0.55 * share * (STATED[k] - value));
+        if (share >= 0.5) colour = STATED[0].map((pale, k) => pale + (2 * share - 1) * (STATED[1][k] - pale));
       }
       colours.setXYZ(v, ...colour);
     }

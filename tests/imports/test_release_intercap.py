@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
-from intercap_core.imports.results import read_results
+from intercap_core.imports.release_intercap import read_results
 
 T = 4
 
