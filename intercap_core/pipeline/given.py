@@ -16,6 +16,7 @@ from intercap_core.pipeline.code_cache import stage_code
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.record import Record, libraries, plain, processor
 from intercap_core.project import Project
+from intercap_core.report.settings import changed
 
 # Columns of a sequence's row that a stage may read; reading another one is an error.
 COLUMNS: dict[str, tuple[str, ...]] = {
