@@ -160,8 +160,9 @@ class Flow:
         pending = set()
         for entry in entries:
             if entry["plan"] != "no update":
-                folder = Path(entry["log-file(s)"]).parent.name  # the sequence's or the dataset's
-                pending.add(("" if folder == self.results.name else folder, entry["rule"]))
+                parts = Path(entry["output_file"]).parts
+                sequence = next((name for name in (ONE, OTHER) if name in parts), "")
+                pending.add((sequence, entry["rule"]))
         return pending
 
 
