@@ -141,8 +141,9 @@ class Measurement:
         body touches."""
         object_vertices = handled.posed(t, handled.mesh.vertices)
         points = handled.posed(t, handled.points)
-        to_body = surface.signed_distance(np.concatenate([object_vertices, points]))
-        point_distance = to_body[len(object_vertices) :]
+        to_body = surface.signed_distance(object_vertices)
+        # of a point outside nothing but its contact is told
+        point_distance = surface.signed_distance(points, reach=1.01 * self.threshold)
         track = handled.track
         to_object = handled.surface.signed_distance(
             vertices, track.rotation[t], track.translation[t]
@@ -150,7 +151,7 @@ class Measurement:
         depth = penetration.depths(to_object)
         return {
             "body_to_object": to_object,
-            "object_to_body": to_body[: len(object_vertices)],
+            "object_to_body": to_body,
             "penetration_mean": depth.mean,
             "penetration_median": depth.median,
             "penetration_max": depth.max,

@@ -18,25 +18,32 @@ _LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own
 
 
 class PosedObject:
-    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once."""
+    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once.
+
+    ``watertight``: rays tell what is inside; else the mesh winds around it.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
-        self._solid = _Solid(
-            DistanceField(vertices, faces, watertight=watertight),
-            SurfaceTree(vertices, faces).shaped(vertices),
-        )
+        tree = SurfaceTree(vertices, faces)
+        self._solid = _Solid(tree.shaped(vertices))
+        if not (watertight and tree.closed):
+            self._solid = _Solid(
+                tree.shaped(vertices), DistanceField(vertices, faces, watertight=watertight)
+            )
 
     def signed_distance(
         self,
         points: np.ndarray,
         rotation: np.ndarray,
         translation: np.ndarray,
+        *,
+        reach: float = REACH_M,
     ) -> np.ndarray:
         """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
 
-        Negative inside; at most ``REACH_M``, at least -``DEEPEST_M``.
+        Negative inside; at most ``reach``, at least -``DEEPEST_M``.
         """
-        return self._solid.signed_distance((points - translation) @ rotation)
+        return self._solid.signed_distance((points - translation) @ rotation, reach)
 
 
 class PosedBody:
@@ -44,11 +51,11 @@ class PosedBody:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
         self._surface = tree.shaped(vertices)
-        self._solid = _Solid(DistanceField(vertices, faces), self._surface)
+        self._solid = _Solid(self._surface, None if tree.closed else DistanceField(vertices, faces))
 
-    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+    def signed_distance(self, points: np.ndarray, *, reach: float = REACH_M) -> np.ndarray:
         """Signed distance (N,) of points (N, 3), as of :class:`PosedObject`."""
-        return self._solid.signed_distance(points)
+        return self._solid.signed_distance(points, reach)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) on either side, at most ``DEEPEST_M``."""
@@ -56,18 +63,20 @@ class PosedBody:
 
 
 class _Solid:
-    """What is inside a surface, and how far from it."""
+    """How far from a ``surface``, and what is inside: by the ``field`` where that is not closed."""
 
-    def __init__(self, field: DistanceField, surface: ShapedSurface) -> None:
-        self._field, self._surface = field, surface
+    def __init__(self, surface: ShapedSurface, field: DistanceField | None = None) -> None:
+        self._surface, self._field = surface, field
 
-    def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        low, high = self._field.box + np.array([[-REACH_M], [REACH_M]])
-        found = np.full(len(points), REACH_M)
+    def signed_distance(self, points: np.ndarray, reach: float) -> np.ndarray:
+        if self._field is None:
+            return self._surface.signed_distance(points, reach, DEEPEST_M)
+        low, high = self._field.box + np.array([[-reach], [reach]])
+        found = np.full(len(points), reach)
         near = np.flatnonzero(((points > low) & (points < high)).all(1))
-        found[near] = self._surface.distance(points[near], REACH_M)
+        found[near] = self._surface.distance(points[near], reach)
         inside = near[self._field.inside(points[near])]
-        deep = inside[found[inside] >= REACH_M]
+        deep = inside[found[inside] >= reach]
         found[deep] = self._surface.distance(points[deep], DEEPEST_M)
         found[inside] *= -1
         return found
