@@ -41,7 +41,8 @@ def parse(characters):
             value -= np.int64(1) << (5 * digits)
         if count > 2:
             value += before
-        negative |= value < 0
+        if value < 0:
+            negative = True
         end += value
         ends[count] = end
         before, one = one, value

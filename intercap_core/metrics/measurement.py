@@ -173,16 +173,19 @@ class Measurement:
         """Distances to frame ``t``'s clouds; the samples that cameras see are found where not
         given."""
         handled = self.handled
-        near, meshes = [vertices[::10]], [(vertices, self.faces)]
+        near = [vertices[::10]]
         if handled is not None:
             object_vertices = handled.posed(t, handled.mesh.vertices)
             near.append(object_vertices)
-            meshes.append((object_vertices, handled.mesh.faces))
         person, object_ = (Cloud(points) for points in self.clouds.at(t, np.concatenate(near)))
         body_points = self.body_samples.of(vertices, self.faces)
         sight = None
         if seen_body is None or (handled is not None and seen_object is None):
-            sight = Sight(meshes)
+            occluders = [surface.surface]
+            if handled is not None:
+                track = handled.track
+                occluders.append(handled.surface.placed(track.rotation[t], track.translation[t]))
+            sight = Sight(occluders)
         if seen_body is None:
             assert sight is not None
             normals = face_normals(vertices, self.faces)[self.body_samples.faces]

@@ -9,7 +9,6 @@ import numpy as np
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
 from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.open3d_core import o3d
 from intercap_core.rigid.surface_tree import ShapedSurface, SurfaceTree
 
 REACH_M = 0.10  # distances are capped here: no reported figure needs larger ones
@@ -24,12 +23,15 @@ class PosedObject:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
-        tree = SurfaceTree(vertices, faces)
-        self._solid = _Solid(tree.shaped(vertices))
-        if not (watertight and tree.closed):
-            self._solid = _Solid(
-                tree.shaped(vertices), DistanceField(vertices, faces, watertight=watertight)
-            )
+        self._tree, self._vertices = SurfaceTree(vertices, faces), vertices
+        field = None
+        if not (watertight and self._tree.closed):
+            field = DistanceField(vertices, faces, watertight=watertight)
+        self._solid = _Solid(self._tree.shaped(vertices), field)
+
+    def placed(self, rotation: np.ndarray, translation: np.ndarray) -> ShapedSurface:
+        """The surface under master_from_object."""
+        return self._tree.shaped(self._vertices @ rotation.T + translation)
 
     def signed_distance(
         self,
@@ -47,11 +49,14 @@ class PosedObject:
 
 
 class PosedBody:
-    """A body in one pose: vertices (V, 3), and the ``tree`` of its faces (F, 3)."""
+    """A body in one pose, vertices (V, 3), with the ``tree`` of its faces (F, 3).
+
+    ``surface``: its tree, posed.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
-        self._surface = tree.shaped(vertices)
-        self._solid = _Solid(self._surface, None if tree.closed else DistanceField(vertices, faces))
+        self.surface = tree.shaped(vertices)
+        self._solid = _Solid(self.surface, None if tree.closed else DistanceField(vertices, faces))
 
     def signed_distance(self, points: np.ndarray, *, reach: float = REACH_M) -> np.ndarray:
         """Signed distance (N,) of points (N, 3), as of :class:`PosedObject`."""
@@ -59,7 +64,7 @@ class PosedBody:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) on either side, at most ``DEEPEST_M``."""
-        return self._surface.distance(points, DEEPEST_M)
+        return self.surface.distance(points, DEEPEST_M)
 
 
 class _Solid:
@@ -83,15 +88,10 @@ class _Solid:
 
 
 class Sight:
-    """Visibility to the rig's cameras, in one frame, of meshes that occlude each other."""
+    """Visibility to the rig's cameras, in one frame, of surfaces that occlude each other."""
 
-    def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-        self._scene = o3d.t.geometry.RaycastingScene()
-        for vertices, faces in meshes:
-            self._scene.add_triangles(
-                o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
-                o3d.core.Tensor.from_numpy(np.ascontiguousarray(faces, np.uint32)),
-            )
+    def __init__(self, surfaces: Sequence[ShapedSurface]) -> None:
+        self._surfaces = surfaces
 
     def seen(
         self,
@@ -101,7 +101,7 @@ class Sight:
     ) -> np.ndarray:
         """Whether some depth camera (colour where it has none) sees each surface point (N,).
 
-        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the meshes.
+        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the surfaces.
         """
         seen = np.zeros(len(points), bool)
         for camera in cameras:
@@ -117,11 +117,10 @@ class Sight:
             if len(ids) == 0:
                 continue
             start = points[ids] + _LIFT_M * normals[ids]
-            rays = np.concatenate([start, eye - start], 1).astype(np.float32)
-            hidden = self._scene.test_occlusions(
-                o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0
-            )
-            seen[ids[~hidden.numpy()]] = True
+            hidden = np.zeros(len(ids), bool)
+            for surface in self._surfaces:
+                surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)
+            seen[ids[~hidden]] = True
         return seen
 
 

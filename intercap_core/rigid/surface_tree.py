@@ -62,6 +62,18 @@ class ShapedSurface:
             queries, self._triangles, self._boxes, self._levels, float(reach), float(deepest)
         )
 
+    def blocks(self, starts: np.ndarray, ends: np.ndarray, blocked: np.ndarray) -> None:
+        """Set ``blocked`` (N,) bool where the way from ``starts`` to ``ends`` (N, 3) meets the
+        surface; what is set already is not asked."""
+        kernel.block(
+            np.ascontiguousarray(starts, np.float64),
+            np.ascontiguousarray(ends, np.float64),
+            self._triangles,
+            self._boxes,
+            self._levels,
+            blocked,
+        )
+
 
 def _closed(faces: np.ndarray) -> bool:
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

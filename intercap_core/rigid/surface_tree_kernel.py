@@ -115,6 +115,77 @@ def signed(points, triangles, boxes, levels, reach, deepest):
 
 
 @numba.njit(cache=True, nogil=True)
+def block(starts, ends, triangles, boxes, levels, blocked):
+    """Set ``blocked`` (M,) bool where the way from ``starts`` to ``ends`` (M, 3) float64 meets the
+    mesh, from either side; what is set already is passed over.
+
+    Ways that follow each other had better be neighbours: the face that was met last comes first.
+    """
+    leaves, count = 1 << levels, len(triangles)
+    stack = np.empty(levels + 2, np.int32)
+    last = 0
+    for m in range(len(starts)):
+        if blocked[m]:
+            continue
+        x, y, z = starts[m, 0], starts[m, 1], starts[m, 2]
+        u, v, w = ends[m, 0] - x, ends[m, 1] - y, ends[m, 2] - z
+        if _meets(x, y, z, u, v, w, triangles, last):
+            blocked[m] = True
+            continue
+        a, b, c = _inverse(u), _inverse(v), _inverse(w)
+        size, stack[0] = 1, 0
+        while size:
+            size -= 1
+            node = stack[size]
+            near, far = 0.0, 1.0
+            for k in range(3):
+                at, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
+                one, other = (boxes[node, k] - at) * over, (boxes[node, 3 + k] - at) * over
+                near, far = max(near, min(one, other)), min(far, max(one, other))
+            if near > far + _ROUNDING:
+                continue
+            if node < leaves - 1:
+                stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
+                size += 2
+                continue
+            leaf = node - leaves + 1
+            for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+                if _meets(x, y, z, u, v, w, triangles, at):
+                    blocked[m], last = True, at
+                    size = 0
+                    break
+
+
+@numba.njit(inline="always")
+def _inverse(value):
+    """1 over a component of a way, finite where that is 0."""
+    return 1.0 / value if abs(value) > 1e-12 else 1e12
+
+
+@numba.njit(cache=True, nogil=True)
+def _meets(x, y, z, u, v, w, triangles, at):
+    """Whether the way from a point (x, y, z) by (u, v, w) meets one of triangles (F, 3, 3) (Moeller
+    and Trumbore 1997)."""
+    ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
+    bx, by, bz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
+    cx, cy, cz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
+    px, py, pz = v * cz - w * cy, w * cx - u * cz, u * cy - v * cx
+    volume = bx * px + by * py + bz * pz
+    if volume == 0:
+        return False
+    tx, ty, tz = x - ax, y - ay, z - az
+    s = (tx * px + ty * py + tz * pz) / volume
+    if not 0 <= s <= 1:
+        return False
+    qx, qy, qz = ty * bz - tz * by, tz * bx - tx * bz, tx * by - ty * bx
+    t = (u * qx + v * qy + w * qz) / volume
+    if t < 0 or s + t > 1:
+        return False
+    along = (cx * qx + cy * qy + cz * qz) / volume
+    return 0 <= along <= 1
+
+
+@numba.njit(cache=True, nogil=True)
 def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
     """Squared distance of a point to the mesh, at most ``most``, and the face where it is found,
     sought from face ``last`` on."""
