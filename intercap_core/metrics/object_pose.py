@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import chi
 
 from intercap_core.metrics.body import MEDIAN_CHI_3
 from intercap_core.rigid.pose import rotation_log
@@ -92,8 +93,6 @@ def normalised_rotation_error(
     Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` say nothing and are left out; NaN
     where all are.
     """
-    from scipy.stats import chi  # a quarter of a second that no other figure needs
-
     truly = symmetry.nearest_equivalent(true_rotation, rotation)
     error = rotation_log(rotation @ np.swapaxes(truly, 1, 2))
     result = np.full(len(error), np.nan)
