@@ -739,6 +739,8 @@ class Annotation(Model):
         beyond = [frame for frame in self.drop_frames if frame >= count]
         if beyond:
             return f"drop_frames holds {beyond[0]}, the recording has {count} frames"
+        if count and len(set(self.drop_frames)) == count:
+            return f"drop_frames drops all {count} frames of the recording"
         return None
 
 

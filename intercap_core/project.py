@@ -145,17 +145,28 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
         )
     config = _parse(Config, _merged(values, overrides or {}), str(path), "setting")
     subjects_table = tidy(path.parent / config.subjects)
-    subjects = {row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject")}
-    objects = _read_objects(tidy(path.parent / config.objects))
+    subjects = {
+        row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject", path)
+    }
+    objects_file = tidy(path.parent / config.objects)
+    if not objects_file.exists():
+        raise UserError(
+            f"{objects_file}: there is no such file; check the path 'objects' in the settings, "
+            f"{path}"
+        )
+    objects = _read_objects(objects_file)
     table = tidy(path.parent / config.sequences)
-    rows = {row.sequence: row for row in _read_table(table, SequenceEntry, "sequence")}
+    rows = {row.sequence: row for row in _read_table(table, SequenceEntry, "sequence", path)}
     for row in rows.values():
-        for field, known in (("subject", subjects), ("object", objects)):
+        for field, known, listed in (
+            ("subject", subjects, subjects_table),
+            ("object", objects, objects_file),
+        ):
             value = getattr(row, field)
             if value is not None and value not in known:
                 raise UserError(
                     f"{table}: sequence {row.sequence!r} has {field} {value!r}, which is not in "
-                    f"the table of {field}s ({_some(known) or 'empty'}); correct the "
+                    f"the table of {field}s {listed} ({_some(known) or 'empty'}); correct the "
                     f"name or add the {field}"
                 )
     unknown = sorted(set(config.exclude) - set(rows))
@@ -321,12 +332,13 @@ def _parse(model: type[M], values: Any, where: str, what: str) -> M:
         raise UserError(f"{where}: {told}; correct it") from None
 
 
-def _read_table(path: Path, model: type[M], key: str) -> list[M]:
+def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]:
     try:
         lines = read_text(path, MAX_TABLE_BYTES).splitlines()
     except Unreadable as error:
         raise UserError(
-            f"{path}: not a readable text file ({error.reason}); check the path in the settings"
+            f"{path}: not a readable text file ({error.reason}); check the path in the settings, "
+            f"{settings}"
         ) from None
     numbered = [
         (number, line)

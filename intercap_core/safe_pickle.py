@@ -59,14 +59,15 @@ class _Array(np.ndarray):
     def __new__(cls, *_: object) -> _Array:
         return super().__new__(cls, 0, np.uint8)
 
-    def __setstate__(self, state: object) -> None:  # type: ignore[override]
+    def __setstate__(self, state: object) -> None:
         if not isinstance(state, tuple) or len(state) not in (4, 5):
             raise pickle.UnpicklingError("it holds an array without shape and values")
         shape, dtype, fortran, values = state[-4:]
         if not isinstance(dtype, _Dtype):
             raise pickle.UnpicklingError("it holds an array of no type")
         checked = _checked(shape, dtype.dtype, values)
-        super().__setstate__((1, checked, dtype.dtype, bool(fortran), values))
+        filled: Any = (1, checked, dtype.dtype, bool(fortran), values)
+        super().__setstate__(filled)
 
 
 def _checked(shape: object, dtype: np.dtype, values: object) -> tuple[int, ...]:
@@ -109,7 +110,7 @@ def _frombuffer(values: object, dtype: object, shape: object, order: object = "C
     content = bytes(values) if isinstance(values, bytes | bytearray) else b""
     checked = _checked(shape, dtype.dtype, content)
     made = np.frombuffer(content, dtype.dtype) if content else np.zeros(0, dtype.dtype)
-    return made.reshape(checked, order=order)  # type: ignore[call-overload]
+    return made.reshape(checked, order=order)
 
 
 def _encode(text: object, name: object = "latin1", *_: object) -> bytes:
@@ -117,6 +118,11 @@ def _encode(text: object, name: object = "latin1", *_: object) -> bytes:
     if not isinstance(text, str) or name not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError("it encodes something else than latin-1 text")
     return codecs.encode(text, "latin1")
+
+
+def _no_bytes() -> bytes:
+    """How protocol 2 carries no bytes at all."""
+    return b""
 
 
 # numpy moved these from ``core`` to ``_core`` in 2.0.
@@ -133,6 +139,7 @@ _STANDS = {
     ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _encode,
     ("collections", "OrderedDict"): OrderedDict,
+    **{(module, "bytes"): _no_bytes for module in ("builtins", "__builtin__")},
     **{
         (module, kind.__name__): kind
         for module in ("builtins", "__builtin__")

@@ -67,7 +67,7 @@ def _distortion_fault(lens: Intrinsics) -> str | None:
     focal = min(lens.fx, lens.fy)
     edge = min(lens.width, lens.height) / 2 / focal  # of the normalised image
     distortion = np.asarray(lens.distortion, np.float64)
-    radius = np.concatenate([np.geomspace(1e-6, 1e-2, 200), np.linspace(0.01, 5.0, 4992)[1:]])
+    radius = np.concatenate([[0], np.geomspace(1e-6, 1e-2, 200), np.linspace(0.01, 5, 4992)[1:]])
     coefficients = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
     with np.errstate(all="ignore"):
         above, below = radial_fraction(radius * radius, coefficients)

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.inputs.files import MAX_ARRAYS_BYTES, Unreadable, read_bytes
+from intercap_core.inputs.quotes import printable
 
 MAX_ARRAYS = 10_000  # of one archive
 _SUFFIX, _ARRAY = ".npy", b"\x93NUMPY"
@@ -72,14 +73,18 @@ class Archive:
         try:
             content = self._zip.read(self._entries[name])
         except _ZIP_ERRORS as error:
-            raise self._refused(f"is damaged at {name!r:.60} ({error})") from None
+            raise self._refused(f"is damaged at {name!r:.60} ({_told(error)})") from None
         try:
             return _array(content)
         except _HEAD_ERRORS as error:
-            raise self._refused(f"has no readable array {name!r:.60} ({error})") from None
+            raise self._refused(f"has no readable array {name!r:.60} ({_told(error)})") from None
 
     def _refused(self, reason: str) -> Unreadable:
         return Unreadable(self._path, reason, self._advice)
+
+
+def _told(error: Exception) -> str:
+    return " ".join(printable(str(error)).split())[:200] or type(error).__name__
 
 
 def read_arrays(

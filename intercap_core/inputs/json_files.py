@@ -111,7 +111,8 @@ def _bounded(content: Any) -> Any:
     if isinstance(content, list):
         return [_bounded(value) for value in content]
     if type(content) is int and not SMALLEST <= content <= LARGEST:
-        return math.copysign(math.inf, content) if content.bit_length() > 1000 else float(content)
+        far = math.inf if content > 0 else -math.inf
+        return far if content.bit_length() > 1000 else float(content)
     return content
 
 

@@ -96,8 +96,6 @@ def parse_yaml(text: str, loader: type[Loader] = Loader) -> Any:
         return opened.construct_document(node)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    except OverflowError as error:  # a date beyond the year 9999
-        raise ValueError(str(error)) from None
     finally:
         opened.dispose()
 

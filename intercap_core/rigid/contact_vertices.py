@@ -75,8 +75,8 @@ def _check_mesh(path: Path, values: Mapping[str, Any], mesh: Path, vertices: np.
         expected = values.get(key)
         if expected is not None and str(expected) != str(found):
             raise UserError(
-                f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {found}; the "
-                "mesh was built anew under an old list: choose the vertices anew, or leave "
+                f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {found}; "
+                "the mesh was built anew under an old list: choose the vertices anew, or leave "
                 "'contact_vertices' out of objects.yaml"
             )
 

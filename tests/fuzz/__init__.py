@@ -1,5 +1,6 @@
-"""Damaged files of every kind that a user supplies, thousands of them, each read in a process of its
-own: it is accepted and plausible, or refused in one sentence that names it.
+"""Damaged files of every kind that a user supplies, thousands, each read in a process of its own.
+
+One is accepted and plausible, or refused in one sentence that names it.
 
 - ``kinds_*``: the kinds of files: a good one, its reader, and what holds of anything it accepts
 - ``mutations``: how a file is damaged, from a seed

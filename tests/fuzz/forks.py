@@ -1,4 +1,4 @@
-"""One case in a child of this process: everything is imported already, and nothing it does lasts."""
+"""One case in a child of this process: everything is imported already, nothing it does lasts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SECONDS = 20.0  # of one case; the slowest good file takes two
 MEMORY_BYTES = 1 << 30  # beyond what the process has: several times what any good file takes
 ADDRESSES_BYTES = 8 << 30
 LONGEST_MESSAGE = 1500  # characters
-_CATCH_ALL = re.compile(r"unexpected (error|\w+Error)|\(\)|Traceback|object at 0x")
+_CATCH_ALL = re.compile(r"unexpected (error|\w+Error)|\(\);|Traceback|object at 0x")
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def _read_candidates(folder: Path) -> list[str]:
     for label in look.labels:
         label.encode()
     notes = [*found.notes, *look.notes]
-    return [note for note in notes if "scaled" not in note]
+    return [f"camera k1: {note}" for note in notes if "scaled" not in note]
 
 
 def _read_keypoints(folder: Path) -> list[str]:
@@ -65,7 +65,8 @@ def _read_keypoints(folder: Path) -> list[str]:
         finite(people=people)
         within(0, 1, confidence=people[..., 2])
         within(-1, max(SIZE), place=people[..., :2])
-    return [*found.notes, *look_at_keypoints(folder, "k1", size=SIZE, full_confidence=1.0)]
+    notes = [*found.notes, *look_at_keypoints(folder, "k1", size=SIZE, full_confidence=1.0)]
+    return [f"camera k1: {note}" for note in notes]
 
 
 def _person(count: int) -> np.ndarray:
@@ -190,7 +191,8 @@ KINDS = (
         {"categories": [{"id": n, "name": COCO_NAMES[n]} for n in (1, 2, 47)]})),
     _labels("labels.yaml", "yaml", "names:\n  0: person\n  1: cup\n  2: chair\n"),
     _labels("labels.txt", "text", "person\ncup\nchair\n"),
-    Kind("onnx-yolo", "bytes", lambda folder: tiny_onnx.yolo(folder / "model.onnx", (320, 256), {"task": "segment"}),
+    Kind("onnx-yolo", "bytes",
+         lambda folder: tiny_onnx.yolo(folder / "model.onnx", (320, 256), {"task": "segment"}),
          ["model.onnx"], _segment, share=0.7),
     Kind("onnx-rcnn", "bytes",
          lambda folder: tiny_onnx.mask_rcnn(folder / "model.onnx", "torchvision"),

@@ -1,4 +1,4 @@
-"""What a user writes by hand: settings, tables, objects, annotations; and tables of released sets."""
+"""What a user writes by hand: settings, tables, objects, annotations; what released sets state."""
 
 from __future__ import annotations
 
@@ -40,8 +40,10 @@ def _make(folder: Path) -> None:
     )
     shutil.copy(ROOT / "config/objects/09_cup.ply", folder / "cup.ply")
     (folder / "objects.yaml").write_text(
-        "cup:\n  mesh: cup.ply\n  symmetry:\n    continuous:\n    - {axis: [0, 0, 1], offset: [0, 0, 0]}\n"
-        "    discrete: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]\n  labels: [cup, wine glass]\n"
+        "cup:\n  mesh: cup.ply\n  symmetry:\n    continuous:\n"
+        "    - {axis: [0, 0, 1], offset: [0, 0, 0]}\n"
+        "    discrete: [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]\n"
+        "  labels: [cup, wine glass]\n"
     )
     (folder / "annotations").mkdir()
     (folder / "annotations/one.yaml").write_text(ANNOTATION)
@@ -72,7 +74,8 @@ def _read_definition(folder: Path) -> None:
 def _make_release(folder: Path) -> None:
     (folder / "contact.txt").write_text("12\n80\n95\n120\n")
     (folder / "config.ini").write_text(
-        "[init_trans]\ntrans = 0.1 0.2 2.0\n[init_rot]\nrot = 0.1 -0.4 1.2\n[init_frame_id]\nid = 3\n"
+        "[init_trans]\ntrans = 0.1 0.2 2.0\n[init_rot]\nrot = 0.1 -0.4 1.2\n"
+        "[init_frame_id]\nid = 3\n"
     )
 
 

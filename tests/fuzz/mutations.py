@@ -1,4 +1,4 @@
-"""Damage to files, from a seeded generator: to their values, their text, their bytes, their place."""
+"""Damage to files, from a seeded generator: to values, text, bytes, and to what the name means."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from typing import Any
 
 NUMBERS = (
     "1e308", "-1e308", "1e-308", "NaN", "Infinity", "1e999", "1" + "0" * 400, "-1", "0", "-0.0",
-    "1e9", "-1e9", "1e-9", "1e30", "50", "0.001", "1000", "9223372036854775808", "18446744073709551616",
-    "-9223372036854775809", "4294967296", "2147483648", "1" * 5000, "1e5", "3.5",
+    "1e9", "-1e9", "1e-9", "1e30", "50", "0.001", "1000", "9223372036854775808",
+    "18446744073709551616", "-9223372036854775809", "4294967296", "2147483648", "1" * 5000, "1e5",
+    "3.5",
 )  # fmt: skip
 OTHERS = (
     "null", "true", "false", '""', "[]", "{}", "[[]]", '"x"', '"\\ud800"', '"../../etc/passwd"',
@@ -28,15 +29,17 @@ _LAUGHS = ", ".join(
     + [f"&l{n} [{', '.join([f'*l{n - 1}'] * 10)}]" for n in range(1, 12)]
 )
 YAML_VALUES = (
-    "&self [*self]", "&me {a: *me}", f"[{_LAUGHS}]", "!!map [a]", "!!set [a]", "!!bool x", "!!int ''",
-    "!!timestamp x", "!!float ''", "!!null x", "!!python/object/apply:os.system [ls]", "!!binary x",
-    "!!omap [a]", "!!pairs [a]", "!!str [a]", "!!seq {a: b}", "2024-13-45", "0001-01-01T00:00:00+23:59",
+    "&self [*self]", "&me {a: *me}", f"[{_LAUGHS}]", "!!map [a]", "!!set [a]", "!!bool x",
+    "!!int ''", "!!timestamp x", "!!float ''", "!!null x", "!!python/object/apply:os.system [ls]",
+    "!!binary x",
+    "!!omap [a]", "!!pairs [a]", "!!str [a]", "!!seq {a: b}", "2024-13-45",
+    "0001-01-01T00:00:00+23:59",
     "0x" + "f" * 400, "1:2:3", "*nowhere", "? [a]\n: b", "<<", "!!opencv-matrix {rows: 3}",
     "!!opencv-matrix {rows: 3, cols: 3, dt: d, data: [1e999, 2]}", ".inf", ".nan", "12_34", "0b1",
 )  # fmt: skip
 TOML_VALUES = ("inf", "nan", "1979-05-27", "'''", '"""', "[[1]]", "{a = 1}", "0xffffffffffffffffff")
 _TOKEN = re.compile(r'-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?|"(?:[^"\\\n]|\\.)*"|[A-Za-z_][\w./-]*')
-_PLACE = "\u2603place\u2603"
+_PLACE = "here a value comes"
 EXTREMES = (
     b"\xff" * 8, b"\0" * 8, struct.pack("<d", 1e308), struct.pack("<d", float("nan")),
     struct.pack("<f", float("inf")), struct.pack("<i", 2**31 - 1), struct.pack("<q", 2**62),
@@ -198,9 +201,7 @@ def _json(text: str, chance: random.Random) -> tuple[bytes, str] | None:
         made = json.dumps(root)
     except (ValueError, RecursionError):
         return None
-    return made.replace(
-        f'"{_PLACE.encode("ascii", "backslashreplace").decode()}"', raw
-    ).encode(), told
+    return made.replace(f'"{_PLACE}"', raw).encode(), told
 
 
 def _member(content: bytes, chance: random.Random) -> tuple[bytes, str]:

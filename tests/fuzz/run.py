@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import os
-
-for _variable in (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-):
-    os.environ[_variable] = "1"  # threads do not outlive a fork
-
 import argparse
 import contextlib
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -24,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from intercap_core.pipeline.job import THREAD_VARIABLES
 from tests.fuzz.forks import Outcome, good_files, run_case
 from tests.fuzz.kinds import KINDS
 
@@ -60,8 +52,10 @@ def _worker(total: int, seed: int, place: str) -> None:
 
 def _lines(total: int, seed: int, workers: int) -> Iterator[Outcome]:
     commands = [
-        [sys.executable, "-m", "tests.fuzz.run", "--cases", str(total), "--seed", str(seed)]
-        + ["--worker", f"{n}/{workers}"]
+        [
+            *(sys.executable, "-m", "tests.fuzz.run", "--cases", str(total)),
+            *("--seed", str(seed), "--worker", f"{n}/{workers}"),
+        ]
         for n in range(workers)
     ]
     running = [subprocess.Popen(c, stdout=subprocess.PIPE, text=True) for c in commands]
@@ -98,6 +92,10 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if any(os.environ.get(variable) != "1" for variable in THREAD_VARIABLES):
+        # threads do not outlive a fork, and libraries count them when they are loaded
+        alone = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
+        os.execve(sys.executable, [sys.executable, "-m", "tests.fuzz.run", *sys.argv[1:]], alone)
     if arguments.worker:
         return _worker(arguments.cases, arguments.seed, arguments.worker)
     if arguments.case:
@@ -125,8 +123,8 @@ def main() -> None:
     total = sum(counts.values())
     print(
         f"{total} cases of {len(KINDS)} kinds in {time.monotonic() - started:.0f} s: "
-        f"{counts['refused']} refused, {counts['ok']} accepted, {counts['unexplained']} unexplained; "
-        f"{refused_seeds} good files refused. One again: "
+        f"{counts['refused']} refused, {counts['ok']} accepted, {counts['unexplained']} "
+        f"unexplained; {refused_seeds} good files refused. One again: "
         f"python -m tests.fuzz.run --seed {arguments.seed} --case KIND:NUMBER"
     )
     from bench.command import add_figures
