@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -232,11 +233,14 @@ def test_a_mask_whose_name_is_no_text_has_a_label_that_is(tmp_path: Path) -> Non
         ({"start_offset_ns": 10**398}, "K4A_START_OFFSET_NS"),
         ({"start_offset_ns": (1 << 63) * 1000}, "K4A_START_OFFSET_NS"),
         ({"depth_delay_ns": 10**29}, "K4A_DEPTH_DELAY_NS"),
-        ({"subordinate_delay_ns": -(10**12)}, "K4A_SUBORDINATE_DELAY_NS"),
+        (
+            {"subordinate_delay_ns": 10**12, "wired_sync_mode": "SUBORDINATE"},
+            "K4A_SUBORDINATE_DELAY_NS",
+        ),
     ],
 )
 def test_times_of_recordings_that_no_clock_has(
-    options: dict[str, int], words: str, tmp_path: Path
+    options: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "k1.mkv"
     calibration = write_calibration(make_camera(0), serial="1", **MODES)
