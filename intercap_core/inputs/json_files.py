@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +19,8 @@ from intercap_core.inputs.structure import check_structure
 MAX_DIGITS = 1000
 LARGEST = (1 << 64) - 1
 SMALLEST = -(1 << 63)
-_MANY_DIGITS = re.compile(r"\d{19}")  # as few as a number beyond 64 bits may have
+_LONG = b"0" * 19  # as few digits as a number beyond 64 bits may have
+_ANY_DIGIT = bytes.maketrans(b"123456789", b"000000000")
 
 
 def parse_json(text: str, entry: Callable[[dict[str, Any]], Any] | None = None) -> Any:
@@ -47,7 +47,8 @@ def decoder(text: str, entry: Callable[[dict[str, Any]], Any] | None = None) -> 
             raise ValueError(f"the key {_twice(pairs)!r:.60} is given twice")
         return found if entry is None else entry(found)
 
-    long = _MANY_DIGITS.search(text) is not None  # a check of every number takes its time
+    # A check of every number takes its time: is there any that may be beyond 64 bits?
+    long = _LONG in text.encode("utf-8", "surrogatepass").translate(_ANY_DIGIT)
     return json.JSONDecoder(object_pairs_hook=made, parse_int=bounded if long else None)
 
 
