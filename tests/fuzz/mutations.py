@@ -9,6 +9,7 @@ import random
 import re
 import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,10 @@ YAML_VALUES = (
 )  # fmt: skip
 TOML_VALUES = ("inf", "nan", "1979-05-27", "'''", '"""', "[[1]]", "{a = 1}", "0xffffffffffffffffff")
 _TOKEN = re.compile(r'-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?|"(?:[^"\\\n]|\\.)*"|[A-Za-z_][\w./-]*')
+_ZIP_ERRORS = (
+    zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, NotImplementedError,
+    RuntimeError, OverflowError, IndexError,
+)  # fmt: skip
 _PLACE = "here a value comes"
 EXTREMES = (
     b"\xff" * 8, b"\0" * 8, struct.pack("<d", 1e308), struct.pack("<d", float("nan")),
@@ -210,7 +215,7 @@ def _member(content: bytes, chance: random.Random) -> tuple[bytes, str]:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = [(info, archive.read(info)) for info in archive.infolist()]
         place = chance.randrange(len(members))
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError, NotImplementedError):
+    except _ZIP_ERRORS:  # damaged before
         return _bytes(content, chance)
     made = io.BytesIO()
     told = "nothing"
