@@ -22,8 +22,8 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command line's options, nothing else"},
     {"evaluation": "figures against truth over many recordings: `intercap evaluate`"},
     {
-        "commands": "the command line's verbs: run, check, report, view, compare, release, bench and "
-        "others"
+        "commands": "the command line's verbs: run, check, report, view, compare, release, bench "
+        "and others"
     },
     {
         "tables": "a project's tables for released datasets",

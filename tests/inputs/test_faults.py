@@ -16,8 +16,11 @@ import torch
 from intercap_core.camera import masks
 from intercap_core.capture.encoded import encoded_size
 from intercap_core.capture.k4a import Recording
+from intercap_core.commands.check import faults_of_truth
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
+from intercap_core.rigid.mesh import colours_of
+from intercap_core.rigid.mesh_files import load_mesh
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
 from tests.fuzz.kinds import KINDS
@@ -313,3 +316,38 @@ def test_inputs_of_models_that_no_memory_holds(shape: list[int], tmp_path: Path)
 def test_no_frame_is_left(tmp_path: Path) -> None:
     assert "all 3 frames" in str(Annotation(drop_frames=(0, 1, 2)).check_frames(3))
     assert Annotation(drop_frames=(0, 1)).check_frames(3) is None
+
+
+def test_textures_are_looked_for_beside_the_mesh_alone(tmp_path: Path) -> None:
+    import cv2
+
+    folder = tmp_path / "object"
+    folder.mkdir()
+    KINDS["mesh-textured"].make(folder)
+    (folder / "box.png").rename(tmp_path / "outside.png")
+    cv2.imwrite(str(tmp_path / "outside.png"), np.full((4, 4, 3), (0, 0, 255), np.uint8))
+    for name in ("../outside.png", str(tmp_path / "outside.png"), "/dev/zero"):
+        (folder / "box.mtl").write_text(f"newmtl a\nKd 0.8 0.8 0.8\nmap_Kd {name}\n")
+        colours = colours_of(load_mesh(folder / "box.obj"))
+        assert not (colours[:, :3] == (255, 0, 0)).all(1).any()
+
+
+def test_a_network_reads_no_other_file(tmp_path: Path) -> None:
+    path = tmp_path / "model.onnx"
+    KINDS["onnx-yolo"].make(tmp_path)
+    model = onnx.load(path)
+    constant = model.graph.initializer[0]
+    constant.data_location = onnx.TensorProto.EXTERNAL
+    length = len(constant.raw_data)
+    constant.ClearField("raw_data")
+    for key, value in (("location", "/dev/zero"), ("offset", "0"), ("length", str(length))):
+        constant.external_data.add(key=key, value=value)
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(UserError, match=r"model\.onnx"):
+        KINDS["onnx-yolo"].read(tmp_path)
+
+
+def test_truth_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "truth.h5").write_text("no truth")
+    told = faults_of_truth(tmp_path / "truth.h5")
+    assert len(told) == 1 and str(tmp_path / "truth.h5") in told[0]
