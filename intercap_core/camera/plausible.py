@@ -24,7 +24,7 @@ LEAST_COVERED = 0.25
 # By how much the distortion may change the scale between the centre and the edge. Measured lenses
 # stay within a quarter to 2 (a GoPro's 130 degrees: 0.3 at the corner).
 MAX_SCALE_CHANGE = 4.0
-MAX_TANGENTIAL = 0.2  # of the image's radius at its edge; a lens mounted askew has 0.01
+MAX_TANGENTIAL = 0.5  # of the image's radius at its edge; a lens mounted askew has 0.01
 FRAMES_PER_SECOND = (0.05, 10_000.0)  # time lapse to high-speed cameras
 LONGEST_OFFSET_S = 1e9  # clocks count from 1970 at most
 

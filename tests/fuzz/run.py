@@ -51,6 +51,9 @@ def _worker(total: int, seed: int, place: str) -> None:
 
 
 def _lines(total: int, seed: int, workers: int) -> Iterator[Outcome]:
+    if workers == 1:
+        yield from outcomes(total, seed)
+        return
     commands = [
         [
             *(sys.executable, "-m", "tests.fuzz.run", "--cases", str(total)),

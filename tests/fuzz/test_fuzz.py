@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+from intercap_core.pipeline.job import THREAD_VARIABLES
 from tests.fuzz.kinds import KINDS
 from tests.fuzz.run import numbers_of_cases
 
@@ -23,7 +24,9 @@ def test_damaged_files_are_accepted_and_plausible_or_refused_by_name(tmp_path: P
             *("--workers", "1", "--output", str(output), "--keep", str(kept)),
         ],
         cwd=Path(__file__).resolve().parents[2],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        env=os.environ
+        | dict.fromkeys(THREAD_VARIABLES, "1")
+        | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
         timeout=600,
