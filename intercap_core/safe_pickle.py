@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from intercap_core.inputs.arrays import check_text
 from intercap_core.inputs.files import MAX_PICKLE_BYTES, Unreadable, read_bytes
 from intercap_core.inputs.quotes import printable
 from intercap_core.inputs.structure import check_structure
@@ -68,6 +69,7 @@ class _Array(np.ndarray):
         checked = _checked(shape, dtype.dtype, values)
         filled: Any = (1, checked, dtype.dtype, bool(fortran), values)
         super().__setstate__(filled)
+        check_text(self)
 
 
 def _checked(shape: object, dtype: np.dtype, values: object) -> tuple[int, ...]:
@@ -101,7 +103,11 @@ def _scalar(dtype: object, value: object = None) -> Any:
     if not isinstance(dtype, _Dtype) or dtype.dtype == _OBJECT or not isinstance(content, bytes):
         raise pickle.UnpicklingError("it holds a number of no type")
     _checked((), dtype.dtype, content)
-    return np.frombuffer(content, dtype.dtype)[0] if dtype.dtype.itemsize else dtype.dtype.type()
+    if not dtype.dtype.itemsize:
+        return dtype.dtype.type()
+    made = np.frombuffer(content, dtype.dtype)
+    check_text(made)
+    return made[0]
 
 
 def _frombuffer(values: object, dtype: object, shape: object, order: object = "C") -> np.ndarray:
@@ -110,6 +116,7 @@ def _frombuffer(values: object, dtype: object, shape: object, order: object = "C
     content = bytes(values) if isinstance(values, bytes | bytearray) else b""
     checked = _checked(shape, dtype.dtype, content)
     made = np.frombuffer(content, dtype.dtype) if content else np.zeros(0, dtype.dtype)
+    check_text(made)
     return made.reshape(checked, order=order)
 
 

@@ -25,6 +25,7 @@ from torch.nn import functional
 
 from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import Unreadable
 from intercap_core.inputs.quotes import quoted
 
 LATENT = 32
@@ -84,7 +85,11 @@ class VPoser:
                 f"VPoser file {path} does not exist: expected TR00_E096.pt (version 1) or a V02_05 "
                 ".ckpt (version 2); leave the setting out to use joint limits alone."
             )
-        weights = {_bare(name): value for name, value in read_tensors(path, advice=_ADVICE).items()}
+        try:
+            read = read_tensors(path, advice=_ADVICE)
+        except Unreadable as error:
+            raise UserError(f"VPoser file {path} {error.reason}: {_ADVICE}.") from error
+        weights = {_bare(name): value for name, value in read.items()}
         for found, (names, slope) in _VERSIONS.items():
             parts = [(f"{name}.weight", f"{name}.bias") for name in names]
             if all(part in weights for pair in parts for part in pair):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -99,6 +100,14 @@ def read_arrays(
     return {name: archive.read(name) for name in archive.names if wanted is None or name in wanted}
 
 
+def check_text(values: np.ndarray) -> None:
+    """Raise ValueError for text of numbers that are no characters: Python believes numpy's."""
+    if values.dtype.kind == "U" and values.size:
+        order = "<u4" if values.dtype.isnative == (sys.byteorder == "little") else ">u4"
+        if np.ascontiguousarray(values).reshape(-1).view(order).max() > sys.maxunicode:
+            raise ValueError("it holds text that is none")
+
+
 def _array(content: bytes) -> np.ndarray:
     """The array of an .npy file's content; raises ``_HEAD_ERRORS`` where it is none of numbers."""
     file = io.BytesIO(content)
@@ -116,4 +125,5 @@ def _array(content: bytes) -> np.ndarray:
     if not size:
         return np.zeros(shape, dtype)
     values = np.frombuffer(content, dtype, offset=file.tell())
+    check_text(values)
     return values.reshape(shape, order="F" if fortran else "C").copy(order="K")

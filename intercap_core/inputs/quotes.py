@@ -25,4 +25,4 @@ def quoted(value: Any, most: int = 80) -> str:
 
 def printable(text: str) -> str:
     """Text that any file can hold: what is none (names that are no UTF-8) becomes ``?``."""
-    return text.encode("utf-8", "replace").decode("utf-8")
+    return text.encode("utf-8", "replace").decode("utf-8", "replace")

@@ -193,6 +193,24 @@ def test_arrays_whose_heads_lie(content: bytes, words: str, tmp_path: Path) -> N
     assert "'values'" in str(caught.value)
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_text_of_numbers_that_are_no_characters(order: str, tmp_path: Path) -> None:
+    letters = np.array([65, 0x110000], f"{order}u4").tobytes()
+    _npz(tmp_path / "a.npz", "values.npy", _head("(2,)", f"{order}U1") + letters)
+    with pytest.raises(Unreadable, match=r"'values' \(it holds text that is none"):
+        read_arrays(tmp_path / "a.npz")
+    good = np.array([65, 0x10FFFF], f"{order}u4").tobytes()
+    _npz(tmp_path / "a.npz", "values.npy", _head("(2,)", f"{order}U1") + good)
+    assert read_arrays(tmp_path / "a.npz")["values"].tolist() == ["A", "\U0010ffff"]
+    program = pickle.dumps(np.array(["A", "B"], f"{order}U1"), protocol=2)
+    wrong = np.array([66, 0x110000], f"{order}u4").tobytes().decode("latin1").encode()
+    (tmp_path / "a.pkl").write_bytes(
+        program.replace(np.array([65, 66], f"{order}u4").tobytes(), wrong)
+    )
+    with pytest.raises(UserError, match=r"a\.pkl: .*text that is none"):
+        safe_pickle.load(tmp_path / "a.pkl")
+
+
 def test_archives_that_unpack_to_too_much(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, zeros=np.zeros(1 << 20))
