@@ -20,6 +20,9 @@
 # make report    the site of the demo from what is computed
 # make scale-report  what 223 sequences of 300 frames cost the site, of the demo's (run that first):
 #                into results/bench.json
+# make fuzz      10,000 damaged files of every kind that a user supplies, each read in a process of its
+#                own: accepted and plausible, or refused by name; into results/bench.json. A quarter of
+#                an hour on two cores; what it prints reproduces a case
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -30,7 +33,7 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench ablation oracle report scale-report docs environment clean
+    evaluate evaluate-quick bench ablation oracle report scale-report fuzz docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -88,6 +91,9 @@ report: $(STAMP)
 
 scale-report: $(STAMP)
 	$(BIN)/python -m bench.scale_report
+
+fuzz: $(STAMP)
+	$(BIN)/python -m tests.fuzz.run
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

@@ -15,6 +15,7 @@ import numpy as np
 from pycocotools import mask as coco_mask
 
 _FARTHEST_CORNER = 1e5  # px from the image's corner; the C code counts every pixel of an edge
+_LONGEST_OUTLINE = 1e6  # px; the C code keeps five points of each, and counts them in 32 bits
 
 
 class Runs:
@@ -120,9 +121,10 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
 def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
     """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
 
-    Raises ValueError where one has fewer than three corners, or a value that is not finite or
-    farther than 1e5 px from the image's corner.
+    Raises ValueError where one has fewer than three corners, a value that is not finite or farther
+    than 1e5 px from the image's corner, or where their outlines are longer than any shape's.
     """
+    outline = 0.0
     for polygon in polygons:
         values = np.asarray(polygon, np.float64)
         if values.ndim != 1 or len(values) < 6 or len(values) % 2 or not np.isfinite(values).all():
@@ -131,6 +133,13 @@ def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) 
             raise ValueError(
                 f"a polygon has a coordinate {values[np.abs(values).argmax()]:.6g}, expected "
                 f"pixels of the image ({width} x {height})"
+            )
+        corners = values.reshape(-1, 2)
+        outline += float(np.abs(corners - np.roll(corners, 1, 0)).max(1).sum())
+        if outline > _LONGEST_OUTLINE:
+            raise ValueError(
+                f"its polygons are more than {_LONGEST_OUTLINE:.0e} px around, expected outlines "
+                "of a shape in the image"
             )
     if not polygons:
         return encode(np.zeros((height, width), np.uint8))
