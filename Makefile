@@ -22,6 +22,9 @@
 #                into results/bench.json
 # make scale     223 sequences: a start with nothing to do, a check, the jobs of an edit, into
 #                results/bench.json
+# make fuzz      10,000 damaged files of every kind that a user supplies, each read in a process of its
+#                own: accepted and plausible, or refused by name; into results/bench.json. A quarter of
+#                an hour on two cores; what it prints reproduces a case
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -32,7 +35,7 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,slurm,test,bench,dev
 
 .PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench ablation oracle report scale-report scale docs environment clean
+    evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -94,6 +97,9 @@ scale-report: $(STAMP)
 scale: $(STAMP)
 	$(BIN)/intercap run config/test/config.yaml --cores $(CORES)
 	$(BIN)/python -m bench.scale
+
+fuzz: $(STAMP)
+	$(BIN)/python -m tests.fuzz.run
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

@@ -28,6 +28,7 @@ from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.camera import projection
 from intercap_core.metrics.proximity import Sight
+from intercap_core.rigid.surface_tree import SurfaceTree
 from intercap_core.solve.robust import geman_mcclure
 
 HAND_COMPONENTS = 12
@@ -211,7 +212,7 @@ class Energy:
             vertices = self._model.forward(self._model.parameters(vector)).vertices
             normals = vertex_normals(vertices, self._model.faces)[0].double().cpu().numpy()
         points, faces = vertices[0].double().cpu().numpy(), self._model.faces.cpu().numpy()
-        sight = Sight([(points, faces)])
+        sight = Sight([SurfaceTree(points, faces).shaped(points)])
         self._visible = [
             torch.as_tensor(np.flatnonzero(sight.seen(points, normals, [camera]))).to(vector.device)
             for camera in self._rig

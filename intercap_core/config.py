@@ -23,9 +23,11 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
+    field_validator,
     model_validator,
 )
 
+from intercap_core.inputs.files import path_fault
 from intercap_core.schemas import CONTACT_REGIONS
 
 MAX_POSITION_M = 50.0  # a capture volume is some metres wide
@@ -72,11 +74,20 @@ LayoutName = Literal["k4a", "intercap", "behave", "plain"]
 
 
 class Model(BaseModel):
-    """Base of every settings model: unknown keys are mistakes, numbers finite, values fixed."""
+    """Base of every settings model: unknown keys are mistakes, numbers finite, values fixed, paths
+    such as a file system has."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
     )
+
+    @field_validator("*")
+    @classmethod
+    def _paths(cls, value: Any) -> Any:
+        fault = path_fault(value) if isinstance(value, Path) else None
+        if fault is not None:
+            raise ValueError(fault)
+        return value
 
 
 # --- settings by stage -----------------------------------------------------------------------
@@ -733,6 +744,8 @@ class Annotation(Model):
         beyond = [frame for frame in self.drop_frames if frame >= count]
         if beyond:
             return f"drop_frames holds {beyond[0]}, the recording has {count} frames"
+        if count and len(set(self.drop_frames)) == count:
+            return f"drop_frames drops all {count} frames of the recording"
         return None
 
 

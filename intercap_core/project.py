@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import os
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
 from intercap_core.detections.converters.label_maps import read_label_map
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
+from intercap_core.inputs.quotes import printable, quoted
+from intercap_core.inputs.yaml_files import read_yaml
 from intercap_core.schemas import FRAMES
 
 M = TypeVar("M", bound=BaseModel)
+NAMES_TOLD = 40  # of a table, in a message
 
 
 @dataclass(frozen=True)
@@ -144,17 +145,28 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
         )
     config = _parse(Config, _merged(values, overrides or {}), str(path), "setting")
     subjects_table = tidy(path.parent / config.subjects)
-    subjects = {row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject")}
-    objects = _read_objects(tidy(path.parent / config.objects))
+    subjects = {
+        row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject", path)
+    }
+    objects_file = tidy(path.parent / config.objects)
+    if not objects_file.exists():
+        raise UserError(
+            f"{objects_file}: there is no such file; check the path 'objects' in the settings, "
+            f"{path}"
+        )
+    objects = _read_objects(objects_file)
     table = tidy(path.parent / config.sequences)
-    rows = {row.sequence: row for row in _read_table(table, SequenceEntry, "sequence")}
+    rows = {row.sequence: row for row in _read_table(table, SequenceEntry, "sequence", path)}
     for row in rows.values():
-        for field, known in (("subject", subjects), ("object", objects)):
+        for field, known, listed in (
+            ("subject", subjects, subjects_table),
+            ("object", objects, objects_file),
+        ):
             value = getattr(row, field)
             if value is not None and value not in known:
                 raise UserError(
                     f"{table}: sequence {row.sequence!r} has {field} {value!r}, which is not in "
-                    f"the table of {field}s ({', '.join(sorted(known)) or 'empty'}); correct the "
+                    f"the table of {field}s {listed} ({_some(known) or 'empty'}); correct the "
                     f"name or add the {field}"
                 )
     unknown = sorted(set(config.exclude) - set(rows))
@@ -179,6 +191,13 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     _check_files(project)
     _check_studio(project, rows, table)
     return project
+
+
+def _some(names: Iterable[str]) -> str:
+    """Names in order, the first of many."""
+    found = sorted(names)
+    more = f" and {len(found) - NAMES_TOLD} more" if len(found) > NAMES_TOLD else ""
+    return ", ".join(found[:NAMES_TOLD]) + more
 
 
 def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -290,51 +309,6 @@ def tidy(path: Path) -> Path:
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 
-def _without_base_60(tag: str, pattern: re.Pattern[str]) -> re.Pattern[str]:
-    """A scalar's ``pattern`` in YAML, without numbers that have colons."""
-    numbers = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
-    return re.compile(f"(?![^:]*:)(?:{pattern.pattern})", re.X) if tag in numbers else pattern
-
-
-class _Loader(yaml.SafeLoader):
-    """The safe loader, which refuses a key that a mapping has twice, and reads 10:00:12:13 as text:
-    YAML 1.1 means a number to the base of 60, a user a time code."""
-
-    yaml_implicit_resolvers = {  # noqa: RUF012 (as the base class has it)
-        first: [(tag, _without_base_60(tag, pattern)) for tag, pattern in resolvers]
-        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"{key.value!r} is given twice", key.start_mark
-                )
-            seen.add((key.tag, str(key.value)))
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(path: Path) -> Any:
-    """Load YAML with the safe loader; raises UserError where it is missing or malformed."""
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file; check the path") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except RecursionError:
-        raise UserError(f"{path}: not valid YAML (nested too deeply); correct it") from None
-    except (yaml.YAMLError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None)
-        if problem is None:
-            problem = "not text in UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
-        raise UserError(f"{path}: not valid YAML{where} ({problem}); correct it") from None
-
-
 def _or_empty(values: Any) -> Any:
     """What a YAML file holds, where an empty file holds no entries."""
     return {} if values is None else values
@@ -342,40 +316,44 @@ def _or_empty(values: Any) -> Any:
 
 def _parse(model: type[M], values: Any, where: str, what: str) -> M:
     if not isinstance(values, dict):
-        raise UserError(f"{where}: expected names and values, found {values!r:.60}; correct it")
+        raise UserError(f"{where}: expected names and values, found {quoted(values)}; correct it")
     try:
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"]) or "(the whole entry)"
-        message = first["msg"].removeprefix("Value error, ")
+        field = ".".join(str(part)[:80] for part in first["loc"]) or "(the whole entry)"
+        message = first["msg"].removeprefix("Value error, ")[:400]
         if first["type"] == "string_pattern_mismatch":
             message = "a name has letters, digits, _ and - only, and does not start with -"
         found = first.get("input")
-        shown = "" if isinstance(found, dict) else f", found {found!r}"
+        shown = "" if isinstance(found, dict) else f", found {quoted(found)}"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise UserError(f"{where}: {what} {field}: {message}{shown}{more}; correct it") from None
+        told = printable(f"{what} {field}: {message}{shown}{more}")
+        raise UserError(f"{where}: {told}; correct it") from None
 
 
-def _read_table(path: Path, model: type[M], key: str) -> list[M]:
+def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError):
+        lines = read_text(path, MAX_TABLE_BYTES).splitlines()
+    except Unreadable as error:
         raise UserError(
-            f"{path}: not a readable text file; check the path in the settings"
+            f"{path}: not a readable text file ({error.reason}); check the path in the settings, "
+            f"{settings}"
         ) from None
     numbered = [
         (number, line)
         for number, line in enumerate(lines, start=1)
         if line.strip() and not line.startswith("#")
     ]
-    reader = csv.DictReader((line for _, line in numbered), delimiter="\t", quoting=csv.QUOTE_NONE)
-    _check_header(path, numbered[0][0] if numbered else 1, reader.fieldnames or (), model)
+    header = numbered[0][1].split("\t") if numbered else []
+    _check_header(path, numbered[0][0] if numbered else 1, header, model)
     rows: list[M] = []
     seen: dict[str, int] = {}
-    for (number, _), record in zip(numbered[1:], reader, strict=True):
-        where = f"{path}, line {number} ({key} {record.get(key)!r})"
-        if None in record or None in record.values():
+    for number, line in numbered[1:]:
+        fields = line.split("\t")
+        record = dict(zip(header, fields, strict=False))
+        where = f"{path}, line {number} ({key} {quoted(record.get(key))})"
+        if len(fields) != len(header):
             raise UserError(f"{where}: the number of columns differs from the header; use tabs")
         row = _parse(model, {k: v for k, v in record.items() if v != ""}, where, "column")
         name = getattr(row, key)
@@ -392,7 +370,7 @@ def _check_header(path: Path, line: int, found: Sequence[str], model: type[BaseM
     problems = [
         *(f"column {name!r} is missing" for name in required if name not in found),
         *(f"column {name!r} is given twice" for name in fields if found.count(name) > 1),
-        *(f"column {name!r} is not known" for name in found if name not in fields),
+        *(f"column {quoted(name)} is not known" for name in found if name not in fields),
     ]
     if problems:
         optional = [name for name in fields if name not in required]
@@ -412,13 +390,16 @@ def _read_objects(path: Path) -> dict[str, ObjectEntry]:
     for name, entry in values.items():
         if not isinstance(entry, dict | None):
             raise UserError(
-                f"{path}, object {name!r}: expected fields such as 'mesh: cup.ply', found "
-                f"{entry!r:.60}; correct it"
+                f"{path}, object {quoted(name)}: expected fields such as 'mesh: cup.ply', found "
+                f"{quoted(entry)}; correct it"
             )
     return {
         name: _absolute(
             _parse(
-                ObjectEntry, {"name": name, **(entry or {})}, f"{path}, object {name!r}", "field"
+                ObjectEntry,
+                {"name": name, **(entry or {})},
+                f"{path}, object {quoted(name)}",
+                "field",
             ),
             path.parent,
         )

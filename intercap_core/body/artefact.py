@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -20,6 +21,10 @@ _NAMES = (
     "betas", "expression", "global_orient", "body_pose", "left_hand_pose", "right_hand_pose",
     "jaw_pose", "leye_pose", "reye_pose", "transl",
 )  # fmt: skip
+
+# Bodies by file and its digest, numbers of coefficients and device, for as long as somebody holds
+# them: a stage that reads several artefacts has one body.
+_LOADED: WeakValueDictionary[tuple[str, int, int, str], BodyModel] = WeakValueDictionary()
 
 
 def file_digest(path: Path) -> str:
@@ -54,14 +59,16 @@ def load_model(
     Raises UserError for a broken body file, or another one than was fitted.
     """
     path = body_models.of(gender) or OPEN_BODY
-    model = BodyModel.load(
-        path,
-        num_betas=artefact["betas"].shape[-1],
-        num_expression=artefact["expression"].shape[-1],
-        device=device,
-    )
+    digest = file_digest(path) if path.is_file() else ""
+    betas, expression = artefact["betas"].shape[-1], artefact["expression"].shape[-1]
+    key = (f"{path} {digest}", betas, expression, str(device))
+    model = _LOADED.get(key)
+    if model is None:
+        _LOADED[key] = model = BodyModel.load(
+            path, num_betas=betas, num_expression=expression, device=device
+        )
     told = artefact.attributes
-    if file_digest(path) != told["body_model"]:
+    if digest != told["body_model"]:
         raise UserError(
             f"{artefact.path}: the bodies of sequence {told['sequence']!r} were fitted with "
             f"another body file than {path}, which the settings give for a {gender} subject; name "

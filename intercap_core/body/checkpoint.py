@@ -7,11 +7,17 @@ classes, which PyTorch's restricted reader refuses. Here such objects become :cl
 from __future__ import annotations
 
 import pickle
+import struct
 import warnings
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
+from torch import Tensor
+
+from intercap_core.inputs.files import MAX_MODEL_BYTES, Unreadable, check_file
+from intercap_core.safe_pickle import PICKLE_ERRORS, check_program
 
 # What makes tensors out of a file's storages; each only builds values
 _ALLOWED = {
@@ -46,6 +52,10 @@ class _Inert:
 class Unpickler(pickle.Unpickler):
     """Knows tensors and plain values; every other name means :class:`_Inert`."""
 
+    def __init__(self, file: BinaryIO, **arguments: Any) -> None:
+        check_program(file)
+        super().__init__(file, **arguments)
+
     def find_class(self, module: str, name: str) -> Any:
         return super().find_class(module, name) if (module, name) in _ALLOWED else _Inert
 
@@ -60,8 +70,50 @@ class _InertPickle:
         return Unpickler(file, **arguments).load()
 
 
-def read_checkpoint(path: Path) -> Any:
-    """What `torch.save` wrote, on the CPU. A damaged file can raise any exception."""
+# What PyTorch's reader raises for damaged files, beside what unpickling does.
+_ERRORS = (*PICKLE_ERRORS, RuntimeError, OSError, struct.error, zipfile.BadZipFile)
+
+
+def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
+    """The tensors by name that `torch.save` wrote as a dictionary, on the CPU, or in it as its
+    `state_dict`.
+
+    Raises Unreadable where the file is missing, too large or damaged, or holds no dictionary.
+    """
+    check_file(path, MAX_MODEL_BYTES, advice=advice)
+    try:
+        read = _read(path)
+    except _ERRORS as error:
+        raise Unreadable(
+            path, f"is damaged or none that torch.save wrote ({type(error).__name__})", advice
+        ) from error
+    if not isinstance(read, dict):
+        raise Unreadable(path, f"holds a {type(read).__name__}, expected tensors by name", advice)
+    state = read.get("state_dict", read)
+    if not isinstance(state, dict):
+        return {}
+    return {str(name)[:200]: value for name, value in state.items() if isinstance(value, Tensor)}
+
+
+def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str | None:
+    """What keeps a tensor from being weights of ``shape``, in words that follow its name, or None.
+
+    Shapes come first: a file may state any, and what it states is taken in memory only then.
+    """
+    if tuple(value.shape) != shape:
+        return f"{tuple(value.shape)}, expected {shape}"
+    if value.device.type != "cpu" or value.layout is not torch.strided:
+        return f"no numbers ({value.device.type}, {value.layout})"
+    if not value.is_floating_point():
+        return f"{value.dtype}, expected floating-point numbers"
+    if not bool(value.isfinite().all()):
+        return "values that are no numbers"
+    if float(value.abs().max()) > largest:
+        return f"weights up to {float(value.abs().max()):.3g}, expected at most {largest:g}"
+    return None
+
+
+def _read(path: Path) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they say of the file is no matter of its user's
         try:

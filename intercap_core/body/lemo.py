@@ -24,9 +24,11 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from intercap_core.body.checkpoint import read_checkpoint
+from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.body.maps import MARKER_NAMES
 from intercap_core.errors import UserError
+from intercap_core.inputs.arrays import read_arrays
+from intercap_core.inputs.files import Unreadable
 
 FRAMES_PER_SECOND = 30.0
 COORDINATES = 3 * len(MARKER_NAMES)
@@ -35,6 +37,8 @@ _SLOPE = 0.2
 _CHANNELS = (1, 32, 64, 64, 64, 64)
 LATENT = _CHANNELS[-1] * (COORDINATES + 2 * _ROWS)
 FEWEST_FRAMES = _COLUMNS + 2  # a reflection repeats other columns than the one at the border
+_LARGEST_WEIGHT = 1e4  # far beyond those of a trained network
+_SPREAD_M = (1e-4, 100.0)  # of markers on a body that walks through a room: some decimetres
 _HINT = "take the release's file, or leave joint.lemo out for small accelerations of the joints"
 
 
@@ -98,28 +102,20 @@ def _state(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise UserError(f"LEMO's encoder {path} does not exist; {_HINT}")
     try:
-        read = read_checkpoint(path)
-    except Exception as error:  # a damaged file can raise nearly anything
+        return read_tensors(path, advice=_HINT)
+    except Unreadable as error:
         raise UserError(
-            f"LEMO's encoder {path} is damaged or none that torch.save wrote "
-            f"({type(error).__name__}), expected Enc_last_model.pkl; {_HINT}"
+            f"LEMO's encoder {path} {error.reason}, expected Enc_last_model.pkl; {_HINT}"
         ) from error
-    if not isinstance(read, dict):
-        raise UserError(
-            f"LEMO's encoder {path} holds a {type(read).__name__}, expected tensors by name; "
-            f"{_HINT}"
-        )
-    return {str(name): value for name, value in read.items() if isinstance(value, Tensor)}
 
 
 def _tensor(path: Path, state: dict[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
     if name not in state:
         raise UserError(f"LEMO's encoder {path} has no {name}, expected one {shape}; {_HINT}")
-    value = state[name]
-    if tuple(value.shape) != shape or not torch.isfinite(value).all():
-        found = tuple(value.shape) if tuple(value.shape) != shape else "values that are no numbers"
-        raise UserError(f"LEMO's encoder {path}: {name} has {found}, expected {shape}; {_HINT}")
-    return value
+    fault = tensor_fault(state[name], shape, _LARGEST_WEIGHT)
+    if fault is not None:
+        raise UserError(f"LEMO's encoder {path}: {name} has {fault}, expected {shape}; {_HINT}")
+    return state[name]
 
 
 def _spread(path: Path) -> np.ndarray:
@@ -127,12 +123,11 @@ def _spread(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"LEMO's statistics {path} do not exist; {_HINT}")
     try:
-        with np.load(path) as read:
-            found = {name: read[name] for name in read.files}
-    except Exception as error:  # not an archive, cut short, or pickled objects
+        found = read_arrays(path, advice=_HINT)
+    except Unreadable as error:
         raise UserError(
-            f"LEMO's statistics {path} cannot be read ({type(error).__name__}: {error}), expected "
-            f"an .npz with Xstd; {_HINT}"
+            f"LEMO's statistics {path} cannot be read ({error.reason}), expected an .npz with "
+            f"Xstd; {_HINT}"
         ) from None
     if "Xstd" not in found:
         raise UserError(
@@ -144,9 +139,14 @@ def _spread(path: Path) -> np.ndarray:
             f"LEMO's statistics {path}: Xstd has {spread.shape}, expected ({COORDINATES},) for "
             f"{len(MARKER_NAMES)} markers; {_HINT}"
         )
-    if not (np.isfinite(spread) & (spread > 0)).all():
+    if spread.dtype.kind != "f":
         raise UserError(
-            f"LEMO's statistics {path}: Xstd has {spread[~(spread > 0)][:1]}, expected numbers "
-            f"above 0; {_HINT}"
+            f"LEMO's statistics {path}: Xstd has {spread.dtype}, expected metres; {_HINT}"
+        )
+    wrong = ~((spread > _SPREAD_M[0]) & (spread < _SPREAD_M[1]))
+    if wrong.any():
+        raise UserError(
+            f"LEMO's statistics {path}: Xstd has {spread[wrong][:1]}, expected metres above 0, "
+            f"{_SPREAD_M[0]:g} to {_SPREAD_M[1]:g}; {_HINT}"
         )
     return spread

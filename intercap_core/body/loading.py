@@ -9,6 +9,8 @@ import numpy as np
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
 from intercap_core.errors import UserError
+from intercap_core.inputs.arrays import read_arrays
+from intercap_core.inputs.files import Unreadable
 
 OPEN_BODY = Path(__file__).parent / "data" / "open_body.npz"
 _REQUIRED = (
@@ -100,12 +102,11 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     wanted = {*_REQUIRED, "posedirs", "hands_coeffsl", "hands_coeffsr", "hands_deviationl",
               "hands_deviationr"}  # fmt: skip
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not hasattr(file, "files"):
-                raise ValueError("a single array")
-            return {name: file[name] for name in file.files if name in wanted}
-    except Exception as error:  # a damaged archive can raise nearly anything
-        raise UserError(f"Body file {path} is no readable npz ({error}): {_HINT}.") from error
+        return read_arrays(path, wanted)
+    except Unreadable as error:
+        raise UserError(
+            f"Body file {path} is no readable npz ({error.reason}): {_HINT}."
+        ) from error
 
 
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -6,13 +6,14 @@ published vertex ids.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.inputs.json_files import read_json
+from intercap_core.inputs.quotes import quoted
 
 SMPLX_VERTICES = 10_475
 
@@ -67,19 +68,28 @@ def maps_path(body_path: Path) -> Path:
     return body_path.with_name(body_path.stem + "_maps.json")
 
 
+def _vertex(value: object) -> int:
+    if type(value) is not int:
+        raise ValueError(f"{quoted(value, 40)} is no vertex")
+    return value
+
+
 def load_maps(body_path: Path, num_vertices: int) -> BodyMaps:
     """The `<body>_maps.json` beside the body file, or SMPL-X's published ids."""
     path = maps_path(body_path)
     if path.exists():
+        read = read_json(path)
         try:
-            read = json.loads(path.read_text())
-            points = {name: int(read["points"][name]) for name in POINT_NAMES}
-            markers = np.array([int(read["markers"][name]) for name in MARKER_NAMES])
-            regions = {name: np.array(ids, int) for name, ids in read["regions"].items()}
+            points = {name: _vertex(read["points"][name]) for name in POINT_NAMES}
+            markers = np.array([_vertex(read["markers"][name]) for name in MARKER_NAMES])
+            regions = {
+                name: np.array([_vertex(i) for i in ids], int)
+                for name, ids in read["regions"].items()
+            }
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(
-                f"Body map {path} cannot be used ({error!r}): expected the objects points, markers "
-                "and regions, each with every name; compare it with the open body's map."
+                f"Body map {path} cannot be used ({quoted(error)}): expected the objects points, "
+                "markers and regions, each with every name; compare it with the open body's map."
             ) from error
         used = [*points.values(), *markers, *(i for ids in regions.values() for i in ids)]
         if min(used) < 0 or max(used) >= num_vertices:

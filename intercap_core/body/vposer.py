@@ -23,8 +23,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from intercap_core.body.checkpoint import read_checkpoint
+from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.quotes import quoted
 
 LATENT = 32
 _JOINTS = 21
@@ -35,6 +37,9 @@ _VERSIONS = {
 _PREFIXES = ("module.", "vp_model.")
 _MATRIX_LOG_EPSILON = 1e-7
 _SPREAD = 0.1  # rad about what a code decodes to: poses of AMASS are rebuilt to some 5 degrees
+_MAX_HIDDEN = 4096  # units of a hidden layer; the published ones have 512
+_LARGEST_WEIGHT = 1e3  # the published ones' are below 10
+_ADVICE = "expected TR00_E096.pt (version 1) or a V02_05 .ckpt (version 2): take the published file"
 _CODE_STEPS = 12
 _CODE_DAMPING = 0.3  # of a unit code: far from linear, the decoder's steps are held back
 
@@ -80,7 +85,11 @@ class VPoser:
                 f"VPoser file {path} does not exist: expected TR00_E096.pt (version 1) or a V02_05 "
                 ".ckpt (version 2); leave the setting out to use joint limits alone."
             )
-        weights = _tensors(path)
+        try:
+            read = read_tensors(path, advice=_ADVICE)
+        except Unreadable as error:
+            raise UserError(f"VPoser file {path} {error.reason}: {_ADVICE}.") from error
+        weights = {_bare(name): value for name, value in read.items()}
         for found, (names, slope) in _VERSIONS.items():
             parts = [(f"{name}.weight", f"{name}.bias") for name in names]
             if all(part in weights for pair in parts for part in pair):
@@ -171,22 +180,6 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
     return factor[..., None] * skewed
 
 
-def _tensors(path: Path) -> dict[str, Tensor]:
-    """The file's tensors by name, without what frameworks put before the names."""
-    try:
-        read = read_checkpoint(path)
-    except Exception as error:  # a damaged file can raise nearly anything
-        raise UserError(
-            f"VPoser file {path} is damaged or none that torch.save wrote "
-            f"({type(error).__name__}): expected TR00_E096.pt (version 1) or a V02_05 .ckpt "
-            "(version 2); take the published file."
-        ) from error
-    state = read.get("state_dict", read) if isinstance(read, dict) else {}
-    if not isinstance(state, dict):
-        return {}
-    return {_bare(str(name)): value for name, value in state.items() if isinstance(value, Tensor)}
-
-
 def _bare(name: str) -> str:
     for prefix in _PREFIXES:
         name = name.removeprefix(prefix)
@@ -198,14 +191,21 @@ def _check(path: Path, layers: tuple[tuple[Tensor, Tensor], ...]) -> None:
     hidden = len(layers[0][1]) if layers[0][1].ndim else 0
     sizes = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
     expected = tuple((size, size[:1]) for size in sizes)
-    if found != expected or not hidden:
+    if found != expected or not 0 < hidden <= _MAX_HIDDEN:
         raise UserError(
-            f"VPoser file {path} has decoder layers of shapes {found}; expected {expected}: take "
-            "the published file."
+            f"VPoser file {path} has decoder layers of shapes {quoted(found, 300)}; expected "
+            f"{expected}: take the published file."
         )
-    parts = [part for pair in layers for part in pair]
-    dense = all(part.layout is torch.strided and part.is_floating_point() for part in parts)
-    if not (dense and all(bool(part.isfinite().all()) for part in parts)):
-        raise UserError(
-            f"VPoser file {path} has weights that are not finite numbers: take the published file."
-        )
+    for (weight, bias), size in zip(layers, sizes, strict=True):
+        fault = tensor_fault(weight, size, _LARGEST_WEIGHT)
+        fault = fault or tensor_fault(bias, size[:1], _LARGEST_WEIGHT)
+        if fault is not None:
+            raise UserError(
+                f"VPoser file {path} has weights that are not finite numbers of a network "
+                f"({fault}): take the published file."
+            )
+        if not bool(weight.any()):
+            raise UserError(
+                f"VPoser file {path} has a layer of zeros, so that every code decodes to one pose: "
+                "take the published file."
+            )

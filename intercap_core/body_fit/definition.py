@@ -7,7 +7,6 @@ that the fit of other recordings starts from, with how far people scatter about 
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +21,13 @@ from intercap_core.body_fit.constants import (
     OFFSET_SIGMA_M,
 )
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, read_text
+from intercap_core.inputs.quotes import quoted
 from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])
 _COLUMNS = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
+_LEAST_SIGMA_MM = 0.01  # :meth:`Definition.write` has one decimal
 _LARGEST_M = 0.1  # farther off it is another joint
 
 
@@ -49,16 +51,17 @@ class Definition:
         if path is None:
             return cls.unknown()
         try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError):
+            lines = read_text(path, MAX_SETTINGS_BYTES).splitlines()
+        except Unreadable as error:
             raise UserError(
-                f"{path}: no readable text; name a table that 'intercap keypoint-definition' wrote "
-                "in body_fit.keypoint_definition, or remove the line"
+                f"{path}: no readable text ({error.reason}); name a table that "
+                "'intercap keypoint-definition' wrote in body_fit.keypoint_definition, or remove "
+                "the line"
             ) from None
-        rows = list(csv.reader((x for x in lines if x and not x.startswith("#")), delimiter="\t"))
+        rows = [x.split("\t") for x in lines if x and not x.startswith("#")]
         if not rows or tuple(rows[0]) != _COLUMNS:
             raise UserError(
-                f"{path}: columns are {', '.join(rows[0]) if rows else 'missing'}, expected "
+                f"{path}: columns are {quoted(rows[0]) if rows else 'missing'}, expected "
                 f"{', '.join(_COLUMNS)}, split by tabs; write it by 'intercap keypoint-definition'"
             )
         found = {row[0]: _numbers(path, row) for row in rows[1:]}
@@ -66,7 +69,7 @@ class Definition:
         if wrong or len(rows) - 1 != len(POINTS):
             raise UserError(
                 f"{path}: {len(rows) - 1} points, expected each of the {len(POINTS)} of the body "
-                f"once ({', '.join(wrong) or 'one is there twice'}); write it anew by "
+                f"once ({quoted(wrong) if wrong else 'one is there twice'}); write it anew by "
                 "'intercap keypoint-definition'"
             )
         values = 1e-3 * np.array([found[name] for name in POINTS])
@@ -88,9 +91,9 @@ def _numbers(path: Path, row: Sequence[str]) -> list[float]:
     except ValueError:
         values = []
     size = np.abs(values).max() if len(values) == 4 else np.nan
-    if not size <= 1e3 * _LARGEST_M or not values[3] > 0:
+    if not size <= 1e3 * _LARGEST_M or not values[3] > _LEAST_SIGMA_MM:
         raise UserError(
-            f"{path}: point {row[0]!r} has {', '.join(row[1:])}, expected three offsets and a "
+            f"{path}: point {quoted(row[0])} has {quoted(row[1:])}, expected three offsets and a "
             f"deviation above 0 in mm, at most {1e3 * _LARGEST_M:.0f}; write it anew by "
             "'intercap keypoint-definition'"
         )

@@ -84,21 +84,17 @@ def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
     x, y, width, height = mask.box
     pad = round(3 * OUTLINE_BLUR_PX)
     window = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
-    window[pad:-pad, pad:-pad] = 255 * drawn(mask.ends, mask.box, mask.height).T
+    window[pad:-pad, pad:-pad] = np.uint8(255) * drawn(mask.ends, mask.box, mask.height).T
     rims, _ = cv2.findContours(window, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     rims = [rim[:, 0] for rim in rims if len(rim) >= SHORTEST_OUTLINE_PX]
     if not rims:
         return np.zeros((0, 2)), np.zeros((0, 2))
     at = np.concatenate(rims)
-    soft = cv2.GaussianBlur(window, (0, 0), OUTLINE_BLUR_PX).astype(np.int16)
+    soft = cv2.GaussianBlur(window, (0, 0), OUTLINE_BLUR_PX)
     column, row = at.T
-    outward = np.stack(
-        [
-            soft[row, column - 1] - soft[row, column + 1],
-            soft[row - 1, column] - soft[row + 1, column],
-        ],
-        -1,
-    ).astype(np.float64)
+    left, right = soft[row, column - 1].astype(float), soft[row, column + 1]
+    above, below = soft[row - 1, column].astype(float), soft[row + 1, column]
+    outward = np.stack([left - right, above - below], -1)
     length = np.linalg.norm(outward, axis=1)
     steep = length > 0
     outward = outward[steep] / length[steep, None]

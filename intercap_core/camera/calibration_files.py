@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from intercap_core.camera.colmap_calibration import is_colmap, read_colmap_calibration
@@ -20,6 +19,8 @@ from intercap_core.camera.opencv_calibration import Calibration, read_opencv_cal
 from intercap_core.camera.other_calibration import Recorded
 from intercap_core.camera.toml_calibration import read_toml_calibration
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json
 
 PARTS = {  # a file that is half of a calibration: its folder is the whole
     INTRINSICS, EXTRINSICS, "cameras.txt", "images.txt", "cameras.bin", "images.bin",
@@ -85,6 +86,6 @@ def _one_toml_file(folder: Path, recorded: Recorded, scale: float | None) -> Cal
 
 def _has_frames(path: Path) -> bool:
     try:
-        return is_nerfstudio(json.loads(path.read_text(encoding="utf-8-sig")))
-    except (OSError, ValueError, RecursionError):
+        return is_nerfstudio(read_json(path))
+    except Unreadable:
         return False  # the reader of OpenCV's files says what is wrong with it

@@ -15,10 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.opencv_calibration import Calibration, opencv_lens
+from intercap_core.camera.opencv_calibration import MAX_SIDE, Calibration, opencv_lens
 from intercap_core.camera.other_calibration import Recorded, fixed_cameras, put_together
 from intercap_core.camera.transforms import rigid
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import MAX_MODEL_BYTES, decoded, read_bytes, read_text
+from intercap_core.inputs.json_files import whole
+from intercap_core.inputs.quotes import printable, quoted
 
 FIRST_PIXEL = 0.5  # where its centre is, in COLMAP's coordinates
 # Number, name, places of fx fy cx cy among the parameters, and of OpenCV's coefficients after them.
@@ -36,6 +39,7 @@ UNSUPPORTED = {
     10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE",
 }  # fmt: skip
 NUMBERS = {model[0]: number for number, model in MODELS.items()}
+_ADVICE = "export the model again"
 MAX_NAME = 4096  # bytes: a path that is longer is none
 
 
@@ -58,21 +62,17 @@ def read_colmap_calibration(folder: Path, recorded: Recorded, scale: float | Non
     """
     suffix = _suffix(folder)
     lenses_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    try:
-        if suffix == ".bin":
-            lenses = dict(_binary_lenses(_Bytes(lenses_file), lenses_file))
-            images = list(_binary_images(_Bytes(images_file)))
-        else:
-            lenses = dict(_text_lenses(lenses_file))
-            images = list(_text_images(images_file))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not text in UTF-8"
-        raise UserError(f"{folder}: cannot be read ({reason}); export the model again") from None
+    if suffix == ".bin":
+        lenses = dict(_binary_lenses(_Bytes(lenses_file), lenses_file))
+        images = list(_binary_images(_Bytes(images_file)))
+    else:
+        lenses = dict(_text_lenses(lenses_file))
+        images = list(_text_images(images_file))
     placed = []
     for image in images:
         if image.camera not in lenses:
             raise UserError(
-                f"{images_file}: image {image.name} is of camera {image.camera}, which "
+                f"{images_file}: image {quoted(image.name)} is of camera {image.camera}, which "
                 f"{lenses_file.name} does not have; export the model again"
             )
         placed.append((image.name, lenses[image.camera], _pose(image, images_file)))
@@ -93,8 +93,8 @@ def _pose(image: _Image, path: Path) -> np.ndarray:
     numbers = np.array([*image.quaternion, *image.shift])
     if not np.isfinite(numbers).all() or abs(np.linalg.norm(image.quaternion) - 1) > 0.01:
         raise UserError(
-            f"{path}: image {image.name} has no unit quaternion and translation; export the model "
-            "again"
+            f"{path}: image {quoted(image.name)} has no unit quaternion and translation; export "
+            "the model again"
         )
     return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(image.shift))
 
@@ -109,6 +109,8 @@ def _lens(model: int, size: tuple[int, int], numbers: list[float], where: str) -
     fx, fy, cx, cy = (numbers[place] for place in places)
     matrix = [[fx, 0, cx - FIRST_PIXEL], [0, fy, cy - FIRST_PIXEL], [0, 0, 1]]
     distortion = [numbers[place] for place in bends]
+    if not all(0 < n <= MAX_SIDE for n in size):
+        raise UserError(f"{where}: images of {size[0]}x{size[1]} pixels; export the model again")
     return opencv_lens(size, matrix, distortion + [0.0] * max(0, 4 - len(distortion)), where)
 
 
@@ -120,7 +122,7 @@ def _refuse(model: str, where: str) -> UserError:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    text = path.read_text(encoding="utf-8-sig")
+    text = read_text(path, MAX_MODEL_BYTES, advice=_ADVICE)
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.lstrip().startswith("#"):
             yield number, line.strip()
@@ -133,7 +135,7 @@ def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
         where = f"{path}, line {number}"
         try:
             identity, model, width, height, *rest = line.split()
-            camera, size = int(identity), (int(width), int(height))
+            camera, size = whole(identity), (whole(width), whole(height))
             numbers = [float(word) for word in rest]
         except ValueError:
             raise UserError(
@@ -141,7 +143,7 @@ def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
                 "again"
             ) from None
         if model not in NUMBERS:
-            raise _refuse(model, where)
+            raise _refuse(printable(model[:40]), where)
         yield camera, _lens(NUMBERS[model], size, numbers, where)
 
 
@@ -153,7 +155,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
         try:
             _, *numbers, camera, name = line.split(maxsplit=9)
             values = [float(word) for word in numbers]
-            identity = int(camera)
+            identity = whole(camera)
         except ValueError:
             values = []
         if len(values) != 7:
@@ -169,7 +171,8 @@ class _Bytes:
     """A binary file, little endian, read from its start; ends with a UserError where it is cut."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._content, self._at = path, path.read_bytes(), 0
+        self._path, self._at = path, 0
+        self._content = read_bytes(path, MAX_MODEL_BYTES, advice=_ADVICE)
 
     def take(self, form: str) -> tuple[Any, ...]:
         end = self._at + struct.calcsize("<" + form)
@@ -183,7 +186,7 @@ class _Bytes:
         end = self._content.find(b"\0", self._at, self._at + MAX_NAME)
         if end < 0:
             raise UserError(f"{self._path}: an image has no name; copy or export it again")
-        name = self._content[self._at : end].decode("utf-8")
+        name = decoded(self._path, self._content[self._at : end])
         self._at = end + 1
         return name
 

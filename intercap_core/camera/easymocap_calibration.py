@@ -22,6 +22,7 @@ from intercap_core.camera.opencv_calibration import (
 )
 from intercap_core.camera.other_calibration import OtherCamera, Recorded, put_together
 from intercap_core.errors import UserError
+from intercap_core.inputs.quotes import quoted
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 SAME_ROTATION = 1e-3  # of the entries of one rotation's two forms; files have six digits
@@ -42,7 +43,7 @@ def read_easymocap_calibration(
         raise UserError(f"{folder / INTRINSICS}: expected 'names', a list of cameras; correct it")
     cameras = []
     for name in map(str, names):
-        where = f"{folder / INTRINSICS}: camera {name!r}"
+        where = f"{folder / INTRINSICS}: camera {quoted(name)}"
         distortion = lenses.get(f"dist_{name}", lenses.get(f"D_{name}"))
         matrix = _entry(lenses, f"K_{name}", where)
         if distortion is None:
@@ -51,7 +52,7 @@ def read_easymocap_calibration(
         lens = opencv_lens(size, matrix, distortion, where)
         cameras.append(
             OtherCamera(
-                (name,), lens, _pose(poses, name, f"{folder / EXTRINSICS}: camera {name!r}")
+                (name,), lens, _pose(poses, name, f"{folder / EXTRINSICS}: camera {quoted(name)}")
             )
         )
     return put_together(folder, "EasyMocap", cameras, recorded, scale=scale, unit=None)

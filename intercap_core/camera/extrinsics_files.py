@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.camera.transforms import invert, is_rigid, rigid
 from intercap_core.errors import UserError
+from intercap_core.inputs.json_files import read_object
+from intercap_core.inputs.quotes import printable, quoted
 
 MAX_DISTANCE_M = 100.0  # from the file's origin; farther: the file is in millimetres
+MAX_APART_M = 30.0  # of a camera from the master: a hall; farther: the file is in centimetres
+MIN_APART_M = 0.003  # of two cameras' centres of projection; a phone's lenses are 10 mm apart
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]+")  # names datasets and files
 RELEASE_NAME = re.compile(r"Color(?:_(\d+))?\.json")
 
@@ -54,7 +59,7 @@ def write_rig_file(path: Path, extrinsics: Extrinsics) -> None:
 
 
 def _read_rig_file(path: Path) -> Extrinsics:
-    content = read_json(path)
+    content = read_object(path)
     master = content.get("master")
     cameras = content.get("cameras")
     if not isinstance(cameras, dict) or not cameras or not isinstance(master, str):
@@ -64,7 +69,7 @@ def _read_rig_file(path: Path) -> Extrinsics:
         )
     if master not in cameras:
         raise UserError(
-            f"{path}: master {master!r} is none of the cameras ({', '.join(cameras)}); correct "
+            f"{path}: master {quoted(master)} is none of the cameras ({named(cameras)}); correct "
             "the name or add the camera"
         )
     poses = {}
@@ -75,8 +80,8 @@ def _read_rig_file(path: Path) -> Extrinsics:
             pose = np.zeros(0)
         if not CAMERA_NAME.fullmatch(name):
             raise UserError(
-                f"{path}: camera {name!r} has a name that no file can have, expected letters, "
-                "digits, '_' and '-'; rename it"
+                f"{path}: camera {quoted(name)} has a name that no file can have, expected "
+                "letters, digits, '_' and '-'; rename it"
             )
         if not is_rigid(pose):
             raise UserError(
@@ -85,7 +90,7 @@ def _read_rig_file(path: Path) -> Extrinsics:
             )
         check_distance(path, f"camera {name!r}", pose[:3, 3])
         poses[name] = pose
-    return relative_to(master, poses)
+    return placed(path, master, poses)
 
 
 def _read_release_folder(folder: Path) -> Extrinsics:
@@ -103,7 +108,7 @@ def _read_release_folder(folder: Path) -> Extrinsics:
         )
     poses = {}
     for number, path in sorted(files.items()):
-        content = read_json(path)
+        content = read_object(path)
         try:
             turn, shift = (np.array(content[k], np.float64).reshape(3) for k in ("R", "T"))
         except (KeyError, TypeError, ValueError, OverflowError):
@@ -113,12 +118,12 @@ def _read_release_folder(folder: Path) -> Extrinsics:
             ) from None
         if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
             raise UserError(
-                f"{path}: 'R' or 'T' holds a value that is not a finite number; calibrate this "
-                "camera again"
+                f"{path}: rotation vector 'R' or translation 'T' holds no finite number; calibrate "
+                "this camera again"
             )
         check_distance(path, "the camera", shift)
         poses[f"k{number}"] = invert(rigid(Rotation.from_rotvec(turn).as_matrix(), shift))
-    return relative_to("k1", poses)
+    return placed(folder, "k1", poses)
 
 
 def check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
@@ -131,22 +136,35 @@ def check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
         )
 
 
+def placed(path: Path, master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
+    """The poses in the master's frame; raises UserError, naming the file, where two cameras are in
+    one place or one is farther off than a room is wide."""
+    found = relative_to(master, world_from_camera)
+    centres = {name: pose[:3, 3] for name, pose in found.master_from_colour.items()}
+    for name, centre in centres.items():
+        if (far := float(np.linalg.norm(centre))) > MAX_APART_M:
+            raise UserError(
+                f"{path}: camera {name!r} is {far:.4g} m from {master!r}, expected at most "
+                f"{MAX_APART_M:.0f} m, so it is likely in centimetres; write it in metres"
+            )
+        for other, there in centres.items():
+            if other < name and np.linalg.norm(centre - there) < MIN_APART_M:
+                raise UserError(
+                    f"{path}: cameras {other!r} and {name!r} are in one place; correct the pose of "
+                    "one of them"
+                )
+    return found
+
+
+def named(cameras: Iterable[str]) -> str:
+    """Names of cameras for a message, the first of many."""
+    names = [printable(str(name)[:40]) for name in islice(cameras, 13)]
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+
+
 def relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
     """Express the poses in the master's frame; exactly the identity for the master itself."""
     master_from_world = invert(world_from_camera[master])
     poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
     poses[master] = np.eye(4)
     return Extrinsics(master, poses, master_from_world)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file of names and values; raises UserError where it is none."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: is not valid JSON ({error}); correct it") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: expected names and values, found {type(content).__name__}")
-    return content

@@ -7,22 +7,24 @@ crops. Sizes and crops are those of the Azure Kinect Sensor SDK (MIT), ``src/tra
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from intercap_core.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
+from intercap_core.camera.opencv_calibration import MAX_LENSES_APART_M
+from intercap_core.camera.plausible import METRIC_RADIUS, lens_fault
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import invert, is_rigid, rigid
 from intercap_core.errors import UserError
+from intercap_core.inputs.json_files import parse_json
+from intercap_core.inputs.quotes import quoted
 
 DEPTH_LOCATION = "CALIBRATION_CameraLocationD0"
 COLOUR_LOCATION = "CALIBRATION_CameraLocationPV0"
 LENS_MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
 ACCELEROMETER = "CALIBRATION_InertialSensorType_Accelerometer"
-_MIN_METRIC_RADIUS = 1e-4  # smaller means "not given" (the SDK's own test)
 
 
 @dataclass(frozen=True)
@@ -56,35 +58,49 @@ DISTORTION_POSITIONS = (4, 5, 13, 12, 6, 7, 8, 9)
 def lens_of(entry: dict[str, Any], mode: Mode) -> Intrinsics:
     """Make the lens of one camera entry of the JSON in ``mode``.
 
-    Raises ValueError or KeyError where the entry is not as the SDK writes it.
+    Raises ValueError, KeyError or TypeError where the entry is not as the SDK writes it, and
+    ValueError for a lens that no camera has.
     """
     intrinsics = entry["Intrinsics"]
     if intrinsics["ModelType"] != LENS_MODEL:
-        raise ValueError(f"its lens model is {intrinsics['ModelType']!r}, expected {LENS_MODEL!r}")
+        raise ValueError(
+            f"its lens model is {quoted(intrinsics['ModelType'])}, expected {LENS_MODEL!r}"
+        )
     values = np.array(intrinsics["ModelParameters"], np.float64)
-    if len(values) < 14 or not np.all(np.isfinite(values)):
-        raise ValueError(f"its lens has {len(values)} finite parameters, expected 14")
+    if values.ndim != 1 or len(values) < 14 or not np.all(np.isfinite(values)):
+        raise ValueError(f"its lens has {values.size} parameters, expected 14 finite numbers")
     if np.any(values[10:12] != 0):
         raise ValueError("its centre of distortion (codx, cody) is not 0, which is not supported")
     (binned_w, binned_h), (crop_x, crop_y) = mode.binned, mode.crop
     radius = float(entry.get("MetricRadius", 0.0))
-    return Intrinsics(
+    # what is smaller means "not given" (the SDK's own test)
+    lens = Intrinsics(
         *mode.size,
         fx=values[2] * binned_w,
         fy=values[3] * binned_h,
         cx=values[0] * binned_w - crop_x - 0.5,
         cy=values[1] * binned_h - crop_y - 0.5,
         distortion=values[list(DISTORTION_POSITIONS)],
-        metric_radius=radius if radius > _MIN_METRIC_RADIUS else DEFAULT_METRIC_RADIUS,
+        metric_radius=radius if not radius <= METRIC_RADIUS[0] else DEFAULT_METRIC_RADIUS,
     )
+    fault = lens_fault(lens)
+    if fault is not None:
+        raise ValueError(fault)
+    return lens
 
 
 def _pose_of(entry: dict[str, Any]) -> np.ndarray:
     """Return sensor_from_reference (4, 4), metres, of one sensor's entry."""
     rt = entry["Rt"]
-    pose = rigid(np.reshape(rt["Rotation"], (3, 3)).astype(float), np.array(rt["Translation"]))
-    if not is_rigid(pose, 1e-3):
+    rotation = np.array(rt["Rotation"], np.float64).reshape(3, 3)
+    translation = np.array(rt["Translation"], np.float64)
+    if translation.shape != (3,) or not is_rigid(pose := rigid(rotation, translation), 1e-3):
         raise ValueError("its Rt is not a rigid transform")
+    if np.linalg.norm(translation) > MAX_LENSES_APART_M:
+        raise ValueError(
+            f"its Rt moves a sensor by {np.linalg.norm(translation):.4g} m, expected at most "
+            f"{MAX_LENSES_APART_M:g} m within one device"
+        )
     return pose
 
 
@@ -144,12 +160,18 @@ def colour_from_accelerometer(content: bytes, *, source: str) -> np.ndarray | No
 
 def _sensors(content: bytes, group: str, key: str) -> dict[str, dict[str, Any]]:
     # Some firmware pads the JSON with zero bytes.
-    parsed = json.loads(content.rstrip(b"\0").decode("utf-8"))
-    return {entry[key]: entry for entry in parsed["CalibrationInformation"].get(group, [])}
+    parsed = parse_json(content.rstrip(b"\0").decode("utf-8"))
+    information = parsed["CalibrationInformation"]
+    if not isinstance(information, dict):
+        raise ValueError(f"CalibrationInformation is {quoted(information, 40)}, expected an object")
+    entries = {entry[key]: entry for entry in information.get(group, [])}
+    if not all(isinstance(entry, dict) for entry in entries.values()):
+        raise ValueError(f"{group} lists something else than sensors")
+    return entries
 
 
 def _broken(source: str, error: Exception) -> UserError:
-    reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+    reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)[:400]
     return UserError(
         f"{source}: the Azure Kinect calibration cannot be used ({reason}); take the recording "
         "again, or put back the calibration.json of the same device"

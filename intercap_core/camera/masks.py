@@ -9,13 +9,13 @@ they are parsed and checked here first.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from pycocotools import mask as coco_mask
 
-_ZERO = 48  # first character of the alphabet
 _FARTHEST_CORNER = 1e5  # px from the image's corner; the C code counts every pixel of an edge
-_LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
+_LONGEST_OUTLINE = 1e6  # px; the C code keeps five points of each, and counts them in 32 bits
 
 
 class Runs:
@@ -28,7 +28,7 @@ class Runs:
 
     def __init__(self, rle: bytes, height: int, width: int) -> None:
         self.height, self.width = height, width
-        self.ends = np.cumsum(_parse(rle))
+        self.ends = _parse(rle)
         filled = int(self.ends[-1]) if len(self.ends) else 0
         if filled != height * width:
             raise ValueError(
@@ -41,24 +41,13 @@ class Runs:
         """Number of pixels set."""
         return int(np.diff(self.ends, prepend=0)[1::2].sum())
 
-    @property
+    @cached_property
     def box(self) -> tuple[int, int, int, int]:
         """x, y, width, height of the pixels set; all 0 where there are none."""
-        starts, ends = self._set_runs()
-        if not len(starts):
-            return 0, 0, 0, 0
-        left, right = int(starts[0]) // self.height, int(ends[-1] - 1) // self.height
-        top, bottom = starts % self.height, (ends - 1) % self.height
-        wraps = starts // self.height != (ends - 1) // self.height  # runs over a column's end
-        if wraps.any():
-            return left, 0, right - left + 1, self.height
-        y0 = int(top.min())
-        return left, y0, right - left + 1, int(bottom.max()) - y0 + 1
+        from intercap_core.camera import masks_kernel
 
-    def _set_runs(self) -> tuple[np.ndarray, np.ndarray]:
-        starts, ends = self.ends[0:-1:2], self.ends[1::2]
-        some = ends > starts
-        return starts[some], ends[some]
+        x, y, width, height = masks_kernel.box(self.ends, self.height)
+        return x, y, width, height
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Read the mask at integer pixels x, y (...): (...) bool, False outside the image."""
@@ -132,9 +121,10 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
 def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
     """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
 
-    Raises ValueError where one has fewer than three corners, or a value that is not finite or
-    farther than 1e5 px from the image's corner.
+    Raises ValueError where one has fewer than three corners, a value that is not finite or farther
+    than 1e5 px from the image's corner, or where their outlines are longer than any shape's.
     """
+    outline = 0.0
     for polygon in polygons:
         values = np.asarray(polygon, np.float64)
         if values.ndim != 1 or len(values) < 6 or len(values) % 2 or not np.isfinite(values).all():
@@ -143,6 +133,13 @@ def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) 
             raise ValueError(
                 f"a polygon has a coordinate {values[np.abs(values).argmax()]:.6g}, expected "
                 f"pixels of the image ({width} x {height})"
+            )
+        corners = values.reshape(-1, 2)
+        outline += float(np.abs(corners - np.roll(corners, 1, 0)).max(1).sum())
+        if outline > _LONGEST_OUTLINE:
+            raise ValueError(
+                f"its polygons are more than {_LONGEST_OUTLINE:.0e} px around, expected outlines "
+                "of a shape in the image"
             )
     if not polygons:
         return encode(np.zeros((height, width), np.uint8))
@@ -155,29 +152,19 @@ def _compress(segmentation: object, height: int, width: int) -> bytes:
 
 
 def _parse(rle: bytes) -> np.ndarray:
-    """Run lengths (n,) int64 of a compressed RLE.
+    """Ends (n,) int64 of the runs of a compressed RLE."""
+    from intercap_core.camera import masks_kernel
 
-    Each number is written in groups of 5 bits, lowest first, bit 5 = more follow, bit 4 of the
-    last = sign; from the fourth on it is the difference to the number two before.
-    """
     if not rle:
         raise ValueError("its RLE is empty")
-    bits = np.frombuffer(rle, np.uint8).astype(np.int64) - _ZERO
-    if bits.min() < 0 or bits.max() > 63:
-        raise ValueError("its RLE holds characters that COCO's alphabet does not have")
-    last = (bits & 0x20) == 0
-    if not last[-1]:
-        raise ValueError("its RLE is cut within a number")
-    stop = np.flatnonzero(last)
-    start = np.concatenate([[0], stop[:-1] + 1])
-    position = np.arange(len(bits)) - np.repeat(start, stop - start + 1)
-    if position.max() >= _LONGEST_NUMBER:
-        raise ValueError("its RLE holds a number that is too long")
-    values = np.add.reduceat((bits & 0x1F) << (5 * position), start)
-    negative = (bits[stop] & 0x10) != 0
-    values[negative] -= np.int64(1) << (5 * (position[stop[negative]] + 1))
-    values[1::2] = np.cumsum(values[1::2])
-    values[2::2] = np.cumsum(values[2::2])
-    if values.min() < 0:
-        raise ValueError("its RLE holds a run of negative length")
-    return values
+    ends, problem = masks_kernel.parse(np.frombuffer(rle, np.uint8))
+    if problem != masks_kernel.FINE:
+        raise ValueError(
+            {
+                masks_kernel.STRANGE: "its RLE holds characters that COCO's alphabet does not have",
+                masks_kernel.CUT: "its RLE is cut within a number",
+                masks_kernel.LONG: "its RLE holds a number that is too long",
+                masks_kernel.NEGATIVE: "its RLE holds a run of negative length",
+            }[problem]
+        )
+    return ends

@@ -14,17 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.camera.extrinsics_files import read_json
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.opencv_calibration import (
     Calibration,
     image_size_of,
-    numbers_of,
     opencv_lens,
 )
 from intercap_core.camera.other_calibration import Recorded, fixed_cameras, put_together
 from intercap_core.camera.transforms import invert, is_rigid
 from intercap_core.errors import UserError
+from intercap_core.inputs.json_files import read_object
+from intercap_core.inputs.numbers import numbers_of
+from intercap_core.inputs.quotes import quoted
 
 TRANSFORMS = "transforms.json"
 FIRST_PIXEL = 0.5  # where its centre is, in nerfstudio's coordinates
@@ -40,7 +41,7 @@ def is_nerfstudio(content: Any) -> bool:
 
 def read_nerfstudio_calibration(path: Path, recorded: Recorded, scale: float | None) -> Calibration:
     """Read a transforms.json; raises UserError naming file, frame and field."""
-    content = read_json(path)
+    content = read_object(path)
     cameras = fixed_cameras(path, _images(path, content), recorded, scale=scale)
     unit = "its world has the unit of the program that made it"
     return put_together(path, "nerfstudio", cameras, recorded, scale=scale, unit=unit)
@@ -55,7 +56,7 @@ def _images(path: Path, content: dict[str, Any]) -> Iterator[tuple[str, Intrinsi
         where = f"{path}: frame {number}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise UserError(f"{where}: has no file_path; correct it")
-        where = f"{where} ({frame['file_path']})"
+        where = f"{where} ({quoted(frame['file_path'])})"
         yield frame["file_path"], _lens({**shared, **frame}, where), _pose(frame, where)
 
 
@@ -72,7 +73,7 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
 def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
     model = entry.get("camera_model", MODELS[0])
     if model not in MODELS or entry.get("is_fisheye"):
-        shown = "is_fisheye" if model in MODELS else f"camera_model {model!r:.40}"
+        shown = "is_fisheye" if model in MODELS else f"camera_model {quoted(model, 40)}"
         raise UserError(
             f"{where}: {shown} cannot be represented, expected {', '.join(MODELS)}; undistort the "
             "recordings, or calibrate with one of these models"
@@ -100,6 +101,6 @@ def _number(entry: dict[str, Any], key: str, default: Any, where: str) -> float:
     number = numbers_of(entry.get(key, default), where, key)
     if number.size != 1:
         raise UserError(
-            f"{where}: {key} is {entry.get(key)!r:.40}, expected one number; correct it"
+            f"{where}: {key} is {quoted(entry.get(key), 40)}, expected one number; correct it"
         )
     return float(number.ravel()[0])

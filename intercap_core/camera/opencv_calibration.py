@@ -7,7 +7,7 @@ a pose is R, T of x_camera = R x_world + T, metres.
 
 from __future__ import annotations
 
-import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,25 @@ from intercap_core.camera.extrinsics_files import (
     CAMERA_NAME,
     Extrinsics,
     check_distance,
-    relative_to,
+    named,
+    placed,
 )
 from intercap_core.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
+from intercap_core.camera.plausible import LONGEST_OFFSET_S, check_lens, check_rate
 from intercap_core.camera.projection import radial_fraction
 from intercap_core.camera.transforms import invert, is_rigid, rigid
 from intercap_core.errors import UserError
+from intercap_core.inputs import yaml_files
+from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, Unreadable
+from intercap_core.inputs.json_files import read_json
+from intercap_core.inputs.numbers import numbers_of
+from intercap_core.inputs.quotes import quoted
 
 SUFFIXES = (".json", ".yaml", ".yml")
 COEFFICIENTS = (4, 5, 8)
 ALIGNED = "aligned"
 MAX_LENSES_APART_M = 1.0  # colour and depth lens of one camera; farther: the file is in millimetres
+MAX_SIDE = 32_768  # px of an image; the largest sensors have half of it
 MAX_OFF_CENTRE = 0.25  # of the image's width or height, of a principal point; 0.03 is usual
 
 
@@ -73,13 +81,13 @@ def read_opencv_calibration(path: Path) -> Calibration:
     master = content.get("master", next(iter(entries)))
     if not isinstance(master, str) or master not in entries:
         raise UserError(
-            f"{path}: master {master!r} is none of the cameras ({', '.join(map(str, entries))}); "
+            f"{path}: master {quoted(master)} is none of the cameras ({named(entries)}); "
             "correct the name or add the camera"
         )
-    fps = _positive(content, "fps", f"{path}")
+    fps = _rate(content, "fps", f"{path}")
     cameras, poses = {}, {}
     for name, entry in entries.items():
-        where = f"{path}: camera {name!r}"
+        where = f"{path}: camera {quoted(name)}"
         if not isinstance(entry, dict) or not CAMERA_NAME.fullmatch(str(name)):
             raise UserError(
                 f"{where}: expected a name of letters, digits, '_' and '-', and fields such as "
@@ -87,7 +95,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
             )
         cameras[str(name)] = _camera(entry, where, fps)
         poses[str(name)] = _pose(entry, where, path, is_master=name == master)
-    return Calibration(cameras, relative_to(str(master), poses))
+    return Calibration(cameras, placed(path, str(master), poses))
 
 
 def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:
@@ -124,7 +132,8 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
     turn = turning_radius(distortion)
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], size]) - 0.5
     widest = np.linalg.norm(Intrinsics(*arguments, turn).unproject(corners)[:, :2], axis=1).max()
-    return Intrinsics(*arguments, min(turn, max(1.1 * float(widest), DEFAULT_METRIC_RADIUS)))
+    radius = min(turn, max(1.1 * float(widest), DEFAULT_METRIC_RADIUS))
+    return check_lens(Intrinsics(*arguments, radius), where)
 
 
 def turning_radius(distortion: np.ndarray) -> float:
@@ -146,7 +155,13 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
     colour = _lens(entry, where)
     offset = numbers_of(entry.get("time_offset", 0.0), where, "time_offset")
     if offset.size != 1:
-        raise UserError(f"{where}: time_offset is {offset.tolist()}, expected seconds; correct it")
+        raise UserError(
+            f"{where}: time_offset is {quoted(offset.tolist())}, expected seconds; correct it"
+        )
+    if abs(offset.ravel()[0]) > LONGEST_OFFSET_S:
+        raise UserError(
+            f"{where}: time_offset is {offset.ravel()[0]:.4g}, expected seconds; correct it"
+        )
     depth = entry.get("depth")
     lens, between = None, None
     if depth == ALIGNED:
@@ -167,18 +182,24 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
             )
     elif depth is not None:
         raise UserError(
-            f"{where}: depth is {depth!r:.40}, expected {ALIGNED!r} or a lens with "
+            f"{where}: depth is {quoted(depth, 40)}, expected {ALIGNED!r} or a lens with "
             "colour_from_depth; correct it"
         )
-    own = _positive(entry, "fps", where)
+    own = _rate(entry, "fps", where)
     return CalibratedCamera(colour, lens, between, own or fps, float(offset.ravel()[0]))
 
 
 def image_size_of(size: Any, where: str) -> tuple[int, int]:
     """Width and height in whole pixels; raises UserError, beginning with ``where``, otherwise."""
     numbers = numbers_of(size, where, "image_size").ravel()
-    if numbers.size != 2 or (numbers < 1).any() or (numbers != numbers.round()).any():
-        raise UserError(f"{where}: image_size is {size!r:.60}, expected width and height in pixels")
+    if (
+        numbers.size != 2
+        or (numbers < 1).any()
+        or ((numbers != numbers.round()) | (numbers > MAX_SIDE)).any()
+    ):
+        raise UserError(
+            f"{where}: image_size is {quoted(size)}, expected width and height in pixels"
+        )
     return int(numbers[0]), int(numbers[1])
 
 
@@ -221,29 +242,25 @@ def opencv_pose(turn: Any, shift: Any, where: str) -> np.ndarray:
     return rigid(r, t)
 
 
-def numbers_of(value: Any, where: str, field: str) -> np.ndarray:
-    """Finite numbers as an array; raises UserError, beginning with ``where``, for anything else."""
-    try:
-        numbers = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        numbers = np.full(1, np.nan)
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{where}: {field} is {value!r:.60}, expected finite numbers; correct it")
-    return numbers
-
-
-def _positive(entry: dict[str, Any], field: str, where: str) -> float | None:
+def _rate(entry: dict[str, Any], field: str, where: str) -> float | None:
     value = entry.get(field)
     if value is None:
         return None
     number = numbers_of(value, where, field)
     if number.size != 1 or number.ravel()[0] <= 0:
-        raise UserError(f"{where}: {field} is {value!r:.60}, expected one positive number")
+        raise UserError(f"{where}: {field} is {quoted(value)}, expected one positive number")
+    check_rate(float(number.ravel()[0]), where)
     return float(number.ravel()[0])
 
 
-class _Loader(yaml.SafeLoader):
+_MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
+_MATRIX_TAGS = [f"tag:yaml.org,2002:{name}" for name in _MATRIX_TYPES]
+
+
+class _Loader(yaml_files.Loader):
     """The safe loader, which also knows OpenCV's matrices."""
+
+    kinds = yaml_files.KINDS | dict.fromkeys(_MATRIX_TAGS, yaml.MappingNode)
 
 
 def _matrix(entry: dict[Any, Any]) -> Any:
@@ -251,7 +268,7 @@ def _matrix(entry: dict[Any, Any]) -> Any:
     try:
         shape = entry["sizes"] if "sizes" in entry else (entry["rows"], entry["cols"])
         return np.array(entry["data"], np.float64).reshape(shape).tolist()
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
 
@@ -259,9 +276,8 @@ def _yaml_matrix(loader: yaml.SafeLoader, node: Any) -> Any:
     return _matrix(loader.construct_mapping(node, deep=True))
 
 
-_MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
-for _name in _MATRIX_TYPES:
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _yaml_matrix)
+for _tag in _MATRIX_TAGS:
+    _Loader.add_constructor(_tag, _yaml_matrix)
 
 
 def _json_object(entry: dict[str, Any]) -> Any:
@@ -274,18 +290,18 @@ def load_opencv(path: Path) -> dict[str, Any]:
     Raises UserError where it is none, or holds no names and values.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not text in UTF-8"
-        raise UserError(f"{path}: cannot be read ({reason}); check the path") from None
-    try:
         if path.suffix.lower() == ".json":
-            content = json.loads(text, object_hook=_json_object)
+            content = read_json(path, entry=_json_object)
         else:  # OpenCV's first line, %YAML:1.0, is none of YAML's own
-            content = yaml.load(text.removeprefix("%YAML:1.0"), _Loader)
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
-        problem = getattr(error, "problem", None) or getattr(error, "msg", None) or "nested"
-        raise UserError(f"{path}: is not valid JSON or YAML ({problem}); correct it") from None
+            content = yaml_files.read_yaml(
+                path,
+                MAX_CALIBRATION_BYTES,
+                loader=_Loader,
+                prepared=lambda text: text.removeprefix("%YAML:1.0"),
+            )
+    except Unreadable as error:
+        reason = re.sub("(is )?not valid (JSON|YAML)", "is not valid JSON or YAML", error.reason)
+        raise UserError(f"{path}: {reason}; correct it") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected names and values, found {type(content).__name__}")
     return content

@@ -12,12 +12,14 @@ from scipy.spatial.transform import Rotation
 from intercap_core.camera.extrinsics_files import (
     CAMERA_NAME,
     MAX_DISTANCE_M,
-    relative_to,
+    named,
+    placed,
 )
 from intercap_core.camera.intrinsics import Intrinsics
 from intercap_core.camera.opencv_calibration import CalibratedCamera, Calibration
 from intercap_core.camera.transforms import invert
 from intercap_core.errors import UserError
+from intercap_core.inputs.quotes import quoted
 
 MIN_RIG_M = 0.05  # between the two cameras farthest apart; nearer: the scale is wrong
 SAME_POSE_M = 0.01  # images of one fixed camera that differ by more were not taken from one place
@@ -78,8 +80,8 @@ def put_together(
         name = next((n for n in camera.names if n in recorded.names), camera.names[0])
         if not CAMERA_NAME.fullmatch(name):
             raise UserError(
-                f"{path}: camera {name!r} has a name that no file can have, expected letters, "
-                "digits, '_' and '-'; rename it"
+                f"{path}: camera {quoted(name)} has a name that no file can have, expected "
+                "letters, digits, '_' and '-'; rename it"
             )
         if name in poses:
             raise UserError(f"{path}: two cameras are named {name!r}; rename one")
@@ -89,7 +91,7 @@ def put_together(
         known[name] = CalibratedCamera(camera.lens)
     _check_names(path, poses, recorded)
     _check_size(path, np.stack([pose[:3, 3] for pose in poses.values()]), scale)
-    return Calibration(known, relative_to(next(iter(poses)), poses))
+    return Calibration(known, placed(path, next(iter(poses)), poses))
 
 
 def fixed_cameras(
@@ -138,8 +140,8 @@ def _camera_of(image: str, recorded: Collection[str]) -> str:
 def _check_names(path: Path, poses: Collection[str], recorded: Recorded) -> None:
     if recorded.names and not set(poses) & set(recorded.names):
         raise UserError(
-            f"{path}: its cameras are {', '.join(poses)}, the recordings are of "
-            f"{', '.join(sorted(recorded.names))}: none is the same; give both the same names"
+            f"{path}: its cameras are {named(poses)}, the recordings are of "
+            f"{named(sorted(recorded.names))}: none is the same; give both the same names"
         )
 
 

@@ -9,7 +9,6 @@ squares were stated, which the file does not say.
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,8 @@ from intercap_core.camera.opencv_calibration import (
 )
 from intercap_core.camera.other_calibration import OtherCamera, Recorded, put_together
 from intercap_core.errors import UserError
+from intercap_core.inputs.json_files import read_toml
+from intercap_core.inputs.quotes import quoted
 
 FIELDS = ("size", "matrix", "distortions", "rotation", "translation")
 # Pose2Sim names a camera after its folder of intrinsic images, its videos are named without these.
@@ -32,7 +33,7 @@ def read_toml_calibration(path: Path, recorded: Recorded, scale: float | None) -
     tables = _camera_tables(path)
     cameras = []
     for section, table in tables.items():
-        where = f"{path}: camera {section!r}"
+        where = f"{path}: camera {quoted(section)}"
         missing = [field for field in FIELDS if field not in table]
         if missing:
             raise UserError(f"{where}: has no {missing[0]}; calibrate this camera too")
@@ -62,12 +63,7 @@ def read_toml_calibration(path: Path, recorded: Recorded, scale: float | None) -
 
 
 def _camera_tables(path: Path) -> dict[str, dict[str, Any]]:
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: is not valid TOML ({error}); correct it") from None
+    content = read_toml(path)
     tables = {
         name: table
         for name, table in content.items()
@@ -84,6 +80,6 @@ def _camera_tables(path: Path) -> dict[str, dict[str, Any]]:
 def _names(section: str, table: dict[str, Any], where: str) -> tuple[str, ...]:
     name = table.get("name", section)
     if not isinstance(name, str):
-        raise UserError(f"{where}: name is {name!r:.40}, expected text; correct it")
+        raise UserError(f"{where}: name is {quoted(name, 40)}, expected text; correct it")
     folder = POSE2SIM_FOLDER.fullmatch(name)
     return (name, section, *([folder[1]] if folder else []))

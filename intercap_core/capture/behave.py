@@ -9,19 +9,21 @@ calibration.json``. Cameras are named k0, k1, ... and k1 is the master.
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 
-from intercap_core.camera.extrinsics_files import MAX_DISTANCE_M, Extrinsics, read_json
+from intercap_core.camera.extrinsics_files import MAX_DISTANCE_M, Extrinsics, placed
 from intercap_core.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
-from intercap_core.camera.transforms import invert, is_rigid, rigid
+from intercap_core.camera.plausible import check_lens
+from intercap_core.camera.transforms import is_rigid, rigid
 from intercap_core.capture.image_files import AlignedRecording, Shot, common_size
 from intercap_core.capture.source import Layout
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json, read_object
 
 MASTER = "k1"
 FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")
@@ -68,6 +70,7 @@ class BehaveLayout(Layout):
                 f"intrinsics of {name} are for {lens.width}x{lens.height}, its colour images have "
                 f"{size[0]}x{size[1]}; give the calibration of this resolution"
             )
+        check_lens(lens, f"intrinsics of {name}")
         pose = self.extrinsics.master_from_colour[name]
         fps = frame_rate(list(self._frames))
         return AlignedRecording(recordings, name, lens, pose, shots=shots, fps=fps)
@@ -122,7 +125,7 @@ def read_poses(folder: Path) -> Extrinsics:
         file = path / "config.json"
         if not file.is_file():
             continue
-        content = read_json(file)
+        content = read_object(file)
         try:
             rotation = np.array(content["rotation"], np.float64).reshape(3, 3)
             translation = np.array(content["translation"], np.float64).reshape(3)
@@ -145,10 +148,7 @@ def read_poses(folder: Path) -> Extrinsics:
             f"{folder}: holds no 1/config.json (the pose of the master, Kinect 1); give the folder "
             "calibs/<date>/config of the data set"
         )
-    master_from_world = invert(world_from_colour[MASTER])
-    poses = {name: master_from_world @ pose for name, pose in world_from_colour.items()}
-    poses[MASTER] = np.eye(4)
-    return Extrinsics(MASTER, poses)
+    return Extrinsics(MASTER, placed(folder, MASTER, world_from_colour).master_from_colour)
 
 
 def read_lens(calibration: Path, number: int) -> Intrinsics:
@@ -169,7 +169,7 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
         )
     where = f"intrinsics/{path.parent.name}/{path.name}"
     try:
-        colour = json.loads(path.read_text(encoding="utf-8-sig"))["color"]
+        colour = read_json(path)["color"]
         fx, fy, cx, cy = (float(colour[key]) for key in ("fx", "fy", "cx", "cy"))
         distortion = np.array(colour["opencv"][4:], np.float64)
         radius = float(colour.get("metric_radius", 0)) or DEFAULT_METRIC_RADIUS
@@ -178,12 +178,13 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
             raise ValueError
         padded = np.concatenate([distortion, np.zeros(8 - len(distortion))])
         radius = radius if np.isfinite(radius) else DEFAULT_METRIC_RADIUS
-        return Intrinsics(*size, fx, fy, cx, cy, padded, radius)
-    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError):
+        lens = Intrinsics(*size, fx, fy, cx, cy, padded, radius)
+    except (Unreadable, KeyError, TypeError, ValueError, OverflowError):
         raise UserError(
             f"{where}: expected 'color' with width, height, fx, fy, cx, cy and 'opencv' (these "
             "four and 4, 5 or 8 coefficients); get the file from the data set again"
         ) from None
+    return lens
 
 
 def _kinect_folders(folder: Path) -> dict[int, Path]:

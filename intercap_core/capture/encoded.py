@@ -13,6 +13,7 @@ JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; about 1 grey level of error
 RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
+_SCAN = 0xDA
 _NO_FRAME_HEADERS = (0xC4, 0xC8, 0xCC)  # among C0..CF: tables, reserved, arithmetic conditioning
 
 
@@ -20,7 +21,8 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
     """Return width and height of a JPEG or PNG file; None for what is no whole file of these.
 
     They are those of the image as OpenCV decodes it: turned as a JPEG's Exif orientation says. The
-    end must be there (zero bytes may follow a JPEG's); what lies between is not looked at.
+    end must be there (zero bytes may follow a JPEG's), and in a JPEG a scan; its pixels are not
+    looked at.
     """
     if content.startswith(PNG_START):
         whole = content.endswith(PNG_END) and len(content) >= 33
@@ -33,8 +35,9 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Walk the segments up to the frame header, which holds the size."""
+    """Walk the segments up to the first scan; the frame header before it holds the size."""
     at, lying = 2, False
+    size: tuple[int, int] | None = None
     while at + 9 <= len(content) and content[at] == 0xFF:
         marker = content[at + 1]
         if marker == 0xFF:  # a fill byte
@@ -42,10 +45,12 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
             continue
         if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME_HEADERS:
             height, width = struct.unpack(">HH", content[at + 5 : at + 9])
-            return (height, width) if lying else (width, height)
+            size = (height, width) if lying else (width, height)
         end = at + 2 + int.from_bytes(content[at + 2 : at + 4], "big")
         if marker == 0xE1 and content[at + 4 : at + 10] == b"Exif\0\0":
             lying = _orientation(content[at + 10 : end]) >= 5  # by a quarter turn
+        if marker == _SCAN:
+            return size if end + 2 < len(content.rstrip(b"\0")) else None
         at = end
     return None
 

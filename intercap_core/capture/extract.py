@@ -15,6 +15,7 @@ from intercap_core.capture.encoded import encoded_size
 from intercap_core.capture.sound import Sound
 from intercap_core.capture.source import CameraRecording, Image, Layout
 from intercap_core.errors import UserError
+from intercap_core.inputs.quotes import printable
 from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -82,7 +83,7 @@ def extract(name: str, layout: Layout, writer: artefacts.Writer, *, depth: bool 
     except UserError as error:
         view.notes.append(str(error))
         view.camera = None
-    view.notes = [_without_folders(note, layout) for note in view.notes]
+    view.notes = [printable(_without_folders(note, layout)) for note in view.notes]
     return view
 
 

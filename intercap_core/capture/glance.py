@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import av
 import numpy as np
 
+from intercap_core.capture.container import open_container
 from intercap_core.capture.encoded import encoded_size
 
 FIRST_PACKETS = 60  # within these some image must decode: two seconds
@@ -39,7 +40,7 @@ class Glance(NamedTuple):
 
 def glance_at_video(path: Path, stream_index: int, fps: float) -> Glance:
     """Look at one track of a video file that opens."""
-    with av.open(str(path), metadata_errors="replace") as container:
+    with open_container(path) as container:
         stream: Any = container.streams[stream_index]
         # read here: a stream of a closed container is freed memory
         stated, frames = float(container.duration or 0) / av.time_base, int(stream.frames)
@@ -57,7 +58,7 @@ def glance_at_video(path: Path, stream_index: int, fps: float) -> Glance:
             share = 1.0
             if frames and seconds is not None:
                 share = min(1.0, (round(seconds * fps) + 1) / frames)
-    with av.open(str(path), metadata_errors="replace") as container:
+    with open_container(path) as container:
         size = _first_size(container, container.streams[stream_index])
     if seconds is None:
         return Glance(size, None, None, share, counted=False)

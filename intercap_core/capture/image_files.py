@@ -20,6 +20,7 @@ from intercap_core.capture.encoded import PNG_END, PNG_START, encoded_size
 from intercap_core.capture.glance import Glance
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
 
 LOOKED_AT = 5  # files of each kind that a glance opens, spread over the recording
 GREY_TYPE = 0  # PNG colour type of one channel
@@ -76,12 +77,11 @@ def _check_size(found: tuple[int, int], expected: tuple[int, int]) -> None:
         )
 
 
-def _read(path: Path, length: int = -1) -> bytes:
+def _read(path: Path, length: int | None = None) -> bytes:
     try:
-        with open(path, "rb") as file:
-            return file.read(length)
-    except OSError as error:
-        raise DamagedImage(f"cannot be read ({error.strerror})") from None
+        return read_bytes(path, MAX_IMAGE_BYTES, head=length)
+    except Unreadable as error:
+        raise DamagedImage(error.reason) from None
 
 
 def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:

@@ -8,7 +8,6 @@ The release states no times: the number in a file's name is its place at 30 imag
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,13 @@ import numpy as np
 
 from intercap_core.camera.extrinsics_files import read_extrinsics
 from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.camera.plausible import check_lens
 from intercap_core.capture.image_files import AlignedRecording, Shot, common_size
 from intercap_core.capture.source import Layout
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json
 
 FPS = 30.0
 CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)
@@ -134,10 +136,10 @@ def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
     """
     where = f"{path.parent.name}/{path.name}"
     try:
-        content: Any = json.loads(path.read_text(encoding="utf-8-sig"))
+        content: Any = read_json(path)
         focal, centre = (np.array(content[key], np.float64).reshape(2) for key in "fc")
         k = np.array(content["k"], np.float64).ravel()
-    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError):
+    except (Unreadable, KeyError, TypeError, ValueError, OverflowError):
         raise UserError(
             f"{where}: expected 'f' and 'c' of two numbers and 'k' of 4, 5 or 8; get the file from "
             "the release again"
@@ -157,4 +159,4 @@ def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
         )
     distortion = np.concatenate([k, np.zeros(8 - len(k))])
     fx, fy, cx, cy = (float(value) for value in (*focal, *centre))
-    return Intrinsics(*size, fx, fy, cx, cy, distortion)
+    return check_lens(Intrinsics(*size, fx, fy, cx, cy, distortion), where)

@@ -9,6 +9,7 @@ tracks: https://learn.microsoft.com/azure/kinect-dk/record-file-format and the S
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,14 +27,19 @@ from intercap_core.camera.k4a_calibration import (
     colour_from_accelerometer,
     read_calibration,
 )
+from intercap_core.camera.plausible import check_rate
 from intercap_core.camera.rig import Camera
+from intercap_core.capture.container import LATEST_US, open_container
 from intercap_core.capture.encoded import RAW_FORMATS, encoded_size
 from intercap_core.capture.glance import Glance, glance_at_video, segment_end
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import read_bytes
+from intercap_core.inputs.quotes import quoted
 
 TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
 CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"
 IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
+LONGEST_DELAY_US = 1_000_000  # of depth or of a subordinate: the SDK allows one frame's period
 PASSIVE_INFRARED = "PASSIVE_IR"  # the depth camera as an infrared one: it measures no depth
 _EBML_MAGIC = b"\x1a\x45\xdf\xa3"
 
@@ -83,9 +89,7 @@ class Recording:
         truncated = _is_truncated(self.path)
         try:
             # the tracks' headers are complete; probing would only buffer packets
-            self._container = av.open(
-                str(self.path), options={"probesize": "32768"}, metadata_errors="replace"
-            )
+            self._container = open_container(self.path, probesize="32768")
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{self.path}: cannot be opened as a recording ({error.strerror}); record again, "
@@ -140,8 +144,11 @@ class Recording:
             if not self._is_whole(kind, content):
                 self.broken_packets += 1
                 continue
-            time_us = round(packet.pts * packet.time_base * 1_000_000)
-            yield Packet(kind, time_us + self.info.start_offset_us, content)
+            time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
+            if abs(time_us) > LATEST_US:
+                self.broken_packets += 1
+                continue
+            yield Packet(kind, time_us, content)
 
     def _is_whole(self, kind: Kind, content: bytes) -> bool:
         if kind == "colour" and self.info.colour_format == "MJPG":
@@ -211,15 +218,17 @@ class Recording:
                 f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
                 "colour; record with k4arecorder and the colour camera on"
             )
+        fps = float(colour.average_rate or 30)
+        check_rate(fps, str(self.path))
         return RecordingInfo(
             colour_mode=self._mode("colour", colour, "K4A_COLOR_MODE", COLOUR_MODES),
             colour_format=self._colour_format(colour),
             depth_mode=self._depth_mode(depth),
-            fps=float(colour.average_rate or 30),
+            fps=fps,
             serial=self._container.metadata.get("K4A_DEVICE_SERIAL_NUMBER", ""),
-            start_offset_us=self._microseconds("K4A_START_OFFSET_NS"),
-            depth_delay_us=self._microseconds("K4A_DEPTH_DELAY_NS"),
-            subordinate_delay_us=self._microseconds("K4A_SUBORDINATE_DELAY_NS"),
+            start_offset_us=self._microseconds("K4A_START_OFFSET_NS", LATEST_US),
+            depth_delay_us=self._microseconds("K4A_DEPTH_DELAY_NS", LONGEST_DELAY_US),
+            subordinate_delay_us=self._microseconds("K4A_SUBORDINATE_DELAY_NS", LONGEST_DELAY_US),
             wired_sync_mode=self._container.metadata.get("K4A_WIRED_SYNC_MODE", "STANDALONE"),
             calibration=self._calibration(),
             truncated=truncated,
@@ -256,15 +265,14 @@ class Recording:
             )
         return name
 
-    def _microseconds(self, tag: str) -> int:
+    def _microseconds(self, tag: str, most: int) -> int:
         value = self._container.metadata.get(tag, "0")
-        try:
-            return round(int(value) / 1000)
-        except ValueError:
-            raise UserError(
-                f"{self.path}: tag {tag} is {value!r}, expected nanoseconds; the file is damaged, "
-                "copy or record it again"
-            ) from None
+        if re.fullmatch(r"-?[0-9]{1,18}", value) and abs(found := round(int(value) / 1000)) <= most:
+            return found
+        raise UserError(
+            f"{self.path}: tag {tag} is {quoted(value)}, expected nanoseconds, at most "
+            f"{most / 1e6:g} s; the file is damaged, copy or record it again"
+        )
 
     def _calibration(self) -> bytes:
         attached: list[Any] = [s for s in self._container.streams if s.type == "attachment"]
@@ -292,10 +300,9 @@ def _is_truncated(path: Path) -> bool:
     """
     try:
         size = os.path.getsize(path)
-        with open(path, "rb") as file:
-            head = file.read(4096)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    head = read_bytes(path, max(size, 4096), head=4096)
     if not head:
         raise UserError(f"{path}: is empty (0 bytes); copy or record it again")
     if not head.startswith(_EBML_MAGIC):

@@ -15,8 +15,7 @@ from intercap_core.camera.calibration_files import read_calibration
 from intercap_core.camera.extrinsics_files import CAMERA_NAME
 from intercap_core.camera.other_calibration import Recorded
 from intercap_core.camera.rig import Camera
-from intercap_core.capture.encoded import encoded_size
-from intercap_core.capture.image_files import FilesRecording
+from intercap_core.capture.image_files import FilesRecording, common_size
 from intercap_core.capture.source import CameraRecording, Layout
 from intercap_core.capture.timestamps import find_timestamps, rate_of, read_timestamps, shots_of
 from intercap_core.config import SequenceEntry
@@ -48,11 +47,8 @@ class PlainLayout(Layout):
         """Width and height of the camera's first image; None where there is none to be read."""
         folder = self._folders.get(name)
         files = _colour(folder) if folder else []
-        try:
-            if files:
-                return encoded_size(files[0].read_bytes())
-        except OSError:
-            return None
+        if files:
+            return common_size(files[:1])
         from intercap_core.capture.video import video_size
 
         return next((video_size(path) for path in self._videos if path.stem == name), None)

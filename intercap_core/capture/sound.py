@@ -10,6 +10,9 @@ from typing import Any
 import av
 import numpy as np
 
+from intercap_core.capture.container import LATEST_US, open_container
+from intercap_core.inputs.files import Unreadable
+
 SOUND_RATE = 8000  # samples a second: telephony's, steps and voices are within 4 kHz
 MAX_SOUND_S = 600.0  # that are read: 19 MB a camera
 JUMP_S = 0.05  # by which a packet's time differs from the samples before it: a gap
@@ -54,8 +57,8 @@ def read_sound(path: Path, first_image_s: float) -> Sound | None:
 def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
     """Times on the file's clock and samples (n,), as they are decoded."""
     try:
-        container = av.open(str(path), metadata_errors="replace")
-    except (av.error.FFmpegError, OSError):
+        container = open_container(path)
+    except (Unreadable, av.error.FFmpegError, OSError):
         return
     with container:
         streams: Any = container.streams.audio
@@ -65,6 +68,8 @@ def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
         after = 0.0
         for frame in _frames(container, streams[0]):
             after = frame.time if frame.time is not None else after
+            if not frame.sample_rate or not abs(after) < LATEST_US * 1e-6:
+                continue
             time_s, after = after, after + frame.samples / frame.sample_rate
             try:
                 for made in resampler.resample(frame):

@@ -10,12 +10,15 @@ import numpy as np
 
 from intercap_core.capture.image_files import Shot
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
+from intercap_core.inputs.quotes import quoted
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds, and within 64 bits in microseconds
 LONGEST_STEP_S = 5.0  # a usual step above this is no second
 NUMBER = re.compile(r"\d+(?=\D*$)")  # the last number of a name
 Timestamps = Mapping[str | int, float]  # seconds by name, or by place where lines have no names
+_WHOLE = re.compile(r"[0-9]{1,18}")
 _SPLIT = re.compile(r"[,;\s]+")
 
 
@@ -32,9 +35,11 @@ def read_timestamps(path: Path) -> Timestamps:
     file and line for what is no number, for a name given twice, and for milliseconds.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError):
-        raise UserError(f"{path}: cannot be read as text; check the file") from None
+        lines = read_text(path, MAX_TABLE_BYTES).splitlines()
+    except Unreadable as error:
+        raise UserError(
+            f"{path}: cannot be read as text ({error.reason}); check the file"
+        ) from None
     times: dict[str | int, float] = {}
     for number, line in enumerate(lines, start=1):
         fields = [field for field in _SPLIT.split(line.strip().lstrip("#")) if field]
@@ -48,12 +53,12 @@ def read_timestamps(path: Path) -> Timestamps:
             if not times and number == 1:
                 continue  # a header
             raise UserError(
-                f"{path}, line {number}: found {line!r:.60}, expected 'seconds' or 'name, "
+                f"{path}, line {number}: found {quoted(line)}, expected 'seconds' or 'name, "
                 "seconds'; correct it"
             )
         name = fields[0] if len(fields) == 2 else len(times)
         if name in times:
-            raise UserError(f"{path}, line {number}: {name!r} is given twice; keep one")
+            raise UserError(f"{path}, line {number}: {quoted(name)} is given twice; keep one")
         if abs(seconds) > LATEST_S:
             raise UserError(f"{path}, line {number}: {seconds:.4g} are no seconds; write seconds")
         times[name] = seconds
@@ -155,7 +160,7 @@ def _stated(
             f"{source}: {len(times)} timestamps for {len(coloured)} colour images; write one for "
             "each, or 'name, seconds'"
         )
-    by_number = {int(n): t for n, t in times.items() if isinstance(n, str) and n.isdigit()}
+    by_number = {int(n): t for n, t in times.items() if isinstance(n, str) and _WHOLE.fullmatch(n)}
     seconds = {}
     for key, files in found.items():
         names = [name for file in files if file is not None for name in (file.name, file.stem)]

@@ -13,7 +13,9 @@ from typing import Any
 import av
 import numpy as np
 
+from intercap_core.camera.plausible import check_rate
 from intercap_core.camera.rig import Camera
+from intercap_core.capture.container import LATEST_US, MAX_SIDE, open_container
 from intercap_core.capture.encoded import JPEG_QUALITY, jpeg_of
 from intercap_core.capture.glance import Glance, glance_at_video
 from intercap_core.capture.image_files import faults_of_files, read_shots
@@ -21,6 +23,7 @@ from intercap_core.capture.sound import Sound, read_sound
 from intercap_core.capture.source import CameraRecording, Image
 from intercap_core.capture.timestamps import Timestamps, shots_of
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import Unreadable
 
 FEW_IMAGES = 0.02  # by which a count from duration and rate may be wrong
 
@@ -28,10 +31,10 @@ FEW_IMAGES = 0.02  # by which a count from duration and rate may be wrong
 def video_size(path: Path) -> tuple[int, int] | None:
     """Width and height of a video's images; None where it cannot be opened."""
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_container(path) as container:
             context = container.streams.video[0].codec_context
             return (context.width, context.height) if context and context.width else None
-    except (av.error.FFmpegError, OSError, IndexError):
+    except (Unreadable, av.error.FFmpegError, OSError, IndexError):
         return None
 
 
@@ -54,7 +57,9 @@ class VideoRecording(CameraRecording):
         times: Timestamps | None,
     ) -> None:
         try:
-            self._container = av.open(str(path), metadata_errors="replace")
+            self._container = open_container(path)
+        except Unreadable as error:
+            raise UserError(f"{path}: cannot be opened as a video ({error.reason})") from error
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{path}: cannot be opened as a video ({error.strerror}); copy the file again, or "
@@ -69,6 +74,17 @@ class VideoRecording(CameraRecording):
         self._stream: Any = streams[0]
         self._stream.thread_type = "AUTO"
         rate = fps or float(self._stream.average_rate or self._stream.guessed_rate or 30)
+        width, height = self._stream.codec_context.width, self._stream.codec_context.height
+        try:
+            check_rate(rate, str(path))
+            if max(width, height) > MAX_SIDE:
+                raise UserError(
+                    f"{path}: states images of {width}x{height} pixels, expected at most "
+                    f"{MAX_SIDE} a side; copy or convert it again"
+                )
+        except UserError:
+            self._container.close()
+            raise
         super().__init__(path, camera, fps=rate)
         self._offset_s = offset_s
         self._times = None if times is None else list(times.values())
@@ -107,7 +123,11 @@ class VideoRecording(CameraRecording):
                     break
                 seconds, first = self._times[count], 0.0
             count += 1
-            yield Image("colour", round((seconds - first + self._offset_s) * 1e6), content)
+            time_us = round((seconds - first + self._offset_s) * 1e6)
+            if abs(time_us) > LATEST_US and self._times is None:
+                self._damaged += 1
+                continue
+            yield Image("colour", time_us, content)
         if self._times is not None and count < len(self._times):
             self.notes.append(f"{len(self._times)} timestamps, but {count} images")
         if not copied:
@@ -149,6 +169,9 @@ class VideoRecording(CameraRecording):
                 self._damaged += 1
                 continue
             for frame in frames:
+                if max(frame.width, frame.height) > MAX_SIDE:
+                    self._damaged += 1
+                    continue
                 image = frame.to_ndarray(format="bgr24")
                 # A phone held upright records lying images and says so; viewers turn them.
                 image = np.rot90(image, round((getattr(frame, "rotation", 0) or 0) / 90))

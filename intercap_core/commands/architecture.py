@@ -75,6 +75,7 @@ LAYERS: tuple[Mapping[str, str], ...] = (
     },
     {"schemas": "what every artefact holds"},
     {"artefacts": "the one place that opens HDF5"},
+    {"inputs": "files that a user supplies, read within bounds"},
 )
 # Stages that are not named as their room.
 ROOM_OF = {"frames": "capture", "summary": "metrics", "page": "report"}

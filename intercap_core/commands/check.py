@@ -333,11 +333,25 @@ def _look_at_files(row: SequenceEntry, settings: FramesSettings) -> Looked:
         path = getattr(row, column)
         if path is not None and not path.exists():
             faults.append(f"column {column} says {path}, which is not there")
+    if row.truth is not None and row.truth.exists():
+        faults += faults_of_truth(row.truth)
     if not row.recordings.is_dir():
         return Looked(faults=[f"there is no folder {row.recordings} of recordings", *faults])
     looked = _look_at_recordings(row, settings) if row.calibration.exists() else Looked()
     looked.faults[:0] = faults
     return looked
+
+
+def faults_of_truth(path: Path) -> list[str]:
+    """Why a file that the table names as truth is none."""
+    from intercap_core import artefacts
+    from intercap_core.schemas import TRUTH
+
+    try:
+        with artefacts.read(path, TRUTH):
+            return []
+    except UserError as error:
+        return [f"column truth says a file that holds none: {error}"]
 
 
 def _look_at_recordings(row: SequenceEntry, settings: FramesSettings) -> Looked:

@@ -29,6 +29,7 @@ from intercap_core.detections.converters.mask_files import (
 )
 from intercap_core.detections.image_numbers import CameraImages
 from intercap_core.detections.instance import Instance
+from intercap_core.inputs.quotes import printable
 
 Result = TypeVar("Result")
 
@@ -164,12 +165,12 @@ def note_absent(notes: list[str], names: list[str], images: CameraImages, where:
         return
     has = f"images {min(images.recorded)} to {max(images.recorded)}" if images.recorded else "none"
     if images.stems:
-        has += f", {images.stems[0]} to {images.stems[-1]}"
+        has += printable(f", {images.stems[0]} to {images.stems[-1]}")
     off_by_one = {str(max(images.recorded, default=-1) + 1)} == set(names)
     hint = "; image numbers count from 0" if off_by_one else ""
     notes.append(
         f"{len(names)} results in {where} are of images that the recording does not have (first: "
-        f"{names[0]:.80}; it has {has}){hint}"
+        f"{printable(names[0][:80])}; it has {has}){hint}"
     )
 
 
@@ -205,7 +206,7 @@ def _add_image_files(
             continue
         if content.results or not content.entries:
             found.by_image.setdefault(place, []).extend(one for _, one in content.results)
-        faults += [f"{name}, {fault}" for fault in content.faults]
+        faults += [f"{printable(name)}, {fault}" for fault in content.faults]
         entries, scaled = entries + content.entries, scaled + content.scaled
     note_broken(found.notes, "candidates", broken)
     if faults:
@@ -218,7 +219,8 @@ def _add_image_files(
         found.notes.append(f"no file of candidates for {without} images")
     if absent:
         found.notes.append(
-            f"{len(absent)} files of candidates belong to no image (first: {absent[0]:.80})"
+            f"{len(absent)} files of candidates belong to no image (first: "
+            f"{printable(absent[0][:80])})"
         )
 
 
@@ -239,7 +241,8 @@ def _add_masks_of_camera(
         absent = [name for name in named if numbers.get(name) not in images.recorded]
         if absent:
             found.notes.append(
-                f"masks of {len(absent)} images are named after no image (first: {absent[0]:.80})"
+                f"masks of {len(absent)} images are named after no image (first: "
+                f"{printable(absent[0][:80])})"
             )
         files = {numbers[name]: of for name, of in named.items() if name in numbers}
     held = [int(images.number[t]) for t in images.sets]
@@ -267,7 +270,7 @@ def add_masks(
 
 def short(path: Path) -> str:
     """The file's name with its folder's, which is a camera or a moment."""
-    return f"{path.parent.name}/{path.name}"
+    return printable(f"{path.parent.name}/{path.name}")
 
 
 def note_broken(notes: list[str], what: str, broken: list[str]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from intercap_core.detections.constants import MAX_LABEL
+from intercap_core.inputs.quotes import quoted
 
 # COCO's 80 classes, and their published ids, which have gaps.
 _CLASSES = (
@@ -52,7 +53,7 @@ def _unique(pairs: Sequence[tuple[Any, Any]]) -> dict[int, str]:
         if isinstance(number, str) and number.isdecimal() and len(number) < 10:
             number = int(number)
         if type(number) is not int or not isinstance(name, str):
-            raise ValueError(f"class {number!r:.40} has the name {name!r:.40}")
+            raise ValueError(f"class {quoted(number, 40)} has the name {quoted(name, 40)}")
         if number in names:
             raise ValueError(f"two classes have the number {number}")
         names[number] = label_text(name)
@@ -66,7 +67,7 @@ def label_text(name: str) -> str:
     try:
         name.encode("utf-8")
     except UnicodeEncodeError:
-        raise ValueError(f"the category's name {name!r:.80} is not valid text") from None
+        raise ValueError(f"the category's name {quoted(name)} is not valid text") from None
     if len(name) > MAX_LABEL:
         raise ValueError(f"a category's name has {len(name)} characters, at most {MAX_LABEL}")
     return name

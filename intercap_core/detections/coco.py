@@ -9,7 +9,6 @@ users, ultralytics, Segment Anything and Grounded SAM.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,8 +20,13 @@ from intercap_core.detections.class_names import label_text, names_of
 from intercap_core.detections.constants import (
     HEAD_BYTES,
     MAX_JSON_BYTES,
+    MAX_SCORE,
+    MIN_SCORE,
 )
 from intercap_core.detections.instance import Instance, to_rle
+from intercap_core.inputs.files import Unreadable, read_bytes
+from intercap_core.inputs.json_files import decoder, parse_json
+from intercap_core.inputs.quotes import quoted
 
 _LARGEST_ID = 2**31 - 1
 _NAME_KEYS = ("category_name", "category", "class_name", "class", "label", "name")
@@ -93,14 +97,14 @@ def candidates_of(
         stated, images = _stated(content, names)
     if not isinstance(entries, list):
         raise UnreadableCandidates(
-            f"holds {short_of(content)}, expected a list of results, or 'annotations' with one"
+            f"holds {quoted(content)}, expected a list of results, or 'annotations' with one"
         )
     found = CandidateFile(images=images)
     for index, entry in enumerate(entries):
         image = ImageKey(None, None)
         try:
             if not isinstance(entry, dict):
-                raise ValueError(f"expected a result, found {short_of(entry)}")
+                raise ValueError(f"expected a result, found {quoted(entry)}")
             image = image_of(entry, stated.files, one_image)
             score = _score(entry)
             if score < min_score:
@@ -125,23 +129,19 @@ def read_head(path: Path) -> Any:
     A look before a run: None where a large file does not begin with results. Raises
     :class:`UnreadableCandidates` as :func:`read_json` does.
     """
-    try:
-        size = path.stat().st_size
-        with open(path, "rb") as file:
-            text = file.read(HEAD_BYTES).decode("utf-8", errors="ignore").lstrip()
-    except OSError as error:
-        raise UnreadableCandidates(f"cannot be read ({error.strerror})") from None
-    if size <= HEAD_BYTES or size > MAX_JSON_BYTES:
+    content = _bytes(path, HEAD_BYTES)
+    if len(content) < HEAD_BYTES:
         return read_json(path)
+    text = content.decode("utf-8", errors="ignore").lstrip()
     if not text.startswith("["):
         return None
-    decoder, at = json.JSONDecoder(), 1
+    reader, at = decoder(text), 1
     entries: list[Any] = []
     while True:
         while text[at : at + 1] in (",", " ", "\t", "\r", "\n"):
             at += 1
         try:
-            entry, at = decoder.raw_decode(text, at)
+            entry, at = reader.raw_decode(text, at)
         except (ValueError, RecursionError):
             return entries or None
         entries.append(entry)
@@ -149,18 +149,20 @@ def read_head(path: Path) -> Any:
 
 def read_json(path: Path) -> Any:
     """Parse a file; raises :class:`UnreadableCandidates` where it is no JSON or too large."""
+    content = _bytes(path)
     try:
-        size = path.stat().st_size
-        if size > MAX_JSON_BYTES:
-            raise UnreadableCandidates(
-                f"has {size / 1e6:.0f} MB, at most {MAX_JSON_BYTES / 1e6:.0f} are read; "
-                "write masks as compressed RLE, or one file an image"
-            )
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise UnreadableCandidates(f"cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
+        return parse_json(content.decode("utf-8-sig"))
+    except ValueError as error:
         raise UnreadableCandidates(f"is not valid JSON ({error}); write it again") from None
+
+
+def _bytes(path: Path, head: int | None = None) -> bytes:
+    try:
+        return read_bytes(path, MAX_JSON_BYTES, head=head)
+    except Unreadable as error:
+        smaller = "; write masks as compressed RLE, or one file an image"
+        large = " MB, at most" in error.reason
+        raise UnreadableCandidates(error.reason + (smaller if large else "")) from None
 
 
 def _stated(
@@ -200,9 +202,7 @@ def listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
     for value in values:
         number = value.get("id") if isinstance(value, dict) else None
         if type(number) is not int or not 0 <= number <= _LARGEST_ID:
-            raise UnreadableCandidates(
-                f"'images' must list objects with id, found {short_of(value)}"
-            )
+            raise UnreadableCandidates(f"'images' must list objects with id, found {quoted(value)}")
         name = value.get("file_name")
         images.append(ImageKey(number, name if isinstance(name, str) else None))
     return images
@@ -234,7 +234,7 @@ def image_of(entry: dict[str, Any], files: Mapping[int, str], one_image: bool) -
     if type(value) is not int or not 0 <= value <= _LARGEST_ID:
         raise ValueError(
             "image_id must be the whole number of a colour image from 0, or its file's name, "
-            f"found {short_of(value)}"
+            f"found {quoted(value)}"
         )
     return ImageKey(value, files.get(value) if name is None else name)
 
@@ -257,13 +257,22 @@ def _instance(
     try:
         x, y, w, h = (float(v) for v in box)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"bbox is {short_of(box)}, expected x, y, width, height") from None
+        raise ValueError(f"bbox is {quoted(box)}, expected x, y, width, height") from None
     if not all(math.isfinite(v) for v in (x, y, w, h)):
-        raise ValueError(f"bbox is {short_of(box)}, expected finite numbers")
+        raise ValueError(f"bbox is {quoted(box)}, expected finite numbers")
     if corners:
         w, h = w - x, h - y
+    if not (w >= 0 and h >= 0 and _near(x, x + w, size[0]) and _near(y, y + h, size[1])):
+        raise ValueError(
+            f"bbox is {quoted(box)}, expected pixels of the image of {size[0]}x{size[1]}"
+        )
     masks.Runs(rle, size[1], size[0])  # raises where the string is no mask of the image
     return Instance(label, score, (x, y, w, h), rle), scaled
+
+
+def _near(low: float, high: float, side: int) -> bool:
+    """Whether an extent lies within a side of the image, or as much beyond it."""
+    return low >= -side and high <= 2 * side
 
 
 def _score(entry: dict[str, Any]) -> float:
@@ -274,8 +283,8 @@ def _score(entry: dict[str, Any]) -> float:
         score = float(value) if type(value) in (int, float) else math.nan
     except OverflowError:
         score = math.inf
-    if not math.isfinite(score):
-        raise ValueError(f"score is {short_of(value)}, expected a number")
+    if not MIN_SCORE <= score <= MAX_SCORE:
+        raise ValueError(f"score is {quoted(value)}, expected a number from 0 to 1")
     return score
 
 
@@ -289,17 +298,8 @@ def _label(entry: dict[str, Any], names: Mapping[int, str]) -> str:
         return ""
     for key in present:
         if type(entry[key]) is int:
-            return names.get(entry[key], f"category {short_of(entry[key])}")
+            return names.get(entry[key], f"category {quoted(entry[key])}")
     raise ValueError(
-        f"{present[0]} is {short_of(entry[present[0]])}, expected a class's number or name; "
+        f"{present[0]} is {quoted(entry[present[0]])}, expected a class's number or name; "
         "category_id or category_name says it"
     )
-
-
-def short_of(value: Any) -> str:
-    """A found value in words of bounded length."""
-    if isinstance(value, dict):
-        keys = ", ".join(str(key)[:40] for key in list(value)[:5])
-        return f"an object with {keys}" if keys else "an empty object"
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:60]}... ({len(text)} characters)"

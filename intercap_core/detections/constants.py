@@ -11,9 +11,16 @@ MAX_LABELS_BYTES = 1 << 26  # a list of classes is some kB; a data set's annotat
 MAX_LABEL = 200  # characters; the artefact keeps all labels at the length of the longest
 MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth
 MAX_MASK_VALUES = 1000  # instances of one mask image; more are a photograph or a depth image
+MAX_REDUCED = 32.0  # by which a mask's side may be smaller than the image's
+MAX_NETWORK_BYTES = 1 << 31  # an ONNX file ends there; larger ones keep weights beside them
+MAX_INPUT_SIDE = 8192  # px of a model's input; detectors look at 640 to 1333
+MAX_BATCH = 256  # images of a model's input
+MAX_GRID_SIDE = 32_767  # cells of a mask that OpenCV's warps take
 FILES_NAMED = 3  # broken files or entries that a note names; more are counted
 
 # --- decision: which numbers can be true
+# Scores are probabilities; Segment Anything's predicted overlaps go a little beyond 1.
+MIN_SCORE, MAX_SCORE = -0.01, 1.2
 SAME_SHAPE_PX = 1.0  # rounding of one side of an image that was reduced
 SHARES_UP_TO = 2.0  # px: coordinates from 0 to 1, some beyond the image, are shares, not pixels
 EDGE_PX = 0.5  # pixels' middles are whole numbers

@@ -16,8 +16,10 @@ from intercap_core.camera import masks
 from intercap_core.detections.constants import (
     MASK_THRESHOLD,
     MAX_PIXELS,
+    MAX_REDUCED,
     SAME_SHAPE_PX,
 )
+from intercap_core.inputs.quotes import quoted
 
 PERSON_LABEL = "person"  # what every detector's list of classes calls people
 
@@ -54,7 +56,7 @@ def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, floa
     if found == size:
         return 1.0, 1.0
     x, y = size[0] / found[0], size[1] / found[1]
-    if abs(found[1] * x - size[1]) > max(x, 1) * SAME_SHAPE_PX:
+    if x > MAX_REDUCED or abs(found[1] * x - size[1]) > max(x, 1) * SAME_SHAPE_PX:
         raise ValueError(
             f"the mask has {found[0]}x{found[1]} pixels, the image {size[0]}x{size[1]}; segment "
             "the images as recorded"
@@ -101,8 +103,8 @@ def _from_rle(
         or stated[0] * stated[1] > MAX_PIXELS
     ):
         raise ValueError(
-            f"the mask's size is {stated!r:.60}, expected [{size[1]}, {size[0]}] (height, width of "
-            "the colour image)"
+            f"the mask's size is {quoted(stated)}, expected [{size[1]}, {size[0]}] (height, "
+            "width of the colour image)"
         )
     height, width = stated
     factors = scale_to((width, height), size)

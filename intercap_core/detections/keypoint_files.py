@@ -28,6 +28,7 @@ from intercap_core.detections.converters.wholebody import people_of
 from intercap_core.detections.image_numbers import CameraImages
 from intercap_core.detections.keypoint_values import NOBODY, Values
 from intercap_core.errors import UserError
+from intercap_core.inputs.quotes import printable
 
 RESULTS = "results_"  # what mmpose's demo puts before the name of an image or a video
 ALPHAPOSE = "alphapose-results.json"
@@ -160,7 +161,7 @@ def _add_image_files(reading: _Reading, folder: Path, images: CameraImages) -> N
     _add_files(reading, {n: by_number.get(n) for n in numbers})
     if absent:
         reading.people.notes.append(
-            f"{len(absent)} keypoint files belong to no image (first: {absent[0]:.80})"
+            f"{len(absent)} keypoint files belong to no image (first: {printable(absent[0][:80])})"
         )
 
 

@@ -39,10 +39,12 @@ class NormalEquations:
         self.gradient = np.zeros((frames, ALL.stop))
         self.energies: dict[str, np.ndarray] = {}
 
-    def copy(self) -> NormalEquations:
-        """The same sums, to which more can be added."""
+    def copy(self, bands: np.ndarray | None = None) -> NormalEquations:
+        """The same sums, to which more can be added; in the memory of ``bands``, of the same shape,
+        where that is given: half of the time goes into new memory."""
         made = NormalEquations(0, self._threads)
-        made.bands, made.damped = self.bands.copy(), self.damped.copy()
+        made.bands = np.empty_like(self.bands) if bands is None else bands
+        made.bands[...], made.damped = self.bands, self.damped.copy()
         made.gradient, made.energies = self.gradient.copy(), dict(self.energies)
         return made
 

@@ -92,7 +92,10 @@ class BodyClouds:
         there = self._images.depth_available[t]
         cameras = [c for i, c in enumerate(self._rig) if there[i] and self._masks[t][i]]
         object_ = truth.object_vertices @ truth.rotation[t].T + truth.translation[t]
-        sight = Sight([(true, self._faces), (object_, truth.object_faces)])
+        occluders = [self._tree.shaped(true)]
+        if truth.has_object:
+            occluders.append(SurfaceTree(object_, truth.object_faces).shaped(object_))
+        sight = Sight(occluders)
         points = self._samples.of(true, self._faces)
         normals = face_normals(true, self._faces)[self._samples.faces]
         # occlusion by furniture is known from the truth of the whole rig

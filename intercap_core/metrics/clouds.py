@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from pykdtree.kdtree import KDTree
+
+from intercap_core.rigid.point_grid import PointGrid
 
 
 class Cloud:
@@ -11,13 +12,13 @@ class Cloud:
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = np.asarray(points, np.float32)
-        self._tree = KDTree(self.points) if len(self.points) else None
+        self._tree = PointGrid(self.points) if len(self.points) else None
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (M,) of mesh points (M, 3) to the closest measured point; NaN without any."""
         if self._tree is None:
             return np.full(len(points), np.nan)
-        return self._tree.query(np.asarray(points, np.float32))[0].astype(np.float64)
+        return self._tree.distance(points)
 
 
 def vertex_to_cloud(vertices: np.ndarray, cloud: Cloud) -> float:

@@ -141,8 +141,9 @@ class Measurement:
         body touches."""
         object_vertices = handled.posed(t, handled.mesh.vertices)
         points = handled.posed(t, handled.points)
-        to_body = surface.signed_distance(np.concatenate([object_vertices, points]))
-        point_distance = to_body[len(object_vertices) :]
+        to_body = surface.signed_distance(object_vertices)
+        # of a point outside nothing but its contact is told
+        point_distance = surface.signed_distance(points, reach=1.01 * self.threshold)
         track = handled.track
         to_object = handled.surface.signed_distance(
             vertices, track.rotation[t], track.translation[t]
@@ -150,7 +151,7 @@ class Measurement:
         depth = penetration.depths(to_object)
         return {
             "body_to_object": to_object,
-            "object_to_body": to_body[: len(object_vertices)],
+            "object_to_body": to_body,
             "penetration_mean": depth.mean,
             "penetration_median": depth.median,
             "penetration_max": depth.max,
@@ -172,16 +173,19 @@ class Measurement:
         """Distances to frame ``t``'s clouds; the samples that cameras see are found where not
         given."""
         handled = self.handled
-        near, meshes = [vertices[::10]], [(vertices, self.faces)]
+        near = [vertices[::10]]
         if handled is not None:
             object_vertices = handled.posed(t, handled.mesh.vertices)
             near.append(object_vertices)
-            meshes.append((object_vertices, handled.mesh.faces))
         person, object_ = (Cloud(points) for points in self.clouds.at(t, np.concatenate(near)))
         body_points = self.body_samples.of(vertices, self.faces)
         sight = None
         if seen_body is None or (handled is not None and seen_object is None):
-            sight = Sight(meshes)
+            occluders = [surface.surface]
+            if handled is not None:
+                track = handled.track
+                occluders.append(handled.surface.placed(track.rotation[t], track.translation[t]))
+            sight = Sight(occluders)
         if seen_body is None:
             assert sight is not None
             normals = face_normals(vertices, self.faces)[self.body_samples.faces]

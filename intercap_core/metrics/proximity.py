@@ -9,7 +9,6 @@ import numpy as np
 from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply
 from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.open3d_core import o3d
 from intercap_core.rigid.surface_tree import ShapedSurface, SurfaceTree
 
 REACH_M = 0.10  # distances are capped here: no reported figure needs larger ones
@@ -18,71 +17,81 @@ _LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own
 
 
 class PosedObject:
-    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once."""
+    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once.
+
+    ``watertight``: rays tell what is inside; else the mesh winds around it.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
-        self._solid = _Solid(
-            DistanceField(vertices, faces, watertight=watertight),
-            SurfaceTree(vertices, faces).shaped(vertices),
-        )
+        self._tree, self._vertices = SurfaceTree(vertices, faces), vertices
+        field = None
+        if not (watertight and self._tree.closed):
+            field = DistanceField(vertices, faces, watertight=watertight)
+        self._solid = _Solid(self._tree.shaped(vertices), field)
+
+    def placed(self, rotation: np.ndarray, translation: np.ndarray) -> ShapedSurface:
+        """The surface under master_from_object."""
+        return self._tree.shaped(self._vertices @ rotation.T + translation)
 
     def signed_distance(
         self,
         points: np.ndarray,
         rotation: np.ndarray,
         translation: np.ndarray,
+        *,
+        reach: float = REACH_M,
     ) -> np.ndarray:
         """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
 
-        Negative inside; at most ``REACH_M``, at least -``DEEPEST_M``.
+        Negative inside; at most ``reach``, at least -``DEEPEST_M``.
         """
-        return self._solid.signed_distance((points - translation) @ rotation)
+        return self._solid.signed_distance((points - translation) @ rotation, reach)
 
 
 class PosedBody:
-    """A body in one pose: vertices (V, 3), and the ``tree`` of its faces (F, 3)."""
+    """A body in one pose, vertices (V, 3), with the ``tree`` of its faces (F, 3).
+
+    ``surface``: its tree, posed.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
-        self._surface = tree.shaped(vertices)
-        self._solid = _Solid(DistanceField(vertices, faces), self._surface)
+        self.surface = tree.shaped(vertices)
+        self._solid = _Solid(self.surface, None if tree.closed else DistanceField(vertices, faces))
 
-    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+    def signed_distance(self, points: np.ndarray, *, reach: float = REACH_M) -> np.ndarray:
         """Signed distance (N,) of points (N, 3), as of :class:`PosedObject`."""
-        return self._solid.signed_distance(points)
+        return self._solid.signed_distance(points, reach)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) on either side, at most ``DEEPEST_M``."""
-        return self._surface.distance(points, DEEPEST_M)
+        return self.surface.distance(points, DEEPEST_M)
 
 
 class _Solid:
-    """What is inside a surface, and how far from it."""
+    """How far from a ``surface``, and what is inside: by the ``field`` where that is not closed."""
 
-    def __init__(self, field: DistanceField, surface: ShapedSurface) -> None:
-        self._field, self._surface = field, surface
+    def __init__(self, surface: ShapedSurface, field: DistanceField | None = None) -> None:
+        self._surface, self._field = surface, field
 
-    def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        low, high = self._field.box + np.array([[-REACH_M], [REACH_M]])
-        found = np.full(len(points), REACH_M)
+    def signed_distance(self, points: np.ndarray, reach: float) -> np.ndarray:
+        if self._field is None:
+            return self._surface.signed_distance(points, reach, DEEPEST_M)
+        low, high = self._field.box + np.array([[-reach], [reach]])
+        found = np.full(len(points), reach)
         near = np.flatnonzero(((points > low) & (points < high)).all(1))
-        found[near] = self._surface.distance(points[near], REACH_M)
+        found[near] = self._surface.distance(points[near], reach)
         inside = near[self._field.inside(points[near])]
-        deep = inside[found[inside] >= REACH_M]
+        deep = inside[found[inside] >= reach]
         found[deep] = self._surface.distance(points[deep], DEEPEST_M)
         found[inside] *= -1
         return found
 
 
 class Sight:
-    """Visibility to the rig's cameras, in one frame, of meshes that occlude each other."""
+    """Visibility to the rig's cameras, in one frame, of surfaces that occlude each other."""
 
-    def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-        self._scene = o3d.t.geometry.RaycastingScene()
-        for vertices, faces in meshes:
-            self._scene.add_triangles(
-                o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
-                o3d.core.Tensor.from_numpy(np.ascontiguousarray(faces, np.uint32)),
-            )
+    def __init__(self, surfaces: Sequence[ShapedSurface]) -> None:
+        self._surfaces = surfaces
 
     def seen(
         self,
@@ -92,7 +101,7 @@ class Sight:
     ) -> np.ndarray:
         """Whether some depth camera (colour where it has none) sees each surface point (N,).
 
-        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the meshes.
+        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the surfaces.
         """
         seen = np.zeros(len(points), bool)
         for camera in cameras:
@@ -108,11 +117,10 @@ class Sight:
             if len(ids) == 0:
                 continue
             start = points[ids] + _LIFT_M * normals[ids]
-            rays = np.concatenate([start, eye - start], 1).astype(np.float32)
-            hidden = self._scene.test_occlusions(
-                o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0
-            )
-            seen[ids[~hidden.numpy()]] = True
+            hidden = np.zeros(len(ids), bool)
+            for surface in self._surfaces:
+                surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)
+            seen[ids[~hidden]] = True
         return seen
 
 

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.clouds import depth_points
 from intercap_core.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.camera.masks import Runs
 from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply
 from intercap_core.capture.frames import Frames
 from intercap_core.detections.read import Detections
+from intercap_core.metrics import segmented_kernel
 from intercap_core.schemas import OBJECT_TRACK, PERSON
 
 # Only depth pixels within this distance of the projected meshes are used: larger errors of a fit
@@ -43,25 +42,16 @@ def segmented_points(
     depth pixels are looked at; ``bias_m`` is subtracted from the depth. A point belongs to the
     mask that covers the colour pixel showing it.
     """
-    shown = [np.zeros(0, np.int64), np.zeros(0, np.int64)]
-    space = _Space.around(depth, camera, near)
+    found = [np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)]
+    space = _Space.around(camera, near)
     for place, runs in enumerate((masks.person, masks.object_)):
         window = None if runs is None or space is None else mask_window(depth, camera, runs)
         if window is not None:
             assert runs is not None and space is not None
-            index = mask_pixels(depth, camera, runs, window)
-            shown[place] = index[space.holds(depth, index)]
-    return _placed(depth, camera, shown[0], bias_m), _placed(depth, camera, shown[1], bias_m)
-
-
-def _placed(depth: np.ndarray, camera: Camera, index: np.ndarray, bias_m: float) -> np.ndarray:
-    """Points (N, 3) float32, master frame, of flat depth pixels (N,)."""
-    if not len(index):
-        return np.empty((0, 3), np.float32)
-    points = depth_points(depth, camera, index).points
-    if bias_m:
-        points = points * (1 - np.float32(bias_m) / points[:, 2:])
-    return apply(camera.master_from_depth, points)
+            found[place] = space.points(
+                depth, camera, mask_pixels(depth, camera, runs, window), bias_m
+            )
+    return found[0], found[1]
 
 
 @dataclass(frozen=True)
@@ -75,37 +65,42 @@ class _Space:
     farthest: float
 
     @classmethod
-    def around(cls, depth: np.ndarray, camera: Camera, near: np.ndarray) -> _Space | None:
+    def around(cls, camera: Camera, near: np.ndarray) -> _Space | None:
         """That of points (M, 3), master frame, with ``MARGIN_M``; None where the camera sees none
         of them."""
         lens = camera.depth
         if lens is None:
             return None
-        local = apply(camera.depth_from_master, near)
-        local = local[lens.inside_model(local)]
-        if not len(local):
+        least, most = segmented_kernel.extent(
+            np.asarray(near, np.float64), camera.depth_from_master, tuple(lens.parameters.tolist())
+        )
+        if not np.isfinite(least[2]):
             return None
-        pixels = lens.project(local)
-        margin = lens.fx * MARGIN_M / max(float(local[:, 2].min()), MARGIN_M)
-        low, high = np.floor(pixels.min(0) - margin), np.ceil(pixels.max(0) + margin) + 1
+        margin = lens.fx * MARGIN_M / max(float(least[2]), MARGIN_M)
+        low, high = np.floor(least[:2] - margin), np.ceil(most[:2] + margin) + 1
         return cls(
             (int(low[0]), int(low[1])),
             (int(high[0]), int(high[1])),
-            1e3 * max(float(local[:, 2].min()) - MARGIN_M, 0.0),
-            1e3 * (float(local[:, 2].max()) + MARGIN_M),
+            1e3 * max(float(least[2]) - MARGIN_M, 0.0),
+            1e3 * (float(most[2]) + MARGIN_M),
         )
 
-    def holds(self, depth: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Which flat pixels (N,) of the image (H, W) mm are in it: (N,) bool."""
-        row, column = np.divmod(index, depth.shape[1])
-        found = depth.ravel()[index]
-        return (
-            (column >= self.low[0])
-            & (column < self.high[0])
-            & (row >= self.low[1])
-            & (row < self.high[1])
-            & (found > self.nearest)
-            & (found < self.farthest)
+    def points(
+        self, depth: np.ndarray, camera: Camera, index: np.ndarray, bias_m: float
+    ) -> np.ndarray:
+        """Points (N, 3) float32, master frame, of those flat pixels (M,) of the image (H, W) mm
+        that are in it."""
+        assert camera.depth is not None
+        return segmented_kernel.placed(
+            depth,
+            index,
+            camera.depth.rays,
+            self.low,
+            self.high,
+            self.nearest,
+            self.farthest,
+            camera.master_from_depth.astype(np.float32),
+            np.float32(bias_m),
         )
 
 

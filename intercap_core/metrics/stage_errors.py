@@ -76,14 +76,25 @@ class StageErrors:
         errors = truths.object_errors(self._truth, track, self._both.mesh, self._fps)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
-    def of_body(self, stage: str, body_track: BodyTrack, track: ObjectTrack) -> Values:
-        """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets."""
+    def of_body(
+        self,
+        stage: str,
+        body_track: BodyTrack,
+        track: ObjectTrack,
+        distance: np.ndarray | None = None,
+    ) -> Values:
+        """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets.
+
+        ``distance`` (T, V) of the body's vertices to the object where it is known already.
+        """
         errors = truths.body_errors(self._truth, body_track, self._fps)
         if self._truth.vertices is not None:
-            errors |= self._vertices(body_track, track)
+            errors |= self._vertices(body_track, track, distance)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
-    def _vertices(self, body_track: BodyTrack, track: ObjectTrack) -> Values:
+    def _vertices(
+        self, body_track: BodyTrack, track: ObjectTrack, known: np.ndarray | None
+    ) -> Values:
         """Errors of skin, contact, hold and stand, frame by frame."""
         pve, counts, touching, held, soles = [], [], [], [], []
         assert self._truth.vertices is not None
@@ -95,9 +106,14 @@ class StageErrors:
             if self._both is None or self._true_distance is None:
                 continue
             distance = np.full(len(vertices), np.inf)  # of an object that was not found
-            if track.known:
+            if known is not None:
+                distance = known[t]
+            elif track.known:
                 distance = self._both.surface.signed_distance(
-                    vertices.astype(np.float64), track.rotation[t], track.translation[t]
+                    vertices.astype(np.float64),
+                    track.rotation[t],
+                    track.translation[t],
+                    reach=1.01 * max(self._threshold, *contact.SWEEP_M),
                 )
             counts.append(truths.contact_counts(distance, self._true_distance[t]))
             touching.append(contact.vertex_contact(distance, self._threshold))

@@ -7,6 +7,9 @@ from __future__ import annotations
 # Sizes of objects that people handle, metres; outside the second pair the file is in another unit.
 HANDLED_MAX_M, HANDLED_MIN_M = 3.0, 0.02
 MAX_EXTENT_M, MIN_EXTENT_M = 5.0, 0.01
+# Of an object's vertices from the origin of its file, metres: scans are as far off as a room is
+# wide, and single precision there ends at micrometres.
+MAX_FROM_ORIGIN_M = 50.0
 # Share of its bounding cube that a body fills; less is a flat sheet with rounding errors.
 MIN_FILLED = 1e-8
 # Share of edges that do not join two faces: a quarter of a lidless box's of few faces; above the

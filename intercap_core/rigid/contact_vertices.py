@@ -8,7 +8,6 @@ list is noticed, also where all ids still exist.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,10 @@ import numpy as np
 
 from intercap_core import safe_pickle
 from intercap_core.errors import UserError
+from intercap_core.inputs.arrays import Archive
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json
+from intercap_core.inputs.quotes import printable, quoted
 
 _IDS, _COUNT, _DIGEST = "contact_vertices", "mesh_vertices", "mesh_digest"
 
@@ -57,7 +60,7 @@ def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.nd
     if ids.ndim != 1 or len(ids) == 0 or not whole:
         raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
     if ids.min() < 0 or ids.max() >= len(vertices):
-        outside = int(ids.max() if ids.max() >= len(vertices) else ids.min())
+        outside = quoted(int(ids.max() if ids.max() >= len(vertices) else ids.min()))
         raise UserError(
             f"{path}: names vertex {outside}, the mesh has {len(vertices)}; the list belongs to "
             f"another mesh than {mesh}: choose the vertices anew, or leave 'contact_vertices' out "
@@ -72,10 +75,14 @@ def _check_mesh(path: Path, values: Mapping[str, Any], mesh: Path, vertices: np.
         expected = values.get(key)
         if expected is not None and str(expected) != str(found):
             raise UserError(
-                f"{path}: was chosen on a mesh with {key} {expected}, {mesh} has {found}; the mesh "
-                "was built anew under an old list: choose the vertices anew, or leave "
+                f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {found}; "
+                "the mesh was built anew under an old list: choose the vertices anew, or leave "
                 "'contact_vertices' out of objects.yaml"
             )
+
+
+def _shown(value: Any) -> str:
+    return printable(str(value)[:80])
 
 
 def _read(path: Path) -> Any:
@@ -89,23 +96,17 @@ def _read(path: Path) -> Any:
     if path.suffix == ".npz":
         return _from_npz(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except (ValueError, RecursionError):
-        raise UserError(f"{path}: not a JSON list of vertex ids; write it as [0, 1, ...]") from None
+        return read_json(path)
+    except Unreadable as error:
+        raise UserError(
+            f"{path}: not a JSON list of vertex ids ({error.reason}); write it as [0, 1, ...]"
+        ) from None
 
 
 def _from_npz(path: Path) -> Any:
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            raise ValueError("it is a single array")
-        with loaded as file:
-            names = file.files
-            found = {name: file[name] for name in (_COUNT, _DIGEST) if name in names}
-            return {**found, _IDS: file[_IDS if _IDS in names else names[0]]}
-    except Exception as error:  # a damaged archive can raise nearly anything
-        raise UserError(
-            f"{path}: not a readable .npz of vertex ids ({error}); save it again"
-        ) from None
+    archive = Archive(path, advice="save the .npz of vertex ids again")
+    names = archive.names
+    if not names:
+        raise UserError(f"{path}: not a readable .npz of vertex ids (it is empty); save it again")
+    found = {name: archive.read(name) for name in (_COUNT, _DIGEST) if name in names}
+    return {**found, _IDS: archive.read(_IDS if _IDS in names else names[0])}

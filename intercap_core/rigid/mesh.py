@@ -17,12 +17,14 @@ from intercap_core.rigid.constants import (
     HANDLED_MAX_M,
     HANDLED_MIN_M,
     MAX_EXTENT_M,
+    MAX_FROM_ORIGIN_M,
     MAX_OPEN_EDGES,
     MIN_EXTENT_M,
     MIN_FILLED,
     SIMPLIFIED_TOLERANCE_M,
 )
 from intercap_core.rigid.contact_vertices import read_contact_vertices
+from intercap_core.rigid.mesh_files import TEXTURE_ERRORS, load_mesh
 from intercap_core.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
@@ -152,19 +154,8 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     """The mesh of a file as it is; raises UserError, naming the file, where it is no mesh."""
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
-    try:
-        mesh: Any = trimesh.load(path, process=False, force="mesh")
-        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    except Exception as error:  # trimesh's readers raise any kind of exception on a broken file
-        raise UserError(
-            f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again as "
-            ".ply or .obj"
-        ) from None
-    if vertices.ndim != 2 or len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
-        raise UserError(
-            f"{path}: holds {len(vertices)} vertices and {len(faces)} faces, expected a triangle "
-            "mesh; export the surface, not a point cloud"
-        )
+    mesh = load_mesh(path)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if faces.min() < 0 or faces.max() >= len(vertices):
         stray = faces.min() if faces.min() < 0 else faces.max()
         raise UserError(
@@ -188,7 +179,7 @@ def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
         if visual is not None and visual.kind == "texture":
             visual = visual.to_color()
         colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
-    except (AttributeError, TypeError, ValueError, IndexError, OSError):
+    except TEXTURE_ERRORS:
         colours = np.zeros(0, np.uint8)  # a texture that is not there, or is no image
     if colours.shape != (len(mesh.vertices), 4):
         return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
@@ -209,6 +200,12 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
         raise UserError(
             f"{path}: is only {extent:.3g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
             "; scale it so that its unit is the metre"
+        )
+    away = float(np.abs(mesh.vertices[np.unique(mesh.faces)]).max())
+    if away > MAX_FROM_ORIGIN_M:
+        raise UserError(
+            f"{path}: has vertices {away:.4g} m from its origin, expected at most "
+            f"{MAX_FROM_ORIGIN_M:g} m; move the object to its origin, in metres"
         )
     if not HANDLED_MIN_M <= extent <= HANDLED_MAX_M:
         log.warning(

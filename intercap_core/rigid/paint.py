@@ -12,6 +12,7 @@ import trimesh
 from intercap_core.rigid.constants import PAINT_POINTS
 from intercap_core.rigid.distance import DistanceField
 from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.mesh_files import TEXTURE_ERRORS, load_mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class Paint:
         ``outward`` is the object that was loaded from it and knows which side of a face is out. A
         texture that cannot be read counts as none.
         """
-        mesh: Any = trimesh.load(path, process=False, force="mesh")
+        mesh = load_mesh(path)
         visual = mesh.visual
         if visual is None or not visual.defined:
             return None
@@ -38,7 +39,7 @@ class Paint:
         points, face, weights = sampled[0], sampled[1], sampled[2]
         try:
             colours = _colours(mesh, face, weights)
-        except (AttributeError, TypeError, ValueError, IndexError, OSError):
+        except TEXTURE_ERRORS:
             return None
         if not np.ptp(colours, axis=0).any():
             return None

@@ -24,6 +24,7 @@ class SurfaceTree:
         centroids = np.asarray(vertices, np.float32)[faces].mean(axis=1)
         self._levels = max(0, int(np.ceil(np.log2(len(faces) / kernel.LEAF_FACES))))
         self._corners = faces[kernel.ordered(centroids, self._levels)].astype(np.int32)
+        self.closed = _closed(faces)
 
     def shaped(self, vertices: np.ndarray) -> ShapedSurface:
         """The mesh with its vertices at (V, 3)."""
@@ -47,3 +48,34 @@ class ShapedSurface:
         queries, most = np.ascontiguousarray(points, np.float32), np.float32(reach * reach)
         found = kernel.nearest(queries, self._triangles, self._boxes, self._levels, most)
         return np.where(found < most, np.sqrt(found.astype(np.float64)), reach)
+
+    def signed_distance(self, points: np.ndarray, reach: float, deepest: float) -> np.ndarray:
+        """Distance (N,) of points (N, 3) to the surface of a mesh that is closed, metres, negative
+        inside: at most ``reach``, at least -``deepest``.
+
+        Inside is where a ray crosses the surface an odd number of times, as in
+        :mod:`intercap_core.rigid.distance`: what is inside two parts of a mesh that cuts itself
+        counts as outside. Points that are no numbers are at ``reach``.
+        """
+        queries = np.ascontiguousarray(points, np.float32)
+        return kernel.signed(
+            queries, self._triangles, self._boxes, self._levels, float(reach), float(deepest)
+        )
+
+    def blocks(self, starts: np.ndarray, ends: np.ndarray, blocked: np.ndarray) -> None:
+        """Set ``blocked`` (N,) bool where the way from ``starts`` to ``ends`` (N, 3) meets the
+        surface; what is set already is not asked."""
+        kernel.block(
+            np.ascontiguousarray(starts, np.float64),
+            np.ascontiguousarray(ends, np.float64),
+            self._triangles,
+            self._boxes,
+            self._levels,
+            blocked,
+        )
+
+
+def _closed(faces: np.ndarray) -> bool:
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    numbers = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
+    return not (np.unique(numbers, return_counts=True)[1] % 2).any()

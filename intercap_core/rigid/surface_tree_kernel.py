@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 LEAF_FACES = 4  # at most, on the tree's last level
+_ROUNDING = 1e-6  # metres, of distances in single precision
 
 
 @numba.njit(cache=True, nogil=True)
@@ -64,60 +65,231 @@ def fitted(vertices, corners, levels):
 def nearest(points, triangles, boxes, levels, reach_sq):
     """Squared distance (M,) of points (M, 3) to the mesh, at most ``reach_sq``. Points that follow
     each other had better be neighbours: each search starts from the face that was found last."""
-    leaves, count = 1 << levels, len(triangles)
     found = np.empty(len(points), np.float32)
-    stack = np.empty(levels + 2, np.int32)
-    reach = np.empty(levels + 2, np.float32)
+    stack, reach = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
     last = 0
     for m in range(len(points)):
         x, y, z = points[m, 0], points[m, 1], points[m, 2]
-        best = min(_to_triangle(x, y, z, triangles[last]), reach_sq)
-        size = 1
-        stack[0], reach[0] = 0, _to_box(x, y, z, boxes[0])
-        while size:
-            size -= 1
-            if reach[size] >= best:
-                continue
-            node = stack[size]
-            while node < leaves - 1:
-                left, right = 2 * node + 1, 2 * node + 2
-                a, b = _to_box(x, y, z, boxes[left]), _to_box(x, y, z, boxes[right])
-                if a > b:
-                    left, right, a, b = right, left, b, a
-                if b < best:
-                    stack[size], reach[size] = right, b
-                    size += 1
-                if a >= best:
-                    node = -1
-                    break
-                node = left
-            if node < 0:
-                continue
-            leaf = node - leaves + 1
-            for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
-                distance = _to_triangle(x, y, z, triangles[at])
-                if distance < best:
-                    best, last = distance, at
-        found[m] = best
+        found[m], last = _search(
+            x, y, z, triangles, boxes, levels, np.float32(reach_sq), last, stack, reach
+        )
     return found
 
 
+@numba.njit(cache=True, nogil=True)
+def signed(points, triangles, boxes, levels, reach, deepest):
+    """Signed distance (M,), metres, of points (M, 3) float32 to a closed mesh, negative inside: at
+    most ``reach``, at least -``deepest``. Points that are no numbers are as far as can be.
+
+    Inside is where a ray crosses the mesh an odd number of times. A ball that does not reach the
+    mesh is on one side of it: a ray is cast only of a point whose ball does not hold the last point
+    of which that is known, and that is not in this one's ball.
+    """
+    found = np.empty(len(points), np.float64)
+    stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
+    last, within = 0, False
+    # of the last known point, and the radius of its ball
+    cx, cy, cz, clear = np.inf, np.inf, np.inf, -np.inf
+    reach_sq, deepest_sq = np.float32(reach * reach), np.float32(deepest * deepest)
+    for m in range(len(points)):
+        x, y, z = points[m, 0], points[m, 1], points[m, 2]
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            found[m] = reach
+            continue
+        square, last = _search(x, y, z, triangles, boxes, levels, reach_sq, last, stack, ahead)
+        far = not square < reach_sq
+        distance = reach if far else np.sqrt(np.float64(square))
+        off = np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
+        if not off < max(distance, clear) - _ROUNDING:
+            within = _odd(x, y, z, triangles, boxes, levels, stack)
+            clear = -np.inf
+        if distance > clear - off:
+            cx, cy, cz, clear = np.float64(x), np.float64(y), np.float64(z), distance
+        if within and far:
+            square, last = _search(
+                x, y, z, triangles, boxes, levels, deepest_sq, last, stack, ahead
+            )
+            distance = np.sqrt(np.float64(square)) if square < deepest_sq else deepest
+        found[m] = -distance if within else distance
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def block(starts, ends, triangles, boxes, levels, blocked):
+    """Set ``blocked`` (M,) bool where the way from ``starts`` to ``ends`` (M, 3) float64 meets the
+    mesh, from either side; what is set already is passed over.
+
+    Ways that follow each other had better be neighbours: the face that was met last comes first.
+    """
+    leaves, count = 1 << levels, len(triangles)
+    stack = np.empty(levels + 2, np.int32)
+    last = 0
+    for m in range(len(starts)):
+        if blocked[m]:
+            continue
+        x, y, z = starts[m, 0], starts[m, 1], starts[m, 2]
+        u, v, w = ends[m, 0] - x, ends[m, 1] - y, ends[m, 2] - z
+        if _meets(x, y, z, u, v, w, triangles, last):
+            blocked[m] = True
+            continue
+        a, b, c = _inverse(u), _inverse(v), _inverse(w)
+        size, stack[0] = 1, 0
+        while size:
+            size -= 1
+            node = stack[size]
+            near, far = 0.0, 1.0
+            for k in range(3):
+                at, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
+                one, other = (boxes[node, k] - at) * over, (boxes[node, 3 + k] - at) * over
+                near, far = max(near, min(one, other)), min(far, max(one, other))
+            if near > far + _ROUNDING:
+                continue
+            if node < leaves - 1:
+                stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
+                size += 2
+                continue
+            leaf = node - leaves + 1
+            for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+                if _meets(x, y, z, u, v, w, triangles, at):
+                    blocked[m], last = True, at
+                    size = 0
+                    break
+
+
 @numba.njit(inline="always")
-def _to_box(x, y, z, box):
-    """Squared distance of a point to a box, 0 inside."""
-    a = max(box[0] - x, x - box[3], np.float32(0))
-    b = max(box[1] - y, y - box[4], np.float32(0))
-    c = max(box[2] - z, z - box[5], np.float32(0))
+def _inverse(value):
+    """1 over a component of a way, finite where that is 0."""
+    return 1.0 / value if abs(value) > 1e-12 else 1e12
+
+
+@numba.njit(cache=True, nogil=True)
+def _meets(x, y, z, u, v, w, triangles, at):
+    """Whether the way from a point (x, y, z) by (u, v, w) meets one of triangles (F, 3, 3) (Moeller
+    and Trumbore 1997)."""
+    ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
+    bx, by, bz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
+    cx, cy, cz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
+    px, py, pz = v * cz - w * cy, w * cx - u * cz, u * cy - v * cx
+    volume = bx * px + by * py + bz * pz
+    if volume == 0:
+        return False
+    tx, ty, tz = x - ax, y - ay, z - az
+    s = (tx * px + ty * py + tz * pz) / volume
+    if not 0 <= s <= 1:
+        return False
+    qx, qy, qz = ty * bz - tz * by, tz * bx - tx * bz, tx * by - ty * bx
+    t = (u * qx + v * qy + w * qz) / volume
+    if t < 0 or s + t > 1:
+        return False
+    along = (cx * qx + cy * qy + cz * qz) / volume
+    return 0 <= along <= 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
+    """Squared distance of a point to the mesh, at most ``most``, and the face where it is found,
+    sought from face ``last`` on."""
+    leaves, count = 1 << levels, len(triangles)
+    best = min(_to_triangle(x, y, z, triangles, last), most)
+    size = 1
+    stack[0], reach[0] = 0, to_box(x, y, z, boxes, 0)
+    while size:
+        size -= 1
+        if reach[size] >= best:
+            continue
+        node = stack[size]
+        while node < leaves - 1:
+            left, right = 2 * node + 1, 2 * node + 2
+            a, b = to_box(x, y, z, boxes, left), to_box(x, y, z, boxes, right)
+            if a > b:
+                left, right, a, b = right, left, b, a
+            if b < best:
+                stack[size], reach[size] = right, b
+                size += 1
+            if a >= best:
+                node = -1
+                break
+            node = left
+        if node < 0:
+            continue
+        leaf = node - leaves + 1
+        for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+            distance = _to_triangle(x, y, z, triangles, at)
+            if distance < best:
+                best, last = distance, at
+    return best, last
+
+
+@numba.njit(cache=True, nogil=True)
+def _odd(x, y, z, triangles, boxes, levels, stack):
+    """Whether a ray along the third axis crosses the mesh an odd number of times."""
+    leaves, count = 1 << levels, len(triangles)
+    odd = False
+    size, stack[0] = 1, 0
+    while size:
+        size -= 1
+        node = stack[size]
+        box = boxes[node]
+        if not (box[0] <= x <= box[3] and box[1] <= y <= box[4] and z <= box[5]):
+            continue
+        if node < leaves - 1:
+            stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
+            size += 2
+            continue
+        leaf = node - leaves + 1
+        for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+            odd ^= _crosses(x, y, z, triangles[at])
+    return odd
+
+
+@numba.njit(cache=True, nogil=True)
+def _crosses(x, y, z, corners):
+    """Whether a ray along the third axis crosses a triangle (3, 3).
+
+    In double precision, and as if the point were off by an infinitely small (e, e^2) where it is
+    on an edge's line: faces that share an edge decide alike, so that a ray through an edge or a
+    corner of a closed mesh crosses it as often as its neighbours do (Edelsbrunner and Mucke 1990).
+    """
+    total, height, sign = 0.0, 0.0, 0
+    for k in range(3):
+        a, b, c = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
+        # an edge is looked at from the same end by both of its faces
+        turned = a[0] > b[0] or (a[0] == b[0] and a[1] > b[1])
+        if turned:
+            a, b = b, a
+        ax, ay = np.float64(a[0]), np.float64(a[1])
+        ux, uy = np.float64(b[0]) - ax, np.float64(b[1]) - ay
+        area = ux * (np.float64(y) - ay) - uy * (np.float64(x) - ax)
+        side = area
+        if side == 0:
+            side = -uy if uy != 0 else ux
+        if turned:
+            area, side = -area, -side
+        way = 1 if side > 0 else -1
+        if side == 0 or (sign and way != sign):  # an edge of no length, or outside of this one
+            return False
+        sign = way
+        total += area
+        height += area * np.float64(c[2])
+    return total != 0 and height / total > z
+
+
+@numba.njit(inline="always")
+def to_box(x, y, z, boxes, node):
+    """Squared distance of a point to a node's box, 0 inside."""
+    a = max(boxes[node, 0] - x, x - boxes[node, 3], np.float32(0))
+    b = max(boxes[node, 1] - y, y - boxes[node, 4], np.float32(0))
+    c = max(boxes[node, 2] - z, z - boxes[node, 5], np.float32(0))
     return a * a + b * b + c * c
 
 
 @numba.njit(inline="always")
-def _to_triangle(x, y, z, corners):
-    """Squared distance of a point to a triangle (3, 3) (Ericson, Real-Time Collision Detection,
-    5.1.5: by the region of the triangle's plane that the point projects to)."""
-    ax, ay, az = corners[0, 0], corners[0, 1], corners[0, 2]
-    ux, uy, uz = corners[1, 0] - ax, corners[1, 1] - ay, corners[1, 2] - az
-    vx, vy, vz = corners[2, 0] - ax, corners[2, 1] - ay, corners[2, 2] - az
+def _to_triangle(x, y, z, triangles, at):
+    """Squared distance of a point to one of triangles (F, 3, 3) (Ericson, Real-Time Collision
+    Detection, 5.1.5: by the region of the triangle's plane that the point projects to)."""
+    ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
+    ux, uy, uz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
+    vx, vy, vz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
     px, py, pz = x - ax, y - ay, z - az
     uu, uv, vv = (
         ux * ux + uy * uy + uz * uz,

@@ -334,6 +334,11 @@ def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry)
             f"frame sets 0 to {count - 1}; correct the annotation"
         )
     dropped[list(frames_to_drop)] = True
+    if dropped.all():
+        raise UserError(
+            f"annotation of sequence {sequence.sequence!r}: drop_frames drops all {count} frames; "
+            "exclude the sequence in the settings instead"
+        )
     return dropped
 
 

@@ -73,24 +73,8 @@ def run(
     contact is left out; of one that is truly there, the errors are infinite. Raises UserError where
     an input artefact is missing, broken or does not fit the others.
     """
-    verdict = {}
     with artefacts.read(joint, JOINT) as fitted:
         made_by = {k: v for k, v in fitted.attributes.items() if k in JOINT.optional_attributes}
-    if settings.hold_out and not made_by:  # the verdict was fitted to errors of this program's
-        verdict = Verdict.reach(
-            frames=frames,
-            scene=scene,
-            detections=detections,
-            person=person,
-            object_track=object_track,
-            body_fit=body_fit,
-            joint=joint,
-            object_=object_,
-            body_models=body_models,
-            settings=joint_settings,
-            body_settings=body_settings,
-            track_settings=track_settings,
-        ).values()
     mesh = None if object_ is None else ObjectMesh.load(object_)
     fitted_body = read_body(joint, "joint", body_models, subject.gender)
     fitted_object = read_object(joint, "joint")
@@ -131,7 +115,9 @@ def run(
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
             values |= errors.of_object("joint", fitted_object)
-            values |= errors.of_body("joint", fitted_body, fitted_object)
+            values |= errors.of_body(
+                "joint", fitted_body, fitted_object, values.get("body_to_object")
+            )
             values |= errors.about_truth(fitted_body.model.regions) | _extrinsics_errors(
                 setting, fitted["master_from_colour"], known
             )
@@ -143,6 +129,24 @@ def run(
             "has_truth": known is not None,
             **made_by,
         }
+    verdict = {}
+    # Last, while the rig and the body are held: what they hold, tables of rays and the like, is not
+    # made again. The verdict was fitted to errors of this program's results alone.
+    if settings.hold_out and not made_by:
+        verdict = Verdict.reach(
+            frames=frames,
+            scene=scene,
+            detections=detections,
+            person=person,
+            object_track=object_track,
+            body_fit=body_fit,
+            joint=joint,
+            object_=object_,
+            body_models=body_models,
+            settings=joint_settings,
+            body_settings=body_settings,
+            track_settings=track_settings,
+        ).values()
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):
             writer.put(key, values[key])

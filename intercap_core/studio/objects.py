@@ -7,12 +7,12 @@ smooth part of its size, and another scan would have other triangles.
 from __future__ import annotations
 
 import zlib
-from typing import Any
+from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from intercap_core.config import ObjectEntry
+from intercap_core.rigid.mesh_files import load_mesh
 
 SCALE_ERROR = 0.005  # of the true size, up or down
 # RMS of the smooth displacement along the normal, in parts of the object's radius (root mean square
@@ -31,7 +31,7 @@ def true_mesh(entry: ObjectEntry, seed: int) -> tuple[np.ndarray, np.ndarray, np
     true pose is also the best pose of the tracked mesh. Four times the faces of the tracked mesh,
     every edge split at a random place. The same entry and seed give the same mesh.
     """
-    source: Any = trimesh.load(entry.mesh, process=False, force="mesh")
+    source = load_mesh(Path(entry.mesh))
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     vertices = np.asarray(source.vertices, np.float64)
     faces = np.asarray(source.faces, np.int64)

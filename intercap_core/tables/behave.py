@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,8 @@ from typing import Any
 from intercap_core.capture.behave import frame_folders
 from intercap_core.errors import UserError
 from intercap_core.imports.file_names import PERSON_MESH
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json
 from intercap_core.tables.project_files import Draft, Row
 
 SEQUENCE = re.compile(r"(Date\d{1,4})_(Sub\d{1,4})_([A-Za-z0-9]+)(?:_[A-Za-z0-9_-]+)?")
@@ -107,8 +108,8 @@ def _mesh(root: Path, thing: str) -> Path | None:
 
 def _gender(path: Path) -> str | None:
     try:
-        content = json.loads((path / "info.json").read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError):
+        content = read_json(path / "info.json")
+    except Unreadable:
         return None
     gender = content.get("gender") if isinstance(content, dict) else None
     return gender if gender in GENDERS else None

@@ -17,6 +17,8 @@ import yaml
 from pydantic import ValidationError
 
 from intercap_core.config import ANY_REGION, Annotation
+from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, read_text
+from intercap_core.inputs.json_files import whole
 
 FOLDER = re.compile(
     r"subject(\d{1,2})_(?:motion|object)(\d{1,2})_seg_?(\d{1,2})([A-Za-z0-9_-]*)", re.IGNORECASE
@@ -87,8 +89,8 @@ def _contact(
     if not path.is_file():
         return None
     try:
-        values = [int(word) for word in path.read_text(encoding="utf-8").split()]
-    except (OSError, ValueError):
+        values = [whole(word) for word in read_text(path, MAX_SETTINGS_BYTES).split()]
+    except (Unreadable, ValueError):
         faults.append("contact.txt is not a list of frame numbers")
         return None
     if len(values) % 2:
@@ -114,15 +116,15 @@ def _object_pose(path: Path, numbers: np.ndarray, faults: list[str]) -> dict[str
         return None
     parser = configparser.ConfigParser(interpolation=None)
     try:
-        parser.read_string(path.read_text(encoding="utf-8"))
+        parser.read_string(read_text(path, MAX_SETTINGS_BYTES))
         translation, rotation = (
             [float(word) for word in parser[section][key].split()]
             for section, key in (("init_trans", "trans"), ("init_rot", "rot"))
         )
-        frame = int(parser["init_frame_id"]["id"])
+        frame = whole(parser["init_frame_id"]["id"])
         if len(translation) != 3 or len(rotation) != 3:
             raise ValueError
-    except (OSError, ValueError, KeyError, configparser.Error):
+    except (Unreadable, ValueError, KeyError, configparser.Error):
         faults.append(
             "config.ini has no [init_trans] trans, [init_rot] rot (three numbers each) and "
             "[init_frame_id] id"

@@ -40,6 +40,7 @@ class Refits:
         for term in assembly.problem.terms:
             if not any(term is seen for _, seen in self._seen):
                 term.add(state, self._rest)
+        self._bands = np.empty_like(self._rest.bands)
         every = np.ones((len(state), len(assembly.body.time_offset)), bool)
         self._descent = self._step(every)
 
@@ -48,7 +49,7 @@ class Refits:
         return self.state.moved(limited(self._step(used) - self._descent))
 
     def _step(self, used: np.ndarray) -> np.ndarray:
-        equations = self._rest.copy()
+        equations = self._rest.copy(self._bands)
         for columns, term in self._seen:
             equations.add_blocks(term.name, columns, *term.of_views(used, self.state))
         step = equations.step(np.full(len(self.state), MIN_DAMPING))

@@ -18,6 +18,7 @@ from intercap_core.camera.rig import Camera
 from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import BodyFitSettings
 from intercap_core.metrics.proximity import Sight
+from intercap_core.rigid.surface_tree import SurfaceTree
 from tests.helpers.bodies import open_body
 from tests.helpers.synthetic_capture import ring
 
@@ -70,7 +71,7 @@ def truth() -> tuple[BodyClip, Tensor]:
 
 def _seen(vertices: Tensor, normals: Tensor, model: BodyModel, camera: Camera) -> np.ndarray:
     points = vertices.double().numpy()
-    sight = Sight([(points, model.faces.numpy())])
+    sight = Sight([SurfaceTree(points, model.faces.numpy()).shaped(points)])
     ids = np.flatnonzero(sight.seen(points, normals.double().numpy(), [camera]))
     return ids[np.linspace(0, len(ids) - 1, POINTS).astype(int)]
 

@@ -181,6 +181,16 @@ def cut(file: str, count: int) -> Callable[[Path], None]:
     return lambda path: (path / file).write_bytes((path / file).read_bytes()[:count]) and None
 
 
+def exchange(one: str, other: str, file: str) -> Callable[[Path], object]:
+    """Exchange two names everywhere in a file."""
+
+    def apply(path: Path) -> None:
+        parts = (path / file).read_text().split(one)
+        (path / file).write_text(other.join(part.replace(other, one) for part in parts))
+
+    return apply
+
+
 def remove(file: str) -> Callable[[Path], None]:
     return lambda path: (path / file).unlink()
 
@@ -215,7 +225,12 @@ FAULTS = [
     ("easymocap", edit("K_front", "L_front", "intri.yml"), "camera 'front': has no K_front"),
     ("easymocap", edit("dist_left", "bend_left", "intri.yml"), "camera 'left': has no dist_left"),
     ("easymocap", edit("T_right", "U_right", "extri.yml"), "camera 'right': has no T_right"),
-    ("easymocap", edit("Rot_front", "Rot_left", "extri.yml"), "R_left and Rot_left are two rota"),
+    ("easymocap", edit("Rot_front", "Rot_left", "extri.yml"), "'Rot_left' is given twice"),
+    (
+        "easymocap",
+        exchange("Rot_front", "Rot_left", "extri.yml"),
+        "R_left and Rot_left are two rota",
+    ),
     ("easymocap", edit("names:", "name:", "intri.yml"), "expected 'names'"),
     ("colmap-text", edit("FULL_OPENCV", "OPENCV_FISHEYE", "cameras.txt"), "OPENCV_FISHEYE cannot"),
     ("colmap-text", edit("FULL_OPENCV", "OPENCV", "cameras.txt"), "has 12 parameters, expected 8"),

@@ -16,6 +16,8 @@ from intercap_core.camera.k4a_calibration import (
 )
 from intercap_core.errors import UserError
 
+RADIAL = (0.01, 0.02, 0.03, 0.04, 0.05, 0.06)  # k1 to k6
+
 
 def make_calibration(**changes) -> bytes:
     """A calibration with round numbers: centre in the middle, focal lengths 0.5 and 0.7."""
@@ -24,7 +26,7 @@ def make_calibration(**changes) -> bytes:
         return {
             "Intrinsics": {
                 "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
-                "ModelParameters": [0.5, 0.5, fx, fy, 1, 2, 3, 4, 5, 6, 0, 0, 8, 7],
+                "ModelParameters": [0.5, 0.5, fx, fy, *RADIAL, 0, 0, 0.008, 0.007],
             },
             "Location": f"CALIBRATION_CameraLocation{location}",
             "MetricRadius": 0,
@@ -44,7 +46,7 @@ def read(content: bytes, colour_mode="1080P", depth_mode="NFOV_UNBINNED"):
 
 def test_order_of_the_lens_parameters_and_default_radius():
     lens = read(make_calibration()).colour
-    assert lens.distortion.tolist() == [1, 2, 7, 8, 3, 4, 5, 6]  # k1 k2 p1 p2 k3 k4 k5 k6
+    assert lens.distortion.tolist() == [0.01, 0.02, 0.007, 0.008, *RADIAL[2:]]  # k1 k2 p1 p2 k3 ...
     assert lens.metric_radius == 1.7
     assert read(make_calibration(MetricRadius=1.25)).colour.metric_radius == 1.25
 

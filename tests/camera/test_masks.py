@@ -46,6 +46,23 @@ def test_everything_read_from_runs_agrees_with_the_decoded_mask(seed):
     )
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_runs_of_large_images_are_those_of_the_peer(seed):
+    height, width = 1536, 2048
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((height, width), bool)
+    for _ in range(3 * seed):
+        top, left = rng.integers(0, height - 1), rng.integers(0, width - 1)
+        mask[top : top + rng.integers(1, 900), left : left + rng.integers(1, 700)] ^= True
+    rle = bytes(peer.encode(np.asfortranarray(mask, dtype=np.uint8))["counts"])
+    runs = masks.Runs(rle, height, width)
+    changes = np.flatnonzero(np.diff(mask.T.ravel().astype(np.int8), prepend=0))
+    np.testing.assert_array_equal(runs.ends, [*changes, mask.size])
+    np.testing.assert_array_equal(
+        runs.box, peer.toBbox({"size": [height, width], "counts": rle}).astype(int)
+    )
+
+
 def test_uncompressed_counts_and_polygons_become_the_same_masks_as_the_peers():
     mask = blob(1)
     changes = np.flatnonzero(np.diff(mask.T.ravel().astype(int), prepend=0))

@@ -225,7 +225,9 @@ def test_check_notes_cameras_without_recording_or_detections(
     (note,) = notes_of_sequences(load_project(Path("config.yaml"), exclude))
     assert str(note).startswith("sequence 'good': its row names neither keypoints nor candidates")
 
-    write_rig_file(Path("rig.json"), Extrinsics("k1", {"k1": np.eye(4), "k2": np.eye(4)}))
+    beside = np.eye(4)
+    beside[0, 3] = 1.5
+    write_rig_file(Path("rig.json"), Extrinsics("k1", {"k1": np.eye(4), "k2": beside}))
     table = Path("sequences.tsv")
     head, good, *others = table.read_text().splitlines()
     lines = [f"{head}\tkeypoints\tcandidates", f"{good}\tpoints\tmasks"]

@@ -259,16 +259,17 @@ def test_sight_knows_occlusion_facing_and_image() -> None:
     far, near = vertices + 2 * ahead, vertices * 0.2 + ahead
     normals = face_normals(far, faces)
     middles = far[faces].mean(1)
-    seen = Sight([(far, faces)]).seen(middles, normals, [camera])
+    tree = SurfaceTree(vertices, faces)
+
+    def sight(*placed: np.ndarray) -> Sight:
+        return Sight([tree.shaped(one) for one in placed])
+
+    seen = sight(far).seen(middles, normals, [camera])
     assert np.array_equal(seen, normals[:, 2] < -0.5)
-    assert (
-        not Sight([(far, faces), (vertices * 0.6 + ahead, faces)])
-        .seen(middles, normals, [camera])
-        .any()
-    )
-    assert Sight([(far, faces), (near + right, faces)]).seen(middles, normals, [camera]).any()
+    assert not sight(far, vertices * 0.6 + ahead).seen(middles, normals, [camera]).any()
+    assert sight(far, near + right).seen(middles, normals, [camera]).any()
     aside = middles + 5 * right
-    assert not Sight([(far, faces)]).seen(aside, normals, [camera]).any()
+    assert not sight(far).seen(aside, normals, [camera]).any()
 
 
 def test_extrinsics_displacement_of_a_shift_and_a_turn() -> None:

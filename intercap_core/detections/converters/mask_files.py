@@ -22,6 +22,8 @@ from intercap_core.detections.instance import (
     resized,
     scale_to,
 )
+from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
+from intercap_core.inputs.quotes import printable
 
 WHITE = 255
 BETWEEN = "__"  # an image's name, a label and a number in the name of a mask
@@ -51,14 +53,17 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
     A mask of the whole picture at another resolution is scaled. Raises :class:`UnreadableMask`.
     """
     try:
-        content = file.path.read_bytes()
-    except OSError as error:
-        raise UnreadableMask(f"cannot be read ({error.strerror})") from None
+        content = read_bytes(file.path, MAX_IMAGE_BYTES)
+    except Unreadable as error:
+        raise UnreadableMask(error.reason) from None
     found = encoded_size(content)
     if found is None or found[0] * found[1] > MAX_PIXELS:
         raise UnreadableMask("is no image" if found is None else "is too large an image")
     kind = cv2.IMREAD_UNCHANGED if file.numbered else cv2.IMREAD_GRAYSCALE
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
+    except cv2.error:  # of an image that takes more memory than OpenCV allows
+        image = None
     if image is None:
         raise UnreadableMask("is no image")
     if image.ndim == 3:
@@ -108,11 +113,11 @@ def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
         if path.is_dir():
             for inner in sorted(path.iterdir()):
                 if _is_png(inner):
-                    label = inner.stem.strip(_AROUND_LABEL)[:MAX_LABEL]
+                    label = printable(inner.stem).strip(_AROUND_LABEL)[:MAX_LABEL]
                     found.setdefault(path.name, []).append(MaskFile(inner, label, numbered=True))
         elif _is_png(path):
             image, _, rest = path.stem.partition(BETWEEN)
-            label = rest.partition(BETWEEN)[0][:MAX_LABEL]
+            label = printable(rest.partition(BETWEEN)[0])[:MAX_LABEL]
             found.setdefault(image, []).append(MaskFile(path, label, numbered=True))
     return found
 

@@ -25,7 +25,6 @@ from intercap_core.detections.coco import (
     files_of,
     image_of,
     listed_images,
-    short_of,
 )
 from intercap_core.detections.keypoint_layouts import (
     COCO_BODY,
@@ -36,6 +35,7 @@ from intercap_core.detections.keypoint_layouts import (
     LAYOUTS,
     to_shared,
 )
+from intercap_core.inputs.quotes import quoted
 
 # Lists beside COCO's 17 points, and how COCO-WholeBody orders their points.
 _PARTS = {
@@ -73,7 +73,7 @@ def people_of(content: Any, *, one_image: bool = False) -> PeopleFile:
         files = files_of(found.images or [])
     if not isinstance(entries, list):
         raise UnreadableCandidates(
-            f"holds {short_of(content)}, expected OpenPose's 'people', a list of people with "
+            f"holds {quoted(content)}, expected OpenPose's 'people', a list of people with "
             "'keypoints', COCO's 'annotations' or mmpose's 'instance_info'"
         )
     for index, entry in enumerate(entries):
@@ -104,7 +104,7 @@ def _people_of_frames(frames: list[dict[str, Any]], first: int) -> PeopleFile:
         number, people = frame.get("frame_id", place + first), frame["instances"]
         if type(number) is not int or number < first or not isinstance(people, list):
             raise UnreadableCandidates(
-                f"has frame {short_of(number)} with {short_of(people)}, expected 'frame_id' from "
+                f"has frame {quoted(number)} with {quoted(people)}, expected 'frame_id' from "
                 f"{first} and a list 'instances'"
             )
         key = ImageKey(number - first, None)
@@ -125,7 +125,7 @@ def _add(
     found.entries += 1
     try:
         if not isinstance(entry, dict):
-            raise ValueError(f"expected a person, found {short_of(entry)}")
+            raise ValueError(f"expected a person, found {quoted(entry)}")
         key = image(entry)
         found.results.append((key, _person(entry)))
     except ValueError as error:
@@ -137,7 +137,7 @@ def _add(
 def _person(entry: dict[str, Any]) -> np.ndarray:
     """One person's keypoints (135, 3); raises ValueError with what is wrong."""
     if "keypoints" not in entry:
-        raise ValueError(f"has no 'keypoints' but {short_of(entry)}")
+        raise ValueError(f"has no 'keypoints' but {quoted(entry)}")
     points = _points("keypoints", entry["keypoints"], entry.get("keypoint_scores"))
     parts = {key: names for key, names in _PARTS.items() if entry.get(key)}
     if not parts:
@@ -186,11 +186,11 @@ def _numbers(key: str, values: Any) -> np.ndarray:
     try:
         array = np.array(_without_none(values), np.float64)
     except (TypeError, ValueError, OverflowError, RecursionError):
-        raise ValueError(f"{key} is {short_of(values)}, expected lists of numbers") from None
+        raise ValueError(f"{key} is {quoted(values)}, expected lists of numbers") from None
     if array.ndim == 3 and len(array) == 1:
         array = array[0]  # mmpose's arrays keep an axis of one person
     if array.ndim not in (1, 2):
-        raise ValueError(f"{key} is {short_of(values)}, expected lists of numbers")
+        raise ValueError(f"{key} is {quoted(values)}, expected lists of numbers")
     return array
 
 

@@ -19,8 +19,13 @@ from intercap_core.detections.constants import (
     CAFFE_MEAN_BGR,
     IMAGENET_DEVIATION_RGB,
     IMAGENET_MEAN_RGB,
+    MAX_BATCH,
+    MAX_INPUT_SIDE,
+    MAX_NETWORK_BYTES,
 )
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import check_file
+from intercap_core.inputs.quotes import printable
 
 PixelValues = Literal["rgb", "bgr255", "bgr_mean", "imagenet"]
 
@@ -63,7 +68,7 @@ class OnnxModel:
         self.path, self._session = path, session
         inputs = session.get_inputs()
         if len(inputs) != 1 or len(inputs[0].shape) not in (3, 4) or inputs[0].type not in _TYPES:
-            told = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+            told = printable(", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)[:300])
             raise UserError(
                 f"{path}: takes {told}; expected one image, (batch,) 3, height, width; export the "
                 "model for images alone"
@@ -75,6 +80,12 @@ class OnnxModel:
         self._channels_last = lengths[0] != 3 and lengths[2] == 3
         height, width = lengths[:2] if self._channels_last else lengths[1:]
         self.size = (width, height) if width and height else None
+        if max(width or 1, height or 1) > MAX_INPUT_SIDE or (self.batch or 1) > MAX_BATCH:
+            raise UserError(
+                f"{path}: takes {self.batch or 'any number of'} images of {width or 'any'}x"
+                f"{height or 'any'} pixels, expected at most {MAX_BATCH} of {MAX_INPUT_SIDE} a "
+                "side; export it at the size that it was trained with"
+            )
         self.metadata: dict[str, str] = dict(session.get_modelmeta().custom_metadata_map)
         self.outputs = [(o.name, tuple(o.shape), o.type) for o in session.get_outputs()]
 
@@ -100,8 +111,9 @@ class OnnxModel:
         if wanted not in onnxruntime.get_available_providers():
             raise _no_device(path, device, onnxruntime)
         try:
+            check_file(path, MAX_NETWORK_BYTES)
             session = onnxruntime.InferenceSession(str(path), options, providers=[wanted])
-        except Exception as error:  # the runtime has a class of error for each kind of damage
+        except _runtime_errors() as error:
             raise UserError(
                 f"{path}: is no ONNX model that can be run ({_first_line(error)}); export it again"
             ) from None
@@ -118,7 +130,7 @@ class OnnxModel:
         values = values if self.batched else values[0]
         try:
             found = self._session.run(None, {self._name: np.ascontiguousarray(values, self._dtype)})
-        except Exception as error:  # see above
+        except _runtime_errors() as error:
             raise UserError(
                 f"{self.path}: fails on an image of {images.shape[3]}x{images.shape[2]} pixels "
                 f"({_first_line(error)}); export it for this size, or for any"
@@ -193,6 +205,16 @@ def parse_names(text: str) -> dict[int, str]:
     return names
 
 
+def _runtime_errors() -> tuple[type[Exception], ...]:
+    """What onnxruntime raises: a class for each status, and pybind11's own for what it is given."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    of_status = [
+        c for c in vars(state).values() if isinstance(c, type) and issubclass(c, Exception)
+    ]
+    return (*of_status, RuntimeError, ValueError, TypeError)
+
+
 def _threads() -> int:
     """Threads that the job may use, 0 = all; the runtime does not ask OpenMP."""
     text = os.environ.get("OMP_NUM_THREADS", "")
@@ -208,5 +230,5 @@ def _no_device(path: Path, device: str, runtime: Any) -> UserError:
 
 
 def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
+    lines = printable(str(error)).strip().splitlines()
     return lines[0][:300] if lines else type(error).__name__

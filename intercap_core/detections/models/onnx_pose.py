@@ -156,11 +156,13 @@ class PoseModel:
             if missing > 0:  # the model insists on its number
                 images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
             outputs = self._model.run(images)
-            yield self._points([outputs[i] for i in self._outputs])[: len(part)]
+            yield self._points([outputs[i] for i in self._outputs], len(part))[: len(part)]
 
-    def _points(self, responses: list[np.ndarray]) -> np.ndarray:
+    def _points(self, responses: list[np.ndarray], people: int) -> np.ndarray:
         """Points (B, K, 3) of columns (B, K, X) and rows (B, K, Y), or of heatmaps (B, K, h, w)."""
         shapes = [r.shape for r in responses]
+        if any(len(shape) < 3 or shape[0] < people for shape in shapes):
+            raise _unknown(self._model, [str(list(shape)) for shape in shapes])
         if len(responses) == 2 and _same_bins(shapes, self._size):
             return simcc_points(responses[0], responses[1], self._size)
         if len(responses) == 1 and _coarser(shapes[0][2:], self._size):

@@ -23,7 +23,9 @@ from intercap_core.detections.class_names import (
     COCO_NAMES_FROM_1,
 )
 from intercap_core.detections.constants import (
+    MAX_GRID_SIDE,
     MAX_LABEL,
+    MAX_SCORE,
     RCNN_LONG,
     RCNN_SHORT,
     RCNN_STRIDE,
@@ -43,6 +45,7 @@ from intercap_core.detections.models.onnx_model import (
 )
 from intercap_core.detections.models.onnx_outputs import rcnn_instances, yolo_instances
 from intercap_core.errors import UserError
+from intercap_core.inputs.quotes import quoted
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -77,7 +80,7 @@ class Segmenter:
         task = model.metadata.get("task", "segment")
         if task != "segment":
             raise UserError(
-                f"{model.path}: is a model for {task!r:.40}, expected 'segment'; export a "
+                f"{model.path}: is a model for {quoted(task, 40)}, expected 'segment'; export a "
                 "segmentation model (its name ends in -seg)"
             )
         found = _yolo_outputs(model) or _rcnn_outputs(model)
@@ -145,10 +148,12 @@ class Segmenter:
         self, outputs: list[np.ndarray], index: int, fit: Fit, size: tuple[int, int]
     ) -> list[Instance]:
         rows, prototypes = (outputs[self._kind.outputs[k]] for k in ("rows", "prototypes"))
-        if rows.ndim != 3 or prototypes.ndim != 4:
+        shaped = rows.ndim == 3 and prototypes.ndim == 4 and min(len(rows), len(prototypes)) > index
+        if not shaped or not _is_grid(prototypes.shape[2:]) or not prototypes.shape[1]:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
+        self._check_numbers(rows[index], prototypes[index])
         try:
-            return yolo_instances(
+            found = yolo_instances(
                 rows[index],
                 prototypes[index],
                 fit,
@@ -158,6 +163,7 @@ class Segmenter:
             )
         except ValueError:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs]) from None
+        return self._plausible(found)
 
     def _rcnn(
         self, outputs: list[np.ndarray], index: int, fit: Fit, size: tuple[int, int]
@@ -165,13 +171,15 @@ class Segmenter:
         boxes, classes, scores, soft = (
             outputs[self._kind.outputs[k]] for k in ("boxes", "classes", "scores", "masks")
         )
-        if boxes.ndim == 3:  # with an axis of images
+        if boxes.ndim == 3 and min(len(v) if v.ndim else 0 for v in outputs[:4]) > index:
             boxes, classes, scores, soft = (v[index] for v in (boxes, classes, scores, soft))
         soft = soft[:, 0] if soft.ndim == 4 and soft.shape[1] == 1 else soft
-        counts = {len(v) for v in (boxes, classes, scores, soft)}
-        if len(counts) != 1 or boxes.shape[1:] != (4,) or soft.ndim != 3 or classes.ndim != 1:
+        counts = {len(v) if v.ndim else -1 for v in (boxes, classes, scores, soft)}
+        shaped = len(counts) == 1 and boxes.shape[1:] == (4,) and scores.ndim == classes.ndim == 1
+        if not shaped or soft.ndim != 3 or (len(soft) and not _is_grid(soft.shape[1:])):
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
-        return rcnn_instances(
+        self._check_numbers(boxes, classes, scores)
+        found = rcnn_instances(
             boxes,
             classes,
             scores,
@@ -181,6 +189,30 @@ class Segmenter:
             min_score=self._min_score,
             names=self._kind.names,
         )
+        return self._plausible(found)
+
+    def _check_numbers(self, *outputs: np.ndarray) -> None:
+        for values in outputs:
+            if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+                raise UserError(
+                    f"{self._model.path}: its outputs hold values that are no numbers; export it "
+                    "again, with float32 where it was float16"
+                )
+
+    def _plausible(self, found: list[Instance]) -> list[Instance]:
+        """The instances; raises UserError where their scores are none."""
+        most = max((instance.score for instance in found), default=0.0)
+        if most > MAX_SCORE:
+            raise UserError(
+                f"{self._model.path}: gives scores up to {most:.4g}, expected 0 to 1; export it "
+                "with its last activation"
+            )
+        return found
+
+
+def _is_grid(shape: tuple[int, ...]) -> bool:
+    """Whether masks of this height and width can be laid over an image."""
+    return min(shape) >= 1 and max(shape) <= MAX_GRID_SIDE
 
 
 def _yolo_outputs(model: OnnxModel) -> dict[str, int] | None:

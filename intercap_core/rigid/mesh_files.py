@@ -1,0 +1,136 @@
+"""Mesh files, read within bounds: what a head states is held against what follows it.
+
+Materials and textures are looked for beside the mesh and nowhere else, whatever path it names.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from intercap_core.errors import UserError
+from intercap_core.inputs.files import MAX_IMAGE_BYTES, MAX_MODEL_BYTES, Unreadable, read_bytes
+from intercap_core.inputs.quotes import printable
+
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+# What trimesh and numpy raise for broken files, and Pillow for broken textures.
+TEXTURE_ERRORS = (
+    AttributeError, TypeError, ValueError, IndexError, KeyError, OSError, SyntaxError,
+    OverflowError, struct.error, zlib.error, Image.DecompressionBombError, EOFError,
+)  # fmt: skip
+_ERRORS = (*TEXTURE_ERRORS, ZeroDivisionError, NotImplementedError, RecursionError,
+           AssertionError, RuntimeError)  # fmt: skip
+
+
+def load_mesh(path: Path) -> Any:
+    """The triangle mesh of a file as it is, one mesh of a whole scene.
+
+    Raises UserError, naming the file, where it is no mesh or another one than its head states.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(f"{path}: is no mesh that is read; export it as {', '.join(SUFFIXES)}")
+    content = read_bytes(path, MAX_MODEL_BYTES)
+    stated = _stated_faces(path, content) if suffix == ".ply" else 0
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of numpy, about values that are refused below
+            mesh: Any = trimesh.load(
+                io.BytesIO(content),
+                file_type=suffix[1:],
+                resolver=_Beside(path.parent),
+                process=False,
+                force="mesh",
+            )
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    except _ERRORS as error:
+        told = printable(str(error).partition("\n")[0][:200])
+        raise UserError(
+            f"{path}: not a readable mesh ({type(error).__name__}: {told}); export it again as "
+            ".ply or .obj"
+        ) from None
+    if vertices.ndim != 2 or len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
+        raise UserError(
+            f"{path}: holds {len(vertices)} vertices and {len(faces)} faces, expected a triangle "
+            "mesh; export the surface, not a point cloud"
+        )
+    if len(faces) < stated:
+        raise UserError(
+            f"{path}: states {stated} faces, of which {len(faces)} can be read; export it again"
+        )
+    return mesh
+
+
+class _Beside(trimesh.resolvers.Resolver):
+    """Files beside the mesh by the last part of the name that it gives them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def get(self, key: Any) -> bytes:
+        name = Path(str(key).strip().replace("\\", "/")).name
+        try:
+            return read_bytes(self._folder / name, MAX_IMAGE_BYTES)
+        except Unreadable as error:
+            raise OSError(str(error)) from None
+
+    def keys(self) -> list[str]:
+        return []
+
+    def write(self, name: str, data: Any) -> None:
+        raise OSError("meshes are only read")
+
+    def namespaced(self, namespace: str) -> _Beside:
+        return self
+
+
+def _stated_faces(path: Path, content: bytes) -> int:
+    """How many faces a PLY's head states; raises UserError where what follows cannot hold them."""
+    head, found, body = content.partition(b"end_header")
+    if not content.startswith(b"ply") or not found:
+        raise UserError(f"{path}: not a readable mesh (it has no head of a PLY); export it again")
+    counts: dict[bytes, int] = {}
+    properties: dict[bytes, list[bytes]] = {}
+    for line in head.splitlines():
+        words = line.split()
+        if words[:1] == [b"element"]:
+            if len(words) != 3 or not words[2].isdigit() or len(words[2]) > 12:
+                raise UserError(
+                    f"{path}: not a readable mesh (its head counts {words[2:]!r:.40}); export it "
+                    "again"
+                )
+            counts[words[1]] = int(words[2])
+            properties[words[1]] = []
+        elif words[:1] == [b"property"] and properties:
+            properties[next(reversed(properties))].append(words[1])
+    if sum(counts.values()) > len(body):
+        raise UserError(
+            f"{path}: states {sum(counts.values())} elements in {len(body)} bytes; the file is cut "
+            "or damaged, export it again"
+        )
+    faces = counts.get(b"face", 0)
+    if b"format ascii" in head and properties.get(b"face", [])[:1] == [b"list"]:
+        _check_lists(path, body, counts)
+    return faces
+
+
+def _check_lists(path: Path, body: bytes, counts: dict[bytes, int]) -> None:
+    """Raise UserError where a face of an ASCII PLY has fewer vertices than it states."""
+    lines = [line.split() for line in body.split(b"\n")[1:] if line.strip()]
+    start = 0
+    for name, count in counts.items():
+        for words in lines[start : start + count] if name == b"face" else ():
+            if not words[0].isdigit() or len(words[0]) > 9 or int(words[0]) >= len(words):
+                raise UserError(
+                    f"{path}: a face states {printable(words[0][:20].decode('latin1'))} vertices "
+                    f"and lists {len(words) - 1}; export it again"
+                )
+        start += count
