@@ -43,16 +43,19 @@ class JobState:
     log: Path
 
 
-def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = ()) -> int:
+def run_workflow(
+    settings: Path, *, cores: int = 0, profile: Path | None = None, arguments: Sequence[str] = ()
+) -> int:
     """Bring a project up to date; returns the exit status.
 
-    Where sequences fail, they are named with their reason and the report is made of the others.
-    Raises UserError where settings or tables are wrong.
+    ``profile`` is Snakemake's, a folder that says where and how jobs run. Where sequences fail,
+    they are named with their reason and the report is made of the others. Raises UserError where
+    settings or tables are wrong.
     """
     project = load_project(settings)
     check_bodies(project)
     console = Console(stderr=True)
-    command = snakemake_command(settings, cores=cores, arguments=arguments)
+    command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
     if DRY_RUN & set(arguments):
         return subprocess.call(command)
     watcher = Watcher(project, console)
@@ -69,9 +72,8 @@ def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = (
         console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
         targets = [str(project.results / name) for name in AGGREGATES]
         excluded = ",".join([*project.config.exclude, *bad])
-        command = snakemake_command(
-            settings, cores=cores, arguments=[*targets, "--config", f"exclude=[{excluded}]"]
-        )
+        others = [*targets, "--config", f"exclude=[{excluded}]"]
+        command = snakemake_command(settings, cores=cores, profile=profile, arguments=others)
         run_watched(command, Watcher(project, console), console)
     print_remarks(project, console)
     report = project.site / "index.html"
@@ -85,14 +87,18 @@ def snakemake_command(
     settings: Path,
     *,
     cores: int = 0,
+    profile: Path | None = None,
     arguments: Sequence[str] = (),
 ) -> list[str]:
-    """The command line that runs a project's workflow; ``cores`` 0 = all."""
+    """The command line that runs a project's workflow; ``cores`` 0 = all, or as a profile says."""
+    if profile is not None and not profile.is_dir():
+        raise UserError(f"{profile}: there is no such profile; name a folder, as profiles/slurm")
     return [
         *(sys.executable, "-m", "snakemake"),
         *("--snakefile", str(snakefile())),
         *("--configfile", str(settings)),
-        *("--cores", str(cores) if cores else "all"),
+        *(("--workflow-profile", str(profile)) if profile is not None else ()),
+        *(("--cores", str(cores) if cores else "all") if cores or profile is None else ()),
         *arguments,
     ]
 

@@ -15,8 +15,9 @@ rule body_fit:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=120,
+        **gpu_of("body_fit"),
+        mem_mb=memory("body_fit"),
+        runtime=duration("body_fit"),
     params:
         settings=settings_of("body_fit"),
         subject=tracked_subject,

@@ -14,8 +14,8 @@ rule export:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=30,
+        mem_mb=memory("export"),
+        runtime=duration("export"),
     params:
         settings=settings_of("export"),
         object=tracked_object,

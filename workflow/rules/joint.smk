@@ -18,8 +18,9 @@ rule joint:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(6000),
-        runtime=120,
+        **gpu_of("joint"),
+        mem_mb=memory("joint"),
+        runtime=duration("joint"),
     params:
         settings=settings_of("joint"),
         annotation=annotation_of("contact"),

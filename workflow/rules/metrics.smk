@@ -15,8 +15,8 @@ rule metrics:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=60,
+        mem_mb=memory("metrics"),
+        runtime=duration("metrics"),
     params:
         settings=settings_of("metrics"),
         object=tracked_object,

@@ -14,8 +14,9 @@ rule object_track:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=120,
+        **gpu_of("object_track"),
+        mem_mb=memory("object_track"),
+        runtime=duration("object_track"),
     params:
         settings=settings_of("object_track"),
         annotation=annotation_of("object_pose"),

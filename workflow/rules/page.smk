@@ -21,8 +21,8 @@ rule page:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=30,
+        mem_mb=memory("page"),
+        runtime=duration("page"),
     params:
         settings=settings_of("page"),
         annotation=annotation_of("contact"),

@@ -13,8 +13,8 @@ rule person:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(2000),
-        runtime=30,
+        mem_mb=memory("person"),
+        runtime=duration("person"),
     params:
         settings=settings_of("person"),
         annotation=annotation_of("subject"),

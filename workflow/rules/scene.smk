@@ -13,8 +13,8 @@ rule scene:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=60,
+        mem_mb=memory("scene"),
+        runtime=duration("scene"),
     params:
         settings=settings_of("scene"),
         annotation=annotation_of("floor", "starts", "starts_sigma"),

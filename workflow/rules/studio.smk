@@ -21,8 +21,8 @@ rule studio:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=60,
+        mem_mb=memory("studio"),
+        runtime=duration("studio"),
     params:
         settings=capture_of,
         object=tracked_object,

@@ -12,8 +12,8 @@ rule summary:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(1500),
-        runtime=10,
+        mem_mb=memory("summary"),
+        runtime=duration("summary"),
     params:
         intent=intent_of,
         code=code_of("summary"),
