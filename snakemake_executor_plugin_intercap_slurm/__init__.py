@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,8 @@ from .ledger import Entry, Ledger, by_outputs, run_name
 from .slurm import LIVE, cancel, states, wait_for_controller
 from .words import Ending, endings
 
-LONGEST_BETWEEN_CHECKS_S = 20
+LONGEST_BETWEEN_CHECKS_S = 20.0
+SHARE_BETWEEN_CHECKS = 0.25  # of the time since a job was last submitted: short jobs, short waits
 FORGOTTEN_AFTER_S = 120.0  # longer than a controller takes to come back and read its state
 ENTRY = "intercap_entry"
 
@@ -53,6 +54,7 @@ class Executor(SlurmExecutor):
         self._over: set[int] = set()
         self._final: set[JobExecutorInterface] = set()
         self._missing_since: dict[str, float] = {}
+        self._last_submission = time.monotonic()
         super().__init__(workflow, logger)
 
     def __post_init__(self, test_mode: bool = False) -> None:
@@ -64,6 +66,10 @@ class Executor(SlurmExecutor):
     def additional_general_args(self) -> str:
         """The submission itself computes; a Slurm step of its own would start Snakemake again."""
         return "--executor local"
+
+    def get_account_arg(self, job: JobExecutorInterface) -> Iterator[str]:
+        """Where no account is named, none is guessed: Slurm takes the user's default."""
+        return super().get_account_arg(job) if job.resources.get("slurm_account") else iter([""])
 
     def run_job(self, job: JobExecutorInterface) -> None:
         """Submit one job, unless an earlier run has: then wait for that one."""
@@ -96,10 +102,11 @@ class Executor(SlurmExecutor):
 
     def report_job_submission(self, job_info: SubmittedJobInfo, register_job: bool = True) -> None:
         """Write the job into the ledger, so that a later run finds it."""
+        self._last_submission = time.monotonic()
         aux = job_info.aux or {}
         if ENTRY not in aux:
             log = Path(aux["slurm_logfile"]).relative_to(self.slurm_logdir)
-            entry = self._asked.pop(job_info.job)
+            entry = self._asked.pop(job_info.job, None) or Entry.of(job_info.job)
             aux[ENTRY] = entry.submitted(str(job_info.external_jobid), str(log))
             self._ledger.write(aux[ENTRY])
         super().report_job_submission(job_info, register_job)
@@ -115,8 +122,11 @@ class Executor(SlurmExecutor):
         for info in active_jobs:
             if id(info) not in self._over and not self._is_forgotten(info, known):
                 yield info
-        proposed: int = self.next_seconds_between_status_checks
-        self.next_seconds_between_status_checks = min(proposed, LONGEST_BETWEEN_CHECKS_S)
+        wait = self.workflow.executor_settings.init_seconds_before_status_checks
+        if active_jobs and not self._over:  # else others are about to be submitted
+            quiet = SHARE_BETWEEN_CHECKS * (time.monotonic() - self._last_submission)
+            wait = max(wait, min(quiet, LONGEST_BETWEEN_CHECKS_S))
+        self.next_seconds_between_status_checks = wait
 
     def _is_forgotten(self, info: SubmittedJobInfo, known: dict[str, str] | None) -> bool:
         """Whether Slurm has not known the job for long; its logs then tell how it ended."""

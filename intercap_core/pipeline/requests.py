@@ -102,7 +102,7 @@ def memory_mb(project: Project, rule: str, extent: Extent, attempt: int = 1) -> 
         needed += CUDA_MB
     if rule == "detections" and has_model(project):
         needed += MODEL_MB
-    return round(needed * _scale(project.config.cluster.memory_scale, rule) * attempt)
+    return attempt * round(needed * _scale(project.config.cluster.memory_scale, rule))
 
 
 def minutes(
@@ -114,7 +114,7 @@ def minutes(
     if rule == "detections" and has_model(project):
         seconds += MODEL_SECONDS * extent.images
     asked = LEAST_MINUTES + seconds * TIME_MARGIN / 60
-    return round(asked * _scale(project.config.cluster.time_scale, rule) * attempt)
+    return attempt * round(asked * _scale(project.config.cluster.time_scale, rule))
 
 
 def has_model(project: Project) -> bool:

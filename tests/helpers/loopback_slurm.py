@@ -19,6 +19,7 @@ from pathlib import Path
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scancel", "scontrol")
 NODES = ("one", "two")
+WITH_GPU = "two"  # as Slurm believes: a device node that does nothing
 READY_WITHIN_S = 60.0
 
 CONFIGURATION = """\
@@ -45,9 +46,10 @@ JobAcctGatherFrequency=task=1
 JobAcctGatherParams=OverMemoryKill
 AccountingStorageType=accounting_storage/none
 JobCompType=jobcomp/none
+GresTypes=gpu
 SwitchType=switch/none
 MpiDefault=none
-MinJobAge=300
+MinJobAge=60000
 ReturnToService=2
 SlurmdTimeout=10
 KillWait=2
@@ -77,12 +79,14 @@ class LoopbackSlurm:
             (folder / name).mkdir()
         nodes = [
             f"NodeName={node} NodeHostname=localhost NodeAddr=127.0.0.1 Port={port} "
-            "CPUs=1 RealMemory=16000"
+            "CPUs=1 RealMemory=16000" + (" Gres=gpu:1" if node == WITH_GPU else "")
             for node, port in zip(NODES, ports[1:], strict=True)
         ]
         partition = f"PartitionName=main Nodes={','.join(NODES)} Default=YES State=UP"
         text = CONFIGURATION.format(controller=ports[0], folder=folder)
-        (folder / "slurm.conf").write_text("\n".join([text, *nodes, partition, ""]))
+        gpu = f"PartitionName=gpu Nodes={WITH_GPU} State=UP"
+        (folder / "slurm.conf").write_text("\n".join([text, *nodes, partition, gpu, ""]))
+        (folder / "gres.conf").write_text(f"NodeName={WITH_GPU} Name=gpu File=/dev/null\n")
         key = folder / "munge.key"
         key.write_bytes(secrets.token_bytes(128))
         key.chmod(0o400)
