@@ -256,26 +256,23 @@ def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, by
         run.start(*targets).ends_well()
 
 
-def test_a_broken_recording_fails_once_and_alone(
+def test_a_broken_annotation_fails_once_and_alone(
     run: ClusterRun, local: dict[str, bytes], record_property: Record
 ) -> None:
-    record_property("fault", "a broken recording")
-    recordings = run.flow.results / "recordings" / OTHER
-    whole = {path: path.read_bytes() for path in recordings.glob("*.mkv")}
-    for path in whole:
-        path.write_bytes(b"not a recording")
-    run.flow.artefact(OTHER, "frames").unlink()
-    before = numbers(run, "rule_frames_", OTHER)
-    kept = written(run.flow.results)
+    record_property("fault", "one sequence's annotation broken")
+    annotation = run.flow.annotation(OTHER)
+    annotation.parent.mkdir(exist_ok=True)
+    annotation.write_text("floor: [[\n")
+    before, kept = run.slurm.jobs(ended=True).keys(), written(run.flow.results)
     started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
     assert started.process.wait(600) == 1, started.said
+    assert "not valid YAML" in started.said
     assert f"the report leaves out {OTHER}" in started.said
-    assert "no camera in" in started.said
-    assert len(numbers(run, "rule_frames_", OTHER) - before) == 1
+    jobs = run.slurm.jobs(ended=True)
+    new = sorted(jobs[number][1] for number in jobs.keys() - before)
+    assert new == [f"rule_broken_annotation_wildcards_{OTHER}", "rule_dataset"]
+    assert "not valid YAML" in (run.flow.results / "site" / "index.html").read_text()
     assert written(run.flow.results) == kept
-    page = (run.flow.results / "site" / "index.html").read_text()
-    assert "no camera in" in page
-    for path, data in whole.items():
-        path.write_bytes(data)
+    annotation.unlink()
     run.start().ends_well()
     assert contents(run.flow.results) == local
