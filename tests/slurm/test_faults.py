@@ -27,7 +27,6 @@ pytestmark = pytest.mark.usefixtures("everything")
 
 # Of two sequences on two nodes these never wait for a node; then two jobs of each go side by side.
 CHAIN = ("frames", "detections", "scene", "person")
-STAGES_OF_A_SEQUENCE = len(STAGES) - 1  # page and export are one job
 Record = Callable[[str, object], None]
 
 
@@ -126,7 +125,7 @@ def test_the_same_bytes_as_on_one_machine(
     assert {name for name in local if found[name] != local[name]} == set()
     jobs = run.slurm.jobs(ended=True)
     assert {state for state, _, _ in jobs.values()} == {"COMPLETED"}
-    assert len(jobs) == 2 * (1 + STAGES_OF_A_SEQUENCE) + 1  # the studio; the dataset
+    assert len(jobs) == 2 * (1 + len(STAGES)) + 1  # the studio; the dataset
     seconds = [float(line) for line in (run.flow.folder / "overheads.txt").read_text().split()]
     assert len(seconds) == 2 * len(CHAIN)
     record_property("overhead_s", sum(seconds) / len(seconds))

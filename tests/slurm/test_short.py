@@ -71,3 +71,14 @@ def test_a_mistake_is_submitted_once_and_told(tiny: ClusterRun, slurm: LoopbackS
     assert f"{NAME}: detections: failed: sequence {NAME}: no detections for any" in started.said
     assert "It is not tried again" in started.said
     assert written(tiny.flow.results) == kept
+
+
+def test_each_stage_of_a_group_is_told(tiny: ClusterRun, slurm: LoopbackSlurm) -> None:
+    tiny.flow.artefact(NAME, "frames").unlink()
+    before = slurm.jobs(ended=True).keys()
+    grouped = ("--groups", "frames=reading", "detections=reading")
+    started = tiny.start(tiny.target(NAME, "detections"), *grouped)
+    assert started.process.wait(300) == 1
+    (number,) = slurm.jobs(ended=True).keys() - before
+    assert f"Slurm job {number}, {NAME}: frames: finished" in started.said
+    assert f"Slurm job {number}, {NAME}: detections: failed: sequence {NAME}" in started.said

@@ -247,30 +247,30 @@ def length_since(sequence, changed):
     return extent_of(PROJECT, sequence)
 
 
-def memory(rule):
+def memory(stage):
     """Resource: by frames and cameras, and more with every attempt after a job was killed."""
 
     def megabytes(wildcards, attempt):
-        return memory_mb(PROJECT, rule, length_of(wildcards), attempt)
+        return memory_mb(PROJECT, stage, length_of(wildcards), attempt)
 
     return megabytes
 
 
-def duration(rule):
+def duration(stage):
     """Resource: minutes, likewise; of the recordings' reader by their bytes."""
 
     def asked(wildcards, attempt):
         read = 0.0
-        if rule == "frames":
+        if stage == "frames":
             read = recorded_mb(PROJECT.sequences[wildcards.sequence].recordings)
-        return minutes(PROJECT, rule, length_of(wildcards), attempt, read_mb=read)
+        return minutes(PROJECT, stage, length_of(wildcards), attempt, read_mb=read)
 
     return asked
 
 
-def gpu_of(rule):
+def gpu_of(stage):
     """Resources: a GPU, and the partition that has some, where the settings have the stage use it."""
-    if not on_gpu(PROJECT, rule):
+    if not on_gpu(PROJECT, stage):
         return {}
     partition = SETTINGS.cluster.gpu_partition
     return {"gpu": 1, **({"slurm_partition": partition} if partition else {})}
