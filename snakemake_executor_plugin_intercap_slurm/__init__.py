@@ -50,6 +50,7 @@ class Executor(SlurmExecutor):
         self._ledger = Ledger(Path(".snakemake") / "slurm_jobs")
         self._left: dict[tuple[str, ...], Entry] | None = None
         self._looking = threading.Lock()
+        self._ending = threading.Event()
         self._asked: dict[JobExecutorInterface, Entry] = {}
         self._over: set[int] = set()
         self._final: set[JobExecutorInterface] = set()
@@ -73,7 +74,16 @@ class Executor(SlurmExecutor):
 
     def run_job(self, job: JobExecutorInterface) -> None:
         """Submit one job, unless an earlier run has: then wait for that one."""
-        wait_for_controller(self.logger, lambda: self.wait)
+        try:
+            self._submit_or_adopt(job)
+        except Exception as error:  # in a thread of its own: nobody else would hear of it
+            words = f"It could not be submitted: {type(error).__name__}: {error}. "
+            self._report_job_error_threadsafe(SubmittedJobInfo(job), words)
+
+    def _submit_or_adopt(self, job: JobExecutorInterface) -> None:
+        wait_for_controller(self.logger, self._ending)
+        if self._ending.is_set():
+            return
         entry = Entry.of(job)
         left = self._left_by_earlier_runs().pop(entry.outputs, None)
         if left is not None and left.digest == entry.digest:
@@ -91,13 +101,13 @@ class Executor(SlurmExecutor):
     def _left_by_earlier_runs(self) -> dict[tuple[str, ...], Entry]:
         """Jobs in the ledger that Slurm still has, by what they write; looked up once."""
         with self._looking:
-            while self._left is None:
+            if self._left is None:
                 known = states(self.run_uuid)
-                if known is None:
-                    wait_for_controller(self.logger, lambda: self.wait)
-                    continue
-                live = {number for number, state in known.items() if state in LIVE}
-                self._left = by_outputs(self._ledger.keep(live))
+                while known is None and not self._ending.is_set():
+                    wait_for_controller(self.logger, self._ending)
+                    known = states(self.run_uuid)
+                live = {number for number, state in (known or {}).items() if state in LIVE}
+                self._left = by_outputs(self._ledger.keep(live)) if known is not None else {}
             return self._left
 
     def report_job_submission(self, job_info: SubmittedJobInfo, register_job: bool = True) -> None:
@@ -164,6 +174,11 @@ class Executor(SlurmExecutor):
         self._over.add(id(job_info))
         if job_info.external_jobid is not None:
             self._ledger.remove(job_info.external_jobid)
+
+    def cancel(self) -> None:
+        """On Ctrl-C what waits for the controller gives up, and Slurm's jobs are cancelled."""
+        self._ending.set()
+        super().cancel()
 
     def handle_job_error(self, job: JobExecutorInterface) -> None:
         """Called before Snakemake compares the job's attempts with those that it may have."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import subprocess
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 ASKED_AGAIN_AFTER_S = 5.0
@@ -39,17 +40,17 @@ def cancel(number: str, name: str) -> None:
         time.sleep(1.0)
 
 
-def wait_for_controller(logger: Any, wanted: Callable[[], bool]) -> None:
+def wait_for_controller(logger: Any, ending: threading.Event) -> None:
     """Return when the controller answers, or when nobody waits for it any more."""
     told = False
-    while wanted():
+    while not ending.is_set():
         done = _run(["scontrol", "ping"])
         if done is not None and " UP" in done.stdout:
             return
         if not told:
             logger.warning("Slurm's controller does not answer; jobs are submitted when it does.")
             told = True
-        time.sleep(ASKED_AGAIN_AFTER_S)
+        ending.wait(ASKED_AGAIN_AFTER_S)
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str] | None:
