@@ -2,6 +2,8 @@
 # make test      the whole test suite, on all cores (PYTEST=-n0 for one process)
 # make test-fast what a developer runs after each edit: all tests but the slow ones, which start
 #                processes, render whole captures or fit whole sequences
+# make test-slurm  the workflow on a real Slurm (Debian: slurm-wlm, munge; as root), the small dataset as
+#                jobs and what goes wrong on clusters, into results/bench.json; a short part is in `make test`
 # make lint      ruff, import-linter, snakefmt, mypy, snakemake --lint
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track and the body's fit, those of config/body to
@@ -32,10 +34,11 @@ CORES ?= 0
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
-EXTRAS := workflow,slurm,test,bench,dev
+EXTRAS := workflow,test,bench,dev
 
-.PHONY: demo test test-fast lint ruff-check ruff-format imports snakefmt mypy snakemake-lint \
-    evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz docs environment clean
+.PHONY: demo test test-fast test-slurm lint ruff-check ruff-format imports snakefmt mypy \
+    snakemake-lint evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz docs \
+    environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -46,6 +49,9 @@ test: $(STAMP)
 
 test-fast: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow" $(PYTEST)
+
+test-slurm: $(STAMP)
+	$(BIN)/python -m bench.slurm $(PYTEST)
 
 lint: ruff-check ruff-format imports snakefmt mypy snakemake-lint
 

@@ -215,18 +215,28 @@ def tables(
     rich_help_panel=WHOLE,
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
 )
-def run(context: typer.Context, settings: Settings = DEFAULT_SETTINGS, cores: Cores = 0) -> None:
+def run(
+    context: typer.Context,
+    settings: Settings = DEFAULT_SETTINGS,
+    cores: Cores = 0,
+    profile: Annotated[
+        Path | None,
+        typer.Option(help="Folder that says where jobs run: profiles/slurm for a cluster."),
+    ] = None,
+) -> None:
     """Compute everything that is missing or out of date, and show how it goes.
 
     Wraps Snakemake: what else you write is handed to it. A sequence that fails leaves the others
     running, and the report is made of those that succeed.
 
     Examples: intercap run config/demo/config.yaml;
-    intercap run config/demo/config.yaml --cores 2 -- --until joint
+    intercap run config/demo/config.yaml --cores 2 -- --until joint;
+    intercap run config/lab/config.yaml --profile profiles/slurm
     """
     from intercap_core.commands.run import run_workflow
 
-    raise typer.Exit(run_workflow(settings, cores=cores, arguments=context.args))
+    status = run_workflow(settings, cores=cores, profile=profile, arguments=context.args)
+    raise typer.Exit(status)
 
 
 @app.command(rich_help_panel=WHOLE)

@@ -29,6 +29,7 @@ from pydantic import (
 
 from intercap_core.inputs.files import path_fault
 from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.stage_list import STAGES
 
 MAX_POSITION_M = 50.0  # a capture volume is some metres wide
 MIN_FLOOR_WIDTH_M = 0.01  # floor points this close to one line give no plane
@@ -428,6 +429,27 @@ class BodyModels(Model):
         return getattr(self, gender) or self.neutral
 
 
+class ClusterSettings(Model):
+    """What jobs ask of a cluster's scheduler; decides no result."""
+
+    memory_scale: dict[Name, Positive] = {}
+    """Times the memory that a stage's jobs ask for, by stage, "all" = the others; a job that was
+    killed for its memory still comes back with more."""
+    time_scale: dict[Name, Positive] = {}
+    """Times the minutes, likewise."""
+    gpu_partition: str = ""
+    """Partition for the stages that run on a GPU; empty = the one that the profile names."""
+
+    @field_validator("memory_scale", "time_scale")
+    @classmethod
+    def _names_stages(cls, scales: dict[str, float]) -> dict[str, float]:
+        known = ("all", "studio", *STAGES, "dataset")
+        unknown = sorted(set(scales) - set(known))
+        if unknown:
+            raise ValueError(f"{unknown[0]!r} is no stage; expected any of {', '.join(known)}")
+        return scales
+
+
 class Config(Model):
     """config.yaml."""
 
@@ -471,6 +493,8 @@ class Config(Model):
     """Files for other tools."""
     card: CardSettings = CardSettings()
     """The dataset's card."""
+    cluster: ClusterSettings = ClusterSettings()
+    """What jobs ask of a cluster's scheduler."""
     studio: StudioSettings | None = None
     """Virtual recordings to make; absent for real ones."""
 

@@ -21,7 +21,7 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 
 # Folders whose tests share a result that takes minutes: they stay with one worker.
-TOGETHER = ("workflow",)
+TOGETHER = ("workflow", "slurm")
 # Folders and files that start processes, render whole captures or fit whole sequences;
 # `make test-fast` leaves them out, and what is marked `slow` elsewhere.
 SLOW = (
@@ -35,6 +35,7 @@ SLOW = (
     "report",
     "rigid/test_open3d_core.py",
     "scene",
+    "slurm",
     "stages",
     "studio/test_capture.py",
     "studio/test_interactions.py",

@@ -81,7 +81,7 @@ def _settings(
             continue
         lines += [""] if not pad else []
         lines += [f"{pad}# {_meaning(entry, top)}"]
-        if isinstance(values[name], dict):
+        if isinstance(values[name], dict) and values[name]:
             lines.append(f"{pad}{name}:")
             _settings(top, _resolved(entry, top), values[name], pad + "  ", lines)
         else:

@@ -47,19 +47,23 @@ class JobState:
     log: Path
 
 
-def run_workflow(settings: Path, *, cores: int = 0, arguments: Sequence[str] = ()) -> int:
+def run_workflow(
+    settings: Path, *, cores: int = 0, profile: Path | None = None, arguments: Sequence[str] = ()
+) -> int:
     """Bring a project up to date; returns the exit status.
 
-    Where sequences fail, they are named with their reason and the report is made of the others.
-    Raises UserError where settings or tables are wrong.
+    ``profile`` is Snakemake's, a folder that says where and how jobs run. Where sequences fail,
+    they are named with their reason and the report is made of the others. Raises UserError where
+    settings or tables are wrong.
     """
     project = load_project(settings)
     check_bodies(project)
     console = Console(stderr=True)
     if DRY_RUN & set(arguments):
-        return subprocess.call(snakemake_command(settings, cores=cores, arguments=arguments))
+        command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
+        return subprocess.call(command)
     with _alone(project, settings, console):
-        return _run(project, settings, cores, arguments, console)
+        return _run(project, settings, cores, profile, arguments, console)
 
 
 @contextmanager
@@ -103,6 +107,7 @@ def _run(
     project: Project,
     settings: Path,
     cores: int,
+    profile: Path | None,
     arguments: Sequence[str],
     console: Console,
 ) -> int:
@@ -114,7 +119,7 @@ def _run(
         console.print(f"nothing to do: all {count} sequences are done", highlight=False)
         _print_report(project, console)
         return 0
-    command = snakemake_command(settings, cores=cores, arguments=arguments)
+    command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
     watcher = Watcher(project, console)
     status = run_watched(command, watcher, console)
     failures = watcher.failures()
@@ -129,9 +134,8 @@ def _run(
         console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
         targets = [str(project.results / name) for name in AGGREGATES]
         excluded = ",".join([*project.config.exclude, *bad])
-        command = snakemake_command(
-            settings, cores=cores, arguments=[*targets, "--config", f"exclude=[{excluded}]"]
-        )
+        others = [*targets, "--config", f"exclude=[{excluded}]"]
+        command = snakemake_command(settings, cores=cores, profile=profile, arguments=others)
         run_watched(command, Watcher(project, console), console)
     print_remarks(project, console)
     _print_report(project, console)
@@ -149,14 +153,18 @@ def snakemake_command(
     settings: Path,
     *,
     cores: int = 0,
+    profile: Path | None = None,
     arguments: Sequence[str] = (),
 ) -> list[str]:
-    """The command line that runs a project's workflow; ``cores`` 0 = all."""
+    """The command line that runs a project's workflow; ``cores`` 0 = all, or as a profile says."""
+    if profile is not None and not profile.is_dir():
+        raise UserError(f"{profile}: there is no such profile; name a folder, as profiles/slurm")
     return [
         *(sys.executable, "-m", "snakemake"),
         *("--snakefile", str(snakefile())),
         *("--configfile", str(settings)),
-        *("--cores", str(cores) if cores else "all"),
+        *(("--workflow-profile", str(profile)) if profile is not None else ()),
+        *(("--cores", str(cores) if cores else "all") if cores or profile is None else ()),
         *arguments,
     ]
 

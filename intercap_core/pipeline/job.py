@@ -26,6 +26,7 @@ THREAD_VARIABLES = (
 FINISHED = "finished in"
 FAILED = "failed:"
 WARNED = "warning:"
+UNEXPECTED = "unexpected"  # what a failure begins with that is no fault of the input
 
 
 def set_threads(threads: int) -> None:
@@ -60,7 +61,7 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
         raise SystemExit(1) from None
     except Exception as error:
         logger.exception("unexpected error")
-        told = f"unexpected {type(error).__name__}: {str(error).strip() or 'no message'}"
+        told = f"{UNEXPECTED} {type(error).__name__}: {str(error).strip() or 'no message'}"
         logger.error("%s %s", FAILED, told.splitlines()[0])
         _tell(f"{name} failed: {told}; the traceback is in {log}")
         raise SystemExit(1) from None

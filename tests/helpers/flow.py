@@ -16,7 +16,8 @@ from numba.core.caching import _CacheLocator
 from intercap_core.kernel_cache import use_kernel_cache
 
 ROOT = Path(__file__).resolve().parents[2]
-COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core")
+EXECUTOR = "snakemake_executor_plugin_intercap_slurm"
+COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core", EXECUTOR)
 KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache beside the source
 AS_IF_MADE_NOW = """
 import sys

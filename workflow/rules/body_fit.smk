@@ -16,8 +16,9 @@ rule body_fit:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=120,
+        **gpu_of("body_fit"),
+        mem_mb=memory("body_fit"),
+        runtime=duration("body_fit"),
     message:
         "{wildcards.sequence}: fitting the body"
     script:

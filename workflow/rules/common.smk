@@ -1,4 +1,5 @@
 import atexit
+import functools
 import re
 from pathlib import Path
 
@@ -8,6 +9,15 @@ from intercap_core.capture.layouts import input_files
 from intercap_core.errors import UserError
 from intercap_core.imports.file_names import files_of
 from intercap_core.pipeline.plan import DATASET, Plan
+from intercap_core.pipeline.requests import (
+    Extent,
+    extent_of,
+    has_model,
+    memory_mb,
+    minutes,
+    on_gpu,
+    recorded_mb,
+)
 from intercap_core.project import load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
@@ -164,6 +174,45 @@ def results_file(wildcards):
     return [] if named is None else existing(*files_of(named))
 
 
-def memory(megabytes):
-    """Resource: grows with every attempt after a job that was killed for its memory."""
-    return lambda wildcards, attempt: megabytes * attempt
+def length_of(wildcards):
+    """How many frame sets and cameras there are to compute; known exactly once frames are."""
+    if not hasattr(wildcards, "sequence"):
+        return Extent(0, 0)
+    frames = PROJECT.artefact(wildcards.sequence, "frames")
+    changed = frames.stat().st_mtime_ns if frames.exists() else None
+    return length_since(wildcards.sequence, changed)
+
+
+@functools.cache
+def length_since(sequence, changed):
+    """The length of a sequence whose frames artefact was written at ``changed``."""
+    return extent_of(PROJECT, sequence)
+
+
+def memory(stage):
+    """Resource: by frames and cameras, and more with every attempt after a job was killed."""
+
+    def megabytes(wildcards, attempt):
+        return memory_mb(PROJECT, stage, length_of(wildcards), attempt)
+
+    return megabytes
+
+
+def duration(stage):
+    """Resource: minutes, likewise; of the recordings' reader by their bytes."""
+
+    def asked(wildcards, attempt):
+        read = 0.0
+        if stage == "frames":
+            read = recorded_mb(PROJECT.sequences[wildcards.sequence].recordings)
+        return minutes(PROJECT, stage, length_of(wildcards), attempt, read_mb=read)
+
+    return asked
+
+
+def gpu_of(stage):
+    """Resources: a GPU, and the partition that has some, where the settings have the stage use it."""
+    if not on_gpu(PROJECT, stage):
+        return {}
+    partition = SETTINGS.cluster.gpu_partition
+    return {"gpu": 1, **({"slurm_partition": partition} if partition else {})}

@@ -19,8 +19,8 @@ rule dataset:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=60,
+        mem_mb=memory("dataset"),
+        runtime=duration("dataset"),
     message:
         "the site's first page"
     script:

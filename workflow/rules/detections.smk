@@ -9,9 +9,6 @@ DETECTORS = [
     )
     if isinstance(path, Path)
 ]
-WITH_MODEL = bool(
-    SETTINGS.detections.segmentation_model or SETTINGS.detections.keypoint_model
-)
 MODEL_THREADS = 8
 
 
@@ -31,10 +28,11 @@ rule detections:
         f"{BENCHMARKS}/{{sequence}}/detections.tsv"
     conda:
         ENVIRONMENT
-    threads: MODEL_THREADS if WITH_MODEL else 1
+    threads: MODEL_THREADS if has_model(PROJECT) else 1
     resources:
-        mem_mb=memory(4000 if WITH_MODEL else 1500),
-        runtime=240 if WITH_MODEL else 30,
+        **gpu_of("detections"),
+        mem_mb=memory("detections"),
+        runtime=duration("detections"),
     message:
         "{wildcards.sequence}: reading keypoints and candidates"
     script:

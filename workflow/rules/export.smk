@@ -15,8 +15,8 @@ rule export:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=30,
+        mem_mb=memory("export"),
+        runtime=duration("export"),
     message:
         "{wildcards.sequence}: exporting"
     script:

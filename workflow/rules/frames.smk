@@ -10,8 +10,8 @@ rule broken_annotation:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(500),
-        runtime=5,
+        mem_mb=memory("annotation"),
+        runtime=duration("annotation"),
     message:
         "{wildcards.sequence}: checking the annotation"
     script:
@@ -35,8 +35,8 @@ rule frames:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(2000),
-        runtime=60,
+        mem_mb=memory("frames"),
+        runtime=duration("frames"),
     message:
         "{wildcards.sequence}: reading and synchronising the recordings"
     script:

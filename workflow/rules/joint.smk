@@ -19,8 +19,9 @@ rule joint:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(6000),
-        runtime=120,
+        **gpu_of("joint"),
+        mem_mb=memory("joint"),
+        runtime=duration("joint"),
     message:
         "{wildcards.sequence}: refining body and object together"
     script:

@@ -16,8 +16,8 @@ rule metrics:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=60,
+        mem_mb=memory("metrics"),
+        runtime=duration("metrics"),
     message:
         "{wildcards.sequence}: measuring"
     script:

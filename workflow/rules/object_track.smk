@@ -15,8 +15,9 @@ rule object_track:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(4000),
-        runtime=120,
+        **gpu_of("object_track"),
+        mem_mb=memory("object_track"),
+        runtime=duration("object_track"),
     message:
         "{wildcards.sequence}: tracking the object"
     script:

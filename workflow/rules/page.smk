@@ -22,8 +22,8 @@ rule page:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=30,
+        mem_mb=memory("page"),
+        runtime=duration("page"),
     message:
         "{wildcards.sequence}: drawing the page"
     script:

@@ -14,8 +14,8 @@ rule person:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(2000),
-        runtime=30,
+        mem_mb=memory("person"),
+        runtime=duration("person"),
     message:
         "{wildcards.sequence}: finding the subject in all views"
     script:

@@ -14,8 +14,8 @@ rule scene:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=60,
+        mem_mb=memory("scene"),
+        runtime=duration("scene"),
     message:
         "{wildcards.sequence}: refining the cameras, finding the floor"
     script:

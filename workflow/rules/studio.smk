@@ -22,8 +22,8 @@ rule studio:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(3000),
-        runtime=60,
+        mem_mb=memory("studio"),
+        runtime=duration("studio"),
     message:
         "{wildcards.sequence}: making a virtual recording"
     script:

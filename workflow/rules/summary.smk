@@ -13,8 +13,8 @@ rule summary:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=memory(1500),
-        runtime=10,
+        mem_mb=memory("summary"),
+        runtime=duration("summary"),
     message:
         "{wildcards.sequence}: summing up"
     script:

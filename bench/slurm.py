@@ -1,0 +1,57 @@
+"""`make test-slurm`: the workflow on a real Slurm of this machine's own, and what goes wrong there.
+
+Runs the tests of ``tests/slurm`` in full and adds to results/bench.json ``slurm.faults_tried`` and
+``slurm.faults_survived``, and ``slurm.overhead_s_per_job``: seconds of a job beside its stage's
+own, from its submission to the moment when its end is known.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from xml.etree import ElementTree
+
+from bench.command import add_figures
+
+OUTPUT = Path("results/bench.json")
+
+
+def figures(report: Path) -> dict[str, float]:
+    """From what pytest wrote about each test: its outcome, and what it recorded."""
+    tried, survived, overhead = 0, 0, {}
+    for case in ElementTree.parse(report).iter("testcase"):
+        recorded = {one.get("name"): one.get("value") for one in case.iter("property")}
+        bad = any(case.find(word) is not None for word in ("failure", "error", "skipped"))
+        if "fault" in recorded:
+            tried += 1
+            survived += not bad
+            print(f"{'not survived' if bad else 'survived'}: {recorded['fault']}")
+        if "overhead_s" in recorded and not bad:
+            overhead = {"overhead_s_per_job": float(str(recorded["overhead_s"]))}
+    return {"faults_tried": tried, "faults_survived": survived, **overhead}
+
+
+def main() -> int:
+    """Run the tests; returns their exit status, 1 where there is no Slurm to run them on."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.xml"
+        command = [sys.executable, "-m", "pytest", "-n0", "-rs", "tests/slurm"]
+        status = subprocess.call(
+            [*command, f"--junitxml={report}", *sys.argv[1:]],
+            env={**os.environ, "INTERCAP_TEST_SLURM": "1"},
+        )
+        measured = figures(report)
+    if not measured["faults_tried"]:
+        print("no fault was tried: Slurm cannot be started here (see above)", file=sys.stderr)
+        return status or 1
+    add_figures(OUTPUT, "slurm", measured)
+    for name, value in measured.items():
+        print(f"slurm.{name}: {value:g}")
+    return status
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

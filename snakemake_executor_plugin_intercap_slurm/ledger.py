@@ -1,0 +1,108 @@
+"""Which Slurm job computes what: a small file a job, for the run that comes after a killed one."""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Collection, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+Stamp = tuple[int, int]  # time of change in nanoseconds, and size
+
+
+def run_name(prefix: str | None) -> str:
+    """Slurm's name for the jobs of this folder and user: the same for every run."""
+    place = f"{getpass.getuser()}:{Path.cwd().resolve()}"
+    name = str(uuid.uuid5(uuid.NAMESPACE_URL, place))
+    return f"{prefix}_{name}" if prefix else name
+
+
+def stamp(path: str | os.PathLike[str]) -> Stamp | None:
+    """Time and size of a file or folder; None where there is none."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+def members(job: Any) -> list[Any]:
+    """The jobs of a group in their order; a single job alone."""
+    return list(job) if job.is_group() else [job]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job by the files that it writes; ``digest`` tells whether it is still what is asked for.
+
+    ``logs`` are the stamps that its stages' logs had before it was submitted, by path.
+    """
+
+    outputs: tuple[str, ...]
+    digest: str
+    logs: dict[str, Stamp | None]
+    slurm_id: str = ""
+    slurm_log: str = ""
+
+    @classmethod
+    def of(cls, job: Any) -> Entry:
+        """Of a job that is about to be submitted."""
+        parts = members(job)
+        outputs = sorted({str(path) for part in parts for path in part.output})
+        asked = [
+            [(part.rule.name, sorted(map(repr, part.params.items()))) for part in parts],
+            sorted((str(path), stamp(path)) for path in job.input if str(path) not in outputs),
+        ]
+        logs = {str(path): stamp(path) for part in parts for path in part.log}
+        return cls(tuple(outputs), hashlib.sha256(repr(asked).encode()).hexdigest(), logs)
+
+    def submitted(self, slurm_id: str, slurm_log: str) -> Entry:
+        return replace(self, slurm_id=slurm_id, slurm_log=slurm_log)
+
+
+class Ledger:
+    """The entries of a folder's jobs, each in the file ``<number of the Slurm job>.json``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def write(self, entry: Entry) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        part = self._folder / f".{entry.slurm_id}.part"
+        part.write_text(json.dumps(asdict(entry)), encoding="utf-8")
+        part.replace(self._file(entry.slurm_id))
+
+    def remove(self, slurm_id: str) -> None:
+        self._file(slurm_id).unlink(missing_ok=True)
+
+    def keep(self, live: Collection[str]) -> list[Entry]:
+        """The entries of jobs that live; those of the others are removed."""
+        kept = []
+        for path in sorted(self._folder.glob("*.json")):
+            if path.stem in live and (entry := _read(path)) is not None:
+                kept.append(entry)
+            else:
+                path.unlink(missing_ok=True)
+        return kept
+
+    def _file(self, slurm_id: str) -> Path:
+        return self._folder / f"{slurm_id}.json"
+
+
+def by_outputs(entries: Iterable[Entry]) -> dict[tuple[str, ...], Entry]:
+    return {entry.outputs: entry for entry in entries}
+
+
+def _read(path: Path) -> Entry | None:
+    """An entry; None where the file is damaged."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        logs = {name: tuple(value) if value else None for name, value in values["logs"].items()}
+        return Entry(**{**values, "outputs": tuple(values["outputs"]), "logs": logs})
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return None

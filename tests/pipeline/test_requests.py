@@ -1,0 +1,115 @@
+"""What jobs ask of a scheduler: more for more, more with every attempt, whatever a user raises."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from intercap_core.config import FramesSettings
+from intercap_core.errors import UserError
+from intercap_core.pipeline.requests import (
+    CUDA_MB,
+    NEEDS,
+    Extent,
+    extent_of,
+    memory_mb,
+    minutes,
+    on_gpu,
+    recorded_mb,
+)
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import STAGES
+from intercap_core.stages import frames
+from tests.conftest import PROJECT_ROOT
+from tests.helpers.plain_capture import CAMERAS, plain_entry, write_rig
+
+SHORT, LONG, FEW = Extent(45, 6), Extent(1000, 6), Extent(1000, 2)
+# Largest resident set of the stage's process, MB: frames, cameras, measured.
+MEASURED = [
+    ("frames", 45, 6, 160), ("detections", 45, 6, 138), ("person", 300, 6, 494),
+    ("scene", 45, 3, 390), ("scene", 300, 6, 541),
+    ("object_track", 45, 3, 429), ("object_track", 300, 6, 1211),
+    ("body_fit", 45, 3, 562), ("body_fit", 300, 6, 1208),
+    ("joint", 45, 3, 767), ("joint", 300, 6, 1963), ("joint", 1000, 6, 4400),
+    ("metrics", 45, 6, 986), ("summary", 300, 6, 383), ("page", 45, 6, 772),
+    ("export", 45, 6, 648),
+]  # fmt: skip
+
+
+def project(**settings: object) -> Project:
+    return load_project(PROJECT_ROOT / "config" / "test" / "config.yaml", settings)
+
+
+@pytest.mark.parametrize(("stage", "frames", "cameras", "peak"), MEASURED)
+def test_what_was_measured_fits_with_a_margin(
+    stage: str, frames: int, cameras: int, peak: int
+) -> None:
+    asked = memory_mb(project(), stage, Extent(frames, cameras))
+    assert 1.25 * peak + 230 < asked < 2.5 * peak + 500
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_longer_recordings_ask_for_no_less_and_every_attempt_for_more(stage: str) -> None:
+    tiny = project()
+    for ask in (memory_mb, minutes):
+        assert ask(tiny, stage, SHORT) <= ask(tiny, stage, FEW) <= ask(tiny, stage, LONG)
+        first = ask(tiny, stage, LONG)
+        assert ask(tiny, stage, LONG, 3) == 3 * first
+
+
+def test_what_a_user_raises_still_grows() -> None:
+    raised = project(cluster={"memory_scale": {"joint": 2, "all": 1.5}, "time_scale": {"joint": 3}})
+    for stage, times in (("joint", 2), ("metrics", 1.5)):
+        for attempt in (1, 2, 3):
+            asked = memory_mb(raised, stage, LONG, attempt)
+            assert asked == pytest.approx(times * memory_mb(project(), stage, LONG, attempt), abs=3)
+    assert minutes(raised, "joint", LONG) == pytest.approx(
+        3 * minutes(project(), "joint", LONG), abs=3
+    )
+    assert minutes(raised, "metrics", LONG) == minutes(project(), "metrics", LONG)
+
+
+def test_stages_on_a_gpu_are_those_of_the_settings() -> None:
+    def found(**settings: object) -> set[str]:
+        return {stage for stage in NEEDS if on_gpu(project(**settings), stage)}
+
+    assert found() == set()
+    assert found(device="cuda") == {"body_fit", "joint"}
+    assert found(object_track={"render_on": "cuda"}) == {"object_track"}
+    # without a model nothing runs on it
+    assert found(detections={"keypoint_device": "cuda"}) == set()
+    more = memory_mb(project(device="cuda"), "joint", SHORT) - memory_mb(project(), "joint", SHORT)
+    assert more == CUDA_MB
+
+
+def test_the_extent_of_a_virtual_recording_is_that_of_its_settings() -> None:
+    assert extent_of(project(), "cup_drink_s04") == Extent(6, 3)
+
+
+def test_the_extent_of_frames_that_are_read_is_theirs(tmp_path: Path) -> None:
+    write_rig(tmp_path, (8, 6), 5.0)
+    for number, name in itertools.product(range(4), CAMERAS):
+        image = np.full((6, 8, 3), 40 * number, np.uint8)
+        cv2.imwrite(str(tmp_path / "recordings" / name / f"{number}.png"), image)
+    frames.run(sequence=plain_entry(tmp_path), output=tmp_path / "f.h5", settings=FramesSettings())
+    read = SimpleNamespace(artefact=lambda sequence, stage: tmp_path / "f.h5")
+    assert extent_of(read, "s1") == Extent(4, 2)
+
+
+def test_megabytes_of_recordings_are_those_of_videos(tmp_path: Path) -> None:
+    assert recorded_mb(tmp_path / "missing") == 0
+    for name in ("k1.mkv", "k2.mkv", "notes.txt"):
+        (tmp_path / name).write_bytes(b"0" * 500_000)
+    assert recorded_mb(tmp_path) == 1.0
+    tiny = project()
+    assert minutes(tiny, "frames", SHORT, read_mb=40_000) > 60 + minutes(tiny, "frames", SHORT)
+
+
+def test_a_factor_of_no_stage_is_refused() -> None:
+    with pytest.raises(UserError, match="'jiont' is no stage; expected any of all, studio, frames"):
+        project(cluster={"memory_scale": {"jiont": 2}})

@@ -1,0 +1,277 @@
+"""The small dataset as Slurm jobs, and what goes wrong on clusters: one command goes on, the bytes
+are those of a local run, and nothing that was complete is computed again.
+
+`make test-slurm` runs these; `fault` names what was tried in its figures.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from intercap_core.stage_list import STAGES
+from tests.helpers.cluster_run import PROFILE, ClusterRun, contents, written
+from tests.helpers.flow import ONE, OTHER, Flow
+from tests.helpers.loopback_slurm import NODES, LoopbackSlurm
+
+pytestmark = pytest.mark.usefixtures("everything")
+
+# Of two sequences on two nodes these never wait for a node; then two jobs of each go side by side.
+CHAIN = ("frames", "detections", "scene", "person")
+Record = Callable[[str, object], None]
+
+
+@pytest.fixture(scope="module")
+def local(everything: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """All files of a run on this machine alone."""
+    flow = Flow.copy(tmp_path_factory.mktemp("local"))
+    done = flow.run()
+    assert done.returncode == 0, done.stderr[-3000:]
+    return contents(flow.results)
+
+
+@pytest.fixture(scope="module")
+def run(everything: None, slurm: LoopbackSlurm, tmp_path_factory: pytest.TempPathFactory):
+    """A finished run of the same as Slurm jobs. Tests leave it as they found it."""
+    run = ClusterRun(Flow.copy(tmp_path_factory.mktemp("cluster")), slurm)
+    with overheads(run) as seconds:
+        run.start().ends_well()
+    (run.flow.folder / "overheads.txt").write_text("\n".join(map(str, seconds)))
+    return run
+
+
+@contextlib.contextmanager
+def overheads(run: ClusterRun) -> Iterator[list[float]]:
+    """Seconds of each job of the chain beside its stage's own: from its entry in the ledger to the
+    moment when Snakemake knows that it has ended."""
+    entries = run.flow.folder / ".snakemake" / "slurm_jobs"
+    appeared: dict[str, tuple[float, str]] = {}
+    seconds: list[float] = []
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.1):
+            there = {path.stem: path for path in entries.glob("*.json")}
+            for number, path in there.items():
+                with contextlib.suppress(OSError):
+                    appeared.setdefault(number, (time.monotonic(), path.read_text()))
+            for number in appeared.keys() - there.keys():
+                start, text = appeared.pop(number)
+                found = re.search(r'"(logs/[^"]*/(\w+)\.log)"', text)
+                if found and found[2] in CHAIN:
+                    log = (run.flow.folder / found[1]).read_text()
+                    own = float(re.findall(r"finished in ([\d.]+) s", log)[-1])
+                    seconds.append(time.monotonic() - start - own)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield seconds
+    finally:
+        ended.set()
+        watcher.join()
+
+
+@contextlib.contextmanager
+def computed_anew(run: ClusterRun, local: dict[str, bytes], *stages: str) -> Iterator[list[str]]:
+    """Within the block these artefacts of one sequence are missing; after it they are there again,
+    with the bytes of a local run, and no other was touched. Gives the targets of a run."""
+    paths = [run.flow.artefact(ONE, stage) for stage in stages]
+    names = {path.relative_to(run.flow.results).as_posix() for path in paths}
+    for path in paths:
+        path.unlink()
+    kept = written(run.flow.results)
+    yield [run.target(ONE, stage) for stage in stages]
+    assert {name: (run.flow.results / name).read_bytes() for name in names} == {
+        name: local[name] for name in names
+    }
+    now = written(run.flow.results)
+    assert {name: now[name] for name in kept} == kept
+
+
+def numbers(run: ClusterRun, *words: str) -> set[str]:
+    return set(run.slurm.submitted_for(*words))
+
+
+def job_runs(run: ClusterRun, stage: str) -> tuple[str, str]:
+    """Number and node of this stage's job, as soon as its stage computes."""
+    log = run.flow.folder / "logs" / "test" / ONE / f"{stage}.log"
+    start = time.time()
+    found = run.slurm.wait_for(
+        lambda: run.slurm.running(f"rule_{stage}_", ONE), f"{stage} runs", within=300
+    )
+    run.slurm.wait_for(
+        lambda: log.exists() and log.stat().st_mtime >= start - 1.0,
+        f"{stage} has begun",
+        within=300,
+    )
+    return found
+
+
+def test_the_same_bytes_as_on_one_machine(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    found = contents(run.flow.results)
+    assert found.keys() == local.keys()
+    assert {name for name in local if found[name] != local[name]} == set()
+    jobs = run.slurm.jobs(ended=True)
+    assert {state for state, _, _ in jobs.values()} == {"COMPLETED"}
+    assert len(jobs) == 2 * (1 + len(STAGES)) + 1  # the studio; the dataset
+    seconds = [float(line) for line in (run.flow.folder / "overheads.txt").read_text().split()]
+    assert len(seconds) == 2 * len(CHAIN)
+    record_property("overhead_s", sum(seconds) / len(seconds))
+
+
+def test_nothing_is_left_to_do(run: ClusterRun) -> None:
+    before = run.slurm.jobs(ended=True).keys()
+    assert "Nothing to be done" in run.start().ends_well()
+    assert run.slurm.jobs(ended=True).keys() == before
+
+
+def test_memory(run: ClusterRun, local: dict[str, bytes], record_property: Record) -> None:
+    record_property("fault", "a job killed for its memory")
+    before = numbers(run, "rule_joint_", ONE)
+    with computed_anew(run, local, "joint") as targets:
+        scale = "cluster={memory_scale: {joint: 0.4}}"
+        said = run.start(*targets, "--config", scale).ends_well()
+    assert "exceeded memory limit" in said
+    assert len(numbers(run, "rule_joint_", ONE) - before) in (2, 3)
+
+
+def test_cancelled(run: ClusterRun, local: dict[str, bytes], record_property: Record) -> None:
+    record_property("fault", "a job cancelled")
+    before = numbers(run, "rule_joint_", ONE)
+    with computed_anew(run, local, "joint") as targets:
+        started = run.start(*targets)
+        number, _ = job_runs(run, "joint")
+        run.slurm.command("scancel", number)
+        said = started.ends_well()
+    assert f"Slurm job {number}, {ONE}: joint: ended without a word: CANCELLED" in said
+    assert len(numbers(run, "rule_joint_", ONE) - before) == 2
+
+
+def test_node_down_and_back(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    record_property("fault", "a node down and back")
+    with computed_anew(run, local, "joint") as targets:
+        started = run.start(*targets)
+        number, node = job_runs(run, "joint")
+        run.slurm.kill(node)
+        for process in processes_of(run, number):
+            os.kill(process, signal.SIGKILL)
+        run.slurm.wait_for(lambda: node not in run.slurm.idle_nodes(), "the node is down")
+        run.slurm.start_one(node)
+        started.ends_well()
+    run.slurm.wait_for(lambda: run.slurm.idle_nodes() == set(NODES), "the node is back")
+
+
+def processes_of(run: ClusterRun, number: str) -> list[int]:
+    """The processes of a job, and Slurm's own that looks after them."""
+    of_this = f"SLURM_CONF={run.environment['SLURM_CONF']}".encode()
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            environment = (folder / "environ").read_bytes().split(b"\0")
+            command = (folder / "cmdline").read_bytes()
+            inside = f"SLURM_JOB_ID={number}".encode() in environment
+            if (of_this in environment and inside) or (
+                command.startswith(f"slurmstepd: [{number}.".encode())
+            ):
+                found.append(int(folder.name))
+    return found
+
+
+def test_controller_restarted(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    record_property("fault", "the controller down for half a minute while a job ends")
+    before = numbers(run, ONE)
+    with computed_anew(run, local, "joint", "metrics") as targets:
+        started = run.start(*targets)
+        job_runs(run, "joint")
+        run.slurm.kill("slurmctld")
+        time.sleep(30.0)
+        run.slurm.start_one("slurmctld")
+        started.ends_well()
+    assert len(numbers(run, ONE) - before) == 2
+
+
+def test_submitter_killed(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    record_property("fault", "Snakemake killed and started again while its job runs on")
+    before = numbers(run, ONE)
+    with computed_anew(run, local, "joint", "metrics") as targets:
+        started = run.start(*targets)
+        number, _ = job_runs(run, "joint")
+        started.kill()
+        run.unlock()
+        said = run.start(*targets).ends_well()
+    assert f"Slurm job {number} of an earlier run computes" in said
+    assert len(numbers(run, ONE) - before) == 2
+
+
+def test_submitter_killed_and_the_input_edited(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    record_property("fault", "Snakemake killed, its job's settings edited before it ended")
+    other = ("--config", "joint={contact_weight: 2}")
+    with computed_anew(run, local, "joint") as targets:
+        started = run.start(*targets, *other)
+        number, _ = job_runs(run, "joint")
+        started.kill()
+        run.unlock()
+        said = run.start(*targets).ends_well()
+    assert f"Slurm job {number} of an earlier run computes" in said
+    assert "it is cancelled" in said
+    assert run.slurm.jobs(ended=True)[number][0] == "CANCELLED"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here the stage would find a GPU")
+def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, bytes]) -> None:
+    """Slurm believes that a node has one; that PyTorch finds none there is told once."""
+    before = numbers(run, "rule_body_fit_", ONE)
+    with computed_anew(run, local, "body_fit") as targets:
+        on_gpu = ("--config", "device=cuda", "cluster={gpu_partition: gpu}")
+        started = run.start(*targets, *on_gpu)
+        assert started.process.wait(300) == 1
+        assert f"{ONE}: body_fit: failed: config/test/config.yaml: device is cuda" in started.said
+        (number,) = numbers(run, "rule_body_fit_", ONE) - before
+        assert (
+            run.slurm.command("squeue", "-h", "-t", "all", "-j", number, "-o", "%P").strip()
+            == "gpu"
+        )
+        assert "gres/gpu=1" in run.slurm.command("scontrol", "show", "job", number)
+        run.start(*targets).ends_well()
+
+
+def test_a_broken_annotation_fails_once_and_alone(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    record_property("fault", "one sequence's annotation broken")
+    annotation = run.flow.annotation(OTHER)
+    annotation.parent.mkdir(exist_ok=True)
+    annotation.write_text("floor: [[\n")
+    before, kept = run.slurm.jobs(ended=True).keys(), written(run.flow.results)
+    started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
+    assert started.process.wait(600) == 1, started.said
+    assert "not valid YAML" in started.said
+    assert f"the report leaves out {OTHER}" in started.said
+    jobs = run.slurm.jobs(ended=True)
+    new = sorted(jobs[number][1] for number in jobs.keys() - before)
+    assert new == [f"rule_broken_annotation_wildcards_{OTHER}", "rule_dataset"]
+    assert "not valid YAML" in (run.flow.results / "site" / "index.html").read_text()
+    assert written(run.flow.results) == kept
+    annotation.unlink()
+    run.start().ends_well()
+    assert contents(run.flow.results) == local
