@@ -167,28 +167,34 @@ def test_node_down_and_back(
         started = run.start(*targets)
         number, node = job_runs(run, "joint")
         run.slurm.kill(node)
-        for process in processes_of(run, number):
-            os.kill(process, signal.SIGKILL)
+        computing = processes_of(run, number)
+        send(signal.SIGKILL, [*processes_of(run, number, keepers=True), *computing])
         run.slurm.wait_for(lambda: node not in run.slurm.idle_nodes(), "the node is down")
         run.slurm.start_one(node)
         started.ends_well()
     run.slurm.wait_for(lambda: run.slurm.idle_nodes() == set(NODES), "the node is back")
 
 
-def processes_of(run: ClusterRun, number: str) -> list[int]:
-    """The processes of a job, and Slurm's own that looks after them."""
-    of_this = f"SLURM_CONF={run.environment['SLURM_CONF']}".encode()
+def processes_of(run: ClusterRun, number: str, *, keepers: bool = False) -> list[int]:
+    """The processes that compute a job; or Slurm's own that look after it."""
+    own = f"slurmstepd: [{number}.".encode()
+    here = f"SLURM_CONF={run.environment['SLURM_CONF']}".encode()
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            environment = (folder / "environ").read_bytes().split(b"\0")
+            environment = set((folder / "environ").read_bytes().split(b"\0"))
             command = (folder / "cmdline").read_bytes()
-            inside = f"SLURM_JOB_ID={number}".encode() in environment
-            if (of_this in environment and inside) or (
-                command.startswith(f"slurmstepd: [{number}.".encode())
-            ):
+            of_job = f"SLURM_JOB_ID={number}".encode() in environment
+            wanted = command.startswith(own) if keepers else of_job and b"slurmstepd" not in command
+            if here in environment and wanted:
                 found.append(int(folder.name))
     return found
+
+
+def send(number: signal.Signals, processes: list[int]) -> None:
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, number)
 
 
 def test_controller_restarted(
@@ -214,10 +220,15 @@ def test_submitter_killed(
     with computed_anew(run, local, "joint", "metrics") as targets:
         started = run.start(*targets)
         number, _ = job_runs(run, "joint")
+        processes = processes_of(run, number)
+        send(signal.SIGSTOP, processes)  # so that it cannot end before it is found
         started.kill()
         run.unlock()
-        said = run.start(*targets).ends_well()
-    assert f"Slurm job {number} of an earlier run computes" in said
+        again = run.start(*targets)
+        found = f"Slurm job {number} of an earlier run computes"
+        run.slurm.wait_for(lambda: found in again.said, "the job is found", within=300)
+        send(signal.SIGCONT, processes)
+        assert "it is waited for" in again.ends_well()
     assert len(numbers(run, ONE) - before) == 2
 
 
@@ -229,6 +240,7 @@ def test_submitter_killed_and_the_input_edited(
     with computed_anew(run, local, "joint") as targets:
         started = run.start(*targets, *other)
         number, _ = job_runs(run, "joint")
+        send(signal.SIGSTOP, processes_of(run, number))
         started.kill()
         run.unlock()
         said = run.start(*targets).ends_well()
@@ -245,13 +257,14 @@ def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, by
         on_gpu = ("--config", "device=cuda", "cluster={gpu_partition: gpu}")
         started = run.start(*targets, *on_gpu)
         assert started.process.wait(300) == 1
-        assert f"{ONE}: body_fit: failed: config/test/config.yaml: device is cuda" in started.said
+        assert f"{ONE}: body_fit: failed: " in started.said
+        assert "config/test/config.yaml: device is cuda, but PyTorch finds no" in started.said
         (number,) = numbers(run, "rule_body_fit_", ONE) - before
         assert (
             run.slurm.command("squeue", "-h", "-t", "all", "-j", number, "-o", "%P").strip()
             == "gpu"
         )
-        assert "gres/gpu=1" in run.slurm.command("scontrol", "show", "job", number)
+        assert "gres:gpu:1" in run.slurm.command("scontrol", "show", "job", number)
         run.start(*targets).ends_well()
 
 
