@@ -8,7 +8,7 @@ from snakemake.exceptions import WorkflowError
 from intercap_core.capture.layouts import input_files
 from intercap_core.errors import UserError
 from intercap_core.imports.file_names import files_of
-from intercap_core.pipeline.plan import DATASET, Plan
+from intercap_core.pipeline.plan import DATASET, STUDIO, Plan
 from intercap_core.pipeline.requests import (
     Extent,
     extent_of,
@@ -72,16 +72,20 @@ def made_by_studio(wildcards, name):
 
 
 def recorded(column):
-    """Input function: what the sequence's row says under ``column``, or the studio made for it."""
+    """Input function: what the sequence's row says under ``column``, or the studio made for it.
+
+    Their dates do not count, but those of what the studio makes anew.
+    """
 
     def files(wildcards):
         made = made_by_studio(wildcards, column)
         if made is not None:
-            return made
+            anew = PLAN.is_stale(wildcards.sequence, STUDIO)
+            return made if anew else ancient(made)
         row = PROJECT.sequences[wildcards.sequence]
         if column == "recordings":
-            return input_files(row)
-        return existing(getattr(row, column))
+            return ancient(input_files(row))
+        return ancient(existing(getattr(row, column)))
 
     return files
 

@@ -16,8 +16,8 @@ rule detections:
     """Keypoints and segmentation candidates, from files or from a model."""
     input:
         unpack(artefacts_read("detections")),
-        keypoints=ancient(recorded("keypoints")),
-        candidates=ancient(recorded("candidates")),
+        keypoints=recorded("keypoints"),
+        candidates=recorded("candidates"),
         detectors=ancient(existing(*DETECTORS)),
         mark=out_of_date("detections"),
     output:

@@ -21,8 +21,8 @@ rule broken_annotation:
 rule frames:
     """Recordings to synchronised frame sets."""
     input:
-        recordings=ancient(recorded("recordings")),
-        calibration=ancient(recorded("calibration")),
+        recordings=recorded("recordings"),
+        calibration=recorded("calibration"),
         annotation=ancient(annotation_input),
         mark=out_of_date("frames"),
     output:

@@ -2,7 +2,7 @@ rule metrics:
     """Distances, penetration, and errors against truth where it is known."""
     input:
         unpack(artefacts_read("metrics")),
-        truth=ancient(recorded("truth")),
+        truth=recorded("truth"),
         object=ancient(object_files),
         body=ancient(body_file),
         mark=out_of_date("metrics"),

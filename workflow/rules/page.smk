@@ -4,7 +4,7 @@ rule page:
         unpack(artefacts_read("page")),
         object=ancient(object_files),
         body=ancient(body_file),
-        truth=ancient(recorded("truth")),
+        truth=recorded("truth"),
         annotation=ancient(annotation_input),
         mark=out_of_date("page"),
     output:
