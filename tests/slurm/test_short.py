@@ -54,7 +54,7 @@ def test_a_job_killed_for_its_memory_comes_back_with_more(
     # Less than half of what Python and its libraries take; by a user's factor, which still grows
     scale = "cluster={memory_scale: {frames: 0.3}}"
     said = tiny.start(tiny.target(NAME, "frames"), "--config", scale).ends_well()
-    asked = asked_mb(slurm, slurm.submitted_for("rule_frames"))
+    asked = asked_mb(slurm, slurm.submitted_for("rule_frames", NAME))
     assert len(asked) in (2, 3)
     assert asked[1:] == [asked[0] * attempt for attempt in range(2, 1 + len(asked))]
     lines = [line for line in said.splitlines() if f"{NAME}: frames: " in line]
@@ -67,7 +67,7 @@ def test_a_mistake_is_submitted_once_and_told(tiny: ClusterRun, slurm: LoopbackS
     kept = written(tiny.flow.results)
     started = tiny.start(tiny.target(NAME, "scene"))
     assert started.process.wait(300) == 1
-    assert len(slurm.submitted_for("rule_detections")) == 1, started.said
+    assert len(slurm.submitted_for("rule_detections", NAME)) == 1, started.said
     assert f"{NAME}: detections: failed: sequence {NAME}: no detections for any" in started.said
     assert "It is not tried again" in started.said
     assert written(tiny.flow.results) == kept
