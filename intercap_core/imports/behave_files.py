@@ -24,6 +24,7 @@ from intercap_core.errors import UserError
 from intercap_core.imports.constants import PERSON_EXTENT_M
 from intercap_core.imports.file_names import BEHAVE_OBJECT, BEHAVE_PERSON
 from intercap_core.imports.results import check_metres, check_radians
+from intercap_core.inputs.arrays import read_arrays
 
 _PERSON, _OBJECT_FIT = "person", "fit01"
 _VERTICES = 6890  # of SMPL and SMPL-H
@@ -156,11 +157,7 @@ def _named(path: Path) -> Mapping[str, Any]:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as .npz ({error}); get the file again") from None
+    return read_arrays(path, advice="get the file again")
 
 
 def _numbers(values: Mapping[str, Any], name: str, path: Path) -> np.ndarray:

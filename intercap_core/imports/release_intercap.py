@@ -13,6 +13,7 @@ from intercap_core import safe_pickle
 from intercap_core.errors import UserError
 from intercap_core.imports.file_names import INTERCAP, intercap_file
 from intercap_core.imports.results import Results, check_metres, check_radians
+from intercap_core.inputs.arrays import read_arrays
 
 _HANDS = 45  # numbers of a hand's full pose; fewer are components
 _TURNS = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
@@ -52,13 +53,7 @@ def read_results(path: Path) -> Results:
 
 
 def _load(path: Path) -> Any:
-    if path.suffix == ".npz":
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path}: cannot be read as .npz ({error})") from None
-    return safe_pickle.load(path)
+    return read_arrays(path) if path.suffix == ".npz" else safe_pickle.load(path)
 
 
 def _stacked(loaded: Any, path: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from intercap_core.body.loading import OPEN_BODY, load_body_file
 from intercap_core.body.maps import load_maps, maps_path
 from intercap_core.body.vposer import VPoser
 from intercap_core.config import ObjectEntry
-from intercap_core.imports.results import read_results
+from intercap_core.imports.release_intercap import read_results
 from intercap_core.rigid.contact_vertices import contact_list, read_contact_vertices
 from intercap_core.rigid.mesh import ObjectMesh, colours_of
 from intercap_core.rigid.mesh_files import load_mesh

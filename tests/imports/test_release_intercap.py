@@ -116,5 +116,5 @@ def test_folders_and_files_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot be read"):
         read_results(tmp_path / "none.pkl")
     (tmp_path / "res.npz").write_bytes(b"no")
-    with pytest.raises(UserError, match=r"cannot be read as \.npz"):
+    with pytest.raises(UserError, match=r"is not a readable \.npz archive"):
         read_results(tmp_path / "res.npz")
