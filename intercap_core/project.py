@@ -73,12 +73,12 @@ class Project:
         """Folder of the pages, which can be given away as it is."""
         return self.results / "site"
 
-    def annotation(self, sequence: str) -> Annotation:
+    def annotation(self, sequence: str, *, look_at_frames: bool = True) -> Annotation:
         """Load this sequence's annotation; empty where there is no file.
 
         Raises UserError naming file and field where the file is broken or the sequence's row names
         one that is not there, or where an entry lies past the end of the recording (as soon as its
-        frames have been read).
+        frames have been read, and unless ``look_at_frames`` is False).
         """
         path = self.annotation_path(sequence)
         if not path.exists():
@@ -95,6 +95,8 @@ class Project:
                 f"{path}: {problem}; remove the section, or name the object of sequence "
                 f"{sequence!r} in the table"
             )
+        if not look_at_frames:
+            return annotation
         with contextlib.suppress(artefacts.Unreadable):
             with artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source:
                 count, names = len(source["times"]), source.text("camera_names")

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+MARKS = "out_of_date"  # folder of the marks of outputs that are to be made anew
 Stamp = tuple[int, int]  # time of change in nanoseconds, and size
 
 
@@ -56,7 +57,12 @@ class Entry:
         outputs = sorted({str(path) for part in parts for path in part.output})
         asked = [
             [(part.rule.name, sorted(map(repr, part.params.items()))) for part in parts],
-            sorted((str(path), stamp(path)) for path in job.input if str(path) not in outputs),
+            sorted(
+                (str(path), stamp(path))
+                for path in job.input
+                # a mark is as old as the run that sets it; what it stands for is in the params
+                if str(path) not in outputs and MARKS not in Path(path).parts
+            ),
         ]
         logs = {str(path): stamp(path) for part in parts for path in part.log}
         return cls(tuple(outputs), hashlib.sha256(repr(asked).encode()).hexdigest(), logs)

@@ -151,6 +151,14 @@ def read_poses(folder: Path) -> Extrinsics:
     return Extrinsics(MASTER, placed(folder, MASTER, world_from_colour).master_from_colour)
 
 
+def intrinsics_of(calibration: Path) -> Path | None:
+    """The folder ``intrinsics`` in ``calibration`` (``calibs/<date>/config``), or up to two folders
+    above; None where there is none."""
+    above = calibration.resolve()
+    places = [above / "intrinsics", above.parent / "intrinsics", above.parents[1] / "intrinsics"]
+    return next((place for place in places if place.is_dir()), None)
+
+
 def read_lens(calibration: Path, number: int) -> Intrinsics:
     """Read the colour lens of one Kinect from the folder ``intrinsics`` beside the dates.
 
@@ -158,9 +166,8 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
     above. The file's ``color`` states ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
     ``opencv``: those four again, then OpenCV's distortion. Raises UserError naming the file.
     """
-    above = calibration.resolve()
-    places = [above / "intrinsics", above.parent / "intrinsics", above.parents[1] / "intrinsics"]
-    folders = next((_kinect_folders(place) for place in places if place.is_dir()), {})
+    place = intrinsics_of(calibration)
+    folders = _kinect_folders(place) if place is not None else {}
     path = folders[number] / "calibration.json" if number in folders else None
     if path is None or not path.is_file():
         raise UserError(

@@ -34,7 +34,8 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
             path
             for pattern in INPUTS[sequence.layout]
             for path in (folder.glob(pattern) if pattern else [folder])
-            if not path.name.startswith(".") and path.suffix.lower() not in _NO_RECORDINGS
+            if not path.name.startswith(".")
+            and (path.suffix.lower() not in _NO_RECORDINGS or path.stem.endswith("timestamps"))
         }
     )
 

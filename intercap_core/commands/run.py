@@ -78,7 +78,9 @@ def _alone(project: Project, settings: Path, console: Console) -> Iterator[None]
             f"{project.results}: another run is going on ({held}); wait for its end, or end it"
         )
     try:
-        if held.left_by is not None:
+        if held.left_by is not None and not held.left_by.is_near():
+            console.print(f"the run by {held.left_by} gave no sign for a minute: taken for dead")
+        elif held.left_by is not None:
             going_on = _snakemake_here()
             if going_on:
                 raise UserError(
@@ -98,7 +100,9 @@ def _snakemake_here() -> int | None:
 
     for process in psutil.process_iter(["pid", "cmdline", "cwd"]):
         words = process.info["cmdline"] or []
-        if "snakemake" in words and process.info["cwd"] == str(Path.cwd()):
+        if "snakemake" in {Path(word).name for word in words[:3]} and process.info["cwd"] == str(
+            Path.cwd()
+        ):
             return int(process.info["pid"])
     return None
 
@@ -129,7 +133,11 @@ def _run(
         lines = watcher.transcript.read_text(encoding="utf-8").splitlines()
         console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
         raise UserError(f"the workflow stopped; its whole output is in {watcher.transcript}")
-    bad = sorted({name.split(":")[0] for name in failures} & set(project.sequences))
+    bad = sorted(
+        name
+        for name in {name.split(":")[0] for name in failures} & set(project.sequences)
+        if not project.artefact(name, "summary").is_file()
+    )
     if bad and len(bad) < len(project.sequences) and not arguments:
         console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
         targets = [str(project.results / name) for name in AGGREGATES]

@@ -61,12 +61,16 @@ class Owner:
         job = f", job {self.job}" if self.job else ""
         return f"process {self.pid} on {self.host}{job}, since {self.since}"
 
+    def is_near(self) -> bool:
+        """Whether its process could be seen from here."""
+        return (self.host, self.place) == (socket.gethostname(), _place())
+
     def lives(self, path: Path) -> bool:
         """Whether the owner of the claim ``path`` still runs."""
-        if (self.host, self.place) == (socket.gethostname(), _place()):
+        if self.is_near():
             return _start_of(self.pid) == self.started
         age = _age_s(path)
-        return age is not None and age < DEAD_S
+        return age is not None and abs(age) < DEAD_S
 
 
 class Claim:
@@ -141,7 +145,7 @@ def try_claim(path: Path) -> Claim | Owner:
                 time.sleep(_LOOK_S)  # it is being written
                 continue
             dead = held
-            _bury(path)
+            _bury(path, held)
             continue
         except OSError as error:
             raise UserError(
@@ -160,12 +164,22 @@ def living_owner(output: Path) -> Owner | None:
     return held if held is not None and held.lives(path) else None
 
 
-def _bury(path: Path) -> None:
-    """Remove a dead owner's claim; of several that try, one succeeds."""
+def _bury(path: Path, held: Owner | None) -> None:
+    """Remove the claim of ``held``, who is dead, and no other one that came in its place."""
     dead = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    with contextlib.suppress(FileNotFoundError):
+    try:
         os.rename(path, dead)
+        if _owner_of(dead) != held:
+            with contextlib.suppress(FileExistsError):
+                os.link(dead, path)
         dead.unlink()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise UserError(
+            f"{path}: is left of a process that is dead, and cannot be removed ({error.strerror}); "
+            "make its folder writable"
+        ) from None
 
 
 def _owner_of(path: Path) -> Owner | None:
@@ -216,7 +230,13 @@ def _start_of(pid: int) -> int | None:
 
 
 def _remove_parts(output: Path) -> None:
-    """Leftovers of killed writers of this output: who holds the claim writes alone."""
+    """Leftovers of killed writers of this output: who holds the claim writes alone. A folder that
+    was put aside for a new one, which never came, goes back."""
+    for old in output.parent.glob(f".{output.name}.*.old"):
+        if output.exists():
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            old.rename(output)
     for path in output.parent.glob(f".{output.name}.*.part"):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -3,7 +3,8 @@
 A recording has gigabytes. What its digest was, and of which size and date, is kept beside the
 sequence's results: a touch or a copy costs one reading and re-runs nothing, and a start with
 nothing to do reads no recording. Folders are as their files; that a file of one was replaced is
-seen by the dates of the folders, a file that was overwritten in place is not.
+seen by the dates of the folders; that one was overwritten in place, in folders of a few files (of
+thousands of images it is not).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 from pathlib import Path
 
 NAME = ".inputs.json"
+FEW = 200  # files of a folder whose own sizes and dates are looked at
 LARGE = 100_000_000  # bytes; where the size of such a file differs it is not read to know
 
 
@@ -75,6 +77,9 @@ def _stamp(path: Path) -> tuple[str, int]:
         folders.sort()
         state.update(f"{os.stat(folder).st_mtime_ns} {len(names)}\n".encode())
         count += len(names)
+        for name in sorted(names) if len(names) <= FEW else ():
+            one = os.stat(Path(folder, name))
+            state.update(f"{name} {one.st_size} {one.st_mtime_ns}\n".encode())
     return state.hexdigest()[:16], count
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from intercap_core.capture.behave import intrinsics_of
 from intercap_core.capture.layouts import input_files
 from intercap_core.config import Annotation, BodyModels, Config, SequenceEntry
 from intercap_core.imports.file_names import intercap_file
@@ -164,8 +165,13 @@ def _told(value: Any) -> tuple[Any, dict[str, Path]]:
     if isinstance(value, SequenceEntry):
         return _row_told(value)
     if isinstance(value, BaseModel):
-        paths = {f"{name}/{entry.name}": entry for name, entry in value if isinstance(entry, Path)}
-        return value.model_dump(mode="json", exclude={n.partition("/")[0] for n in paths}), paths
+        named = {name: entry for name, entry in value if isinstance(entry, Path)}
+        paths = {
+            f"{name}/{path.name}": path
+            for name, entry in named.items()
+            for path in (entry, *_beside(entry))
+        }
+        return value.model_dump(mode="json", exclude=set(named)), paths
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_told(entry)[0] for entry in value], {}
     return value, {}
@@ -184,7 +190,16 @@ def _row_told(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
             paths[f"{name}/{value.name}"] = value
         else:
             values[name] = value
+    if "calibration" in row.model_fields_set and row.layout == "behave":
+        lenses = intrinsics_of(row.calibration)
+        paths |= {lenses.name: lenses} if lenses is not None else {}
     return values, paths
+
+
+def _beside(path: Path) -> list[Path]:
+    """Files that are read with another one: a mesh's materials and texture, a body's maps."""
+    names = (f"{path.stem}.mtl", f"{path.stem}.png", f"{path.stem}.jpg", f"{path.stem}_maps.json")
+    return [one for name in names if (one := path.with_name(name)).is_file()]
 
 
 def _body_files(config: Config, gender: str) -> BodyModels:

@@ -106,12 +106,16 @@ def _tell(line: str) -> None:
 
 
 def last_failure(folder: Path) -> str | None:
-    """Why the newest job that logged into ``folder`` failed; None where it did not."""
+    """Why a job that logged into ``folder`` failed, the newest first; None where none did.
+
+    A job that ended without a word, as one that was killed, has failed as well.
+    """
     logs = sorted(folder.glob("*.log"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
-    for log in logs[:1]:
-        state, words = read_state(log)
-        return words if state == "failed" else None
-    return None
+    states = [read_state(log) for log in logs]
+    failed = [words for state, words in states if state == "failed"]
+    if failed:
+        return failed[0]
+    return "ended without a word" if any(state == "running" for state, _ in states) else None
 
 
 def read_state(log: Path) -> tuple[str, str]:

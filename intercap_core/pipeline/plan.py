@@ -10,7 +10,7 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -27,6 +27,10 @@ from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
 DATASET = "dataset"
+OF_ALL = (  # what is made of all sequences
+    "site/index.html", "summary.json", "heatmaps.h5", "tables", "card.md", "card.json",
+    "croissant.json",
+)  # fmt: skip
 MARKS = Path(".snakemake") / "out_of_date"
 _KNOWN = ".records.json"  # of all outputs, by place, size and date: to open each once
 _LATER_S = 1.0
@@ -57,6 +61,7 @@ class Plan:
     def __init__(self, project: Project) -> None:
         self.project = project
         self._sequences: dict[str, dict[str, State]] = {}
+        self._faults: dict[str, str] = {}
         self._records = _Records(project.results)
 
     def states(self, sequence: str) -> dict[str, State]:
@@ -74,7 +79,9 @@ class Plan:
             {name: self.states(name)["summary"].identity for name in self.project.sequences},
             failures(self.project),
         )
-        return _compared(path, self._records.of(dataset_record_of(self.project)), wanted)
+        there = all((self.project.results / name).exists() for name in OF_ALL)
+        record = self._records.of(dataset_record_of(self.project)) if there else None
+        return _compared(path if there else Path("none"), record, wanted)
 
     def output(self, sequence: str, stage: str) -> Path:
         """Where a stage of a sequence writes."""
@@ -96,6 +103,16 @@ class Plan:
     def is_stale(self, sequence: str, stage: str) -> bool:
         """Whether an output is there that was made from something else than it would be now."""
         return self._state(sequence, stage).kind is Kind.stale
+
+    def identity(self, sequence: str, stage: str) -> str:
+        """What the output is to be made from, "" where that is not known yet."""
+        return self._state(sequence, stage).identity
+
+    def annotation_fault(self, sequence: str) -> str:
+        """What is wrong with the sequence's annotation, "" = nothing; what it says of frames counts
+        as long as those are the ones that it is of."""
+        states = self.states(sequence)
+        return self._faults.get(sequence, "") if states else ""
 
     def mark(self, sequence: str, stage: str) -> list[Path]:
         """A file newer than the stage's output where that is out of date, else nothing.
@@ -130,16 +147,20 @@ class Plan:
         if self.project.recordings_made(sequence) is not None:
             wanted = given.studio_record(self.project, sequence, contents)
             path = self.output(sequence, STUDIO)
-            state = _compared(path / "capture.json", self._records.of(path), wanted)
+            whole = all((path / name).is_file() for name in ("capture.json", "truth.h5"))
+            state = _compared(path if whole else Path("none"), self._records.of(path), wanted)
             if state.kind is not Kind.done:
                 made_anew = "its recording is made anew"
             yield STUDIO, state
+        there = {stage: _exists(self.output(sequence, stage)) for stage in STAGES}
         try:
-            annotation = self.project.annotation(sequence)
+            annotation = self.project.annotation(sequence, look_at_frames=False)
         except UserError as error:
+            yield from self._broken(sequence, error, there)
+            return
+        if not any(there.values()):  # without reading gigabytes to say so
             for stage in STAGES:
-                there = _exists(self.output(sequence, stage))
-                yield stage, State(Kind.stale if there else Kind.missing, (str(error),), "")
+                yield stage, State(Kind.missing, (), "")
             return
         identities: dict[str, str] = {}
         for stage, declared in STAGES.items():
@@ -159,8 +180,22 @@ class Plan:
                 kind = Kind.missing if state.kind is Kind.missing else Kind.stale
                 state = State(kind, (made_anew,), f"{wanted.identity}+")
             identities[stage] = state.identity
+            if stage == "frames" and state.kind is Kind.done:
+                try:
+                    self.project.annotation(sequence)
+                except UserError as error:
+                    yield from self._broken(sequence, error, there)
+                    return
             yield stage, state
         contents.keep()
+
+    def _broken(
+        self, sequence: str, error: UserError, there: Mapping[str, bool]
+    ) -> Iterator[tuple[str, State]]:
+        """All stages wait for the annotation to be mended."""
+        self._faults[sequence] = str(error)
+        for stage in STAGES:
+            yield stage, State(Kind.stale if there[stage] else Kind.missing, (str(error),), "")
 
 
 def failures(project: Project) -> dict[str, str]:

@@ -22,7 +22,10 @@ from typing import Any
 from intercap_core import artefacts
 from intercap_core.errors import UserError
 
-LIBRARIES = ("numpy", "numba", "torch", "scipy", "open3d-cpu", "open3d", "opencv-python-headless")
+LIBRARIES = (
+    "numpy", "numba", "torch", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "libigl",
+    "trimesh", "av", "onnxruntime", "onnxruntime-gpu",
+)  # fmt: skip
 FILE = ".made_from.json"  # beside what a folder holds
 FORMAT = 1
 _TOLD = 3  # values that differ, named in one reason

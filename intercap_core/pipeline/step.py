@@ -16,8 +16,7 @@ from intercap_core.pipeline import given, outcome
 from intercap_core.pipeline.claim import Claim, claim
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.given import STUDIO
-from intercap_core.pipeline.plan import DATASET, dataset_record_of, failures, mark_of
+from intercap_core.pipeline.plan import DATASET, dataset_record_of, failures
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
@@ -42,19 +41,24 @@ def run_step(
     ``inputs`` are the artefacts by the name of the stage that wrote them; ``output`` is an artefact
     or, for the export and the page, a folder. It is made by one process at a time: another one that
     makes it is waited for. ``keep``: where the output is there by then and was made from the same,
-    it is kept. Raises UserError where an input is missing, unreadable or of another sequence, where
-    the stage finds a fault in it, and where another process took the output over.
+    it is kept, as is what another process made that took the output over. Raises UserError where an
+    input is missing, unreadable or of another sequence, and where the stage finds a fault in it.
     """
-    annotation = project.annotation(sequence)
+    annotation = project.annotation(sequence, look_at_frames=stage != "frames")
     _give_back_memory()
-    with claim(output) as held:
-        made_from = _made_from(stage, project, sequence, annotation, inputs)
-        if keep and _is_made(output, made_from):
-            log.info("sequence %s, %s: was made meanwhile, and is kept", sequence, stage)
-        else:
-            _check_inputs(stage, sequence, inputs)
-            _make(stage, project, sequence, annotation, inputs, output, made_from, held)
-    mark_of(project, sequence, stage).unlink(missing_ok=True)
+    made = False
+    while not made:
+        with claim(output) as held:
+            made_from = _made_from(stage, project, sequence, annotation, inputs)
+            if keep and _is_made(output, made_from):
+                log.info("sequence %s, %s: was made meanwhile, and is kept", sequence, stage)
+                made = True
+            else:
+                _check_inputs(stage, sequence, inputs)
+                made = _make(stage, project, sequence, annotation, inputs, output, made_from, held)
+        if not made:  # this process stood still for a while
+            log.info("sequence %s, %s: another process took it over", sequence, stage)
+            keep = True
     if not STAGES[stage].writes_folder:
         for note in outcome.notes(stage, output):
             log.warning("sequence %s: %s", sequence, note)
@@ -100,8 +104,9 @@ def _make(
     output: Path,
     made_from: Record,
     held: Claim,
-) -> None:
-    """Run the stage, and put its output in its place together with its record."""
+) -> bool:
+    """Run the stage, and put its output in its place together with its record; False where another
+    process took that place over meanwhile, and nothing was put there."""
     if STAGES[stage].on_device:
         check_device(project)
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
@@ -110,17 +115,15 @@ def _make(
     if STAGES[stage].writes_folder:
         run(output=output, **passed)
         add_record(output, made_from)
-        return
+        return True
     part = artefacts.part_of(output)
     try:
         run(output=part, **passed)
         add_record(part, made_from)
         if not held.still_held():
-            raise UserError(
-                f"{output}: another process took over while this one stood still, and its result "
-                "stands; this one is dropped"
-            )
+            return False
         os.replace(part, output)
+        return True
     finally:
         part.unlink(missing_ok=True)
 
@@ -185,7 +188,6 @@ def run_studio(project: Project, sequence: str) -> Path:
             output=folder,
         )
         add_record(folder, made_from)
-    mark_of(project, sequence, STUDIO).unlink(missing_ok=True)
     return folder
 
 
@@ -206,22 +208,23 @@ def run_dataset(project: Project) -> Path:
         {name: record.identity for name, record in records.items() if record is not None},
         failed,
     )
-    first = dataset.run(
-        dataset=project.config.dataset,
-        summaries={name: project.artefact(name, "summary") for name in project.sequences},
-        objects=project.objects,
-        body_models=project.config.body_models,
-        site=project.site,
-        summary=folder / "summary.json",
-        heatmaps=folder / "heatmaps.h5",
-        tables_folder=folder / "tables",
-        card=project.config.card,
-        formats=project.config.export.formats,
-        virtual=all(project.recordings_made(name) is not None for name in project.sequences),
-        failed=failed,
-        changed=changed(project.config),
-    )
-    add_record(dataset_record_of(project), made_from)
-    mark_of(project, "", DATASET).unlink(missing_ok=True)
+    with claim(folder / DATASET):
+        (dataset_record_of(project) / FILE).unlink(missing_ok=True)
+        first = dataset.run(
+            dataset=project.config.dataset,
+            summaries={name: project.artefact(name, "summary") for name in project.sequences},
+            objects=project.objects,
+            body_models=project.config.body_models,
+            site=project.site,
+            summary=folder / "summary.json",
+            heatmaps=folder / "heatmaps.h5",
+            tables_folder=folder / "tables",
+            card=project.config.card,
+            formats=project.config.export.formats,
+            virtual=all(project.recordings_made(name) is not None for name in project.sequences),
+            failed=failed,
+            changed=changed(project.config),
+        )
+        add_record(dataset_record_of(project), made_from)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first

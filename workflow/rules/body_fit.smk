@@ -19,6 +19,8 @@ rule body_fit:
         **gpu_of("body_fit"),
         mem_mb=memory("body_fit"),
         runtime=duration("body_fit"),
+    params:
+        identity=identity_of("body_fit"),
     message:
         "{wildcards.sequence}: fitting the body"
     script:

@@ -92,11 +92,9 @@ def recorded(column):
 
 def annotation_broken(sequence):
     """Whether the sequence's annotation cannot be read; the studio's own is not there yet."""
-    try:
-        PROJECT.annotation(sequence)
-    except UserError:
-        return not PROJECT.annotation_made(sequence)
-    return False
+    return bool(PLAN.annotation_fault(sequence)) and not PROJECT.annotation_made(
+        sequence
+    )
 
 
 def annotation_input(wildcards):
@@ -117,6 +115,11 @@ def out_of_date(stage):
     This alone makes a job run again: all other inputs are ``ancient``.
     """
     return lambda wildcards: PLAN.mark(getattr(wildcards, "sequence", ""), stage)
+
+
+def identity_of(stage):
+    """Param: what the output is to be made from, for whoever compares jobs of two runs."""
+    return lambda wildcards: PLAN.identity(getattr(wildcards, "sequence", ""), stage)
 
 
 def artefacts_read(stage):

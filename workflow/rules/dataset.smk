@@ -21,6 +21,8 @@ rule dataset:
     resources:
         mem_mb=memory("dataset"),
         runtime=duration("dataset"),
+    params:
+        identity=identity_of("dataset"),
     message:
         "the site's first page"
     script:

@@ -33,6 +33,8 @@ rule detections:
         **gpu_of("detections"),
         mem_mb=memory("detections"),
         runtime=duration("detections"),
+    params:
+        identity=identity_of("detections"),
     message:
         "{wildcards.sequence}: reading keypoints and candidates"
     script:

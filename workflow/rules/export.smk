@@ -17,6 +17,8 @@ rule export:
     resources:
         mem_mb=memory("export"),
         runtime=duration("export"),
+    params:
+        identity=identity_of("export"),
     message:
         "{wildcards.sequence}: exporting"
     script:

@@ -37,6 +37,8 @@ rule frames:
     resources:
         mem_mb=memory("frames"),
         runtime=duration("frames"),
+    params:
+        identity=identity_of("frames"),
     message:
         "{wildcards.sequence}: reading and synchronising the recordings"
     script:

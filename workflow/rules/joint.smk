@@ -22,6 +22,8 @@ rule joint:
         **gpu_of("joint"),
         mem_mb=memory("joint"),
         runtime=duration("joint"),
+    params:
+        identity=identity_of("joint"),
     message:
         "{wildcards.sequence}: refining body and object together"
     script:

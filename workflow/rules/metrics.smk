@@ -18,6 +18,8 @@ rule metrics:
     resources:
         mem_mb=memory("metrics"),
         runtime=duration("metrics"),
+    params:
+        identity=identity_of("metrics"),
     message:
         "{wildcards.sequence}: measuring"
     script:

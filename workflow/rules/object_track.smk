@@ -18,6 +18,8 @@ rule object_track:
         **gpu_of("object_track"),
         mem_mb=memory("object_track"),
         runtime=duration("object_track"),
+    params:
+        identity=identity_of("object_track"),
     message:
         "{wildcards.sequence}: tracking the object"
     script:

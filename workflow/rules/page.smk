@@ -24,6 +24,8 @@ rule page:
     resources:
         mem_mb=memory("page"),
         runtime=duration("page"),
+    params:
+        identity=identity_of("page"),
     message:
         "{wildcards.sequence}: drawing the page"
     script:

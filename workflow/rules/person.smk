@@ -16,6 +16,8 @@ rule person:
     resources:
         mem_mb=memory("person"),
         runtime=duration("person"),
+    params:
+        identity=identity_of("person"),
     message:
         "{wildcards.sequence}: finding the subject in all views"
     script:

@@ -16,6 +16,8 @@ rule scene:
     resources:
         mem_mb=memory("scene"),
         runtime=duration("scene"),
+    params:
+        identity=identity_of("scene"),
     message:
         "{wildcards.sequence}: refining the cameras, finding the floor"
     script:

@@ -24,6 +24,8 @@ rule studio:
     resources:
         mem_mb=memory("studio"),
         runtime=duration("studio"),
+    params:
+        identity=identity_of("studio"),
     message:
         "{wildcards.sequence}: making a virtual recording"
     script:

@@ -15,6 +15,8 @@ rule summary:
     resources:
         mem_mb=memory("summary"),
         runtime=duration("summary"),
+    params:
+        identity=identity_of("summary"),
     message:
         "{wildcards.sequence}: summing up"
     script:
