@@ -25,7 +25,9 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "layout", "recordings", "calibration", "calibration_scale", "calibration_up",
         "calibration_floor",
     ),
-    "detections": ("layout", "recordings", "keypoints", "candidates"),
+    "detections": (
+        "layout", "recordings", "calibration", "calibration_scale", "keypoints", "candidates",
+    ),
     "summary": ("intent",),
     "page": ("intent",),
 }  # fmt: skip

@@ -338,7 +338,7 @@ def test_the_vposer_that_is_named_takes_part(version: int, model, tmp_path: Path
         2: ("vp_model.decoder_net.0", "vp_model.decoder_net.3", "vp_model.decoder_net.5"),
     }[version]
     shapes = ((64, 32), (64, 64), (126, 64))
-    state = {f"{n}.weight": torch.zeros(s) for n, s in zip(names, shapes, strict=True)}
+    state = {f"{n}.weight": torch.full(s, 1e-9) for n, s in zip(names, shapes, strict=True)}
     state |= {f"{n}.bias": torch.zeros(s[0]) for n, s in zip(names, shapes, strict=True)}
     # spine1 bent by 0.4 rad about x, all other joints straight
     pose = torch.zeros(21, 3)
