@@ -105,6 +105,24 @@ def test_of_many_one_holds_it_at_a_time(tmp_path: Path) -> None:
     assert most == [1, 1, 1, 1]
 
 
+def test_a_claim_that_came_in_place_of_a_dead_one_is_left(tmp_path: Path) -> None:
+    """Two look at a dead claim; the second one's removal finds the first one's new claim."""
+    output = tmp_path / "x.h5"
+    dead = Owner("elsewhere", "", 1, 1, "", "then", "dead")
+    with claim(output) as own:
+        claims._bury(path_of(output), dead)
+        assert own.still_held()
+    assert [path.name for path in tmp_path.iterdir()] == []
+
+
+def test_a_folder_that_was_put_aside_for_none_goes_back(tmp_path: Path) -> None:
+    aside = tmp_path / ".export.host.1.old"
+    aside.mkdir()
+    (aside / "export.json").write_text("{}")
+    with claim(tmp_path / "export"):
+        assert (tmp_path / "export" / "export.json").is_file() and not aside.exists()
+
+
 def test_owners_give_signs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(claims, "BEAT_S", 0.05)
     output = tmp_path / "x.h5"

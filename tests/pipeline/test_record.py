@@ -176,3 +176,5 @@ def test_a_folder_is_what_is_in_it(tmp_path: Path) -> None:
     second = contents.digest(folder)
     (folder / "colour" / "00002.jpg").unlink()
     assert first != second and contents.digest(folder) == first
+    (folder / "colour" / "00001.jpg").write_bytes(b"uno")  # in place
+    assert contents.digest(folder) != first
