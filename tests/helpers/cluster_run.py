@@ -81,12 +81,15 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
+DATES = (".inputs.json", ".records.json")  # to read nothing twice
+
+
 def contents(results: Path) -> dict[str, bytes]:
-    """Bytes of all files of a run's results, by place."""
+    """Bytes of all files of a run's results, by place; but those that hold dates of others."""
     return {
         path.relative_to(results).as_posix(): path.read_bytes()
         for path in sorted(results.rglob("*"))
-        if path.is_file() and path.name != ".snakemake_timestamp"
+        if path.is_file() and path.name not in (".snakemake_timestamp", *DATES)
     }
 
 
