@@ -126,10 +126,9 @@ class Executor(SlurmExecutor):
     ) -> AsyncIterator[SubmittedJobInfo]:
         """Jobs that have not ended: all of them where Slurm does not answer."""
         self._over.clear()
+        async for _ in super().check_active_jobs(active_jobs):
+            pass
         known = states(self.run_uuid) if active_jobs else {}
-        if known is not None:  # else the plugin would turn to sacct, and wait there for minutes
-            async for _ in super().check_active_jobs(active_jobs):
-                pass
         for info in active_jobs:
             if id(info) not in self._over and not self._is_forgotten(info, known):
                 yield info
