@@ -582,6 +582,43 @@ def keypoint_definition(
 
 
 @app.command(rich_help_panel=LOOK)
+def annotate(
+    settings: Settings = DEFAULT_SETTINGS,
+    sequence: Annotated[
+        str | None, typer.Argument(help="A sequence of the table; without, a list, worst first.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 = any that is free.")] = 0,
+    by: Annotated[
+        str, typer.Option(metavar="NAME", help="Who annotates: kept, with the time, beside answers.")
+    ] = "",
+    cores: Cores = 0,
+    profile: Annotated[
+        Path | None,
+        typer.Option(help="Where runs go, as of `intercap run`: the page then tells the command."),
+    ] = None,
+    show: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open it in the default browser.")
+    ] = False,
+) -> None:
+    """Mend annotations in the browser: see the result over the images, fix it, run what it touches.
+
+    Serves a page on this machine alone and prints its address. From another machine, open a
+    tunnel (ssh -L PORT:127.0.0.1:PORT HOST) and use the same address. docs/annotate.md teaches
+    it in five minutes.
+
+    Examples: intercap annotate config/demo/config.yaml;
+    intercap annotate config/lab/config.yaml cup_drink_s02 --port 8123 --by ann
+    """
+    _prepare()
+    from intercap_core.annotate.serve import serve
+
+    serve(
+        settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show,
+        say=lambda line: typer.echo(line),
+    )  # fmt: skip
+
+
+@app.command(rich_help_panel=LOOK)
 def view(
     settings: Settings,
     sequence: SequenceName,

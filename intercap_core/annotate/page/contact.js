@@ -1,0 +1,127 @@
+/* Contact by body part: what was found, as a draft, and what the annotation states. Once a section
+ * states contact, nothing touches outside of its intervals; so the first edit takes all that was
+ * found into the draft. */
+import { bytes } from "./api.js";
+
+const TOUCHING = 0.5;
+
+export class Contact {
+  constructor(app) {
+    this.app = app;
+    const told = app.told.contact;
+    this.regions = told?.regions ?? app.told.regions;
+    this.probability = told ? bytes(told.probability) : null;
+    this.fromFound = new Set(); // intervals of the draft that nobody has looked at
+    this.selected = null; // { part, start, end }
+  }
+
+  p(part, frame) {
+    const r = this.regions.indexOf(part);
+    return this.probability && r >= 0 ? this.probability[frame * this.regions.length + r] / 255 : null;
+  }
+
+  mean(interval) {
+    let sum = 0;
+    for (let t = interval.start; t < interval.end; t += 1) sum += this.p(interval.part, t) ?? 0;
+    return sum / Math.max(1, interval.end - interval.start);
+  }
+
+  found() {
+    const intervals = [];
+    for (const part of this.regions) {
+      let start = -1;
+      for (let t = 0; t <= this.app.told.frames; t += 1) {
+        const on = t < this.app.told.frames && (this.p(part, t) ?? 0) >= TOUCHING;
+        if (on && start < 0) start = t;
+        if (!on && start >= 0) { intervals.push({ part, start, end: t }); start = -1; }
+      }
+    }
+    return intervals;
+  }
+
+  get stated() { return this.app.draft.get("contact"); }
+
+  intervals() { return this.stated ?? this.found(); }
+
+  /* The intervals to change: the draft's, or what was found, which becomes the draft. */
+  #taken() {
+    if (this.stated) return structuredClone(this.stated);
+    const found = this.found();
+    for (const one of found) this.fromFound.add(id(one));
+    return found;
+  }
+
+  looked(interval) { return this.stated !== null && !this.fromFound.has(id(interval)); }
+
+  #put(intervals, says) {
+    intervals.sort((a, b) => order(this.regions, a) - order(this.regions, b) || a.start - b.start);
+    this.app.draft.set("contact", intervals, says);
+  }
+
+  change(interval, start, end) {
+    const all = this.#taken(), k = all.findIndex((one) => id(one) === id(interval));
+    if (k < 0) return;
+    const bound = (v) => Math.max(0, Math.min(this.app.told.frames, Math.round(v)));
+    const next = { ...all[k], start: bound(start), end: bound(end) };
+    if (next.end <= next.start) return;
+    all[k] = next;
+    this.fromFound.delete(id(interval));
+    this.selected = next;
+    this.#put(all, "contact moved");
+  }
+
+  confirm(interval) {
+    const all = this.#taken();
+    this.fromFound.delete(id(interval));
+    this.selected = interval;
+    if (this.stated) this.app.draft.told();
+    else this.#put(all, "contact confirmed");
+  }
+
+  remove(interval) {
+    this.selected = null;
+    this.#put(this.#taken().filter((one) => id(one) !== id(interval)), "contact deleted");
+  }
+
+  split(interval, frame) {
+    if (frame <= interval.start || frame >= interval.end) return;
+    const rest = this.#taken().filter((one) => id(one) !== id(interval));
+    const parts = [{ ...interval, end: frame }, { ...interval, start: frame }];
+    if (this.fromFound.has(id(interval))) parts.forEach((one) => this.fromFound.add(id(one)));
+    this.selected = parts[1];
+    this.#put([...rest, ...parts], "contact split");
+  }
+
+  add(part, start, end) {
+    const all = this.#taken().filter((one) => !(one.part === part && one.start < end && one.end > start));
+    const meets = this.intervals().filter((one) => one.part === part && one.start < end && one.end > start);
+    const next = {
+      part, start: Math.min(start, ...meets.map((one) => one.start)),
+      end: Math.max(end, ...meets.map((one) => one.end)),
+    };
+    this.selected = next;
+    this.#put([...all, next], "contact added");
+  }
+
+  /* No contact of a part in these frames. */
+  clear(part, start, end) {
+    const left = [];
+    for (const one of this.#taken()) {
+      if (one.part !== part || one.end <= start || one.start >= end) { left.push(one); continue; }
+      if (one.start < start) left.push({ ...one, end: start });
+      if (one.end > end) left.push({ ...one, start: end });
+    }
+    this.#put(left, "contact denied");
+  }
+
+  takeAll() { this.#put(this.#taken(), "found contact taken"); }
+
+  under(frame) {
+    const chosen = this.selected;
+    if (chosen && this.intervals().some((one) => id(one) === id(chosen))) return chosen;
+    return this.intervals().find((one) => one.start <= frame && frame < one.end) ?? null;
+  }
+}
+
+export const id = (one) => `${one.part}:${one.start}:${one.end}`;
+const order = (regions, one) => (one.part === "any" ? 99 : regions.indexOf(one.part));

@@ -1,0 +1,199 @@
+/* Saving what was edited, with the difference shown before; running what it touches; new beside old. */
+import { get, post } from "./api.js";
+import { ask, banner, button, diff, find, make, words } from "./dom.js";
+
+const CHECK_MS = 250;
+const LOOK_MS = 4000;
+const RUN_MS = 1000;
+
+export class Keep {
+  constructor(app) {
+    this.app = app;
+    this.path = `sequences/${app.told.sequence}`;
+    this.faults = [];
+    this.run = { state: "none" };
+    this.touched = null;
+    this.beside = null;
+    app.draft.addEventListener("change", () => this.checkSoon());
+    find("undo").onclick = () => app.undo();
+    find("redo").onclick = () => app.redo();
+    find("save").onclick = () => this.save();
+    window.addEventListener("beforeunload", (event) => { if (app.draft.dirty) event.preventDefault(); });
+    this.state();
+    setInterval(() => this.look(), LOOK_MS);
+    const left = app.draft.left();
+    if (left) {
+      banner("left", `Edits that were not saved are here, from ${new Date(left.at).toLocaleString()} (${Object.keys(left.changes).map(words).join(", ")}).`, [
+        ["Take them up again", () => app.draft.takeLeft(left)], ["Discard them", () => app.draft.dropLeft()]]);
+    }
+    this.progress();
+  }
+
+  checkSoon() {
+    clearTimeout(this.soon);
+    this.soon = setTimeout(() => this.check(), CHECK_MS);
+    this.state();
+  }
+
+  async check() {
+    const { app } = this;
+    if (!app.draft.dirty) { this.faults = []; this.state(); return; }
+    try {
+      const found = await post(`${this.path}/check`, { changes: app.draft.changes() });
+      this.faults = found.faults;
+    } catch (error) { this.faults = [{ where: "", words: error.message }]; }
+    this.state();
+  }
+
+  state() {
+    const { app } = this, count = Object.keys(app.draft.changes()).length;
+    find("undo").disabled = !app.draft.done.length;
+    find("redo").disabled = !app.draft.undone.length;
+    find("save").disabled = !count || Boolean(app.told.read_only);
+    const fault = this.faults[0];
+    find("status").className = fault ? "fault" : count ? "open" : "dim";
+    find("status").textContent = fault ? fault.words : count ? `not saved: ${Object.keys(app.draft.changes()).map(words).join(", ")}` : app.told.annotation.text ? "saved" : "no annotation yet";
+  }
+
+  async save() {
+    const { app } = this, changes = app.draft.changes();
+    if (!Object.keys(changes).length) { app.say("there is nothing to save"); return; }
+    if (app.told.read_only) { app.say(app.told.read_only); return; }
+    let found;
+    try { found = await post(`${this.path}/check`, { changes, plan: true }); } catch (error) { app.say(error.message); return; }
+    this.faults = found.faults;
+    this.state();
+    if (found.faults.length) {
+      await ask("Not saved: this is not right yet", make("ul", {}, found.faults.map((one) => make("li", {}, `${one.where}: ${one.words}`))), [["", "Back", true]]);
+      return;
+    }
+    const stages = found.touched?.map((one) => words(one.stage)) ?? [];
+    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference),
+      make("p", {}, stages.length ? `A run then makes anew: ${stages.join(", ")}.` : "Nothing has to be run again.")],
+    [["save", "Save", true], ...(stages.length && !app.told.profile ? [["run", "Save and run"]] : []), ["", "Cancel"]]);
+    if (!answer) return;
+    try {
+      app.saved(await post(`${this.path}/save`, { digest: app.draft.file.digest, text: app.draft.file.text, changes }));
+      app.say("saved");
+    } catch (error) {
+      if (error.status === 409) await this.conflict(error.told);
+      else await ask("Not saved", make("p", {}, error.message), [["", "Back", true]]);
+      return;
+    }
+    await this.plan();
+    if (answer === "run") this.start();
+  }
+
+  /* Somebody else saved meanwhile: their change is shown, and nothing of either is lost. */
+  async conflict(told) {
+    const { app } = this, theirs = told.now.sections, mine = app.draft.changes();
+    const both = Object.keys(mine).filter((name) => JSON.stringify(theirs[name] ?? null) !== JSON.stringify(app.draft.saved[name] ?? null));
+    const answer = await ask("Somebody else changed this annotation meanwhile", [
+      make("p", {}, "Their change, which is in the file:"), diff(told.difference || "(only the layout changed)"),
+      make("p", {}, both.length ? `Both of you changed ${both.map(words).join(", ")}: yours would replace theirs there.` : "You changed other sections: both changes can stand.")],
+    [["mine", both.length ? "Keep mine there, theirs elsewhere" : "Keep both", !both.length], ["theirs", "Take theirs, drop mine"], ["", "Decide later", both.length > 0]]);
+    if (!answer) return;
+    const edited = structuredClone(mine);
+    app.draft.base(told.now);
+    app.told.annotation = told.now;
+    if (answer === "theirs") { app.draft.takeFile("theirs taken"); banner("changed", ""); return; }
+    app.draft.sections = { ...structuredClone(app.draft.saved), ...edited };
+    app.draft.told();
+    banner("changed", "");
+    await this.save();
+  }
+
+  /* Has the file or the result changed behind this page? */
+  async look() {
+    const { app } = this;
+    if (document.hidden || !app.told.frames) return;
+    let now;
+    try { now = await get(`${this.path}/state`); } catch (error) {
+      banner("server", error.message);
+      this.lost = true;
+      return;
+    }
+    if (this.lost) { banner("server", ""); this.lost = false; }
+    if (now.annotation !== app.draft.file.digest && this.known !== now.annotation) {
+      this.known = now.annotation;
+      banner("changed", "The annotation was changed meanwhile, in another tab or by somebody else.", [["Show", () => this.showChange()]]);
+    }
+    if (now.result !== app.told.result && this.run.state !== "running" && this.seen !== now.result) {
+      this.seen = now.result;
+      banner("result", "The results are others by now.", [["Load them", () => app.reload()]]);
+    }
+  }
+
+  async showChange() {
+    const { app } = this, now = await get(`${this.path}/annotation`);
+    if (!app.draft.dirty) { app.saved(now); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
+    await this.conflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
+  }
+
+  async plan() {
+    try { this.touched = (await post(`${this.path}/check`, { changes: {}, plan: true })).touched ?? []; } catch (error) { this.app.say(error.message); }
+    this.app.panels();
+  }
+
+  async start() {
+    const { app } = this;
+    if (app.draft.dirty) { app.say("save first: a run reads the saved annotation"); return; }
+    app.tab("run");
+    try { this.run = await post(`${this.path}/run`, { do: "start" }); } catch (error) { app.say(error.message); }
+    app.panels();
+    this.progress();
+  }
+
+  async progress() {
+    clearTimeout(this.timer);
+    const { app } = this, before = this.run.state;
+    try { this.run = await get(`${this.path}/run`); } catch { /* told by look() */ }
+    if (before === "running" && this.run.state !== "running" && this.run.sequence === app.told.sequence) {
+      this.touched = null;
+      await app.reload();
+      this.beside = await get(`${this.path}/beside`);
+      await app.loadBefore();
+      app.say(this.run.state === "done" ? "the new result is drawn; B shows the old one beside it" : "the run failed");
+    }
+    if (this.run.state === "running") this.timer = setTimeout(() => this.progress(), RUN_MS);
+    if (before !== "none" || this.run.state !== "none") app.panels();
+  }
+
+  panel() {
+    const { app, run } = this, parts = [];
+    const own = run.sequence === app.told.sequence;
+    if (run.state === "running") {
+      parts.push(make("p", {}, own ? `Running, ${run.seconds.toFixed(0)} s` : `A run of ${run.sequence} goes on.`),
+        make("ol", { class: "stages" }, run.stages.map((one) => make("li", { data: { state: one.state } }, make("b", {}, words(one.stage)), ` ${one.state === "waits" ? "" : one.state} `, make("span", { class: "dim" }, one.words)))),
+        button("Stop", async () => { this.run = await post(`${this.path}/run`, { do: "stop" }); }));
+      return make("div", { class: "run" }, parts);
+    }
+    if (own && run.state === "failed") parts.push(make("p", { class: "fault" }, "The run failed:"), make("pre", { tabIndex: 0 }, run.words));
+    if (own && run.state === "done") parts.push(make("p", {}, `Done in ${run.seconds.toFixed(0)} s.`));
+    if (this.touched) parts.push(this.touched.length ? make("div", {}, make("p", {}, "A run makes anew:"),
+      make("ol", {}, this.touched.map((one) => make("li", {}, make("b", {}, words(one.stage)), make("span", { class: "dim" }, ` ${one.reasons.join("; ")}`))))) : make("p", {}, "All results are up to date."));
+    if (run.cluster) parts.push(make("p", {}, "Jobs go to a cluster. Run there:"), make("pre", { tabIndex: 0 }, run.command));
+    else parts.push(button("Run what is out of date", () => this.start(), { class: "main" }));
+    parts.push(button("What would run?", () => this.plan()));
+    if (!run.cluster && run.command) parts.push(make("details", {}, make("summary", {}, "The same on a terminal"), make("pre", { tabIndex: 0 }, run.command)));
+    if (this.beside?.there) {
+      const show = (value) => (value === null || value === undefined ? "–" : String(value));
+      parts.push(make("table", { class: "beside" }, make("tr", {}, make("th", {}, "verdict"), make("th", {}, "old"), make("th", {}, "new")),
+        this.beside.rows.map((row) => make("tr", { class: row.old === row.new ? "" : "differs" }, make("td", {}, row.name), make("td", {}, show(row.old)), make("td", {}, show(row.new))))));
+      const moved = (name, by) => (by ? make("p", { class: "dim" }, `${name} moved by ${Math.max(...by).toFixed(1)} mm at the most, in frame ${by.indexOf(Math.max(...by))}.`) : null);
+      parts.push(moved("The body", this.beside.body_moved_mm), moved("The object", this.beside.object_moved_mm));
+    } else if (!this.beside) {
+      parts.push(button("New beside old", async () => {
+        this.beside = await get(`${this.path}/beside`);
+        if (this.beside.there) await app.loadBefore(); else app.say("nothing was run from this page yet");
+        app.panels();
+      }));
+    }
+    return make("div", { class: "run" }, parts);
+  }
+}
+
+function lineDiff(before, now) {
+  const [a, b] = [before.split("\n"), now.split("\n")];
+  return [...a.filter((line) => !b.includes(line)).map((line) => `-${line}`), ...b.filter((line) => !a.includes(line)).map((line) => `+${line}`)].join("\n");
+}

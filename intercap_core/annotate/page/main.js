@@ -1,0 +1,460 @@
+/* The page: one frame for all views, the viewer and the timeline; layers, modes, keys. */
+import { base64, get, packed, takeToken } from "./api.js";
+import { ask, banner, button, find, make } from "./dom.js";
+import { Contact } from "./contact.js";
+import { Draft } from "./draft.js";
+import { IDENTITY, apply, compose, invert } from "./geometry.js";
+import { Keep } from "./keep.js";
+import { showList } from "./list.js";
+import { DroppedFrames, FloorMarks, SubjectMarks } from "./marks.js";
+import { Overlay } from "./overlay.js";
+import { Pictures } from "./pictures.js";
+import { PoseEditor } from "./pose.js";
+import { Questions } from "./questions.js";
+import { Timeline } from "./timeline.js";
+import { Views } from "./views.js";
+
+const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45], BEFORE = [0.72, 0.5, 0.95];
+const KEYS = [
+  ["← →", "a frame back or on; with Shift ten"], ["Home End", "first and last frame"], ["Space", "play"],
+  ["N P", "next and previous flag or doubt"], ["F", "near the object, and all again"], ["1 2 3 4", "layers: body, object, contact, marks"],
+  ["B", "the result before the last run"], ["O", "place the object"], ["S", "fit it to the images"],
+  ["C", "confirm contact"], ["[ ]", "contact starts or ends at this frame"], ["K", "split contact"], ["Delete", "delete contact"],
+  ["U", "click the subject"], ["G", "click floor points"], ["X", "drop the frame, or keep it"],
+  ["Q", "next question; then 1, 2, 3 answer it"], ["Ctrl+Z", "undo; with Shift redo"], ["Ctrl+S", "save"], ["Esc", "end what is going on"],
+];
+
+class App {
+  constructor(told) {
+    this.told = told;
+    this.frame = 0;
+    this.direction = 1;
+    this.opacity = 0.62;
+    this.layers = { body: true, object: true, contact: true, marks: true, before: false };
+    this.mode = null;
+    this.steps = []; // milliseconds from a wish for a frame to all views drawn
+    this.draft = new Draft(told.sequence, told.annotation);
+    this.pictures = new Pictures(told.sequence, told.stamp);
+    this.contact = new Contact(this);
+    try { this.overlay = new Overlay(); } catch (error) { banner("overlay", error.message); }
+    this.subject = new SubjectMarks(this);
+    this.floor = new FloorMarks(this);
+    this.dropped = new DroppedFrames(this);
+    this.views = new Views(this);
+    this.timeline = new Timeline(this);
+    this.questions = new Questions(this);
+    this.keep = new Keep(this);
+    this.draft.addEventListener("change", () => {
+      this.timeline.draw();
+      this.panels();
+      this.redraw();
+    });
+    this.#bar();
+    this.#tabs();
+    document.addEventListener("keydown", (event) => this.key(event));
+    find("help").onclick = () => this.help();
+  }
+
+  // ---------------------------------------------------------------- what is loaded
+  async load() {
+    const of = `sequences/${this.told.sequence}`;
+    this.show(0);
+    if (this.told.object) {
+      try {
+        const object = await packed(`${of}/object?v=${this.told.result}`);
+        this.pose = new PoseEditor(this, object);
+        this.overlay?.mesh("object", object.arrays.faces, OBJECT);
+        this.overlay?.move("object", object.arrays.vertices);
+      } catch (error) { banner("object", error.message); }
+    }
+    this.panels();
+    this.redraw();
+    this.questions.load();
+    if (this.told.viewer) await this.#space(of);
+    else find("space").replaceChildren(make("p", { class: "dim" }, "No body yet: the 4D viewer comes with stage body_fit."));
+    document.body.dataset.ready = "yes";
+  }
+
+  async #space(of) {
+    find("space").replaceChildren(make("p", { class: "dim" }, "Loading the 4D viewer…"));
+    try {
+      const { header, arrays, data } = await packed(`${of}/viewer?v=${this.told.result}`);
+      find("space").replaceChildren(viewerElement());
+      await window.showInterCap(await base64(data));
+      this.viewer = window.intercapViewer;
+      if (!this.viewer) throw new Error("this browser shows no 3D");
+      this.main = Object.keys(header.versions)[0];
+      this.overlay?.mesh("body", arrays.faces, [0.42, 0.66, 0.92]);
+      this.master_from_zup = invert(this.told.zup_from_master);
+    } catch (error) {
+      this.viewer = null;
+      find("space").replaceChildren(make("p", { class: "fault" }, error.message));
+      return;
+    }
+    const root = document.querySelector(".viewer");
+    new MutationObserver(() => { // the viewer's own keys and fingers move time as well
+      const frame = Number(root.dataset.frame);
+      if (frame !== this.frame) this.show(frame);
+    }).observe(root, { attributes: true, attributeFilter: ["data-frame"] });
+    this.pose?.watch(root.querySelector("canvas"));
+    this.redraw();
+  }
+
+  /* The result before the last run, to be drawn beside the new one. */
+  async loadBefore() {
+    const of = `sequences/${this.told.sequence}`;
+    this.before = {};
+    for (const what of ["object", "viewer"]) {
+      try { this.before[what] = await packed(`${of}/${what}?version=before&v=${this.told.result}`); } catch { /* it was not there */ }
+    }
+    const { viewer } = this.before;
+    if (viewer && this.overlay) {
+      const name = Object.keys(viewer.header.versions)[0];
+      this.before.body = window.skinnedBody(name, viewer.header, viewer.arrays);
+      this.overlay.mesh("before", viewer.arrays.faces, BEFORE);
+    }
+    this.layers.before = true;
+    this.#bar();
+    this.redraw();
+  }
+
+  async reload() {
+    const told = await get(`sequences/${this.told.sequence}`);
+    const frame = this.frame;
+    Object.assign(this.told, told);
+    this.pictures = new Pictures(told.sequence, told.stamp);
+    this.contact = Object.assign(new Contact(this), { fromFound: this.contact.fromFound });
+    this.timeline.contact = this.contact;
+    this.views.views.forEach((view, k) => (view.camera = told.cameras[k] ?? view.camera));
+    this.setMode(null);
+    if (told.annotation.digest !== this.draft.file.digest && !this.draft.dirty) this.saved(told.annotation);
+    facts(told);
+    await this.load();
+    this.timeline.draw();
+    this.show(Math.min(frame, told.frames - 1));
+  }
+
+  // ---------------------------------------------------------------- time
+  has(camera, frame) { return this.told.images[camera]?.[frame] === "1"; }
+
+  /* The frame set whose image of a camera shows a moment, -1 = none. */
+  setOf(camera, frame) {
+    if (!this.has(camera, frame)) return -1;
+    return this.told.image_of ? this.told.image_of[camera][frame] : frame;
+  }
+
+  show(wanted) {
+    const frame = Math.max(0, Math.min(this.told.frames - 1, Math.round(wanted)));
+    this.asked ??= performance.now();
+    if (frame !== this.frame) {
+      this.direction = frame < this.frame ? -1 : 1;
+      this.pictures.calm();
+      if (this.pose?.editing) this.setMode(null);
+    }
+    this.frame = frame;
+    this.redraw();
+  }
+
+  redraw() {
+    if (this.waits) return;
+    this.waits = true;
+    requestAnimationFrame(() => {
+      this.waits = false;
+      this.draw();
+    });
+  }
+
+  draw() {
+    if (!this.told.frames) return;
+    this.viewer?.show(this.frame);
+    this.views.draw();
+    this.#object3d();
+    this.timeline.cursor();
+    const place = this.told.places.find((one) => one.first <= this.frame && this.frame <= one.last);
+    find("moment").textContent = `${this.told.times[this.frame].toFixed(2)} s, frame ${this.frame} of ${this.told.frames}${place ? `: ${place.words}` : ""}`;
+    document.body.dataset.frame = this.frame;
+    if (this.panelFrame !== this.frame) { this.panelFrame = this.frame; this.panels(); }
+  }
+
+  /* All views show the frame that was asked for. */
+  drawn() {
+    if (this.asked === null || this.asked === undefined) return;
+    this.steps.push(performance.now() - this.asked);
+    this.asked = null;
+    document.body.dataset.drawn = this.frame;
+    if (this.playing) this.#tick();
+  }
+
+  play() {
+    this.playing = !this.playing;
+    find("play").textContent = this.playing ? "Pause" : "Play";
+    if (this.playing) this.show(this.frame >= this.told.frames - 1 ? 0 : this.frame + 1);
+  }
+
+  #tick() {
+    if (this.frame >= this.told.frames - 1) { this.play(); return; }
+    const wait = Math.max(0, 1000 / this.told.fps - (this.steps.at(-1) ?? 0));
+    setTimeout(() => { if (this.playing) this.show(this.frame + 1); }, wait);
+  }
+
+  go(place) { this.show(place.frame); }
+
+  jump(by) {
+    const frames = [...new Set(this.told.places.map((one) => one.frame))].sort((a, b) => a - b);
+    const next = by > 0 ? frames.find((t) => t > this.frame) : frames.findLast((t) => t < this.frame);
+    if (next === undefined) this.say(`no flag or doubt ${by > 0 ? "after" : "before"} this frame`);
+    else this.show(next);
+  }
+
+  // ---------------------------------------------------------------- what is drawn
+  things() {
+    const found = [], { overlay, layers, frame } = this;
+    if (!overlay) return found;
+    if (layers.before && this.before) {
+      if (this.before.body && layers.body) {
+        this.before.body.pose(frame);
+        overlay.move("before", this.before.body.mesh.geometry.attributes.position.array);
+        found.push({ name: "before", pose: this.master_from_zup ?? IDENTITY });
+      }
+      const pose = this.before.object && this.pose?.found.call({ object: this.before.object }, frame);
+      if (pose && layers.object) found.push({ name: "object", pose, colour: BEFORE });
+    }
+    if (layers.body && this.viewer) {
+      const body = this.viewer.versions[this.main];
+      body.pose(frame);
+      const { position, color } = body.mesh.geometry.attributes;
+      overlay.move("body", position.array, color.array);
+      found.push({ name: "body", pose: this.master_from_zup });
+    }
+    const pose = layers.object && this.pose?.at(frame);
+    if (pose) {
+      const own = this.pose.editing || this.draft.get("object_pose")?.frame === frame;
+      found.push({ name: "object", pose, colour: own ? EDITED : OBJECT });
+    }
+    return found;
+  }
+
+  #object3d() { // the 3D viewer shows the pose that is edited
+    const object = this.viewer?.versions[this.main]?.object;
+    const pose = this.pose?.at(this.frame);
+    if (!object || !pose || !(this.pose.editing || this.draft.get("object_pose"))) return;
+    const [a, b, c] = compose(this.told.zup_from_master, pose);
+    object.mesh.visible = this.layers.object;
+    object.mesh.matrix.set(...a, ...b, ...c, 0, 0, 0, 1);
+    object.mesh.matrixWorldNeedsUpdate = true;
+    this.viewer.draw();
+  }
+
+  mark(view, brush) {
+    if (this.layers.marks) {
+      this.subject.mark(view, brush);
+      if (this.mode === this.floor || this.draft.get("floor")) this.floor.mark(view, brush);
+    }
+    if (this.pose?.editing) this.pose.mark(view, brush);
+    this.questions?.mark(view, brush);
+  }
+
+  /* The 3D viewer's eye as a camera of the master's frame. */
+  eye() {
+    const { eye } = this.viewer, canvas = document.querySelector(".viewer canvas");
+    eye.updateMatrixWorld();
+    const m = eye.matrixWorld.elements; // column-major, looks along -z with y up
+    const zup_from_eye = [0, 1, 2].map((k) => [m[k], -m[4 + k], -m[8 + k], m[12 + k]]);
+    const camera_from_master = compose(invert(zup_from_eye), this.told.zup_from_master);
+    const tall = 2 * Math.tan((eye.fov * Math.PI) / 360);
+    return { camera_from_master, metres: (depth) => (depth * tall) / canvas.clientHeight };
+  }
+
+  middle() {
+    const seen = this.pose?.at(this.frame);
+    if (seen) return apply(seen, this.pose.centre);
+    const ahead = this.told.cameras.filter((one) => one.pose).map((one) => apply(invert(one.pose), [0, 0, 2]));
+    return [0, 1, 2].map((i) => ahead.reduce((s, v) => s + v[i], 0) / Math.max(1, ahead.length));
+  }
+
+  nearby() { this.near = true; this.views.near(this.middle(), Math.max(0.45, this.pose?.object.header.diameter ?? 0)); }
+
+  whole() { this.near = false; this.views.near(null); }
+
+  // ---------------------------------------------------------------- modes, panels, words
+  setMode(mode) {
+    if (this.mode === this.pose && this.pose && mode !== this.pose) this.pose.leave();
+    this.mode = mode;
+    find("hint").hidden = !mode;
+    find("hint").textContent = mode?.hint ?? "";
+    document.body.dataset.mode = mode ? mode.constructor.name : "";
+    this.panels();
+    this.redraw();
+  }
+
+  say(text) {
+    const box = find("hint");
+    box.hidden = false;
+    box.textContent = text;
+    clearTimeout(this.saying);
+    this.saying = setTimeout(() => { box.textContent = this.mode?.hint ?? ""; box.hidden = !this.mode; }, 5000);
+  }
+
+  undo() { this.draft.undo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
+
+  redo() { this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
+
+  saved(annotation) {
+    this.told.annotation = annotation;
+    const untouched = !this.draft.dirty;
+    this.draft.base(annotation);
+    if (untouched) this.draft.sections = structuredClone(this.draft.saved);
+    this.draft.told();
+  }
+
+  #bar() {
+    const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", before: this.before ? "before" : null };
+    find("layers").replaceChildren(...Object.entries(names).filter(([, text]) => text).map(([name, text], k) => make("label", { title: name === "before" ? "B" : String(k + 1) },
+      make("input", { type: "checkbox", checked: this.layers[name], data: { layer: name }, onchange: (event) => this.layer(name, event.target.checked) }), ` ${text}`)));
+  }
+
+  layer(name, on) {
+    this.layers[name] = on;
+    if (this.viewer) {
+      this.viewer.state.contact = this.layers.contact;
+      const { group, object } = this.viewer.versions[this.main];
+      group.children[0].visible = this.layers.body;
+      if (object) object.wanted = this.layers.object;
+    }
+    this.#bar();
+    this.redraw();
+  }
+
+  #tabs() {
+    const panels = { doubts: "Doubts", questions: "Questions", object: "Object", marks: "Marks", run: "Run" };
+    if (!this.told.object) delete panels.object;
+    find("tabs").replaceChildren(...Object.entries(panels).map(([name, text]) => {
+      const tab = button(text, () => this.tab(name), { id: `tab-${name}`, role: "tab", data: { tab: name } });
+      tab.setAttribute("aria-controls", "panels");
+      return tab;
+    }));
+    find("panels").setAttribute("role", "tabpanel");
+    this.tab("doubts");
+  }
+
+  tab(name) {
+    this.open = name;
+    for (const tab of find("tabs").children) tab.setAttribute("aria-selected", String(tab.dataset.tab === name));
+    find("panels").setAttribute("aria-labelledby", `tab-${name}`);
+    this.panels();
+  }
+
+  panels() {
+    const box = find("panels");
+    const typing = box.contains(document.activeElement) && document.activeElement.tagName === "INPUT";
+    if (typing && this.open === "object") { this.pose?.panel(); return; }
+    const parts = {
+      doubts: () => [doubts(this)],
+      questions: () => [this.questions?.panel()],
+      object: () => [this.pose?.panel() ?? make("p", {}, "The object's mesh is not there.")],
+      marks: () => [make("h2", {}, "Subject"), this.subject.panel(), make("h2", {}, "Floor"), this.floor.panel(), make("h2", {}, "Frames to drop"), this.dropped.panel()],
+      run: () => [this.keep?.panel()],
+    };
+    box.replaceChildren(...(parts[this.open]?.() ?? []).filter(Boolean));
+  }
+
+  help() {
+    ask("Keys", make("table", { class: "keys" }, KEYS.map(([key, says]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, says)))), [["", "Close", true]]);
+  }
+
+  key(event) {
+    if (find("dialog").open) return;
+    const control = event.ctrlKey || event.metaKey, typed = event.target.tagName, letter = event.key.toLowerCase();
+    if (control && letter === "s") { event.preventDefault(); this.keep.save(); return; }
+    if (["INPUT", "SELECT", "TEXTAREA"].includes(typed) && event.target.type !== "checkbox" && event.target.type !== "range") return;
+    if (control && letter === "z") { event.preventDefault(); if (event.shiftKey) this.redo(); else this.undo(); return; }
+    if (control && letter === "y") { event.preventDefault(); this.redo(); return; }
+    if (control || event.altKey || event.target.closest?.(".viewer")) return;
+    const one = this.contact.selected && this.contact.under(this.frame);
+    const far = event.shiftKey ? 10 : 1;
+    const names = Object.keys(this.layers);
+    const act = {
+      arrowleft: () => this.show(this.frame - far), arrowright: () => this.show(this.frame + far),
+      home: () => this.show(0), end: () => this.show(this.told.frames - 1),
+      n: () => this.jump(1), p: () => this.jump(-1),
+      f: () => (this.near ? this.whole() : this.nearby()),
+      o: () => { if (this.pose) { this.tab("object"); this.pose.start(); } },
+      s: () => { if (this.pose) { this.tab("object"); this.pose.snap(); } },
+      u: () => { this.tab("marks"); this.setMode(this.subject); },
+      g: () => { this.tab("marks"); this.setMode(this.floor); },
+      x: () => this.dropped.toggle(this.frame),
+      q: () => this.questions.next(),
+      b: () => this.layer("before", !this.layers.before),
+      c: () => one && this.contact.confirm(one), k: () => one && this.contact.split(one, this.frame),
+      "[": () => one && this.contact.change(one, this.frame, one.end), "]": () => one && this.contact.change(one, one.start, this.frame + 1),
+      delete: () => one && this.contact.remove(one), backspace: () => one && this.contact.remove(one),
+      escape: () => { this.setMode(null); this.questions.current = null; this.contact.selected = null; this.timeline.draw(); this.panels(); },
+      "?": () => this.help(),
+      " ": () => this.play(),
+    }[letter];
+    if (/^[1-9]$/.test(event.key)) {
+      const number = Number(event.key);
+      if (this.open !== "questions" || !this.questions.key(number)) {
+        const name = names[number - 1];
+        if (name) this.layer(name, !this.layers[name]);
+      }
+    } else if (act && !(event.key === " " && typed === "BUTTON")) act();
+    else return;
+    event.preventDefault();
+  }
+}
+
+function doubts(app) {
+  const { told } = app, verdict = told.verdict ?? [];
+  const doubt = [told.track?.doubts, told.subject?.doubts].filter(Boolean);
+  return make("div", {},
+    verdict.length ? make("p", {}, "Stated errors: ", verdict.map((one) => `${one.part} ${one.mm === null ? `– (${one.silent})` : `${one.mm} mm`}`).join(", "), ".") : null,
+    doubt.map((text) => make("p", { class: "fault" }, text)),
+    told.places.length ? make("ol", { class: "places" }, told.places.slice(0, 60).map((place) => make("li", {},
+      button(`${place.first === place.last ? place.first : `${place.first}–${place.last}`}: ${place.words}`, () => app.go(place), { class: "plain" }))))
+      : make("p", {}, told.frames && told.verdict ? "Nothing is flagged or doubted." : "No verdict yet."));
+}
+
+function viewerElement() {
+  const part = (tag, name, more = {}, ...children) => {
+    const element = make(tag, { ...more }, ...children);
+    element.dataset.part = name;
+    return element;
+  };
+  const root = make("div", { class: "viewer", tabIndex: 0, role: "group" },
+    part("canvas", "canvas", { role: "img", "aria-label": "Body and object in 3D" }), part("div", "message", { role: "status" }),
+    make("div", { class: "time", hidden: true }, part("button", "play", { type: "button" }),
+      make("div", { class: "track" }, part("input", "scrub", { type: "range", min: "0", max: "0", value: "0", "aria-label": "Frame" }), part("canvas", "marks"))),
+    make("div", { class: "row", hidden: true }, part("span", "time"), part("span", "flag"), part("select", "speed", { "aria-label": "Speed" })),
+    make("details", {}, make("summary", {}, "3D view"), part("div", "layers", { role: "group", "aria-label": "Shown in 3D" }),
+      make("label", {}, "view ", part("select", "views", {}, new Option("free", "-1"))), part("button", "reset", { type: "button" }, "Overview")));
+  root.setAttribute("aria-label", "Sequence in 3D over time");
+  return root;
+}
+
+function facts(told) {
+  find("name").textContent = told.sequence;
+  find("facts").textContent = [told.person, told.object.replaceAll("_", " "), told.frames ? `${told.frames} frames` : ""].filter(Boolean).join(" · ");
+  document.title = `${told.sequence}: annotate`;
+  for (const old of find("banners").querySelectorAll("[data-banner^=note]")) old.remove();
+  [told.read_only, told.annotation.problem, told.annotation.note, ...told.notes].filter(Boolean).forEach((note, k) => banner(`note${k}`, note));
+}
+
+async function begin() {
+  const stop = (text) => { find("stopped").hidden = false; find("stopped").textContent = text; };
+  if (!takeToken()) { stop("Open this page by the address that `intercap annotate` printed, with its token."); return; }
+  const name = /^\/sequence\/([^/]+)$/.exec(location.pathname)?.[1];
+  try {
+    if (!name) { await showList(); return; }
+    const told = await get(`sequences/${name}`);
+    find("editor").hidden = false;
+    facts(told);
+    if (!told.frames) {
+      Object.assign(told, { cameras: [], places: [], images: [], times: [], fps: 1, result: "", stamp: "" });
+    }
+    window.annotate = new App(told);
+    await window.annotate.load();
+  } catch (error) { stop(error.message); }
+}
+
+begin();

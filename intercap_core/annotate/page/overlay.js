@@ -1,0 +1,135 @@
+/* Body and object drawn as the cameras saw them, lens included, all views on one WebGL canvas: one
+ * picture a step, from which each view takes its part. */
+import { columnMajor } from "./geometry.js";
+
+const VERTEX = `#version 300 es
+in vec3 place; in vec3 colour;
+uniform mat4 master_from_mesh, camera_from_master;
+uniform float lens[13]; uniform vec4 crop;
+out vec3 seen; out vec3 paint;
+void main() {
+  vec4 p = camera_from_master * (master_from_mesh * vec4(place, 1.0));
+  float z = max(p.z, 1e-3);
+  vec2 q = p.xy / z;
+  float stretch = max(1.0, length(q) / lens[12]);
+  q /= stretch;
+  float s = dot(q, q);
+  float d = (1.0 + s * (lens[4] + s * (lens[5] + s * lens[8]))) / (1.0 + s * (lens[9] + s * (lens[10] + s * lens[11])));
+  vec2 bent = q * d + vec2(
+    2.0 * lens[6] * q.x * q.y + lens[7] * (s + 2.0 * q.x * q.x),
+    lens[6] * (s + 2.0 * q.y * q.y) + 2.0 * lens[7] * q.x * q.y);
+  vec2 pixel = vec2(lens[0], lens[1]) * bent * stretch + vec2(lens[2], lens[3]) + 0.5;
+  vec2 at = 2.0 * (pixel - crop.xy) / crop.zw - 1.0;
+  seen = p.xyz;
+  paint = colour;
+  gl_Position = p.z < 0.05 ? vec4(2.0, 2.0, 2.0, 1.0) : vec4(at.x, -at.y, clamp(2.0 * (z - 0.05) / 20.0 - 1.0, -1.0, 1.0), 1.0);
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+in vec3 seen; in vec3 paint;
+out vec4 shown;
+void main() {
+  vec3 across = cross(dFdx(seen), dFdy(seen));
+  float light = 0.42 + 0.58 * abs(across.z) / max(length(across), 1e-12);
+  shown = vec4(paint * light, 1.0);
+}`;
+
+export class Overlay {
+  constructor() {
+    this.canvas = document.createElement("canvas");
+    const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: true, premultipliedAlpha: true, powerPreference: "high-performance" });
+    if (!gl) throw new Error("this browser draws no 3D (WebGL is switched off or missing)");
+    this.gl = gl;
+    this.program = link(gl);
+    this.at = {};
+    for (const name of ["master_from_mesh", "camera_from_master", "lens", "crop"]) {
+      this.at[name] = gl.getUniformLocation(this.program, name);
+    }
+    this.meshes = new Map();
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.SCISSOR_TEST);
+  }
+
+  /* A mesh by name: faces and one colour (3,), or colours by vertex with `paint`. */
+  mesh(name, faces, colour) {
+    const gl = this.gl;
+    const own = { count: faces.length, colour, vao: gl.createVertexArray(), place: gl.createBuffer(), paint: null };
+    gl.bindVertexArray(own.vao);
+    gl.bindBuffer(gl.ARRAY_BUFFER, own.place);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    this.meshes.set(name, own);
+  }
+
+  move(name, places, colours = null) {
+    const gl = this.gl, own = this.meshes.get(name);
+    gl.bindBuffer(gl.ARRAY_BUFFER, own.place);
+    gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
+    if (!colours) return;
+    gl.bindVertexArray(own.vao);
+    own.paint ??= gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, own.paint);
+    gl.bufferData(gl.ARRAY_BUFFER, colours, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribPointer(1, 3, gl.FLOAT, false, 0, 0);
+    gl.bindVertexArray(null);
+  }
+
+  /* Draw `things` ({ name, pose: master_from_mesh }) for each of `views` ({ camera, crop, width,
+   * height }); afterwards view.part is where its picture lies on this.canvas. */
+  draw(views, things) {
+    const gl = this.gl;
+    let top = 0, wide = 1;
+    for (const view of views) {
+      view.part = [0, top, view.width, view.height];
+      top += view.height;
+      wide = Math.max(wide, view.width);
+    }
+    if (this.canvas.width < wide || this.canvas.height < top || this.canvas.width > 2 * wide) {
+      this.canvas.width = wide;
+      this.canvas.height = Math.max(1, top);
+    }
+    gl.useProgram(this.program);
+    gl.scissor(0, 0, this.canvas.width, this.canvas.height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    for (const thing of things) thing.matrix = columnMajor(thing.pose);
+    for (const view of views) {
+      if (!view.camera.pose) continue;
+      const [x, y, w, h] = view.part;
+      const bottom = this.canvas.height - y - h;
+      gl.viewport(x, bottom, w, h);
+      gl.scissor(x, bottom, w, h);
+      gl.uniformMatrix4fv(this.at.camera_from_master, false, columnMajor(view.camera.pose));
+      gl.uniform1fv(this.at.lens, view.camera.lens);
+      gl.uniform4fv(this.at.crop, view.crop);
+      for (const { name, matrix, colour } of things) {
+        const own = this.meshes.get(name);
+        gl.bindVertexArray(own.vao);
+        if (!own.paint) gl.vertexAttrib3f(1, ...(colour ?? own.colour));
+        gl.uniformMatrix4fv(this.at.master_from_mesh, false, matrix);
+        gl.drawElements(gl.TRIANGLES, own.count, gl.UNSIGNED_INT, 0);
+      }
+    }
+    gl.bindVertexArray(null);
+  }
+}
+
+function link(gl) {
+  const program = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(program, shader);
+  }
+  gl.bindAttribLocation(program, 0, "place");
+  gl.bindAttribLocation(program, 1, "colour");
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+  return program;
+}

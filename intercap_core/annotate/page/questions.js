@@ -1,0 +1,86 @@
+/* A queue of questions, those first whose answer changes most; each answered in seconds. */
+import { get, post } from "./api.js";
+import { button, make } from "./dom.js";
+import { putPose } from "./pose.js";
+
+export class Questions {
+  constructor(app) {
+    this.app = app;
+    this.list = [];
+    this.current = null;
+  }
+
+  async load() {
+    if (!this.app.told.frames) return;
+    try { this.list = await get(`sequences/${this.app.told.sequence}/questions`); } catch (error) { this.app.say(error.message); }
+    this.app.panels();
+  }
+
+  ask(question) {
+    const { app } = this;
+    this.current = question;
+    if (question.kind === "subject") app.views.prefer([question.camera]);
+    app.show(question.frame);
+    app.tab("questions");
+    if (question.kind !== "subject") app.nearby();
+    app.panels();
+  }
+
+  next() { if (this.list.length) this.ask(this.list[0]); else this.app.say("no question is open"); }
+
+  async answer(question, answer) {
+    const { app } = this, { contact, pose, draft } = app;
+    if (question.kind === "contact" && answer === "yes") contact.add(question.part, question.first, question.last + 1);
+    if (question.kind === "contact" && answer === "no") contact.clear(question.part, question.first, question.last + 1);
+    if (question.kind === "turn" && answer === "yes" && pose?.found(question.frame)) {
+      putPose(draft, question.frame, pose.found(question.frame), "turn confirmed");
+    }
+    if (question.kind === "subject" && answer === "yes") {
+      const { camera, frame, x, y } = question;
+      const set = app.setOf(app.told.cameras.findIndex((one) => one.name === camera), frame);
+      draft.set("subject", [...(draft.get("subject") ?? []), { camera, frame: set, x, y }], "subject confirmed");
+    }
+    try {
+      const { kind, part, first, last, frame, from_s, to_s } = question;
+      const told = await post(`sequences/${app.told.sequence}/answer`, { kind, part, first, last, frame, from_s, to_s, answer });
+      this.list = told.questions;
+    } catch (error) { app.say(error.message); return; }
+    this.current = null;
+    const opens = { place: pose, no: question.kind === "turn" ? pose : question.kind === "subject" ? app.subject : null }[answer];
+    app.panels();
+    if (opens === pose && pose) { app.show(question.frame); pose.start(); app.tab("object"); }
+    else if (opens) { app.setMode(opens); app.tab("marks"); }
+    else if (this.list.length) this.ask(this.list[0]);
+    else app.say("all questions are answered: save, then run");
+  }
+
+  /* Keys 1 to 9 answer the question that is shown. */
+  key(number) {
+    const choice = this.current?.choices[number - 1];
+    if (choice) this.answer(this.current, choice.answer);
+    return Boolean(choice);
+  }
+
+  mark(view, brush) {
+    const one = this.current, { app } = this;
+    if (one?.kind !== "subject" || one.camera !== view.camera.name || one.frame !== app.frame) return;
+    const [x, y] = app.views.spot(view, one.x, one.y);
+    brush.strokeStyle = "#ffd60a";
+    brush.lineWidth = 3;
+    brush.strokeRect(x - 14, y - 14, 28, 28);
+  }
+
+  panel() {
+    const { app } = this, one = this.current;
+    const seconds = (q) => `${q.from_s.toFixed(1)}–${q.to_s.toFixed(1)} s`;
+    return make("div", { class: "questions" },
+      one ? make("div", { class: "question" }, make("p", { class: "ask" }, one.words),
+        make("p", { class: "dim" }, `frames ${one.first} to ${one.last}`),
+        make("div", {}, one.choices.map((choice, k) => button(`${k + 1}  ${choice.label}`, () => this.answer(one, choice.answer), { data: { answer: choice.answer } }))))
+        : make("p", {}, this.list.length ? `${this.list.length} questions, those first that change most.` : "No question is open."),
+      this.list.length && !one ? button("Ask me", () => this.next(), { class: "main", title: "Q" }) : null,
+      make("ol", {}, this.list.filter((q) => q !== one).slice(0, 12).map((q) => make("li", {},
+        button(q.words, () => this.ask(q), { class: "plain" }), make("span", { class: "dim" }, ` ${seconds(q)}`)))),
+      make("p", { class: "dim" }, "What is answered is never asked again. Answers that edit are saved with the annotation."));
+  }
+}

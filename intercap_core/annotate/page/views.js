@@ -1,0 +1,215 @@
+/* The synchronised views: some large, the others as a strip; image, overlay and marks of each. */
+import { find, make } from "./dom.js";
+import { apply, project } from "./geometry.js";
+
+const AHEAD = 4; // frames fetched before they are asked for
+const NEAREST = 8; // times the whole image: the largest zoom
+
+export class Views {
+  constructor(app) {
+    this.app = app;
+    this.views = app.told.cameras.map((camera, index) => this.#view(camera, index));
+    this.order = this.views.map((view) => view.index);
+    this.large = Number(find("large").value);
+    find("large").onchange = () => { this.large = Number(find("large").value); this.arrange(); };
+    find("quality").onchange = () => app.show(app.frame);
+    new ResizeObserver(() => app.redraw()).observe(find("views"));
+    this.arrange();
+  }
+
+  #view(camera, index) {
+    const canvas = make("canvas", { role: "img", tabIndex: 0 });
+    canvas.setAttribute("aria-label", `Camera ${camera.name}`);
+    const figure = make("figure", { class: "view", data: { camera: camera.name } }, canvas,
+      make("figcaption", {}, camera.name));
+    const [w, h] = camera.size;
+    const view = { camera, index, figure, canvas, brush: canvas.getContext("2d"), crop: [0, 0, w, h], shown: -1 };
+    view.pixel = (event) => { // of the image as recorded
+      const box = canvas.getBoundingClientRect();
+      const [x, y, wide, high] = view.crop;
+      return [
+        x + ((event.clientX - box.left) / box.width) * wide - 0.5,
+        y + ((event.clientY - box.top) / box.height) * high - 0.5];
+    };
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      if (this.app.mode?.wheel?.(view, event)) return;
+      this.zoom(view, view.pixel(event), event.deltaY < 0 ? 1 / 1.25 : 1.25);
+    }, { passive: false });
+    canvas.addEventListener("pointerdown", (event) => this.#press(view, event));
+    canvas.addEventListener("dblclick", () => { if (!this.app.mode) this.enlarge(view); });
+    canvas.addEventListener("keydown", (event) => {
+      if (event.key === "Enter" && !this.app.mode) { this.enlarge(view); event.preventDefault(); }
+    });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    return view;
+  }
+
+  #press(view, event) {
+    const canvas = view.canvas;
+    canvas.focus({ preventScroll: true });
+    const drag = this.app.mode?.press?.(view, event) ?? this.#pan(view, event);
+    if (!drag) return;
+    canvas.setPointerCapture(event.pointerId);
+    const move = (next) => drag.move?.(next);
+    const up = (next) => {
+      canvas.removeEventListener("pointermove", move);
+      canvas.removeEventListener("pointerup", up);
+      canvas.removeEventListener("pointercancel", up);
+      drag.end?.(next);
+    };
+    canvas.addEventListener("pointermove", move);
+    canvas.addEventListener("pointerup", up);
+    canvas.addEventListener("pointercancel", up);
+  }
+
+  #pan(view, event) {
+    const from = [event.clientX, event.clientY], [x, y] = view.crop;
+    return {
+      move: (next) => {
+        const scale = view.crop[2] / view.canvas.clientWidth;
+        view.crop[0] = x - (next.clientX - from[0]) * scale;
+        view.crop[1] = y - (next.clientY - from[1]) * scale;
+        this.#bound(view);
+        this.app.redraw();
+      },
+    };
+  }
+
+  zoom(view, [px, py], factor) {
+    const [w, h] = view.camera.size;
+    const wide = Math.min(w, Math.max(w / NEAREST, view.crop[2] * factor));
+    const high = (wide * h) / w, by = wide / view.crop[2];
+    view.crop = [px - (px - view.crop[0]) * by, py - (py - view.crop[1]) * by, wide, high];
+    this.#bound(view);
+    this.app.redraw();
+  }
+
+  #bound(view) {
+    const [w, h] = view.camera.size;
+    view.crop[0] = Math.min(Math.max(0, view.crop[0]), w - view.crop[2]);
+    view.crop[1] = Math.min(Math.max(0, view.crop[1]), h - view.crop[3]);
+  }
+
+  /* All views near to a point of the room, or to all again. */
+  near(point, radius) {
+    for (const view of this.views) {
+      const [w, h] = view.camera.size;
+      view.crop = [0, 0, w, h];
+      if (!point || !view.camera.pose) continue;
+      const at = apply(view.camera.pose, point);
+      if (at[2] < 0.2) continue;
+      const [x, y] = project(view.camera.lens, at);
+      if (x < 0 || y < 0 || x > w || y > h) continue;
+      const high = Math.min(h, Math.max(h / NEAREST, (2 * radius * view.camera.lens[1]) / at[2]));
+      view.crop = [x - (high * w) / h / 2, y - high / 2, (high * w) / h, high];
+      this.#bound(view);
+    }
+    this.app.redraw();
+  }
+
+  enlarge(view) {
+    this.order = [view.index, ...this.order.filter((index) => index !== view.index)];
+    this.arrange();
+  }
+
+  /* Those cameras first. */
+  prefer(names) {
+    const first = this.views.filter((view) => names.includes(view.camera.name)).map((view) => view.index);
+    this.order = [...first, ...this.order.filter((index) => !first.includes(index))];
+    this.arrange();
+  }
+
+  arrange() {
+    const cells = this.order.map((index) => this.views[index]);
+    find("big").replaceChildren(...cells.slice(0, this.large).map((view) => view.figure));
+    find("strip").replaceChildren(...cells.slice(this.large).map((view) => view.figure));
+    find("big").dataset.count = Math.min(this.large, cells.length);
+    this.app.redraw();
+  }
+
+  /* Draw all views at the app's frame; what is not there yet is fetched and drawn when it comes. */
+  draw() {
+    const { app } = this, { pictures, frame } = app;
+    for (const view of this.views) {
+      const width = view.canvas.clientWidth;
+      view.width = Math.max(1, Math.round(width * Math.min(devicePixelRatio, 1.5)));
+      view.height = Math.max(1, Math.round((view.width * view.camera.size[1]) / view.camera.size[0]));
+      if (view.canvas.width !== view.width || view.canvas.height !== view.height) {
+        view.canvas.width = view.width;
+        view.canvas.height = view.height;
+      }
+      const near = view.camera.size[0] / view.crop[2];
+      const wanted = view.width * near * Number(find("quality").value);
+      view.fetched = pictures.width(Math.min(wanted, view.camera.size[0]));
+    }
+    const things = app.things();
+    if (app.overlay && things.length) app.overlay.draw(this.views, things);
+    let missing = 0;
+    for (const view of this.views) missing += this.#paint(view, things.length > 0) ? 0 : 1;
+    if (missing === 0) app.drawn();
+    for (let k = 1; k <= AHEAD; k += 1) {
+      const next = frame + k * app.direction;
+      if (next < 0 || next >= app.told.frames) break;
+      for (const view of this.views) {
+        if (app.has(view.index, next)) pictures.want(view.camera.name, next, view.fetched, false);
+      }
+    }
+  }
+
+  /* Whether the right image was there. */
+  #paint(view, overlaid) {
+    const { app } = this, { pictures, frame } = app, brush = view.brush;
+    const { name } = view.camera;
+    let right = true;
+    let image = null;
+    if (app.has(view.index, frame)) {
+      image = pictures.now(name, frame, view.fetched);
+      if (image === undefined) {
+        right = false;
+        pictures.want(name, frame, view.fetched).then(() => { if (app.frame === frame) app.redraw(); });
+        image = pictures.any(name, frame);
+      }
+    }
+    const [w, h] = [view.width, view.height];
+    if (image) {
+      const scale = image.width / view.camera.size[0];
+      brush.drawImage(image, ...view.crop.map((v) => v * scale), 0, 0, w, h);
+      view.shown = frame;
+    } else if (right || view.shown < 0) {
+      brush.fillStyle = "#30343b";
+      brush.fillRect(0, 0, w, h);
+      brush.fillStyle = "#e7eaef";
+      brush.font = "13px system-ui";
+      brush.fillText(right ? "no image" : "…", 10, h - 12);
+      view.shown = frame;
+    }
+    if (overlaid && app.overlay && view.camera.pose) {
+      brush.globalAlpha = app.opacity;
+      brush.drawImage(app.overlay.canvas, ...view.part, 0, 0, w, h);
+      brush.globalAlpha = 1;
+    }
+    if (app.draft.get("drop_frames")?.includes(frame)) {
+      brush.fillStyle = "rgba(194, 47, 54, 0.35)";
+      brush.fillRect(0, 0, w, h);
+    }
+    app.mark(view, brush);
+    return right;
+  }
+
+  /* A point of the master's frame on a view's canvas; null = not before the camera. */
+  place(view, point) {
+    if (!view.camera.pose) return null;
+    const at = apply(view.camera.pose, point);
+    if (at[2] < 0.05) return null;
+    const [x, y] = project(view.camera.lens, at);
+    return this.spot(view, x, y);
+  }
+
+  /* A pixel of the image as recorded on a view's canvas. */
+  spot(view, x, y) {
+    return [
+      ((x + 0.5 - view.crop[0]) / view.crop[2]) * view.width,
+      ((y + 0.5 - view.crop[1]) / view.crop[3]) * view.height];
+  }
+}

@@ -1,0 +1,178 @@
+"""A few questions whose answers change most: lost objects, ambiguous turns, contact at even odds, a
+doubtful subject. What was answered is kept beside the annotation and never asked again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.annotate.opened import Opened
+from intercap_core.errors import UserError
+from intercap_core.metrics.flags import ranges
+from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
+
+EVEN = (0.25, 0.75)  # probabilities of contact between which it is asked
+SHORTEST_S = 0.1  # contact at even odds for less time is not asked
+MOST = 40  # questions of a sequence at a time
+_MID_HIP = 8  # of the 135 keypoints
+_MAX_BYTES = 1 << 22
+
+
+def answers_path(annotation: Path) -> Path:
+    """Where answers are kept: beside the annotation, by the same name."""
+    return annotation.with_name(f"{annotation.stem}.answers.jsonl")
+
+
+def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Questions that are open, those first whose answer changes most frames.
+
+    Each has ``kind``, ``part``, frames ``first`` to ``last``, the ``frame`` to look at, the same in
+    seconds, its ``words``, ``weight`` (frames that the answer is expected to change) and the
+    ``choices``.
+    """
+    found: list[dict[str, Any]] = []
+    with opened.lock:
+        with opened.images() as images:
+            times = images.time_s
+        object_ = opened.project.sequences[opened.name].object or ""
+        for look in (_of_subject, _of_object, _of_contact):
+            try:
+                found += look(opened, object_.replace("_", " "), times)
+            except UserError:  # not there, or of an older version: told by the result
+                continue
+    for one in found:
+        one["from_s"] = round(float(times[one["first"]]), 3)
+        one["to_s"] = round(float(times[one["last"]]), 3)
+    left = [one for one in found if not any(_same(one, other) for other in answered)]
+    left.sort(key=lambda one: -one["weight"])
+    return left[:MOST]
+
+
+def read_answers(path: Path) -> list[dict[str, Any]]:
+    """What was answered; lines that are none (a write that was cut off) are left out."""
+    if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+        return []
+    found = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            told = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(told, dict):
+            found.append(told)
+    return found
+
+
+def keep_answer(path: Path, told: Mapping[str, Any], by: str | None) -> None:
+    """Add an answer to the file; ``by`` names who answered, and then it is also told when."""
+    record = dict(told)
+    if by:
+        record |= {"by": by, "at": datetime.now(UTC).isoformat(timespec="seconds")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = json.dumps(record, ensure_ascii=False) + "\n"
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    try:
+        size = os.fstat(handle).st_size
+        if size and not _ends_line(path, size):  # after a write that was cut off
+            line = "\n" + line
+        os.write(handle, line.encode())
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _ends_line(path: Path, size: int) -> bool:
+    with open(path, "rb") as file:
+        file.seek(size - 1)
+        return file.read(1) == b"\n"
+
+
+def _same(question: Mapping[str, Any], answer: Mapping[str, Any]) -> bool:
+    """Whether an answer is of this question, whatever its frames are numbered by now."""
+    if any(question[key] != answer.get(key) for key in ("kind", "part")):
+        return False
+    first, last = answer.get("from_s"), answer.get("to_s")
+    if not isinstance(first, int | float) or not isinstance(last, int | float):
+        return False
+    return bool(first <= question["to_s"] and question["from_s"] <= last)
+
+
+def _question(
+    kind: str, part: str, first: int, last: int, frame: int, words: str, weight: float,
+    choices: Sequence[tuple[str, str]], **more: Any,
+) -> dict[str, Any]:  # fmt: skip
+    return {
+        "id": f"{kind}.{part}.{first}.{last}", "kind": kind, "part": part, "first": int(first),
+        "last": int(last), "frame": int(frame), "words": words, "weight": round(weight, 2),
+        "choices": [{"answer": answer, "label": label} for answer, label in choices], **more,
+    }  # fmt: skip
+
+
+def _of_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    with artefacts.read(opened.paths["person"], PERSON) as person:
+        doubts, by = str(person.attributes["doubts"]), str(person.attributes["chosen_by"])
+        if by in ("alone", "named") and not doubts:
+            return []
+        shown = person["keypoints"][:, :, _MID_HIP, 2]  # (T, C)
+        t, c = np.unravel_index(int(shown.argmax()), shown.shape)
+        x, y, confidence = person["keypoints"][t, c, _MID_HIP]
+        camera = person.text("camera_names")[c]
+    if not confidence > 0:
+        return []
+    why = f" ({doubts})" if doubts else ""
+    choices = (("yes", "Yes, this one"), ("no", "No: I click who it is"))
+    return [
+        _question(
+            "subject", "", 0, len(times) - 1, int(t),
+            f"Several people are seen. Is the marked one the subject?{why}",
+            len(times), choices, camera=camera, x=round(float(x), 1), y=round(float(y), 1),
+        )
+    ]  # fmt: skip
+
+
+def _of_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    if not object_:
+        return []
+    with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
+        lost, ambiguous = track["lost"], track["ambiguous"] & ~track["lost"]
+    found = []
+    for first, last, _ in ranges(["x" if one else "" for one in lost]):
+        choices = (("place", "I place it"), ("hidden", "It is not to be seen"))
+        words = f"The {object_} is lost here. Where is it?"
+        found.append(_question("lost", "", first, last, (first + last) // 2, words,
+                               2.0 * (last - first + 1), choices))  # fmt: skip
+    for first, last, _ in ranges(["x" if one else "" for one in ambiguous]):
+        choices = (("yes", "Yes, as drawn"), ("no", "No: I turn it"), ("unsure", "Cannot be seen"))
+        words = f"Is the {object_} turned as it is drawn?"
+        found.append(_question("turn", "", first, last, (first + last) // 2, words,
+                               3.0 + 1.5 * (last - first), choices))  # fmt: skip
+    return found
+
+
+def _of_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    with artefacts.read(opened.paths["joint"], JOINT) as joint:
+        probability, labels = joint["contact_probability"], joint["contact_annotated"]
+        regions = joint.text("region_names")
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    found = []
+    for r, region in enumerate(regions):
+        p = probability[:, r]
+        even = (p > EVEN[0]) & (p < EVEN[1]) & (labels[:, r] < 0)
+        for first, last, _ in ranges(["x" if one else "" for one in even]):
+            if (last - first + 1) * step < SHORTEST_S:
+                continue
+            run = p[first : last + 1]
+            frame = first + int(np.abs(run - 0.5).argmin())
+            words = f"Does the {region.replace('_', ' ')} touch the {object_} here?"
+            choices = (("yes", "It touches"), ("no", "It does not"), ("unsure", "Cannot be seen"))
+            found.append(_question("contact", region, first, last, frame, words,
+                                   float((4 * run * (1 - run)).sum()), choices))  # fmt: skip
+    return found

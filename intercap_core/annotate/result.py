@@ -1,0 +1,252 @@
+"""What the page knows of a sequence: its cameras, its frames, the result that is drawn and what
+speaks against it. What cannot be read is a sentence among ``notes``; the rest is there all the same.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.annotate.opened import Opened
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import rigid
+from intercap_core.errors import UserError
+from intercap_core.metrics.flags import ranges
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.schemas import CONTACT_REGIONS as REGIONS
+from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
+from intercap_core.viewer.content import gather
+from intercap_core.viewer.package import payload
+
+DOUBTED = 1.5  # times the part's stated error: a frame that the verdict doubts
+_VIEWER = ("frames", "scene", "body_fit")
+
+
+def describe(opened: Opened) -> dict[str, Any]:
+    """All but images and meshes, as JSON; raises UserError where there are no frames to show."""
+    with opened.lock:
+        found: dict[str, Any] = {"notes": [], "places": []}
+        with opened.images() as images:
+            found |= {
+                "sequence": opened.name,
+                "frames": images.num_sets,
+                "fps": images.fps,
+                "times": np.round(images.time_s, 4).tolist(),
+                "master": images.master,
+                "stamp": opened.stamp("frames", "scene"),
+                "result": opened.stamp(),
+                "images": ["".join(map(str, c)) for c in images.colour_available.T.astype(int)],
+            }
+            rig = images.rig
+            found["image_of"] = None
+        found["dropped"] = np.flatnonzero(opened.dropped()).tolist()
+        found["zup_from_master"] = np.eye(4)[:3].tolist()
+        for look in (_scene, _person, _track, _body, _joint, _metrics):
+            stage = look.__name__[1:]
+            stage = {"track": "object_track", "body": "body_fit"}.get(stage, stage)
+            if not opened.there(stage):
+                continue
+            try:
+                rig = look(opened, found) or rig
+            except UserError as error:  # an older version, damaged, or another recording's
+                found["notes"].append(str(error))
+        found["cameras"] = _cameras(rig)
+        found["viewer"] = all(opened.there(stage) for stage in _VIEWER)
+        if not opened.there("joint"):
+            found["notes"].append(
+                "there is no joint result yet: "
+                + ("the sequential fits are shown" if found["viewer"] else "images alone are shown")
+            )
+        recordings = opened.project.sequences[opened.name].recordings
+        if not recordings.exists():
+            found["notes"].append(
+                f"{recordings}: the recordings are not there; what is computed can be looked at and "
+                "mended, a run that reads them again fails until the table names their new place"
+            )
+        found["places"].sort(key=lambda place: -place["weight"])
+    return found
+
+
+def viewer_payload(opened: Opened) -> str:
+    """The 4D viewer's data; raises UserError where there is no body yet or it is not readable."""
+    project = opened.project
+    row = project.sequences[opened.name]
+
+    def made() -> str:
+        content = gather(
+            opened.paths,
+            object_=project.object_of(opened.name),
+            body_models=project.config.body_models,
+            gender=project.subjects[row.subject].gender,
+        )
+        return payload(content.header, content.arrays)
+
+    missing = [stage for stage in _VIEWER if not opened.there(stage)]
+    if missing:
+        raise UserError(f"sequence {opened.name!r} has no body yet: stage {missing[0]!r} lacks")
+    stages = (*_VIEWER, "joint", "metrics", "object_track", "person", "detections")
+    return opened.made("viewer", stages, made)
+
+
+def object_payload(opened: Opened) -> str:
+    """The object's mesh and, where it is tracked, poses (T, 3, 4) master_from_object, for the
+    overlay; raises UserError where the sequence names no object."""
+    entry = opened.project.object_of(opened.name)
+    if entry is None:
+        raise UserError(f"sequence {opened.name!r} names no object")
+
+    def made() -> str:
+        mesh = ObjectMesh.load(entry)
+        arrays = {
+            "vertices": mesh.vertices.astype(np.float32),
+            "faces": mesh.faces.astype(np.uint32),
+            "centre": np.asarray(mesh.centre_of_mass, np.float32),
+        }
+        header: dict[str, Any] = {"name": entry.name, "diameter": float(mesh.diameter)}
+        for name, schema in (("joint", JOINT), ("object_track", OBJECT_TRACK)):
+            try:
+                with artefacts.read(opened.paths[name], schema) as source:
+                    poses = rigid(source["rotation"], source["translation"])
+            except artefacts.Unreadable:
+                continue
+            arrays[f"poses/{name}"] = poses[:, :3].astype(np.float32)
+        return payload(header, arrays)
+
+    return opened.made("object", ("joint", "object_track"), made)
+
+
+def _scene(opened: Opened, found: dict[str, Any]) -> Rig:
+    with artefacts.read(opened.paths["scene"], SCENE) as scene:
+        found["zup_from_master"] = scene["zup_from_master"][:3].tolist()
+        found["image_of"] = scene["image_of"].T.tolist()
+        point, normal = scene["ground_point"], scene["ground_normal"]
+        if np.isfinite(point).all():
+            found["ground"] = {"point": point.tolist(), "normal": normal.tolist()}
+        return Rig.from_artefact(scene)
+
+
+def _person(opened: Opened, found: dict[str, Any]) -> None:
+    with artefacts.read(opened.paths["person"], PERSON) as person:
+        found["subject"] = {
+            "chosen_by": str(person.attributes["chosen_by"]),
+            "doubts": str(person.attributes["doubts"]),
+            "others": int(person["others"].max(initial=0)),
+        }
+        missing = person["missing"]
+    found["places"] += _runs(missing, "subject", "fewer than two views see the subject", 1.0)
+
+
+def _track(opened: Opened, found: dict[str, Any]) -> None:
+    with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
+        found["track"] = {
+            "object": str(track.attributes["object"]),
+            "source": str(track.attributes["seed_source"]),
+            "seed": int(track.attributes["seed_frame"]),
+            "doubts": str(track.attributes["doubts"]),
+            "lost": np.flatnonzero(track["lost"]).tolist(),
+            "ambiguous": np.flatnonzero(track["ambiguous"]).tolist(),
+            "probability": _bytes(track["probability"]),
+        }
+        if not found["track"]["object"]:
+            return
+        found["places"] += _runs(track["lost"], "object", "the object is lost", 3.0)
+        words = "the object may be turned another way"
+        found["places"] += _runs(track["ambiguous"], "object", words, 2.0)
+
+
+def _body(opened: Opened, found: dict[str, Any]) -> None:
+    with artefacts.read(opened.paths["body_fit"], BODY_FIT) as fit:
+        failed = fit["failed"]
+    found["places"] += _runs(failed, "body", "no believable body", 2.5)
+
+
+def _joint(opened: Opened, found: dict[str, Any]) -> Rig | None:
+    with artefacts.read(opened.paths["joint"], JOINT) as joint:
+        probability = joint["contact_probability"]
+        if np.isfinite(probability).any():
+            found["contact"] = {
+                "regions": joint.text("region_names"),
+                "probability": _bytes(probability),
+                "annotated": bool((joint["contact_annotated"] >= 0).any()),
+            }
+        found["flags"] = ranges(joint.text("flag_reason"))
+        moved = joint["master_from_colour"]
+    if opened.there("scene"):
+        return Rig.from_scene(opened.paths["scene"]).moved(moved)
+    return None
+
+
+def _metrics(opened: Opened, found: dict[str, Any]) -> None:
+    with artefacts.read(opened.paths["metrics"], METRICS) as metrics:
+        found["flags"] = ranges(metrics.text("flag_reason"))
+        if "verdict/error" in metrics:
+            parts = metrics.text("verdict/part_names")
+            error, by_frame = metrics["verdict/error"], metrics["verdict/error_frame"]
+            silent = metrics.text("verdict/silent")
+            found["verdict"] = [
+                {
+                    "part": part,
+                    "mm": None if not np.isfinite(error[p]) else round(1e3 * float(error[p]), 1),
+                    "silent": silent[p],
+                    "by_frame": [None if not np.isfinite(e) else round(1e3 * float(e), 1)
+                                 for e in by_frame[p]],
+                }
+                for p, part in enumerate(parts)
+            ]  # fmt: skip
+            for p, part in enumerate(parts):
+                found["places"] += _doubted(part, float(error[p]), by_frame[p])
+    for first, last, reason in found["flags"]:
+        found["places"].append(_place(first, last, "flag", f"flagged: {reason}", 1.5))
+
+
+def _doubted(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[str, Any]]:
+    """Runs of frames whose stated error is well above the sequence's, each at its worst frame."""
+    if not np.isfinite(error):
+        return
+    high = np.nan_to_num(by_frame) > DOUBTED * error
+    for first, last, _ in ranges(["x" if one else "" for one in high]):
+        worst = first + int(np.nanargmax(by_frame[first : last + 1]))
+        ratio = float(by_frame[worst] / error)
+        words = f"the verdict states {1e3 * by_frame[worst]:.0f} mm for the {part} here"
+        yield _place(first, last, "verdict", words, min(ratio, 3.0), worst)
+
+
+def _runs(mask: np.ndarray, kind: str, words: str, weight: float) -> list[dict[str, Any]]:
+    runs = ranges([words if one else "" for one in mask])
+    return [_place(first, last, kind, words, weight) for first, last, _ in runs]
+
+
+def _place(
+    first: int, last: int, kind: str, words: str, weight: float, frame: int | None = None
+) -> dict[str, Any]:
+    """A run of frames to look at, and the frame to jump to."""
+    middle = (first + last) // 2 if frame is None else frame
+    return {
+        "first": int(first), "last": int(last), "frame": int(middle), "kind": kind,
+        "words": words, "weight": round(weight * float(np.log2(2 + last - first)), 3),
+    }  # fmt: skip
+
+
+def _cameras(rig: Rig) -> list[dict[str, Any]]:
+    """Lens (13,) and colour_from_master (3, 4) of each camera, None where the pose is not known."""
+    return [
+        {
+            "name": camera.name,
+            "size": [camera.colour.width, camera.colour.height],
+            "lens": camera.colour.parameters.tolist(),
+            "pose": camera.colour_from_master[:3].tolist()
+            if np.isfinite(camera.master_from_colour).all()
+            else None,
+        }
+        for camera in rig
+    ]
+
+
+def _bytes(share: np.ndarray) -> str:
+    """Shares 0..1 in 255ths, row by row, in base64."""
+    values = np.rint(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
+    return base64.b64encode(values.tobytes()).decode()

@@ -1,0 +1,69 @@
+"""`intercap annotate`: the server on the loopback, and the address to open."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+from intercap_core.errors import UserError
+
+HOST = "127.0.0.1"
+
+
+def serve(
+    settings: Path,
+    sequence: str | None = None,
+    *,
+    port: int = 0,
+    by: str = "",
+    cores: int = 0,
+    profile: Path | None = None,
+    show: bool = False,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Serve the page until the process is interrupted; ``port`` 0 = any that is free.
+
+    Raises UserError where the project has a fault, the port is taken or a library is missing.
+    """
+    try:
+        import uvicorn
+
+        from intercap_core.annotate.server import Annotator, application
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"the page needs the package {error.name}: pip install 'intercap-core[annotate]'"
+        ) from None
+    annotator = Annotator(settings, by=by, cores=cores, profile=profile)
+    if sequence is not None and sequence not in annotator.project.sequences:
+        raise UserError(
+            f"there is no sequence {sequence!r} in the table; it lists "
+            f"{', '.join(annotator.project.sequences)}"
+        )
+    token = secrets.token_urlsafe(24)
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((HOST, port))
+        except OSError as error:
+            raise UserError(
+                f"port {port} cannot be used ({error.strerror}); name another one by --port"
+            ) from None
+        used = listening.getsockname()[1]
+        where = f"/sequence/{sequence}" if sequence else "/"
+        address = f"http://{HOST}:{used}{where}#token={token}"
+        say(f"open {address}")
+        say(f"from another machine: ssh -L {used}:{HOST}:{used} {socket.gethostname()}, then the same address")
+        say("who has the address may change annotations; Ctrl+C ends it")
+        if show:
+            webbrowser.open(address)
+        options = uvicorn.Config(
+            application(annotator, token), log_level="warning", access_log=False,
+            server_header=False, timeout_graceful_shutdown=2, ws="none",
+        )  # fmt: skip
+        try:
+            uvicorn.Server(options).run(sockets=[listening])
+        finally:
+            annotator.runs.stop()

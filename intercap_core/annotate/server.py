@@ -1,0 +1,348 @@
+"""The page's server: what it shows as JSON, JPEG and arrays, and what it may ask to be done."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from intercap_core.annotate import document, questions, rerun, result, snap
+from intercap_core.annotate.guard import App, Guard
+from intercap_core.annotate.images import Pictures
+from intercap_core.annotate.opened import Opened
+from intercap_core.annotate.sequences import SequenceList
+from intercap_core.config import Annotation
+from intercap_core.errors import UserError
+from intercap_core.project import Project, load_project
+from intercap_core.viewer.package import DATA as VIEWER
+
+PAGE = Path(__file__).parent / "page"
+OPEN_SEQUENCES = 3  # with their images and meshes in memory
+_KEEP = {"cache-control": "private, max-age=86400, immutable"}  # of what has its stamp in its address
+
+
+class Annotator:
+    """A project as the page sees it; ``by`` is who annotates, kept with what is answered."""
+
+    def __init__(
+        self, settings: Path, *, by: str = "", cores: int = 0, profile: Path | None = None
+    ) -> None:
+        self.settings, self.by = settings, by
+        self.project = load_project(settings)
+        self.runs = rerun.Runs(cores=cores, profile=profile)
+        self.pictures = Pictures()
+        self._list = SequenceList()
+        self._opened: OrderedDict[str, Opened] = OrderedDict()
+        self._lock = threading.Lock()
+
+    # --- looking -------------------------------------------------------------------------------
+
+    def sequences(self) -> dict[str, Any]:
+        """The table, read again: rows may have come."""
+        self.project = load_project(self.settings)
+        rows = self._list.rows(self.project)
+        return {"dataset": self.project.config.dataset, "by": self.by, "sequences": rows}
+
+    def opened(self, name: str, version: str = "now") -> Opened:
+        """The sequence's artefacts, or those before the last run; raises HTTPException where the
+        table has no such sequence."""
+        if name not in self.project.sequences or version not in ("now", "before"):
+            raise HTTPException(404, f"there is no sequence {name[:80]!r} in the table")
+        key = f"{version}/{name}"
+        with self._lock:
+            if key not in self._opened:
+                paths = rerun.before_paths(self.project, name) if version == "before" else None
+                self._opened[key] = Opened(self.project, name, paths)
+            self._opened.move_to_end(key)
+            while len(self._opened) > 2 * OPEN_SEQUENCES:
+                self._opened.popitem(last=False)[1].close()
+            return self._opened[key]
+
+    def sequence(self, name: str) -> dict[str, Any]:
+        """Everything but images and meshes."""
+        opened = self.opened(name)
+        if not opened.there("frames"):
+            told = (
+                "no images have been read of this recording yet: run it, or "
+                f"`intercap run {self.settings} -- --until frames`"
+            )
+            found: dict[str, Any] = {"sequence": name, "frames": 0, "notes": [told]}
+        else:
+            found = result.describe(opened)
+        row = self.project.sequences[name]
+        made = self.project.annotation_made(name)
+        found |= {
+            "object": row.object or "",
+            "person": row.subject,
+            "annotation": self.annotation(name),
+            "regions": list(result.REGIONS),
+            "read_only": "the studio writes this annotation anew with the recording" if made else "",
+            "profile": str(self.runs.profile or ""),
+        }
+        return found
+
+    def annotation(self, name: str) -> dict[str, Any]:
+        """The annotation file as it is."""
+        found = document.read(self.project.annotation_path(name))
+        return _told(found)
+
+    def state(self, name: str) -> dict[str, Any]:
+        """What tells an open page that annotation or results are others by now."""
+        opened = self.opened(name)
+        return {
+            "annotation": document.read(self.project.annotation_path(name)).digest,
+            "result": opened.stamp(),
+        }
+
+    def questions(self, name: str) -> list[dict[str, Any]]:
+        """Open questions, those first that change most."""
+        answered = questions.read_answers(self._answers(name))
+        return questions.propose(self.opened(name), answered)
+
+    # --- changing ------------------------------------------------------------------------------
+
+    def check(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """What is wrong with changed sections, what changes in the file, and what runs again."""
+        now = document.read(self.project.annotation_path(name))
+        changes = _changes(told)
+        sections = {k: v for k, v in (now.sections | changes).items() if v not in (None, [])}
+        faults = [] if not now.problem else [{"where": "file", "words": now.problem}]
+        faults += document.faults(sections)
+        found: dict[str, Any] = {"faults": faults, "digest": now.digest, "difference": ""}
+        if faults:
+            return found
+        annotation = Annotation.model_validate(sections)
+        faults += self._faults(name, annotation)
+        if not faults:
+            text = document.patched(now, changes)
+            found["difference"] = document.difference(now.text, text, now.path.name)
+            if told.get("plan"):
+                edited = rerun.EditedProject.of(self.project, name, annotation)
+                found["touched"] = rerun.touched(edited, name)
+        return found
+
+    def save(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """Save changed sections into the file that the page has read."""
+        if self.project.annotation_made(name):
+            raise UserError("the studio writes this annotation; it is not changed here")
+        path = self.project.annotation_path(name)
+        now = document.read(path)
+        changes = _changes(told)
+        if now.digest != told.get("digest"):
+            base = str(told.get("text", ""))
+            raise document.Changed(now, document.difference(base, now.text, path.name))
+        sections = {k: v for k, v in (now.sections | changes).items() if v not in (None, [])}
+        faults = document.faults(sections)
+        faults = faults or self._faults(name, Annotation.model_validate(sections))
+        if faults:
+            raise UserError("; ".join(f"{one['where']}: {one['words']}" for one in faults))
+        saved = document.save(now, document.patched(now, changes))
+        if self.by:
+            told = {"kind": "saved", "sections": sorted(changes)}
+            questions.keep_answer(self._answers(name), told, self.by)
+        return _told(saved)
+
+    def answer(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """Keep an answer, so that it is not asked again."""
+        opened = self.opened(name)
+        del opened
+        kept = {key: told.get(key) for key in ("kind", "part", "answer", "first", "last", "frame")}
+        for key in ("from_s", "to_s"):
+            if not isinstance(told.get(key), int | float):
+                raise UserError(f"an answer tells {key}, seconds")
+            kept[key] = float(told[key])
+        if any(isinstance(v, str) and len(v) > 80 for v in kept.values()):
+            raise UserError("an answer's words are too long")
+        questions.keep_answer(self._answers(name), kept, self.by or None)
+        return {"questions": self.questions(name)}
+
+    def snap(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """The object's pose fitted to the images of a frame."""
+        entry = self.project.object_of(self.opened(name).name)
+        if entry is None:
+            raise UserError(f"sequence {name!r} names no object")
+        pose = _pose(told)
+        opened = self.opened(name)
+        with opened.images() as images:
+            if not 0 <= pose.frame < images.num_sets:
+                raise UserError(f"there is no frame {pose.frame}")
+        found = snap.snap(
+            opened, entry, pose.frame, list(pose.rotation_vector), list(pose.translation)
+        )
+        return found.__dict__
+
+    def point(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """The point of the room under a pixel."""
+        opened = self.opened(name)
+        frame, x, y = int(told["frame"]), float(told["x"]), float(told["y"])
+        with opened.images() as images:
+            if not 0 <= frame < images.num_sets:
+                raise UserError(f"there is no frame {frame}")
+        return {"point": snap.point_under(opened, str(told["camera"]), frame, x, y)}
+
+    def run(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """Start, stop or look at a run."""
+        wanted = told.get("do")
+        project = self.project
+        if wanted == "start":
+            self.opened(name)
+            self.project.annotation(name)
+            self.runs.start(project, name)
+        elif wanted == "stop":
+            self.runs.stop()
+        return self.run_state(name)
+
+    def run_state(self, name: str) -> dict[str, Any]:
+        """The run's progress, and the command that does the same."""
+        self.opened(name)
+        told = rerun.command(
+            self.project, name, cores=self.runs.cores, profile=self.runs.profile
+        )
+        progress = self.runs.progress(self.project)
+        return progress | {"command": " ".join(told), "cluster": self.runs.profile is not None}
+
+    def _answers(self, name: str) -> Path:
+        return questions.answers_path(self.project.annotation_path(name))
+
+    def _faults(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
+        """What the recording says against an annotation."""
+        told = [annotation.check_object(self.project.sequences[name].object)]
+        opened = self.opened(name)
+        if opened.there("frames"):
+            try:
+                with opened.images() as images:
+                    told.append(annotation.check_frames(images.num_sets))
+                    told.append(annotation.check_cameras(images.rig.names, images.master))
+            except UserError:  # of an older version: a run reads the frames anew
+                pass
+        return [{"where": words.partition(".")[0].partition("[")[0].split(" ")[0], "words": words}
+                for words in told if words]  # fmt: skip
+
+
+def _told(found: document.Document) -> dict[str, Any]:
+    return {
+        "path": str(found.path), "text": found.text, "digest": found.digest,
+        "sections": found.sections, "problem": found.problem, "note": found.note,
+    }  # fmt: skip
+
+
+def _changes(told: dict[str, Any]) -> dict[str, Any]:
+    changes = told.get("changes")
+    if not isinstance(changes, dict):
+        raise UserError("changes are sections by name")
+    return changes
+
+
+def _pose(told: dict[str, Any]) -> Any:
+    from intercap_core.config import InitialObjectPose
+
+    faults = document.faults({"object_pose": told})
+    if faults:
+        raise UserError(f"{faults[0]['where']}: {faults[0]['words']}")
+    return InitialObjectPose.model_validate(told)
+
+
+# --- routes ----------------------------------------------------------------------------------
+
+
+def application(annotator: Annotator, token: str) -> App:
+    """The server of a project; every request under /api/ carries the ``token``."""
+
+    def page(_: Request) -> Response:
+        return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
+
+    def image(request: Request) -> Response:
+        at = request.path_params
+        width = int(request.query_params.get("width", "0") or 0)
+        opened = annotator.opened(at["name"])
+        data = annotator.pictures.jpeg(opened, at["camera"], at["frame"], width or 1 << 20)
+        if data is None:
+            raise HTTPException(404, "there is no image")
+        kind = "image/png" if data[:4] == b"\x89PNG" else "image/jpeg"
+        return Response(data, media_type=kind, headers=_KEEP)
+
+    def arrays(made: Callable[[Opened], str]) -> Callable[[Request], Response]:
+        def endpoint(request: Request) -> Response:
+            version = request.query_params.get("version", "now")
+            data = base64.b64decode(made(annotator.opened(request.path_params["name"], version)))
+            return Response(data, media_type="application/octet-stream", headers=_KEEP)
+
+        return endpoint
+
+    def look(function: Callable[[str], Any]) -> Callable[[Request], Response]:
+        def endpoint(request: Request) -> Response:
+            name = request.path_params["name"]
+            annotator.opened(name)
+            return _json(function(name))
+
+        return endpoint
+
+    def change(function: Callable[[str, dict[str, Any]], Any]) -> Callable[..., Any]:
+        async def endpoint(request: Request) -> Response:
+            from starlette.concurrency import run_in_threadpool
+
+            name = request.path_params["name"]
+            annotator.opened(name)
+            try:
+                told = json.loads(await request.body())
+            except ValueError:
+                told = None
+            if not isinstance(told, dict):
+                raise HTTPException(400, "expected a JSON object")
+            return _json(await run_in_threadpool(function, name, told))
+
+        return endpoint
+
+    def beside(name: str) -> dict[str, Any]:
+        return rerun.beside(annotator.project, name)
+
+    of = "/api/sequences/{name}"
+    routes = [
+        Route("/", page),
+        Route("/sequence/{name}", page),
+        Mount("/page", StaticFiles(directory=PAGE)),
+        Mount("/viewer", StaticFiles(directory=VIEWER)),
+        Route("/api/sequences", lambda _: _json(annotator.sequences())),
+        Route(of, look(annotator.sequence)),
+        Route(f"{of}/annotation", look(annotator.annotation)),
+        Route(f"{of}/state", look(annotator.state)),
+        Route(f"{of}/questions", look(annotator.questions)),
+        Route(f"{of}/run", look(annotator.run_state), methods=["GET"]),
+        Route(f"{of}/beside", look(beside)),
+        Route(f"{of}/image/{{camera}}/{{frame:int}}", image),
+        Route(f"{of}/viewer", arrays(result.viewer_payload)),
+        Route(f"{of}/object", arrays(result.object_payload)),
+        *(
+            Route(f"{of}/{verb}", change(getattr(annotator, verb)), methods=["POST"])
+            for verb in ("check", "save", "answer", "snap", "point", "run")
+        ),
+    ]
+    handlers: Any = {
+        document.Changed: _changed,
+        UserError: lambda _, error: _json({"error": str(error)}, 422),
+        HTTPException: lambda _, error: _json({"error": error.detail}, error.status_code),
+        KeyError: lambda _, error: _json({"error": f"{error} is missing"}, 400),
+        ValueError: lambda _, error: _json({"error": f"not a number: {error}"}, 400),
+        OSError: lambda _, error: _json({"error": str(error)}, 500),
+    }
+    return Guard(Starlette(routes=routes, exception_handlers=handlers), token)
+
+
+def _changed(_: Request, error: Any) -> Response:
+    told = {"error": str(error), "now": _told(error.now), "difference": error.difference}
+    return _json(told, 409)
+
+
+def _json(value: Any, status: int = 200) -> Response:
+    return JSONResponse(value, status, headers={"cache-control": "no-store"})

@@ -1,0 +1,139 @@
+"""The object's pose of one frame, fitted to the images from where a person has put it; and points
+of the room under a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.annotate.opened import Opened
+from intercap_core.camera.clouds import master_points
+from intercap_core.camera.rig import Rig
+from intercap_core.camera.transforms import apply, rigid
+from intercap_core.config import ObjectEntry
+from intercap_core.detections.read import Detections
+from intercap_core.errors import UserError
+from intercap_core.object_track.constants import SEEN_LOG_RATIO, TRACKING_FACES
+from intercap_core.object_track.fit import MotionPrior, fit_pose
+from intercap_core.object_track.recording import ObjectRecording
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.render import open_renderer
+from intercap_core.schemas import SCENE
+
+NEEDED = ("frames", "detections", "scene", "person")
+NEAR_PX = 5.0  # of a click, in the colour image as recorded
+SAME_SURFACE_M = 0.03  # of points under a click, behind the nearest one
+
+
+@dataclass(frozen=True)
+class Snapped:
+    """Pose master_from_object as the annotation has it, rad and m; ``overlap`` mean IoU over the
+    ``views`` that show it, ``seen``: the images bear it out; by how much it moved, m and rad."""
+
+    rotation_vector: list[float]
+    translation: list[float]
+    overlap: float
+    views: int
+    seen: bool
+    moved_m: float
+    turned_rad: float
+
+
+def snap(
+    opened: Opened,
+    entry: ObjectEntry,
+    frame: int,
+    rotation_vector: list[float],
+    translation: list[float],
+) -> Snapped:
+    """Fit the pose of a frame to depth and masks of all views, from this one.
+
+    Raises UserError where what it needs of the earlier stages is not there.
+    """
+    missing = [stage for stage in NEEDED if not opened.there(stage)]
+    if missing:
+        raise UserError(f"a fit to the images needs stage {missing[0]!r}; run it first")
+    settings = opened.project.config.object_track
+    start = rigid(Rotation.from_rotvec(rotation_vector).as_matrix(), np.array(translation))
+    with opened.sets() as images:
+        mesh = opened.made("mesh", (), lambda: ObjectMesh.load(entry).simplified(TRACKING_FACES))
+        detected = opened.made(
+            "detections", ("detections",), lambda: Detections.load(opened.paths["detections"])
+        )
+        source = opened.made(
+            "recording",
+            NEEDED,
+            lambda: ObjectRecording(
+                images, detected, opened.paths["scene"], opened.paths["person"], mesh.diameter
+            ),
+        )
+        views = source.views(frame)
+    fit = fit_pose(
+        mesh,
+        views,
+        start,
+        prior=MotionPrior(start),
+        min_overlap=settings.min_overlap,
+        background_term=settings.background_term,
+        labels=entry.labels,
+        renderer=open_renderer("cpu"),
+    )
+    turned = Rotation.from_matrix(fit.pose[:3, :3] @ start[:3, :3].T).magnitude()
+    middle = mesh.centre_at(fit.pose) - mesh.centre_at(start)
+    return Snapped(
+        Rotation.from_matrix(fit.pose[:3, :3]).as_rotvec().round(6).tolist(),
+        fit.pose[:3, 3].round(5).tolist(),
+        round(fit.mean_overlap, 3),
+        fit.support,
+        bool(fit.log_ratio > SEEN_LOG_RATIO),
+        round(float(np.linalg.norm(middle)), 5),
+        round(float(turned), 5),
+    )
+
+
+def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> list[float]:
+    """The point (3,), master frame, metres, that a pixel of the colour image as recorded shows.
+
+    By the camera's depth, else where the ray meets the floor that is known. Raises UserError where
+    neither tells.
+    """
+    with opened.images() as images:
+        rig = images.rig
+        bias = np.zeros(len(rig))
+        normal = point = np.full(3, np.nan)
+        if opened.there("scene"):
+            with artefacts.read(opened.paths["scene"], SCENE) as scene:
+                rig, bias = Rig.from_artefact(scene), scene["depth_bias"]
+                normal, point = scene["ground_normal"], scene["ground_point"]
+        if camera not in rig.names:
+            raise UserError(f"there is no camera {camera!r}; expected one of {rig.names}")
+        c = rig.names.index(camera)
+        lens, pixel = rig[c].colour, np.array([x, y])
+        depth = images.depth(frame, c) if rig[c].depth is not None else None
+    if not np.isfinite(rig[c].master_from_colour).all():
+        raise UserError(f"camera {camera}: its pose is not known, so no point can be placed by it")
+    if depth is not None:
+        points = master_points(depth, rig[c]).points.astype(np.float64)
+        seen = apply(rig[c].colour_from_master, points)
+        away = np.linalg.norm(lens.project(seen) - pixel, axis=1)
+        near = np.flatnonzero((away < NEAR_PX) & lens.inside_model(seen))
+        if len(near):
+            ahead = seen[near, 2]
+            kept = near[ahead < ahead.min() + SAME_SURFACE_M]
+            middle = np.median(seen[kept], axis=0)
+            middle *= 1 - float(np.nan_to_num(bias[c])) / middle[2]
+            return apply(rig[c].master_from_colour, middle[None])[0].round(4).tolist()
+    ray = rig[c].master_from_colour[:3, :3] @ lens.unproject(pixel)
+    origin = rig[c].master_from_colour[:3, 3]
+    along = float(normal @ ray)
+    if np.isfinite(along) and abs(along) > 1e-6:
+        far = float(normal @ (point - origin)) / along
+        if far > 0:
+            return (origin + far * ray).round(4).tolist()
+    raise UserError(
+        f"camera {camera} has no depth at this pixel of frame {frame}; click beside it, or use "
+        "another camera"
+    )
