@@ -3,6 +3,7 @@ of the room under a pixel."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,17 +14,24 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.camera.clouds import master_points
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import apply, rigid
-from intercap_core.config import ObjectEntry
+from intercap_core.config import ObjectEntry, ObjectTrackSettings
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
-from intercap_core.object_track.constants import SEEN_LOG_RATIO, TRACKING_FACES
-from intercap_core.object_track.fit import MotionPrior, fit_pose
+from intercap_core.object_track.constants import (
+    ASSESS_MIN_OVERLAP,
+    SEEN_LOG_RATIO,
+    TRACKING_FACES,
+)
+from intercap_core.object_track.fit import Fit, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.recording import ObjectRecording
+from intercap_core.object_track.view import View
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.rigid.render import open_renderer
 from intercap_core.schemas import SCENE
 
 NEEDED = ("frames", "detections", "scene", "person")
+REACH_DIAMETERS = (0.35, 0.7, 1.2)  # of the object: how far from the start it is looked for
+FITTED_AROUND = 4  # of the places around, those that agree most
 NEAR_PX = 5.0  # of a click, in the colour image as recorded
 SAME_SURFACE_M = 0.03  # of points under a click, behind the nearest one
 
@@ -71,16 +79,7 @@ def snap(
             ),
         )
         views = source.views(frame)
-    fit = fit_pose(
-        mesh,
-        views,
-        start,
-        prior=MotionPrior(start),
-        min_overlap=settings.min_overlap,
-        background_term=settings.background_term,
-        labels=entry.labels,
-        renderer=open_renderer("cpu"),
-    )
+    fit = _fitted(mesh, views, start, settings, entry.labels)
     turned = Rotation.from_matrix(fit.pose[:3, :3] @ start[:3, :3].T).magnitude()
     middle = mesh.centre_at(fit.pose) - mesh.centre_at(start)
     return Snapped(
@@ -92,6 +91,39 @@ def snap(
         round(float(np.linalg.norm(middle)), 5),
         round(float(turned), 5),
     )
+
+
+def _fitted(
+    mesh: ObjectMesh,
+    views: list[View],
+    start: np.ndarray,
+    settings: ObjectTrackSettings,
+    labels: tuple[str, ...],
+) -> Fit:
+    """The fit from ``start`` (4, 4); where the images do not bear it out, also from places around it
+    that show most of the object, and the likeliest of all."""
+    renderer = open_renderer("cpu")
+
+    def fitted(pose: np.ndarray) -> Fit:
+        return fit_pose(
+            mesh, views, pose, prior=MotionPrior(pose), min_overlap=settings.min_overlap,
+            background_term=settings.background_term, labels=labels, renderer=renderer,
+        )  # fmt: skip
+
+    best = fitted(start)
+    if best.log_ratio > SEEN_LOG_RATIO:
+        return best
+    steps = np.array(list(itertools.product((-1, 0, 1), repeat=3)), float)
+    steps = steps[np.abs(steps).sum(1) > 0]
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    around = np.repeat(start[None], len(steps) * len(REACH_DIAMETERS), 0)
+    shifts = [mesh.diameter * far * steps for far in REACH_DIAMETERS]
+    around[:, :3, 3] += np.concatenate(shifts)
+    seen = assess_all(
+        mesh, views, around, min_overlap=ASSESS_MIN_OVERLAP, labels=labels, renderer=renderer
+    )
+    order = np.argsort([-one.log_ratio for one in seen], kind="stable")[:FITTED_AROUND]
+    return max([best, *(fitted(around[k]) for k in order)], key=lambda one: one.log_ratio)
 
 
 def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> list[float]:

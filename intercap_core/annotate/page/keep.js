@@ -60,17 +60,19 @@ export class Keep {
     if (!Object.keys(changes).length) { app.say("there is nothing to save"); return; }
     if (app.told.read_only) { app.say(app.told.read_only); return; }
     let found;
-    try { found = await post(`${this.path}/check`, { changes, plan: true }); } catch (error) { app.say(error.message); return; }
+    try { found = await post(`${this.path}/check`, { changes }); } catch (error) { app.say(error.message); return; }
     this.faults = found.faults;
     this.state();
     if (found.faults.length) {
       await ask("Not saved: this is not right yet", make("ul", {}, found.faults.map((one) => make("li", {}, `${one.where}: ${one.words}`))), [["", "Back", true]]);
       return;
     }
-    const stages = found.touched?.map((one) => words(one.stage)) ?? [];
-    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference),
-      make("p", {}, stages.length ? `A run then makes anew: ${stages.join(", ")}.` : "Nothing has to be run again.")],
-    [["save", "Save", true], ...(stages.length && !app.told.profile ? [["run", "Save and run"]] : []), ["", "Cancel"]]);
+    const touches = make("p", { data: { part: "touches" } }, "What a run then makes anew is looked up…");
+    post(`${this.path}/check`, { changes, plan: true }).then(({ touched }) => {
+      touches.textContent = touched?.length ? `A run then makes anew: ${touched.map((one) => words(one.stage)).join(", ")}.` : "Nothing has to be run again.";
+    }, (error) => { touches.textContent = error.message; });
+    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference), touches],
+      [["save", "Save", true], ...(app.told.profile ? [] : [["run", "Save and run"]]), ["", "Cancel"]]);
     if (!answer) return;
     try {
       app.saved(await post(`${this.path}/save`, { digest: app.draft.file.digest, text: app.draft.file.text, changes }));

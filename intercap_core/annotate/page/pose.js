@@ -165,9 +165,11 @@ export class PoseEditor {
         frame, rotation_vector: rotationVector(this.pose), translation: this.pose.map((row) => row[3]),
       });
       if (app.frame !== frame || !this.editing) return;
-      this.pose = rigid(found.rotation_vector, found.translation);
-      this.report = `${found.seen ? "the images bear it out" : "the images do not bear it out"}: overlap ${found.overlap.toFixed(2)} in ${found.views} views, moved ${(1000 * found.moved_m).toFixed(0)} mm and ${((found.turned_rad * 180) / Math.PI).toFixed(0)}°`;
-      this.put("object fitted to the images");
+      if (found.seen) {
+        this.pose = rigid(found.rotation_vector, found.translation);
+        this.report = `fitted: overlap ${found.overlap.toFixed(2)} in ${found.views} views, moved ${(1000 * found.moved_m).toFixed(0)} mm and ${((found.turned_rad * 180) / Math.PI).toFixed(0)}°`;
+        this.put("object fitted to the images");
+      } else this.report = "the images bear out no pose near this one; drag it nearer, or leave it as you see it";
     } catch (error) { this.report = error.message; }
     this.changed();
   }
