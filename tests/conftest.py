@@ -25,6 +25,7 @@ TOGETHER = ("workflow", "slurm")
 # Folders and files that start processes, render whole captures or fit whole sequences;
 # `make test-fast` leaves them out, and what is marked `slow` elsewhere.
 SLOW = (
+    "annotate/test_browser.py",
     "bench",
     "body/test_jacobian.py",
     "body_fit/test_recover.py",

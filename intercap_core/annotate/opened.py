@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,9 +22,9 @@ T = TypeVar("T")
 
 class Opened:
     """One sequence's artefacts: images stay open, and what is made of files is kept until one of
-    them is another. For several threads.
+    them is another. For several threads; ``lock`` keeps the images open while they are read.
 
-    ``paths`` by stage. HDF5 is not for two threads at once, so whoever reads holds the lock.
+    ``paths`` by stage.
     """
 
     def __init__(self, project: Project, name: str, paths: dict[str, Path] | None = None) -> None:
@@ -31,6 +32,7 @@ class Opened:
         self.paths = paths or {s: project.artefact(name, s) for s in SEQUENCE_STAGES}
         self.lock = threading.RLock()
         self._made: dict[str, tuple[tuple[str, ...], Any]] = {}
+        self._making: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
         self._stack = contextlib.ExitStack()
         self._images: tuple[str, Frames, Frames, np.ndarray] | None = None
 
@@ -43,8 +45,11 @@ class Opened:
         return self.paths[stage].is_file()
 
     def made(self, key: str, stages: tuple[str, ...], make: Callable[[], T]) -> T:
-        """What ``make`` returns, made anew where an artefact of these ``stages`` is another."""
+        """What ``make`` returns, made anew where an artefact of these ``stages`` is another; once,
+        however many ask for it meanwhile."""
         with self.lock:
+            making = self._making[key]
+        with making:
             stamps = tuple(_stamp(self.paths[stage]) for stage in stages)
             known = self._made.get(key)
             if known is None or known[0] != stamps:

@@ -60,7 +60,7 @@ def serve(
         if show:
             webbrowser.open(address)
         options = uvicorn.Config(
-            application(annotator, token), log_level="warning", access_log=False,
+            application(annotator, token), log_level="error", access_log=False,
             server_header=False, timeout_graceful_shutdown=2, ws="none",
         )  # fmt: skip
         try:

@@ -67,7 +67,7 @@ class Visit:
 
 @contextmanager
 def visit(
-    shown: Path,
+    shown: Path | str,
     *,
     size: tuple[int, int] = DESK,
     phone: bool = False,
@@ -75,7 +75,8 @@ def visit(
     address: str = "",
     log: Path | None = None,
 ) -> Iterator[Visit]:
-    """The page in a window of ``size`` CSS pixels; ``address`` is added to its own.
+    """The page, a file or an address, in a window of ``size`` CSS pixels; ``address`` is added to
+    its own.
 
     A ``phone`` has a touch screen, a finger in place of a pointer, and obeys the page's viewport.
     The browser's own record of its network goes to ``log``; read it by :func:`asked`, afterwards.
@@ -99,7 +100,8 @@ def visit(
         found.page.set_default_timeout(_PATIENCE_MS)
         found.page.on("console", lambda message: found.console.append(message.text))
         found.page.on("pageerror", lambda error: found.console.append(str(error)))
-        found.page.goto(shown.resolve().as_uri() + address)
+        own = shown if isinstance(shown, str) else shown.resolve().as_uri()
+        found.page.goto(own + address)
         try:
             yield found
         finally:

@@ -154,6 +154,7 @@ export class Keep {
       this.touched = null;
       await app.reload();
       this.beside = await get(`${this.path}/beside`);
+      app.panels();
       await app.loadBefore();
       app.say(this.run.state === "done" ? "the new result is drawn; B shows the old one beside it" : "the run failed");
     }

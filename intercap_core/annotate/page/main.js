@@ -152,6 +152,7 @@ class App {
       if (this.pose?.editing) this.setMode(null);
     }
     this.frame = frame;
+    if (this.near) this.nearby(); // goes along with the object
     this.redraw();
   }
 

@@ -67,6 +67,7 @@ export class Views {
     const from = [event.clientX, event.clientY], [x, y] = view.crop;
     return {
       move: (next) => {
+        this.app.near = false;
         const scale = view.crop[2] / view.canvas.clientWidth;
         view.crop[0] = x - (next.clientX - from[0]) * scale;
         view.crop[1] = y - (next.clientY - from[1]) * scale;
@@ -77,6 +78,7 @@ export class Views {
   }
 
   zoom(view, [px, py], factor) {
+    this.app.near = false;
     const [w, h] = view.camera.size;
     const wide = Math.min(w, Math.max(w / NEAREST, view.crop[2] * factor));
     const high = (wide * h) / w, by = wide / view.crop[2];

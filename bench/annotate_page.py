@@ -1,0 +1,116 @@
+"""From a key to all views drawn: the page of `intercap annotate` in a real Chromium.
+
+    python -m bench.annotate_page [config/demo/config.yaml] [--sequence NAME] [--steps 30]
+        [--output results/bench.json]
+
+The arrow key is pressed as a person does, with a pause between; a step ends when every view and the
+3D viewer have drawn the new frame, the graphics process has ended its work and the browser has
+painted. Into the JSON go ``annotate.page_ms_per_step``, the median of steps on,
+``annotate.page_ms_per_step_p95``, and ``annotate.page_ms_per_jump``, to the last frame, whose images
+nobody has fetched ahead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from intercap_core.commands.bench import put_figures
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+PAUSE_MS = 160  # between keys
+READY = "document.body.dataset.ready === 'yes'"
+# A step begins with the key, before the page hears of it, and ends when all is painted.
+WATCH = """
+(() => {
+  const app = window.annotate, drawn = app.drawn.bind(app);
+  window.stepMs = [];
+  let pressed = null;
+  window.addEventListener("keydown", (event) => { pressed = event.timeStamp; }, { capture: true });
+  app.drawn = () => {
+    const stepped = app.asked !== null && app.asked !== undefined;
+    drawn();
+    if (!stepped || pressed === null) return;
+    const key = pressed;
+    pressed = null;
+    const solid = document.querySelector(".viewer canvas")?.getContext("webgl2");
+    for (const gl of [app.overlay?.gl, solid]) { // waits for all that was to be drawn
+      gl?.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    }
+    requestAnimationFrame(() => { // and the next message comes after the frame was painted
+      const channel = new MessageChannel();
+      channel.port1.onmessage = () => window.stepMs.push([app.frame, performance.now() - key]);
+      channel.port2.postMessage(0);
+    });
+  };
+})()
+"""
+
+
+def steps_ms(page: Page, steps: int, key: str = "ArrowRight") -> list[float]:
+    """Milliseconds of so many steps, one after the other, of a page that is watched (WATCH)."""
+    page.evaluate("window.stepMs.length = 0")
+    for step in range(steps):
+        page.keyboard.press(key)
+        while page.evaluate("window.stepMs.length") <= step:
+            page.wait_for_timeout(5)
+        page.wait_for_timeout(PAUSE_MS)
+    return [float(ms) for _, ms in page.evaluate("window.stepMs")]
+
+
+def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
+    """Figures of one sequence, served by a process of its own."""
+    from tests.helpers.browser import visit
+
+    command = [sys.executable, "-m", "intercap_core.cli", "annotate", str(settings), sequence]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    try:
+        address = re.search(r"http\S+", server.stdout.readline())
+        if address is None:
+            raise SystemExit("the server did not start")
+        with visit(address.group(0), size=(1440, 900)) as page:
+            page.wait(READY)
+            page.page.wait_for_timeout(1500)
+            page.page.evaluate(WATCH)
+            steps = min(steps, page.page.evaluate("window.annotate.told.frames") - 1)
+            on = steps_ms(page.page, steps)
+            page.page.reload()
+            page.wait(READY)
+            page.page.wait_for_timeout(1500)
+            page.page.evaluate(WATCH)
+            jump = steps_ms(page.page, 1, "End")
+    finally:
+        server.terminate()
+        server.wait()
+    return {
+        "annotate.page_ms_per_step": round(float(np.median(on)), 1),
+        "annotate.page_ms_per_step_p95": round(float(np.percentile(on, 95)), 1),
+        "annotate.page_ms_per_jump": round(jump[0], 1),
+    }
+
+
+def main() -> None:
+    """Measure, print, and put the figures beside what is in the output."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/demo/config.yaml"))
+    parser.add_argument("--sequence", default="cup_drink_s02")
+    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
+    told = parser.parse_args()
+    found = measure(told.settings, told.sequence, told.steps)
+    for name, value in found.items():
+        print(f"{name}: {value}")
+    put_figures(told.output, found, instead_of=("annotate.page_",))
+
+
+if __name__ == "__main__":
+    main()

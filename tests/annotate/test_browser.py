@@ -1,0 +1,246 @@
+"""The page in a real browser, used as a person would: keys, drags, clicks, a save, a conflict."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from tests.annotate.served import NAME, TOKEN, Served, annotation, artefact, served, small_project
+from tests.helpers.browser import Visit, needs_chromium, serious_faults, visit
+
+pytestmark = needs_chromium
+SIZE = (1440, 900)
+READY = "document.body.dataset.ready === 'yes'"
+HAND = '[data-part="right_hand"] .bar'
+STEP_MS = 100.0  # from the key to all views drawn
+# Of a machine that draws without a GPU and shares its cores the tests ask less than of a desk.
+PATIENCE = 4.0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    settings = small_project(tmp_path_factory.mktemp("browsed"), total=10)
+    with h5py.File(artefact(settings, "joint"), "r+") as file:
+        names = [name.decode() for name in file["region_names"][:]]
+        file["contact_probability"][...] = 0.02
+        file["contact_probability"][2:8, names.index("right_hand")] = 0.9
+        file["contact_probability"][4:8, names.index("seat")] = 0.45
+        file["contact_annotated"][...] = -1
+    return settings
+
+
+@pytest.fixture
+def settings(made: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "project"
+    shutil.copytree(made.parent, folder)
+    path = folder / "config.yaml"
+    path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
+    return path
+
+
+@contextmanager
+def _open(page: Served, **options: Any) -> Iterator[Visit]:
+    address = f"{page.address}/sequence/{NAME}#token={TOKEN}"
+    with visit(address, size=SIZE, **options) as found:
+        found.wait(READY)
+        yield found
+        assert not [line for line in found.console if "Failed to load" not in line], found.console
+
+
+def _draft(page: Visit, section: str) -> Any:
+    return page.page.evaluate(f"window.annotate.draft.get({section!r})")
+
+
+def _drag(page: Visit, start: tuple[float, float], by: tuple[float, float]) -> None:
+    mouse = page.page.mouse
+    mouse.move(*start)
+    mouse.down()
+    mouse.move(start[0] + by[0], start[1] + by[1], steps=6)
+    mouse.up()
+
+
+def _save(page: Visit, answer: str = "save") -> None:
+    page.page.keyboard.press("Control+s")
+    page.wait("document.getElementById('dialog').open")
+    page.page.locator(f'[data-answer="{answer}"]').click()
+
+
+def test_contact_is_dragged_split_denied_and_saved_with_its_difference(settings: Path) -> None:
+    annotation(settings).write_text("# kept\ndrop_frames: [9]\n")
+    with served(settings) as server, _open(server) as page:
+        keys = page.page.keyboard
+        box = page.page.locator(HAND).bounding_box()
+        assert box is not None
+        frame = box["width"] / 6
+        _drag(page, (box["x"] + box["width"] - 4, box["y"] + 10), (-2 * frame, 3))
+        assert _draft(page, "contact") == [{"part": "right_hand", "start": 2, "end": 6}]
+        keys.press("Control+z")
+        assert _draft(page, "contact") is None
+        keys.press("Control+Shift+z")
+        page.page.locator(HAND).focus()
+        page.page.evaluate("window.annotate.show(4)")
+        keys.press("k")
+        assert [one["start"] for one in _draft(page, "contact")] == [2, 4]
+        keys.press("Delete")
+        assert _draft(page, "contact") == [{"part": "right_hand", "start": 2, "end": 4}]
+        keys.press("Control+s")
+        page.wait("document.getElementById('dialog').open")
+        shown = page.page.locator("#dialog").inner_text()
+        assert "+  - {part: right_hand, start: 2, end: 4}" in shown
+        page.page.locator('[data-answer="save"]').click()
+        page.wait("document.getElementById('status').textContent === 'saved'")
+        text = annotation(settings).read_text()
+        assert text.startswith("# kept\ndrop_frames: [9]\n") and "start: 2, end: 4" in text
+
+
+def test_the_object_is_moved_in_a_view_where_the_pointer_goes(settings: Path) -> None:
+    with served(settings) as server, _open(server) as page:
+        keys = page.page.keyboard
+        keys.press("o")
+        box = page.page.locator("#big canvas").first.bounding_box()
+        assert box is not None
+        told = page.page.evaluate(
+            """() => { const a = window.annotate, view = a.views.views[0];
+              return { at: a.views.place(view, a.pose.middle()), wide: view.width, pose: a.pose.pose,
+                       focal: view.camera.lens[0], size: view.camera.size[0] }; }"""
+        )
+        scale = box["width"] / told["wide"]
+        start = (box["x"] + told["at"][0] * scale, box["y"] + told["at"][1] * scale)
+        _drag(page, start, (40, -20))
+        pose = _draft(page, "object_pose")
+        depth = told["pose"][2][3]
+        metres = depth / told["focal"] * told["size"] / box["width"]
+        moved = np.array(pose["translation"]) - np.array(told["pose"])[:, 3]
+        assert np.allclose(moved, [40 * metres, -20 * metres, 0], atol=0.1 * 40 * metres)
+        keys.down("Shift")
+        _drag(page, start, (50, 0))
+        keys.up("Shift")
+        turned = Rotation.from_rotvec(_draft(page, "object_pose")["rotation_vector"])
+        assert 0.3 < turned.magnitude() < 0.5  # about the vertical of the view, 0.008 rad a pixel
+        keys.press("Escape")
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'saved'")
+    told = yaml.safe_load(annotation(settings).read_text())
+    assert told["object_pose"]["frame"] == 0
+
+
+def test_subject_floor_and_dropped_frames_are_clicked(settings: Path) -> None:
+    with served(settings) as server, _open(server) as page:
+        keys, view = page.page.keyboard, page.page.locator('[data-camera="k1"] canvas')
+        box = view.bounding_box()
+        assert box is not None
+        keys.press("u")
+        page.page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+        [point] = _draft(page, "subject")
+        assert point["camera"] == "k1" and abs(point["x"] - 239.5) < 2 and abs(point["y"] - 134.5) < 2
+        keys.press("Escape")
+        keys.press("g")
+        for k, (x, y) in enumerate(((0.1, 0.9), (0.9, 0.9), (0.5, 0.1))):
+            page.page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+            page.wait(f"(window.annotate.draft.get('floor') ?? []).length === {k + 1}")
+        assert all(abs(z - 4.0) < 0.3 for _, _, z in _draft(page, "floor"))  # the wall of the capture
+        keys.press("Escape")
+        keys.press("End")
+        keys.press("x")
+        assert _draft(page, "drop_frames") == [9]
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'saved'")
+    assert set(yaml.safe_load(annotation(settings).read_text())) == {
+        "floor", "subject", "drop_frames",
+    }  # fmt: skip
+
+
+def test_a_question_is_answered_by_a_key_and_never_asked_again(settings: Path) -> None:
+    with served(settings) as server, _open(server) as page:
+        page.wait("window.annotate.questions.list.length > 0")
+        asked = page.page.evaluate("window.annotate.questions.list.map((q) => q.id)")
+        assert "contact.seat.4.7" in asked
+        page.page.evaluate(
+            "window.annotate.questions.ask(window.annotate.questions.list.find((q) => q.part === 'seat'))"
+        )
+        page.page.keyboard.press("1")
+        page.wait("!window.annotate.questions.list.some((q) => q.part === 'seat')")
+        assert {"part": "seat", "start": 4, "end": 8} in _draft(page, "contact")
+        page.page.reload()
+        page.wait(READY)
+        page.wait("document.getElementById('tab-questions') !== null")
+        asked = page.page.evaluate("window.annotate.questions.list.map((q) => q.id)")
+        assert "contact.seat.4.7" not in asked
+
+
+def test_two_annotators_keep_both_changes(settings: Path) -> None:
+    path = annotation(settings)
+    path.write_text("# two people\ndrop_frames: [9]\n")
+    with served(settings) as server, _open(server) as page:
+        page.page.locator(HAND).focus()
+        page.page.keyboard.press("c")
+        path.write_text("# two people\ndrop_frames: [8, 9]\n")
+        _save(page)
+        page.wait("document.getElementById('dialog-title').textContent.startsWith('Somebody')")
+        assert "[8, 9]" in page.page.locator("#dialog").inner_text()
+        page.page.locator('[data-answer="mine"]').click()
+        page.wait("document.getElementById('dialog-title').textContent.startsWith('Save')")
+        page.page.locator('[data-answer="save"]').click()
+        page.wait("document.getElementById('status').textContent === 'saved'")
+    text = path.read_text()
+    assert "drop_frames: [8, 9]" in text and "right_hand" in text and text.startswith("# two people")
+
+
+def test_edits_of_a_tab_that_went_away_are_found_again(settings: Path) -> None:
+    with served(settings) as server, _open(server) as page:
+        page.page.keyboard.press("x")
+        assert _draft(page, "drop_frames") == [0]
+        page.page.on("dialog", lambda dialog: dialog.accept())
+        page.page.reload()
+        page.wait(READY)
+        assert _draft(page, "drop_frames") is None
+        page.page.get_by_text("Take them up again").click()
+        assert _draft(page, "drop_frames") == [0]
+
+
+def test_images_alone_are_shown_and_can_be_annotated(settings: Path) -> None:
+    for path in artefact(settings, "joint").parent.glob("*.h5"):
+        if path.stem != "frames":
+            path.unlink()
+    with served(settings) as server, _open(server) as page:
+        assert "images alone" in page.page.locator("#banners").inner_text()
+        page.page.keyboard.press("ArrowRight")
+        page.wait("document.body.dataset.drawn === '1'")
+        page.page.keyboard.press("x")
+        assert _draft(page, "drop_frames") == [1]
+
+
+def test_a_page_without_the_token_shows_nothing(settings: Path) -> None:
+    with served(settings) as server, visit(server.address, size=SIZE) as page:
+        page.wait("!document.getElementById('stopped').hidden")
+        assert "token" in page.page.locator("#stopped").inner_text()
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_it_can_be_used_with_assistive_technology(settings: Path, dark: bool) -> None:
+    with served(settings) as server:
+        with visit(f"{server.address}/#token={TOKEN}", size=SIZE, dark=dark) as page:
+            page.wait("document.querySelectorAll('#sequences a').length === 1")
+            assert serious_faults(page) == []
+        with _open(server, dark=dark) as page:
+            for tab in ("doubts", "questions", "object", "marks", "run"):
+                page.page.locator(f"#tab-{tab}").click()
+                assert serious_faults(page) == []
+
+
+def test_a_step_is_drawn_in_all_views_in_time(settings: Path) -> None:
+    from bench.annotate_page import WATCH, steps_ms
+
+    with served(settings) as server, _open(server) as page:
+        page.page.evaluate(WATCH)
+        found = steps_ms(page.page, 9)
+    assert float(np.median(found)) < PATIENCE * STEP_MS, found

@@ -1,0 +1,177 @@
+"""The annotation file: what a user wrote stays, saves are whole, another's change is noticed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import yaml
+
+from intercap_core.annotate import document
+from intercap_core.errors import UserError
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "annotations.example.yaml"
+WRITTEN = """\
+# by Ann, on Monday
+contact: # looked at twice
+- part: seat # sits
+  start: 1
+  end: 4
+# between
+- part: back
+  start: 1
+  end: 4 # late
+drop_frames: [3, 4] # dark
+# the end
+"""
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "s01.yaml"
+
+
+def _patched(path: Path, text: str, **changes: object) -> str:
+    path.write_text(text)
+    return document.patched(document.read(path), changes)
+
+
+def test_comments_and_order_stay_where_a_value_changes(path: Path) -> None:
+    contact = [
+        {"part": "seat", "start": 1, "end": 5},
+        {"part": "back", "start": 1, "end": 4},
+        {"part": "any", "start": 8, "end": 9},
+    ]
+    new = _patched(path, WRITTEN, contact=contact)
+    assert new == WRITTEN.replace("end: 4\n# between", "end: 5\n# between").replace(
+        "end: 4 # late\n", "end: 4 # late\n- {part: any, start: 8, end: 9}\n"
+    )
+
+
+def test_a_section_that_stays_is_not_touched(path: Path) -> None:
+    text = EXAMPLE.read_text()
+    new = _patched(path, text, drop_frames=[17, 18, 40])
+    assert new == text.replace("drop_frames: [17, 18]", "drop_frames: [17, 18, 40]")
+
+
+def test_each_section_can_be_changed_taken_away_and_added(path: Path) -> None:
+    text = EXAMPLE.read_text()
+    whole = yaml.safe_load(text)
+    for section, value in whole.items():
+        if section in ("starts", "starts_sigma"):
+            continue
+        without = _patched(path, text, **{section: None})
+        assert yaml.safe_load(without) == {k: v for k, v in whole.items() if k != section}
+        assert without.count("#") == text.count("#")  # no comment is lost with it
+        again = _patched(path, without, **{section: value})
+        assert yaml.safe_load(again) == whole
+
+
+def test_a_new_file_reads_like_the_example(path: Path) -> None:
+    changes = {
+        "contact": [{"part": "seat", "start": 1, "end": 5}],
+        "object_pose": {
+            "frame": 3,
+            "rotation_vector": [0.1, 0.2, 0.3],
+            "translation": [0, 0.5, 2.25],
+        },
+    }
+    new = document.patched(document.read(path), changes)
+    assert new == (
+        "contact:\n  - {part: seat, start: 1, end: 5}\n\nobject_pose:\n  frame: 3\n"
+        "  rotation_vector: [0.1, 0.2, 0.3]\n  translation: [0, 0.5, 2.25]\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{contact: [{part: seat, start: 1, end: 4}]}\n",
+        "contact: &c\n  - {part: seat, start: 1, end: 4}\n",
+        "contact:\r\n  - {part: seat, start: 1, end: 4}\r\n",
+        "---\ncontact:\n  - {part: seat, start: 1, end: 4}\n...\n",
+        "contact:\n  - {part: seat, start: 1, end: 4}",
+    ],
+)
+def test_other_layouts_are_understood_or_left_alone(path: Path, text: str) -> None:
+    path.write_bytes(text.encode())
+    new = document.patched(document.read(path), {"drop_frames": [2]})
+    assert yaml.safe_load(new) == {**yaml.safe_load(text), "drop_frames": [2]}
+    assert ("\r\n" in new) == ("\r\n" in text)
+
+
+def test_a_broken_file_is_named_and_never_written(path: Path) -> None:
+    path.write_text("contact: [\n")
+    found = document.read(path)
+    assert str(path) in found.problem and "line" in found.problem
+    with pytest.raises(UserError, match="not valid YAML"):
+        document.patched(found, {"drop_frames": [1]})
+
+
+def test_faults_are_those_of_the_settings_model() -> None:
+    faults = document.faults(
+        {"contact": [{"part": "tail", "start": 5, "end": 2}], "floor": [[0, 0, 1]]}
+    )
+    assert {one["where"] for one in faults} >= {"contact.0.part"}
+    assert not document.faults({"contact": [{"part": "any", "start": 1, "end": 2}]})
+
+
+def test_a_second_annotators_change_is_shown_and_kept(path: Path) -> None:
+    path.write_text(WRITTEN)
+    mine = document.read(path)
+    theirs = WRITTEN.replace("[3, 4]", "[3, 4, 5]")
+    path.write_text(theirs)
+    with pytest.raises(document.Changed) as refused:
+        document.save(mine, document.patched(mine, {"contact": None}))
+    assert path.read_text() == theirs
+    assert "+drop_frames: [3, 4, 5] # dark" in refused.value.difference
+    assert refused.value.now.sections["drop_frames"] == [3, 4, 5]
+
+
+def test_a_file_that_came_meanwhile_is_not_overwritten(path: Path) -> None:
+    nothing = document.read(path)
+    path.write_text("drop_frames: [1]\n")
+    with pytest.raises(document.Changed):
+        document.save(nothing, "drop_frames: [2]\n")
+    assert path.read_text() == "drop_frames: [1]\n"
+
+
+@pytest.mark.parametrize("cut_off_in", ["fsync", "replace"])
+def test_a_save_that_is_cut_off_leaves_the_file_as_it_was(
+    path: Path, monkeypatch: pytest.MonkeyPatch, cut_off_in: str
+) -> None:
+    path.write_text(WRITTEN)
+    found = document.read(path)
+
+    def cut_off(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, cut_off_in, cut_off)
+        patch.setattr(Path, "unlink", lambda *_, **__: None)  # a killed process clears nothing
+        with pytest.raises(KeyboardInterrupt):
+            document.save(found, "drop_frames: [2]\n")
+    assert path.read_text() == WRITTEN
+    again = document.read(path)
+    assert "cut off" in again.note and again.digest == found.digest
+    saved = document.save(again, "drop_frames: [2]\n")
+    assert path.read_text() == "drop_frames: [2]\n" and not saved.note
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
+
+
+def test_a_link_and_its_permissions_stay(tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    real, link = tmp_path / "kept" / "a.yaml", tmp_path / "s01.yaml"
+    real.write_text("drop_frames: [1]\n")
+    real.chmod(0o640)
+    link.symlink_to(real)
+    document.save(document.read(link), "drop_frames: [2]\n")
+    assert link.is_symlink() and real.read_text() == "drop_frames: [2]\n"
+    assert real.stat().st_mode & 0o777 == 0o640
+
+
+def test_dropping_frames_leaves_intervals_where_they_are_in_time(path: Path) -> None:
+    """A dropped frame keeps its number, so that nothing else of the annotation moves."""
+    new = _patched(path, WRITTEN, drop_frames=[0, 1, 2, 3, 4])
+    assert yaml.safe_load(new)["contact"] == yaml.safe_load(WRITTEN)["contact"]

@@ -1,0 +1,84 @@
+"""Which questions are asked, in which order, and that none is asked twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core.annotate import questions
+from intercap_core.annotate.opened import Opened
+from intercap_core.project import load_project
+from intercap_core.schemas import CONTACT_REGIONS
+from tests.annotate.served import NAME, artefact, small_project
+
+HAND, SEAT = (CONTACT_REGIONS.index(name) for name in ("right_hand", "seat"))
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = small_project(tmp_path_factory.mktemp("asked"))
+    with h5py.File(artefact(made, "joint"), "r+") as file:
+        file["contact_probability"][...] = 0.01
+        file["contact_probability"][1:5, HAND] = [0.3, 0.5, 0.5, 0.6]
+        file["contact_probability"][2:4, SEAT] = [0.3, 0.3]
+        file["contact_annotated"][...] = -1
+    with h5py.File(artefact(made, "object_track"), "r+") as file:
+        file["lost"][...] = False
+        file["lost"][3:6] = True
+        file["ambiguous"][...] = False
+    return made
+
+
+@pytest.fixture
+def opened(settings: Path) -> Iterator[Opened]:
+    found = Opened(load_project(settings), NAME)
+    yield found
+    found.close()
+
+
+def test_what_changes_most_comes_first(opened: Opened) -> None:
+    asked = [q for q in questions.propose(opened, []) if q["kind"] != "subject"]
+    assert [(q["kind"], q["part"], q["first"], q["last"]) for q in asked] == [
+        ("lost", "", 3, 5), ("contact", "right_hand", 1, 4), ("contact", "seat", 2, 3),
+    ]  # fmt: skip
+    assert asked[1]["words"] == "Does the right hand touch the football here?"
+    even = np.array([0.3, 0.5, 0.5, 0.6])
+    assert asked[1]["weight"] == pytest.approx(float((4 * even * (1 - even)).sum()), abs=0.01)
+
+
+def test_what_was_answered_is_not_asked_again(opened: Opened, tmp_path: Path) -> None:
+    first = questions.propose(opened, [])
+    path = tmp_path / "x.answers.jsonl"
+    hand = next(q for q in first if q["part"] == "right_hand")
+    questions.keep_answer(path, {**hand, "answer": "unsure"}, None)
+    left = questions.propose(opened, questions.read_answers(path))
+    assert [q["id"] for q in left] == [q["id"] for q in first if q is not hand]
+
+
+def test_an_answer_is_of_its_time_whatever_the_frames_are_numbered(opened: Opened) -> None:
+    hand = next(q for q in questions.propose(opened, []) if q["part"] == "right_hand")
+    answered = {**hand, "first": 400, "last": 403, "answer": "yes"}
+    assert hand["id"] not in [q["id"] for q in questions.propose(opened, [answered])]
+
+
+def test_a_write_that_was_cut_off_spoils_no_other_answer(tmp_path: Path) -> None:
+    path = tmp_path / "x.answers.jsonl"
+    questions.keep_answer(path, {"kind": "turn"}, None)
+    path.write_bytes(path.read_bytes() + b'{"kind": "lo')
+    questions.keep_answer(path, {"kind": "lost"}, "ann")
+    assert [one["kind"] for one in questions.read_answers(path)] == ["turn", "lost"]
+
+
+def test_annotated_contact_is_not_asked(settings: Path, opened: Opened) -> None:
+    with h5py.File(artefact(settings, "joint"), "r+") as file:
+        file["contact_annotated"][...] = 0
+    try:
+        kinds = {q["kind"] for q in questions.propose(opened, [])}
+        assert "contact" not in kinds
+    finally:
+        with h5py.File(artefact(settings, "joint"), "r+") as file:
+            file["contact_annotated"][...] = -1

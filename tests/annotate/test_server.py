@@ -1,0 +1,194 @@
+"""What the page is given and what it may change; results that are old, missing or replaced."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from intercap_core.annotate import rerun
+from intercap_core.config import Annotation
+from intercap_core.viewer.package import unpacked
+from tests.annotate.served import NAME, Served, annotation, artefact, served, small_project
+
+OF = f"sequences/{NAME}"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_project(tmp_path_factory.mktemp("annotated"))
+
+
+@pytest.fixture
+def settings(made: Path, tmp_path: Path) -> Path:
+    """The project, to be changed."""
+    folder = tmp_path / "project"
+    shutil.copytree(made.parent, folder)
+    path = folder / "config.yaml"
+    path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
+    return path
+
+
+@pytest.fixture
+def page(settings: Path) -> Iterator[Served]:
+    with served(settings) as found:
+        yield found
+
+
+def test_the_list_and_a_sequence_are_told(page: Served) -> None:
+    rows = page.json("sequences")["sequences"]
+    assert [row["name"] for row in rows] == [NAME] and not rows[0]["annotated"]
+    told = page.json(OF)
+    assert told["frames"] == 6 and told["object"] == "football" and told["viewer"]
+    assert [one["name"] for one in told["cameras"]] == ["k1", "k2", "k3"]
+    assert told["annotation"]["digest"] == "none"
+
+
+def test_images_come_as_large_as_they_are_shown(page: Served) -> None:
+    for asked, wide in ((200, 240), (300, 320), (4000, 480)):
+        status, data = page.get(f"/api/{OF}/image/k1/2?width={asked}")
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert status == 200 and image.shape[1] == wide
+    assert page.get(f"/api/{OF}/image/k1/99?width=240")[0] == 422
+    assert page.get(f"/api/{OF}/image/k9/0?width=240")[0] == 422
+
+
+def test_the_objects_poses_are_the_joint_fits(page: Served, settings: Path) -> None:
+    import base64
+
+    _, data = page.get(f"/api/{OF}/object")
+    _, arrays = unpacked(base64.b64encode(data).decode())
+    with h5py.File(artefact(settings, "joint")) as joint:
+        assert np.allclose(arrays["poses/joint"][:, :, 3], joint["translation"][:], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["..", "../../etc/passwd", "%2e%2e", "nobody", "a/b"])
+def test_only_sequences_of_the_table_are_known(page: Served, name: str) -> None:
+    assert page.get(f"/api/sequences/{name}")[0] in (404, 405)
+    assert page.get(f"/page/{name}/config.yaml")[0] == 404
+
+
+def test_without_the_token_or_from_elsewhere_nothing_is_told(page: Served) -> None:
+    assert page.get("/api/sequences", **{"x-intercap-token": ""})[0] == 401
+    assert page.get("/", host="evil.example")[0] == 400
+    assert page.get("/")[0] == 200
+
+
+def test_an_edit_is_checked_as_it_is_typed(page: Served) -> None:
+    contact = [{"part": "right_hand", "start": 1, "end": 9}]
+    _, told = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    assert told["faults"] == [
+        {"where": "contact", "words": "contact[0].end is 9, the recording has 6 frames"}
+    ]
+    contact[0]["end"] = 4
+    _, told = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    assert not told["faults"] and "+  - {part: right_hand, start: 1, end: 4}" in told["difference"]
+    _, told = page.post(f"{OF}/check", {"changes": {"contact": [{"part": "tail"}]}})
+    assert told["faults"][0]["where"].startswith("contact.0")
+
+
+def test_a_save_writes_what_was_shown_and_refuses_what_it_did_not_see(
+    page: Served, settings: Path
+) -> None:
+    path = annotation(settings)
+    path.write_text("# mine\ndrop_frames: [1] # dark\n")
+    digest = page.json(f"{OF}/annotation")["digest"]
+    pose = {"frame": 2, "rotation_vector": [0, 0.1, 0], "translation": [0, 0.2, 2.4]}
+    told = {"digest": digest, "changes": {"object_pose": pose}}
+    status, saved = page.post(f"{OF}/save", told)
+    assert status == 200 and path.read_text().startswith("# mine\ndrop_frames: [1] # dark\n")
+    assert Annotation.model_validate(yaml.safe_load(path.read_text())).object_pose is not None
+    status, refused = page.post(f"{OF}/save", told)  # a second tab, with the older file
+    assert status == 409 and refused["now"]["digest"] == saved["digest"]
+    told = {"digest": saved["digest"], "changes": {"drop_frames": [77]}}
+    status, refused = page.post(f"{OF}/save", told)
+    assert status == 422 and "77" in refused["error"]
+
+
+def test_who_and_when_are_kept_by_choice_alone(settings: Path) -> None:
+    answers = annotation(settings).with_name(f"{NAME}.answers.jsonl")
+    told = {"kind": "turn", "part": "", "answer": "yes", "from_s": 0.0, "to_s": 0.1}
+    with served(settings) as page:
+        assert page.post(f"{OF}/answer", told)[0] == 200
+    with served(settings, by="ann") as page:
+        assert page.post(f"{OF}/answer", told)[0] == 200
+    without, named = map(json.loads, answers.read_text().splitlines())
+    assert "by" not in without and "at" not in without
+    assert named["by"] == "ann" and named["at"]
+
+
+def test_images_alone_are_shown_where_nothing_else_is_there(page: Served, settings: Path) -> None:
+    for path in artefact(settings, "joint").parent.glob("*.h5"):
+        if path.stem != "frames":
+            path.unlink()
+    told = page.json(OF)
+    assert told["frames"] == 6 and not told["viewer"]
+    assert any("images alone" in note for note in told["notes"])
+    assert page.get(f"/api/{OF}/image/k2/0?width=240")[0] == 200
+    assert page.get(f"/api/{OF}/viewer")[0] == 422
+    assert page.json(f"{OF}/questions") == []
+    status, told = page.post(
+        f"{OF}/snap", {"frame": 0, "rotation_vector": [0, 0, 0], "translation": [0, 0, 2]}
+    )
+    assert status == 422 and "run it first" in told["error"]
+
+
+def test_before_the_first_run_it_says_what_to_do(page: Served, settings: Path) -> None:
+    artefact(settings, "frames").unlink()
+    told = page.json(OF)
+    assert told["frames"] == 0 and "intercap run" in told["notes"][0]
+
+
+def test_a_result_of_an_older_version_is_named_and_the_rest_is_shown(
+    page: Served, settings: Path
+) -> None:
+    with h5py.File(artefact(settings, "joint"), "r+") as file:
+        file.attrs["schema_version"] = 1
+    told = page.json(OF)
+    assert told["frames"] == 6
+    assert any("joint" in note and "re-run" in note for note in told["notes"])
+    status, answer = page.get(f"/api/{OF}/viewer")
+    assert status == 422 and b"joint" in answer
+
+
+def test_recordings_that_were_moved_are_named(page: Served) -> None:
+    assert any("the recordings are not there" in note for note in page.json(OF)["notes"])
+
+
+def test_results_that_change_while_the_page_is_open_are_noticed(
+    page: Served, settings: Path
+) -> None:
+    before = page.json(f"{OF}/state")
+    path = artefact(settings, "joint")
+    shutil.copy(path, path.with_suffix(".new"))
+    path.with_suffix(".new").replace(path)
+    annotation(settings).write_text("drop_frames: [1]\n")
+    after = page.json(f"{OF}/state")
+    assert after["result"] != before["result"] and after["annotation"] != before["annotation"]
+    assert page.get(f"/api/{OF}/object")[0] == 200
+
+
+def test_what_an_edit_touches_is_what_a_run_would_make(page: Served, settings: Path) -> None:
+    project = page.annotator.project
+    edited = rerun.EditedProject.of(
+        project, NAME, Annotation.model_validate({"drop_frames": [1]})
+    )
+    assert edited.annotation(NAME).drop_frames == (1,)
+    assert project.annotation(NAME).drop_frames == ()
+    told = rerun.command(project, NAME, profile=Path("profiles/slurm"))
+    assert told[:2] == ["intercap", "run"] and "profiles/slurm" in told
+    assert [Path(one).name for one in told[-3:]] == ["summary.h5", NAME, "export"]
+
+
+def test_on_a_cluster_the_command_is_told_instead(settings: Path) -> None:
+    with served(settings, profile=Path("profiles/slurm")) as page:
+        status, told = page.post(f"{OF}/run", {"do": "start"})
+        assert status == 422 and "intercap run" in told["error"]
+        assert page.json(f"{OF}/run")["cluster"]
