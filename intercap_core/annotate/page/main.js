@@ -14,6 +14,7 @@ import { Questions } from "./questions.js";
 import { Timeline } from "./timeline.js";
 import { Views } from "./views.js";
 
+const BODY = [0.42, 0.66, 0.92], TOUCHING = [0.86, 0.2, 0.26], STATED = [0.95, 0.62, 0.25];
 const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45], BEFORE = [0.72, 0.5, 0.95];
 const KEYS = [
   ["← →", "a frame back or on; with Shift ten"], ["Home End", "first and last frame"], ["Space", "play"],
@@ -84,7 +85,8 @@ class App {
       this.viewer = window.intercapViewer;
       if (!this.viewer) throw new Error("this browser shows no 3D");
       this.main = Object.keys(header.versions)[0];
-      this.overlay?.mesh("body", arrays.faces, [0.42, 0.66, 0.92]);
+      this.overlay?.mesh("body", arrays.faces, BODY, arrays[`${this.main}/rest`]);
+      this.skin = skinPaint(header, arrays);
       this.master_from_zup = invert(this.told.zup_from_master);
     } catch (error) {
       this.viewer = null;
@@ -94,7 +96,7 @@ class App {
     const root = document.querySelector(".viewer");
     new MutationObserver(() => { // the viewer's own keys and fingers move time as well
       const frame = Number(root.dataset.frame);
-      if (frame !== this.frame) this.show(frame);
+      if (frame !== this.frame && !this.follows) this.show(frame);
     }).observe(root, { attributes: true, attributeFilter: ["data-frame"] });
     this.pose?.watch(root.querySelector("canvas"));
     this.redraw();
@@ -111,7 +113,7 @@ class App {
     if (viewer && this.overlay) {
       const name = Object.keys(viewer.header.versions)[0];
       this.before.body = window.skinnedBody(name, viewer.header, viewer.arrays);
-      this.overlay.mesh("before", viewer.arrays.faces, BEFORE);
+      this.overlay.mesh("before", viewer.arrays.faces, BEFORE, viewer.arrays[`${name}/rest`]);
     }
     this.layers.before = true;
     this.#bar();
@@ -167,9 +169,8 @@ class App {
 
   draw() {
     if (!this.told.frames) return;
-    this.viewer?.show(this.frame);
     this.views.draw();
-    this.#object3d();
+    this.#space3d();
     this.timeline.cursor();
     const place = this.told.places.find((one) => one.first <= this.frame && this.frame <= one.last);
     find("moment").textContent = `${this.told.times[this.frame].toFixed(2)} s, frame ${this.frame} of ${this.told.frames}${place ? `: ${place.words}` : ""}`;
@@ -223,8 +224,7 @@ class App {
     if (layers.body && this.viewer) {
       const body = this.viewer.versions[this.main];
       body.pose(frame);
-      const { position, color } = body.mesh.geometry.attributes;
-      overlay.move("body", position.array, color.array);
+      overlay.move("body", body.mesh.geometry.attributes.position.array, this.skin(frame, layers.contact));
       found.push({ name: "body", pose: this.master_from_zup });
     }
     const pose = layers.object && this.pose?.at(frame);
@@ -233,6 +233,17 @@ class App {
       found.push({ name: "object", pose, colour: own ? EDITED : OBJECT });
     }
     return found;
+  }
+
+  /* The 3D viewer follows in the next frame: the images come first. */
+  #space3d() {
+    if (!this.viewer || this.follows) return;
+    this.follows = true;
+    requestAnimationFrame(() => {
+      this.follows = false;
+      this.viewer?.show(this.frame);
+      this.#object3d();
+    });
   }
 
   #object3d() { // the 3D viewer shows the pose that is edited
@@ -403,6 +414,24 @@ class App {
     else return;
     event.preventDefault();
   }
+}
+
+/* Colours by vertex (V, 3): red where the meshes touch, orange where contact is stated. */
+function skinPaint(header, arrays) {
+  const region = arrays["contact/region"], probability = arrays["contact/probability"], touching = arrays["contact/touching"];
+  const count = header.regions?.length ?? 0, total = arrays.faces.reduce((most, v) => Math.max(most, v), 0) + 1;
+  const colours = new Float32Array(3 * total), width = touching ? touching.length / header.frames : 0;
+  return (frame, shown) => {
+    for (let v = 0; v < total; v += 1) {
+      let colour = BODY;
+      if (shown && touching && (touching[frame * width + (v >> 3)] >> (v & 7)) & 1) colour = TOUCHING;
+      else if (shown && region && region[v] < 255 && probability[frame * count + region[v]] >= 128) colour = STATED;
+      colours[3 * v] = colour[0];
+      colours[3 * v + 1] = colour[1];
+      colours[3 * v + 2] = colour[2];
+    }
+    return colours;
+  };
 }
 
 function doubts(app) {

@@ -2,6 +2,9 @@
  * picture a step, from which each view takes its part. */
 import { columnMajor } from "./geometry.js";
 
+const CELLS_M = [0.01, 0.02, 0.04]; // of the coarser meshes
+const COARSE_PX = 4; // a cell may be seen this large
+
 const VERTEX = `#version 300 es
 in vec3 place; in vec3 colour;
 uniform mat4 master_from_mesh, camera_from_master;
@@ -50,17 +53,23 @@ export class Overlay {
     gl.enable(gl.SCISSOR_TEST);
   }
 
-  /* A mesh by name: faces and one colour (3,), or colours by vertex with `paint`. */
-  mesh(name, faces, colour) {
+  /* A mesh by name: faces and one colour (3,), or colours by vertex with `move`. With its `rest`
+   * places (metres) it is also drawn coarser where a view shows it small. */
+  mesh(name, faces, colour, rest = null) {
     const gl = this.gl;
-    const own = { count: faces.length, colour, vao: gl.createVertexArray(), place: gl.createBuffer(), paint: null };
+    const own = { colour, vao: gl.createVertexArray(), place: gl.createBuffer(), paint: null, levels: [] };
     gl.bindVertexArray(own.vao);
     gl.bindBuffer(gl.ARRAY_BUFFER, own.place);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
+    for (const cell of rest ? [0, ...CELLS_M] : [0]) {
+      const kept = cell ? coarser(faces, rest, cell) : faces;
+      const buffer = gl.createBuffer();
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, kept, gl.STATIC_DRAW);
+      own.levels.push({ cell, buffer, count: kept.length });
+    }
     this.meshes.set(name, own);
   }
 
@@ -107,15 +116,40 @@ export class Overlay {
       gl.uniform1fv(this.at.lens, view.camera.lens);
       gl.uniform4fv(this.at.crop, view.crop);
       for (const { name, matrix, colour } of things) {
-        const own = this.meshes.get(name);
+        const own = this.meshes.get(name), level = levelFor(own, view, matrix);
         gl.bindVertexArray(own.vao);
+        gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, level.buffer);
         if (!own.paint) gl.vertexAttrib3f(1, ...(colour ?? own.colour));
         gl.uniformMatrix4fv(this.at.master_from_mesh, false, matrix);
-        gl.drawElements(gl.TRIANGLES, own.count, gl.UNSIGNED_INT, 0);
+        gl.drawElements(gl.TRIANGLES, level.count, gl.UNSIGNED_INT, 0);
       }
     }
     gl.bindVertexArray(null);
   }
+}
+
+/* The coarsest level whose cells a view shows no larger than a few pixels. */
+function levelFor(own, view, matrix) {
+  const [, , ahead] = view.camera.pose;
+  const depth = Math.max(0.5, ahead[0] * matrix[12] + ahead[1] * matrix[13] + ahead[2] * matrix[14] + ahead[3]);
+  const pixels = (view.camera.lens[0] / depth) * (view.width / view.crop[2]); // of a metre
+  return own.levels.findLast((level) => level.cell * pixels <= COARSE_PX) ?? own.levels[0];
+}
+
+/* Faces with all vertices of a cell drawn as one: those that are left. */
+function coarser(faces, rest, cell) {
+  const first = new Map(), stands = new Uint32Array(rest.length / 3);
+  for (let v = 0; v < stands.length; v += 1) {
+    const key = [0, 1, 2].map((k) => Math.floor(rest[3 * v + k] / cell)).join();
+    if (!first.has(key)) first.set(key, v);
+    stands[v] = first.get(key);
+  }
+  const kept = [];
+  for (let f = 0; f < faces.length; f += 3) {
+    const [a, b, c] = [stands[faces[f]], stands[faces[f + 1]], stands[faces[f + 2]]];
+    if (a !== b && b !== c && c !== a) kept.push(a, b, c);
+  }
+  return new Uint32Array(kept);
 }
 
 function link(gl) {
