@@ -3,11 +3,11 @@
     python -m bench.annotate_page [config/demo/config.yaml] [--sequence NAME] [--steps 30]
         [--output results/bench.json]
 
-The arrow key is pressed as a person does, with a pause between; a step ends when every view has drawn
-the new frame, the graphics process has ended its work on them and the browser has painted. Into the
-JSON go ``annotate.page_ms_per_step``, the median of steps on, ``annotate.page_ms_per_step_p95``, the
-median until the 3D viewer has followed (``..._3d``, two frames later at the least), and
-``annotate.page_ms_per_jump``, to the last frame, whose images nobody has fetched ahead.
+The arrow key is pressed as a person does, with a pause between; a step ends when every view has
+drawn the new frame, the graphics process has ended its work on them and the browser has painted.
+Into the JSON go ``annotate.page_ms_per_step``, the median of steps on, their 95th percentile
+(``..._p95``), the median until the 3D viewer has followed (``..._3d``, two frames later at the
+least), and ``annotate.page_ms_per_jump``, to the last frame, whose images nobody fetched ahead.
 """
 
 from __future__ import annotations

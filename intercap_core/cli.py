@@ -589,7 +589,8 @@ def annotate(
     ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 = any that is free.")] = 0,
     by: Annotated[
-        str, typer.Option(metavar="NAME", help="Who annotates: kept, with the time, beside answers.")
+        str,
+        typer.Option(metavar="NAME", help="Who annotates: kept, with the time, beside answers."),
     ] = "",
     cores: Cores = 0,
     profile: Annotated[

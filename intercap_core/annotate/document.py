@@ -1,4 +1,4 @@
-"""The annotation file as a text: a patch by section, what it changes, and a save that loses nothing.
+"""The annotation file as a text: a patch by section, its difference, a save that loses nothing.
 
 Comments, order and layout stay: only the lines of the sections that change are written anew, and in
 them what stays equal keeps its form. A save is refused where the file is not the one that was read.
@@ -315,6 +315,7 @@ def _commented(value: Any) -> Any:
 
 def _node(name: str, value: Any, *, flow: bool | None = None) -> Any:
     """A value that has no form yet; ``flow``: on one line."""
+    node: Any
     if isinstance(value, dict):
         node = _commented({k: _node(str(k), v, flow=flow) for k, v in value.items()})
     elif isinstance(value, (list, tuple)):
@@ -337,7 +338,7 @@ def _merged(node: Any, value: Any, name: str) -> Any:
         for key in [key for key in node if key not in value]:
             del node[key]
         for key, one in value.items():
-            flow = node.fa.flow_style()
+            flow = node.fa.flow_style()  # type: ignore[attr-defined]
             node[key] = (
                 _merged(node[key], one, key) if key in node else _node(str(key), one, flow=flow)
             )

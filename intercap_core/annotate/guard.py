@@ -2,7 +2,8 @@
 
 Login nodes are shared: other users reach the loopback's ports, and a page of the web can send
 requests to them from the annotator's own browser. So the token goes with each request in a header,
-which no other page can set; requests that name another host or come from another origin are refused.
+which no other page can set; requests that name another host, or come from another origin, are
+refused.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class Guard:
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
             return
-        headers = {key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]}
+        headers = {
+            key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]
+        }
         fault = refusal(scope["method"], scope["path"], headers, self._token)
         if fault is not None:
             await _refuse(send, *fault)

@@ -83,9 +83,11 @@ class Opened:
             self.close()
             file = self._stack.enter_context(artefacts.read(self.paths["frames"], FRAMES))
             sets = shown = Frames(file)
-            with contextlib.suppress(artefacts.Unreadable):
-                with artefacts.read(self.paths["scene"], SCENE) as scene:
-                    shown = sets.showing(scene["image_of"])
+            with (
+                contextlib.suppress(artefacts.Unreadable),
+                artefacts.read(self.paths["scene"], SCENE) as scene,
+            ):
+                shown = sets.showing(scene["image_of"])
             self._images = stamp, sets, shown, file["dropped"]
         return self._images[1:]
 

@@ -150,10 +150,10 @@ def _of_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str
         found.append(_question("lost", "", first, last, (first + last) // 2, words,
                                2.0 * (last - first + 1), choices))  # fmt: skip
     for first, last, _ in ranges(["x" if one else "" for one in ambiguous]):
-        choices = (("yes", "Yes, as drawn"), ("no", "No: I turn it"), ("unsure", "Cannot be seen"))
+        turns = (("yes", "Yes, as drawn"), ("no", "No: I turn it"), ("unsure", "Cannot be seen"))
         words = f"Is the {object_} turned as it is drawn?"
         found.append(_question("turn", "", first, last, (first + last) // 2, words,
-                               3.0 + 1.5 * (last - first), choices))  # fmt: skip
+                               3.0 + 1.5 * (last - first), turns))  # fmt: skip
     return found
 
 

@@ -151,9 +151,7 @@ class Runs:
         status = self._process.poll()
         if status is not None and not self._ended:
             self._ended = time.time()
-        stages = [
-            {"stage": stage, **self._stage(project, stage)} for stage in self._stages
-        ]
+        stages = [{"stage": stage, **self._stage(project, stage)} for stage in self._stages]
         state = "running" if status is None else ("done" if status == 0 else "failed")
         words = ""
         if state == "failed" and self._said is not None and self._said.is_file():
@@ -194,7 +192,7 @@ def beside(project: Project, sequence: str) -> dict[str, Any]:
     body and object moved, millimetres. Empty where there was none."""
     old = before_paths(project, sequence)
     new = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
-    rows = []
+    rows: list[dict[str, Any]] = []
     found: dict[str, Any] = {"rows": rows, "there": old["joint"].is_file()}
     figures = [_figures(old), _figures(new)]
     for name in dict.fromkeys([*figures[0], *figures[1]]):
@@ -226,9 +224,10 @@ def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
             rows["penetration, mm"] = round(1e3 * float(np.nanmean(depth)), 2)
     except artefacts.Unreadable:
         pass
-    with contextlib.suppress(artefacts.Unreadable):
-        with artefacts.read(paths["object_track"], OBJECT_TRACK) as track:
-            rows["frames with the object lost"] = int(track["lost"].sum())
-            rows["frames with an ambiguous turn"] = int(track["ambiguous"].sum())
+    with (
+        contextlib.suppress(artefacts.Unreadable),
+        artefacts.read(paths["object_track"], OBJECT_TRACK) as track,
+    ):
+        rows["frames with the object lost"] = int(track["lost"].sum())
+        rows["frames with an ambiguous turn"] = int(track["ambiguous"].sum())
     return rows
-

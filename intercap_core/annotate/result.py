@@ -1,5 +1,5 @@
 """What the page knows of a sequence: its cameras, its frames, the result that is drawn and what
-speaks against it. What cannot be read is a sentence among ``notes``; the rest is there all the same.
+speaks against it. What cannot be read is a sentence among ``notes``; all else is there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from intercap_core.camera.transforms import rigid
 from intercap_core.errors import UserError
 from intercap_core.metrics.flags import ranges
 from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.schemas import CONTACT_REGIONS as REGIONS
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
 from intercap_core.viewer.content import gather
 from intercap_core.viewer.package import payload
@@ -64,8 +63,8 @@ def describe(opened: Opened) -> dict[str, Any]:
         recordings = opened.project.sequences[opened.name].recordings
         if not recordings.exists():
             found["notes"].append(
-                f"{recordings}: the recordings are not there; what is computed can be looked at and "
-                "mended, a run that reads them again fails until the table names their new place"
+                f"{recordings}: the recordings are not there; what is computed can be looked at "
+                "and mended, a run that reads them again fails until the table names their new place"
             )
         found["places"].sort(key=lambda place: -place["weight"])
     return found

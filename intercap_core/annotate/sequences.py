@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.errors import UserError
 from intercap_core.metrics.figures import SequenceMetrics
@@ -12,7 +13,6 @@ from intercap_core.metrics.verdict_figures import stated_errors
 from intercap_core.project import Project
 from intercap_core.report.tables import sequence_table
 from intercap_core.schemas import SUMMARY
-from intercap_core import artefacts
 
 
 class SequenceList:

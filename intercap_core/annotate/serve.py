@@ -55,7 +55,8 @@ def serve(
         where = f"/sequence/{sequence}" if sequence else "/"
         address = f"http://{HOST}:{used}{where}#token={token}"
         say(f"open {address}")
-        say(f"from another machine: ssh -L {used}:{HOST}:{used} {socket.gethostname()}, then the same address")
+        tunnel = f"ssh -L {used}:{HOST}:{used} {socket.gethostname()}"
+        say(f"from another machine: {tunnel}, then the same address")
         say("who has the address may change annotations; Ctrl+C ends it")
         if show:
             webbrowser.open(address)

@@ -24,12 +24,15 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sequences import SequenceList
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.project import Project, load_project
+from intercap_core.project import load_project
+from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.viewer.package import DATA as VIEWER
 
 PAGE = Path(__file__).parent / "page"
 OPEN_SEQUENCES = 3  # with their images and meshes in memory
-_KEEP = {"cache-control": "private, max-age=86400, immutable"}  # of what has its stamp in its address
+_KEEP = {
+    "cache-control": "private, max-age=86400, immutable"
+}  # of what has its stamp in its address
 
 
 class Annotator:
@@ -86,8 +89,10 @@ class Annotator:
             "object": row.object or "",
             "person": row.subject,
             "annotation": self.annotation(name),
-            "regions": list(result.REGIONS),
-            "read_only": "the studio writes this annotation anew with the recording" if made else "",
+            "regions": list(CONTACT_REGIONS),
+            "read_only": "the studio writes this annotation anew with the recording"
+            if made
+            else "",
             "profile": str(self.runs.profile or ""),
         }
         return found
@@ -206,9 +211,7 @@ class Annotator:
     def run_state(self, name: str) -> dict[str, Any]:
         """The run's progress, and the command that does the same."""
         self.opened(name)
-        told = rerun.command(
-            self.project, name, cores=self.runs.cores, profile=self.runs.profile
-        )
+        told = rerun.command(self.project, name, cores=self.runs.cores, profile=self.runs.profile)
         progress = self.runs.progress(self.project)
         return progress | {"command": " ".join(told), "cluster": self.runs.profile is not None}
 

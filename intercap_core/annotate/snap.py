@@ -100,8 +100,8 @@ def _fitted(
     settings: ObjectTrackSettings,
     labels: tuple[str, ...],
 ) -> Fit:
-    """The fit from ``start`` (4, 4); where the images do not bear it out, also from places around it
-    that show most of the object, and the likeliest of all."""
+    """The fit from ``start`` (4, 4); where the images do not bear it out, the likeliest of it and
+    of those from places around it that agree most."""
     renderer = open_renderer("cpu")
 
     def fitted(pose: np.ndarray) -> Fit:

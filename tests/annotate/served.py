@@ -25,7 +25,7 @@ TOKEN = "token-of-the-tests"
 
 
 def small_project(folder: Path, total: int = 6) -> Path:
-    """Settings of a project of one sequence, up to joint; its object is a ball in the right hand."""
+    """Settings of a project of one sequence, up to joint: a ball in the right hand."""
     (folder / "made").mkdir(parents=True)
     capture = fitted.make_capture(folder / "made", name=NAME, total=total)
     (folder / "project").mkdir()

@@ -110,8 +110,9 @@ def test_the_object_is_moved_in_a_view_where_the_pointer_goes(settings: Path) ->
         assert box is not None
         told = page.page.evaluate(
             """() => { const a = window.annotate, view = a.views.views[0];
-              return { at: a.views.place(view, a.pose.middle()), wide: view.width, pose: a.pose.pose,
-                       focal: view.camera.lens[0], size: view.camera.size[0] }; }"""
+              return { at: a.views.place(view, a.pose.middle()), wide: view.width,
+                       pose: a.pose.pose, focal: view.camera.lens[0],
+                       size: view.camera.size[0] }; }"""
         )
         scale = box["width"] / told["wide"]
         start = (box["x"] + told["at"][0] * scale, box["y"] + told["at"][1] * scale)
@@ -141,13 +142,17 @@ def test_subject_floor_and_dropped_frames_are_clicked(settings: Path) -> None:
         keys.press("u")
         page.page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
         [point] = _draft(page, "subject")
-        assert point["camera"] == "k1" and abs(point["x"] - 239.5) < 2 and abs(point["y"] - 134.5) < 2
+        assert (
+            point["camera"] == "k1" and abs(point["x"] - 239.5) < 2 and abs(point["y"] - 134.5) < 2
+        )
         keys.press("Escape")
         keys.press("g")
         for k, (x, y) in enumerate(((0.1, 0.9), (0.9, 0.9), (0.5, 0.1))):
             page.page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
             page.wait(f"(window.annotate.draft.get('floor') ?? []).length === {k + 1}")
-        assert all(abs(z - 4.0) < 0.3 for _, _, z in _draft(page, "floor"))  # the wall of the capture
+        assert all(
+            abs(z - 4.0) < 0.3 for _, _, z in _draft(page, "floor")
+        )  # the wall of the capture
         keys.press("Escape")
         keys.press("End")
         keys.press("x")
@@ -165,7 +170,8 @@ def test_a_question_is_answered_by_a_key_and_never_asked_again(settings: Path) -
         asked = page.page.evaluate("window.annotate.questions.list.map((q) => q.id)")
         assert "contact.seat.4.7" in asked
         page.page.evaluate(
-            "window.annotate.questions.ask(window.annotate.questions.list.find((q) => q.part === 'seat'))"
+            "(({ list }) => window.annotate.questions.ask(list.find((q) => q.part === 'seat')))"
+            "(window.annotate.questions)"
         )
         page.page.keyboard.press("1")
         page.wait("!window.annotate.questions.list.some((q) => q.part === 'seat')")
@@ -192,7 +198,9 @@ def test_two_annotators_keep_both_changes(settings: Path) -> None:
         page.page.locator('[data-answer="save"]').click()
         page.wait("document.getElementById('status').textContent === 'saved'")
     text = path.read_text()
-    assert "drop_frames: [8, 9]" in text and "right_hand" in text and text.startswith("# two people")
+    assert (
+        "drop_frames: [8, 9]" in text and "right_hand" in text and text.startswith("# two people")
+    )
 
 
 def test_edits_of_a_tab_that_went_away_are_found_again(settings: Path) -> None:

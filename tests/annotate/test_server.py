@@ -177,9 +177,7 @@ def test_results_that_change_while_the_page_is_open_are_noticed(
 
 def test_what_an_edit_touches_is_what_a_run_would_make(page: Served, settings: Path) -> None:
     project = page.annotator.project
-    edited = rerun.EditedProject.of(
-        project, NAME, Annotation.model_validate({"drop_frames": [1]})
-    )
+    edited = rerun.EditedProject.of(project, NAME, Annotation.model_validate({"drop_frames": [1]}))
     assert edited.annotation(NAME).drop_frames == (1,)
     assert project.annotation(NAME).drop_frames == ()
     told = rerun.command(project, NAME, profile=Path("profiles/slurm"))

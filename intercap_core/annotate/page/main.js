@@ -87,6 +87,8 @@ class App {
       this.main = Object.keys(header.versions)[0];
       this.overlay?.mesh("body", arrays.faces, BODY, arrays[`${this.main}/rest`]);
       this.skin = skinPaint(header, arrays);
+      this.regionOf = arrays["contact/region"];
+      this.middlesOf = -1;
       this.master_from_zup = invert(this.told.zup_from_master);
     } catch (error) {
       this.viewer = null;
@@ -258,12 +260,58 @@ class App {
   }
 
   mark(view, brush) {
+    if (this.layers.contact) this.#markContact(view, brush);
     if (this.layers.marks) {
       this.subject.mark(view, brush);
       if (this.mode === this.floor || this.draft.get("floor")) this.floor.mark(view, brush);
     }
     if (this.pose?.editing) this.pose.mark(view, brush);
     this.questions?.mark(view, brush);
+  }
+
+  /* Which parts touch, whatever hides them from the camera: a dot in the middle of each. */
+  #markContact(view, brush) {
+    if (this.middlesOf !== this.frame) {
+      this.middlesOf = this.frame;
+      this.middles = this.viewer && this.told.object ? this.#middles() : [];
+    }
+    for (const [k, { part, share, point }] of this.middles.entries()) {
+      const at = this.views.place(view, point);
+      if (!at) continue;
+      brush.globalAlpha = Math.max(0.35, share);
+      brush.fillStyle = "#ff3b47";
+      brush.strokeStyle = "#ffffff";
+      brush.lineWidth = 1.5;
+      brush.beginPath();
+      brush.arc(...at, view.width > 400 ? 5 : 3, 0, 7);
+      brush.fill();
+      brush.stroke();
+      if (view.width > 400) {
+        brush.font = "600 12px system-ui";
+        brush.lineWidth = 3;
+        brush.strokeStyle = "rgba(0, 0, 0, 0.7)";
+        const text = `${part.replaceAll("_", " ")} ${Math.round(100 * share)} %`;
+        const below = at[1] - 3 + 15 * k; // so that no two lie on each other
+        brush.strokeText(text, at[0] + 9, below);
+        brush.fillStyle = "#ffffff";
+        brush.fillText(text, at[0] + 9, below);
+      }
+      brush.globalAlpha = 1;
+    }
+  }
+
+  #middles() {
+    const { regions } = this.contact, region = this.regionOf, places = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
+    if (!region) return [];
+    const sums = regions.map((part) => ({ part, share: this.contact.p(part, this.frame) ?? 0, count: 0, sum: [0, 0, 0] }));
+    for (let v = 0; v < region.length; v += 1) {
+      const own = sums[region[v]];
+      if (!own || own.share < 0.25) continue;
+      own.count += 1;
+      for (let k = 0; k < 3; k += 1) own.sum[k] += places[3 * v + k];
+    }
+    return sums.filter((one) => one.count).map(({ part, share, count, sum }) =>
+      ({ part, share, point: apply(this.master_from_zup, sum.map((v) => v / count)) }));
   }
 
   /* The 3D viewer's eye as a camera of the master's frame. */
