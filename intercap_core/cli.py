@@ -607,12 +607,15 @@ def annotate(
     tunnel (ssh -L PORT:127.0.0.1:PORT HOST) and use the same address. docs/annotate.md teaches
     it in five minutes.
 
-    Examples: intercap annotate config/demo/config.yaml;
+    Examples: intercap annotate cup_drink_s02 (of config/config.yaml);
+    intercap annotate config/demo/config.yaml;
     intercap annotate config/lab/config.yaml cup_drink_s02 --port 8123 --by ann
     """
     _prepare()
     from intercap_core.annotate.serve import serve
 
+    if sequence is None and not settings.exists() and settings.suffix == "":
+        settings, sequence = DEFAULT_SETTINGS, str(settings)  # a name alone is a sequence's
     serve(
         settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show,
         say=lambda line: typer.echo(line),

@@ -64,7 +64,7 @@ def describe(opened: Opened) -> dict[str, Any]:
         if not recordings.exists():
             found["notes"].append(
                 f"{recordings}: the recordings are not there; what is computed can be looked at "
-                "and mended, a run that reads them again fails until the table names their new place"
+                "and mended, a run that reads them fails until the table names their new place"
             )
         found["places"].sort(key=lambda place: -place["weight"])
     return found

@@ -338,6 +338,7 @@ def application(annotator: Annotator, token: str) -> App:
         KeyError: lambda _, error: _json({"error": f"{error} is missing"}, 400),
         ValueError: lambda _, error: _json({"error": f"not a number: {error}"}, 400),
         OSError: lambda _, error: _json({"error": str(error)}, 500),
+        Exception: lambda _, error: _json({"error": f"unexpected {type(error).__name__}"}, 500),
     }
     return Guard(Starlette(routes=routes, exception_handlers=handlers), token)
 

@@ -21,6 +21,10 @@ pytestmark = needs_chromium
 SIZE = (1440, 900)
 READY = "document.body.dataset.ready === 'yes'"
 HAND = '[data-part="right_hand"] .bar'
+_ASK_SEAT = (
+    "(({ list }) => window.annotate.questions.ask(list.find((q) => q.part === 'seat')))"
+    "(window.annotate.questions)"
+)
 STEP_MS = 100.0  # from the key to all views drawn
 # Of a machine that draws without a GPU and shares its cores the tests ask less than of a desk.
 PATIENCE = 4.0
@@ -169,16 +173,20 @@ def test_a_question_is_answered_by_a_key_and_never_asked_again(settings: Path) -
         page.wait("window.annotate.questions.list.length > 0")
         asked = page.page.evaluate("window.annotate.questions.list.map((q) => q.id)")
         assert "contact.seat.4.7" in asked
-        page.page.evaluate(
-            "(({ list }) => window.annotate.questions.ask(list.find((q) => q.part === 'seat')))"
-            "(window.annotate.questions)"
-        )
+        page.page.evaluate(_ASK_SEAT)
         page.page.keyboard.press("1")
         page.wait("!window.annotate.questions.list.some((q) => q.part === 'seat')")
         assert {"part": "seat", "start": 4, "end": 8} in _draft(page, "contact")
+        page.page.keyboard.press("Control+z")  # an edit that is undone is asked again
+        page.wait("window.annotate.questions.list.some((q) => q.part === 'seat')")
+        page.page.evaluate(_ASK_SEAT)
+        page.page.keyboard.press("1")
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'saved'")
+        page.wait("window.annotate.questions.pending.length === 0")
         page.page.reload()
         page.wait(READY)
-        page.wait("document.getElementById('tab-questions') !== null")
+        page.wait("window.annotate.questions.list.length > 0")
         asked = page.page.evaluate("window.annotate.questions.list.map((q) => q.id)")
         assert "contact.seat.4.7" not in asked
 
@@ -225,6 +233,14 @@ def test_images_alone_are_shown_and_can_be_annotated(settings: Path) -> None:
         page.wait("document.body.dataset.drawn === '1'")
         page.page.keyboard.press("x")
         assert _draft(page, "drop_frames") == [1]
+
+
+def test_before_the_first_run_it_says_what_to_do(settings: Path) -> None:
+    artefact(settings, "frames").unlink()
+    with served(settings) as server, _open(server) as page:
+        assert "intercap run" in page.page.locator("#banners").inner_text()
+        page.page.locator("#tab-run").click()
+        assert page.page.get_by_text("Run what is out of date").is_visible()
 
 
 def test_a_page_without_the_token_shows_nothing(settings: Path) -> None:

@@ -77,6 +77,7 @@ export class Keep {
     try {
       app.saved(await post(`${this.path}/save`, { digest: app.draft.file.digest, text: app.draft.file.text, changes }));
       app.say("saved");
+      app.questions.saved();
     } catch (error) {
       if (error.status === 409) await this.conflict(error.told);
       else await ask("Not saved", make("p", {}, error.message), [["", "Back", true]]);

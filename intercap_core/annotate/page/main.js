@@ -9,7 +9,7 @@ import { showList } from "./list.js";
 import { DroppedFrames, FloorMarks, SubjectMarks } from "./marks.js";
 import { Overlay } from "./overlay.js";
 import { Pictures } from "./pictures.js";
-import { PoseEditor } from "./pose.js";
+import { PoseEditor, poseAt, posedFrames } from "./pose.js";
 import { Questions } from "./questions.js";
 import { Timeline } from "./timeline.js";
 import { Views } from "./views.js";
@@ -231,7 +231,7 @@ class App {
     }
     const pose = layers.object && this.pose?.at(frame);
     if (pose) {
-      const own = this.pose.editing || this.draft.get("object_pose")?.frame === frame;
+      const own = this.pose.editing || poseAt(this.draft, frame);
       found.push({ name: "object", pose, colour: own ? EDITED : OBJECT });
     }
     return found;
@@ -251,7 +251,7 @@ class App {
   #object3d() { // the 3D viewer shows the pose that is edited
     const object = this.viewer?.versions[this.main]?.object;
     const pose = this.pose?.at(this.frame);
-    if (!object || !pose || !(this.pose.editing || this.draft.get("object_pose"))) return;
+    if (!object || !pose || !(this.pose.editing || posedFrames(this.draft).length)) return;
     const [a, b, c] = compose(this.told.zup_from_master, pose);
     object.mesh.visible = this.layers.object;
     object.mesh.matrix.set(...a, ...b, ...c, 0, 0, 0, 1);

@@ -1,4 +1,5 @@
-/* A queue of questions, those first whose answer changes most; each answered in seconds. */
+/* A queue of questions, those first whose answer changes most; each answered in seconds. An answer that
+ * edits counts as given when the edit is saved: an edit that is lost or undone is asked again. */
 import { get, post } from "./api.js";
 import { button, make } from "./dom.js";
 import { putPose } from "./pose.js";
@@ -8,11 +9,30 @@ export class Questions {
     this.app = app;
     this.list = [];
     this.current = null;
+    this.pending = []; // answers that edit: { told, depth: steps of the draft with the edit }
+    app.draft.addEventListener("change", () => {
+      const kept = this.pending.filter((one) => one.depth <= app.draft.done.length);
+      if (kept.length === this.pending.length) return;
+      this.pending = kept;
+      this.load();
+    });
   }
 
   async load() {
     if (!this.app.told.frames) return;
-    try { this.list = await get(`sequences/${this.app.told.sequence}/questions`); } catch (error) { this.app.say(error.message); }
+    try { this.#take(await get(`sequences/${this.app.told.sequence}/questions`)); } catch (error) { this.app.say(error.message); }
+    this.app.panels();
+  }
+
+  #take(list) { this.list = list.filter((one) => !this.pending.some(({ told }) => told.id === one.id)); }
+
+  /* The draft was saved: what was answered by it is kept. */
+  async saved() {
+    const given = this.pending;
+    this.pending = [];
+    for (const { told } of given) {
+      try { this.#take((await post(`sequences/${this.app.told.sequence}/answer`, told)).questions); } catch (error) { this.app.say(error.message); }
+    }
     this.app.panels();
   }
 
@@ -30,6 +50,11 @@ export class Questions {
 
   async answer(question, answer) {
     const { app } = this, { contact, pose, draft } = app;
+    const edits = ["yes", "no", "place"].includes(answer);
+    const opens = { place: pose, no: question.kind === "turn" ? pose : question.kind === "subject" ? app.subject : null }[answer];
+    const told = { ...question, answer };
+    // before the edit, so that the steps tell whether it is there
+    if (edits) this.pending.push({ told, depth: draft.done.length + (opens ? 1 : 0) });
     if (question.kind === "contact" && answer === "yes") contact.add(question.part, question.first, question.last + 1);
     if (question.kind === "contact" && answer === "no") contact.clear(question.part, question.first, question.last + 1);
     if (question.kind === "turn" && answer === "yes" && pose?.found(question.frame)) {
@@ -40,13 +65,13 @@ export class Questions {
       const set = app.setOf(app.told.cameras.findIndex((one) => one.name === camera), frame);
       draft.set("subject", [...(draft.get("subject") ?? []), { camera, frame: set, x, y }], "subject confirmed");
     }
-    try {
-      const { kind, part, first, last, frame, from_s, to_s } = question;
-      const told = await post(`sequences/${app.told.sequence}/answer`, { kind, part, first, last, frame, from_s, to_s, answer });
-      this.list = told.questions;
-    } catch (error) { app.say(error.message); return; }
+    if (edits) {
+      this.list = this.list.filter((one) => one.id !== question.id);
+      this.pending.at(-1).depth = draft.done.length + (opens ? 1 : 0);
+    } else {
+      try { this.#take((await post(`sequences/${app.told.sequence}/answer`, told)).questions); } catch (error) { app.say(error.message); return; }
+    }
     this.current = null;
-    const opens = { place: pose, no: question.kind === "turn" ? pose : question.kind === "subject" ? app.subject : null }[answer];
     app.panels();
     if (opens === pose && pose) { app.show(question.frame); pose.start(); app.tab("object"); }
     else if (opens) { app.setMode(opens); app.tab("marks"); }
@@ -81,6 +106,6 @@ export class Questions {
       this.list.length && !one ? button("Ask me", () => this.next(), { class: "main", title: "Q" }) : null,
       make("ol", {}, this.list.filter((q) => q !== one).slice(0, 12).map((q) => make("li", {},
         button(q.words, () => this.ask(q), { class: "plain" }), make("span", { class: "dim" }, ` ${seconds(q)}`)))),
-      make("p", { class: "dim" }, "What is answered is never asked again. Answers that edit are saved with the annotation."));
+      make("p", { class: "dim" }, "What is answered is never asked again. Answers that edit count when the annotation is saved."));
   }
 }
