@@ -1,21 +1,21 @@
 /* The page: one frame for all views, the viewer and the timeline; layers, modes, keys. */
-import { base64, get, packed, takeToken } from "./api.js";
+import { get, packed, takeToken } from "./api.js";
 import { ask, banner, button, find, make } from "./dom.js";
 import { Contact } from "./contact.js";
 import { Draft } from "./draft.js";
-import { IDENTITY, apply, compose, invert } from "./geometry.js";
+import { apply, invert } from "./geometry.js";
 import { Keep } from "./keep.js";
 import { showList } from "./list.js";
 import { DroppedFrames, FloorMarks, SubjectMarks } from "./marks.js";
 import { Overlay } from "./overlay.js";
 import { Pictures } from "./pictures.js";
-import { PoseEditor, poseAt, posedFrames } from "./pose.js";
+import { PoseEditor, objectPose, poseAt } from "./pose.js";
 import { Questions } from "./questions.js";
+import { BEFORE, Space } from "./space.js";
 import { Timeline } from "./timeline.js";
 import { Views } from "./views.js";
 
-const BODY = [0.42, 0.66, 0.92], TOUCHING = [0.86, 0.2, 0.26], STATED = [0.95, 0.62, 0.25];
-const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45], BEFORE = [0.72, 0.5, 0.95];
+const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45];
 const KEYS = [
   ["← →", "a frame back or on; with Shift ten"], ["Home End", "first and last frame"], ["Space", "play"],
   ["N P", "next and previous flag or doubt"], ["F", "near the object, and all again"], ["1 2 3 4", "layers: body, object, contact, marks"],
@@ -41,6 +41,7 @@ class App {
     this.subject = new SubjectMarks(this);
     this.floor = new FloorMarks(this);
     this.dropped = new DroppedFrames(this);
+    this.space = new Space(this);
     this.views = new Views(this);
     this.timeline = new Timeline(this);
     this.questions = new Questions(this);
@@ -71,52 +72,13 @@ class App {
     this.panels();
     this.redraw();
     this.questions.load();
-    if (this.told.viewer) await this.#space(of);
+    if (this.told.viewer) await this.space.load();
     else find("space").replaceChildren(make("p", { class: "dim" }, "No body yet: the 4D viewer comes with stage body_fit."));
     document.body.dataset.ready = "yes";
   }
 
-  async #space(of) {
-    find("space").replaceChildren(make("p", { class: "dim" }, "Loading the 4D viewer…"));
-    try {
-      const { header, arrays, data } = await packed(`${of}/viewer?v=${this.told.result}`);
-      find("space").replaceChildren(viewerElement());
-      await window.showInterCap(await base64(data));
-      this.viewer = window.intercapViewer;
-      if (!this.viewer) throw new Error("this browser shows no 3D");
-      this.main = Object.keys(header.versions)[0];
-      this.overlay?.mesh("body", arrays.faces, BODY, arrays[`${this.main}/rest`]);
-      this.skin = skinPaint(header, arrays);
-      this.regionOf = arrays["contact/region"];
-      this.middlesOf = -1;
-      this.master_from_zup = invert(this.told.zup_from_master);
-    } catch (error) {
-      this.viewer = null;
-      find("space").replaceChildren(make("p", { class: "fault" }, error.message));
-      return;
-    }
-    const root = document.querySelector(".viewer");
-    new MutationObserver(() => { // the viewer's own keys and fingers move time as well
-      const frame = Number(root.dataset.frame);
-      if (frame !== this.frame && !this.follows) this.show(frame);
-    }).observe(root, { attributes: true, attributeFilter: ["data-frame"] });
-    this.pose?.watch(root.querySelector("canvas"));
-    this.redraw();
-  }
-
-  /* The result before the last run, to be drawn beside the new one. */
   async loadBefore() {
-    const of = `sequences/${this.told.sequence}`;
-    this.before = {};
-    for (const what of ["object", "viewer"]) {
-      try { this.before[what] = await packed(`${of}/${what}?version=before&v=${this.told.result}`); } catch { /* it was not there */ }
-    }
-    const { viewer } = this.before;
-    if (viewer && this.overlay) {
-      const name = Object.keys(viewer.header.versions)[0];
-      this.before.body = window.skinnedBody(name, viewer.header, viewer.arrays);
-      this.overlay.mesh("before", viewer.arrays.faces, BEFORE, viewer.arrays[`${name}/rest`]);
-    }
+    await this.space.loadBefore();
     this.layers.before = true;
     this.#bar();
     this.redraw();
@@ -172,7 +134,7 @@ class App {
   draw() {
     if (!this.told.frames) return;
     this.views.draw();
-    this.#space3d();
+    this.space.follow();
     this.timeline.cursor();
     const place = this.told.places.find((one) => one.first <= this.frame && this.frame <= one.last);
     find("moment").textContent = `${this.told.times[this.frame].toFixed(2)} s, frame ${this.frame} of ${this.told.frames}${place ? `: ${place.words}` : ""}`;
@@ -212,24 +174,13 @@ class App {
 
   // ---------------------------------------------------------------- what is drawn
   things() {
-    const found = [], { overlay, layers, frame } = this;
-    if (!overlay) return found;
-    if (layers.before && this.before) {
-      if (this.before.body && layers.body) {
-        this.before.body.pose(frame);
-        overlay.move("before", this.before.body.mesh.geometry.attributes.position.array);
-        found.push({ name: "before", pose: this.master_from_zup ?? IDENTITY });
-      }
-      const pose = this.before.object && this.pose?.found.call({ object: this.before.object }, frame);
-      if (pose && layers.object) found.push({ name: "object", pose, colour: BEFORE });
-    }
-    if (layers.body && this.viewer) {
-      const body = this.viewer.versions[this.main];
-      body.pose(frame);
-      overlay.move("body", body.mesh.geometry.attributes.position.array, this.skin(frame, layers.contact));
-      found.push({ name: "body", pose: this.master_from_zup });
-    }
-    const pose = layers.object && this.pose?.at(frame);
+    const { overlay, layers, frame, space } = this;
+    if (!overlay) return [];
+    const found = space.bodies(frame, layers);
+    if (!layers.object || !this.pose) return found;
+    const old = layers.before && space.before?.object ? objectPose(space.before.object.arrays, frame) : null;
+    if (old) found.push({ name: "object", pose: old, colour: BEFORE });
+    const pose = this.pose.at(frame);
     if (pose) {
       const own = this.pose.editing || poseAt(this.draft, frame);
       found.push({ name: "object", pose, colour: own ? EDITED : OBJECT });
@@ -237,92 +188,14 @@ class App {
     return found;
   }
 
-  /* The 3D viewer follows in the next frame: the images come first. */
-  #space3d() {
-    if (!this.viewer || this.follows) return;
-    this.follows = true;
-    requestAnimationFrame(() => {
-      this.follows = false;
-      this.viewer?.show(this.frame);
-      this.#object3d();
-    });
-  }
-
-  #object3d() { // the 3D viewer shows the pose that is edited
-    const object = this.viewer?.versions[this.main]?.object;
-    const pose = this.pose?.at(this.frame);
-    if (!object || !pose || !(this.pose.editing || posedFrames(this.draft).length)) return;
-    const [a, b, c] = compose(this.told.zup_from_master, pose);
-    object.mesh.visible = this.layers.object;
-    object.mesh.matrix.set(...a, ...b, ...c, 0, 0, 0, 1);
-    object.mesh.matrixWorldNeedsUpdate = true;
-    this.viewer.draw();
-  }
-
   mark(view, brush) {
-    if (this.layers.contact) this.#markContact(view, brush);
+    if (this.layers.contact) this.space.markContact(view, brush);
     if (this.layers.marks) {
       this.subject.mark(view, brush);
       if (this.mode === this.floor || this.draft.get("floor")) this.floor.mark(view, brush);
     }
     if (this.pose?.editing) this.pose.mark(view, brush);
     this.questions?.mark(view, brush);
-  }
-
-  /* Which parts touch, whatever hides them from the camera: a dot in the middle of each. */
-  #markContact(view, brush) {
-    if (this.middlesOf !== this.frame) {
-      this.middlesOf = this.frame;
-      this.middles = this.viewer && this.told.object ? this.#middles() : [];
-    }
-    for (const [k, { part, share, point }] of this.middles.entries()) {
-      const at = this.views.place(view, point);
-      if (!at) continue;
-      brush.globalAlpha = Math.max(0.35, share);
-      brush.fillStyle = "#ff3b47";
-      brush.strokeStyle = "#ffffff";
-      brush.lineWidth = 1.5;
-      brush.beginPath();
-      brush.arc(...at, view.width > 400 ? 5 : 3, 0, 7);
-      brush.fill();
-      brush.stroke();
-      if (view.width > 400) {
-        brush.font = "600 12px system-ui";
-        brush.lineWidth = 3;
-        brush.strokeStyle = "rgba(0, 0, 0, 0.7)";
-        const text = `${part.replaceAll("_", " ")} ${Math.round(100 * share)} %`;
-        const below = at[1] - 3 + 15 * k; // so that no two lie on each other
-        brush.strokeText(text, at[0] + 9, below);
-        brush.fillStyle = "#ffffff";
-        brush.fillText(text, at[0] + 9, below);
-      }
-      brush.globalAlpha = 1;
-    }
-  }
-
-  #middles() {
-    const { regions } = this.contact, region = this.regionOf, places = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
-    if (!region) return [];
-    const sums = regions.map((part) => ({ part, share: this.contact.p(part, this.frame) ?? 0, count: 0, sum: [0, 0, 0] }));
-    for (let v = 0; v < region.length; v += 1) {
-      const own = sums[region[v]];
-      if (!own || own.share < 0.25) continue;
-      own.count += 1;
-      for (let k = 0; k < 3; k += 1) own.sum[k] += places[3 * v + k];
-    }
-    return sums.filter((one) => one.count).map(({ part, share, count, sum }) =>
-      ({ part, share, point: apply(this.master_from_zup, sum.map((v) => v / count)) }));
-  }
-
-  /* The 3D viewer's eye as a camera of the master's frame. */
-  eye() {
-    const { eye } = this.viewer, canvas = document.querySelector(".viewer canvas");
-    eye.updateMatrixWorld();
-    const m = eye.matrixWorld.elements; // column-major, looks along -z with y up
-    const zup_from_eye = [0, 1, 2].map((k) => [m[k], -m[4 + k], -m[8 + k], m[12 + k]]);
-    const camera_from_master = compose(invert(zup_from_eye), this.told.zup_from_master);
-    const tall = 2 * Math.tan((eye.fov * Math.PI) / 360);
-    return { camera_from_master, metres: (depth) => (depth * tall) / canvas.clientHeight };
   }
 
   middle() {
@@ -368,19 +241,14 @@ class App {
   }
 
   #bar() {
-    const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", before: this.before ? "before" : null };
+    const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", before: this.space.before ? "before" : null };
     find("layers").replaceChildren(...Object.entries(names).filter(([, text]) => text).map(([name, text], k) => make("label", { title: name === "before" ? "B" : String(k + 1) },
       make("input", { type: "checkbox", checked: this.layers[name], data: { layer: name }, onchange: (event) => this.layer(name, event.target.checked) }), ` ${text}`)));
   }
 
   layer(name, on) {
     this.layers[name] = on;
-    if (this.viewer) {
-      this.viewer.state.contact = this.layers.contact;
-      const { group, object } = this.viewer.versions[this.main];
-      group.children[0].visible = this.layers.body;
-      if (object) object.wanted = this.layers.object;
-    }
+    this.space.layers(this.layers);
     this.#bar();
     this.redraw();
   }
@@ -464,24 +332,6 @@ class App {
   }
 }
 
-/* Colours by vertex (V, 3): red where the meshes touch, orange where contact is stated. */
-function skinPaint(header, arrays) {
-  const region = arrays["contact/region"], probability = arrays["contact/probability"], touching = arrays["contact/touching"];
-  const count = header.regions?.length ?? 0, total = arrays.faces.reduce((most, v) => Math.max(most, v), 0) + 1;
-  const colours = new Float32Array(3 * total), width = touching ? touching.length / header.frames : 0;
-  return (frame, shown) => {
-    for (let v = 0; v < total; v += 1) {
-      let colour = BODY;
-      if (shown && touching && (touching[frame * width + (v >> 3)] >> (v & 7)) & 1) colour = TOUCHING;
-      else if (shown && region && region[v] < 255 && probability[frame * count + region[v]] >= 128) colour = STATED;
-      colours[3 * v] = colour[0];
-      colours[3 * v + 1] = colour[1];
-      colours[3 * v + 2] = colour[2];
-    }
-    return colours;
-  };
-}
-
 function doubts(app) {
   const { told } = app, verdict = told.verdict ?? [];
   const doubt = [told.track?.doubts, told.subject?.doubts].filter(Boolean);
@@ -491,23 +341,6 @@ function doubts(app) {
     told.places.length ? make("ol", { class: "places" }, told.places.slice(0, 60).map((place) => make("li", {},
       button(`${place.first === place.last ? place.first : `${place.first}–${place.last}`}: ${place.words}`, () => app.go(place), { class: "plain" }))))
       : make("p", {}, told.frames && told.verdict ? "Nothing is flagged or doubted." : "No verdict yet."));
-}
-
-function viewerElement() {
-  const part = (tag, name, more = {}, ...children) => {
-    const element = make(tag, { ...more }, ...children);
-    element.dataset.part = name;
-    return element;
-  };
-  const root = make("div", { class: "viewer", tabIndex: 0, role: "group" },
-    part("canvas", "canvas", { role: "img", "aria-label": "Body and object in 3D" }), part("div", "message", { role: "status" }),
-    make("div", { class: "time", hidden: true }, part("button", "play", { type: "button" }),
-      make("div", { class: "track" }, part("input", "scrub", { type: "range", min: "0", max: "0", value: "0", "aria-label": "Frame" }), part("canvas", "marks"))),
-    make("div", { class: "row", hidden: true }, part("span", "time"), part("span", "flag"), part("select", "speed", { "aria-label": "Speed" })),
-    make("details", {}, make("summary", {}, "3D view"), part("div", "layers", { role: "group", "aria-label": "Shown in 3D" }),
-      make("label", {}, "view ", part("select", "views", {}, new Option("free", "-1"))), part("button", "reset", { type: "button" }, "Overview")));
-  root.setAttribute("aria-label", "Sequence in 3D over time");
-  return root;
 }
 
 function facts(told) {

@@ -25,6 +25,16 @@ export const takePose = (draft) => draft.set("object_pose", null, "object pose r
 
 export const posedFrames = (draft) => (draft.get("object_pose") ? [draft.get("object_pose").frame ?? 0] : []);
 
+/* Where a result has the object at a frame: the joint fit, else the track; null = nowhere. */
+export function objectPose(arrays, frame) {
+  for (const poses of [arrays["poses/joint"], arrays["poses/object_track"]]) {
+    if (!poses || poses.length < 12 * (frame + 1)) continue;
+    const own = poses.subarray(12 * frame, 12 * frame + 12);
+    if (Number.isFinite(own[0])) return rows(own);
+  }
+  return null;
+}
+
 /* --- the object as the page has it ------------------------------------------------------------- */
 export class PoseEditor {
   constructor(app, object) {
@@ -37,15 +47,7 @@ export class PoseEditor {
   }
 
   /* Where the result has the object; null = nowhere. */
-  found(frame, version = null) {
-    for (const name of version ? [version] : ["poses/joint", "poses/object_track"]) {
-      const poses = this.object.arrays[name];
-      if (!poses || poses.length < 12 * (frame + 1)) continue;
-      const own = poses.subarray(12 * frame, 12 * frame + 12);
-      if (Number.isFinite(own[0])) return rows(own);
-    }
-    return null;
-  }
+  found(frame) { return objectPose(this.object.arrays, frame); }
 
   at(frame) {
     if (this.editing) return this.pose;
@@ -134,8 +136,8 @@ export class PoseEditor {
   /* A drag on the object in the 3D viewer, which else turns the view. */
   watch(canvas) {
     canvas.addEventListener("pointerdown", (event) => {
-      if (!this.editing || !this.app.viewer) return;
-      const camera = this.app.eye();
+      if (!this.editing || !this.app.space.viewer) return;
+      const camera = this.app.space.eye();
       const at = apply(camera.camera_from_master, this.middle());
       const box = canvas.getBoundingClientRect();
       const x = box.left + box.width / 2 + at[0] / camera.metres(at[2]);
