@@ -91,7 +91,7 @@ def patched(document: Document, changes: Mapping[str, Any]) -> str:
     text = document.text.replace("\r\n", "\n")
     for section in Annotation.model_fields:
         if section in changes:
-            text = _with_section(text, section, changes[section])
+            text = with_section(text, section, changes[section])
     kept = {k: v for k, v in document.sections.items() if k not in changes}
     wanted = kept | {k: v for k, v in changes.items() if v not in (None, [], ())}
     if _plain(_sections(text)) != _plain(wanted):
@@ -137,7 +137,7 @@ def save(document: Document, text: str) -> Document:
             now = read(path)
             if now.digest != document.digest:
                 raise Changed(now, difference(document.text, now.text, path.name))
-            _replace(path, text)
+            replace(path, text)
     except OSError as error:
         raise UserError(
             f"{path}: cannot be saved ({error.strerror}); nothing was changed"
@@ -145,7 +145,7 @@ def save(document: Document, text: str) -> Document:
     return read(path)
 
 
-def _replace(path: Path, text: str) -> None:
+def replace(path: Path, text: str) -> None:
     """Under a temporary name beside the file, to the disk, then renamed."""
     for part in _parts(path):  # of a save that was cut off
         part.unlink(missing_ok=True)
@@ -207,7 +207,7 @@ def _plain(values: Any) -> str:
 # --- one section of the text -----------------------------------------------------------------
 
 
-def _with_section(text: str, section: str, value: Any) -> str:
+def with_section(text: str, section: str, value: Any) -> str:
     spans = _spans(text)
     if spans is None:
         return _with_whole(text, section, value)

@@ -116,7 +116,7 @@ class Runs:
     def start(self, project: Project, sequence: str) -> None:
         """Run what is out of date of a sequence; what is there now is kept beside.
 
-        Raises UserError where a run goes on, or where jobs go to a cluster.
+        Raises UserError where a run goes on, nothing is to be done, or jobs go to a cluster.
         """
         told = command(project, sequence, cores=self.cores, profile=self.profile)
         if self.profile is not None:
@@ -125,6 +125,8 @@ class Runs:
             if self.going_on:
                 raise UserError(f"a run of {self._sequence} goes on; wait for its end, or stop it")
             self._stages = [one["stage"] for one in touched(project, sequence)]
+            if not self._stages:
+                raise UserError(f"nothing to run: all results of {sequence} are up to date")
             _keep(project, sequence)
             self._said = project.logs / "annotate.txt"  # no .log: those are of jobs
             self._said.parent.mkdir(parents=True, exist_ok=True)

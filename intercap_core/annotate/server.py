@@ -17,12 +17,12 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from intercap_core.annotate import document, questions, rerun, result, snap
+from intercap_core.annotate import document, questions, rerun, result, snap, surface
 from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sequences import SequenceList
-from intercap_core.config import Annotation
+from intercap_core.config import Annotation, ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 from intercap_core.schemas import CONTACT_REGIONS
@@ -174,10 +174,7 @@ class Annotator:
 
     def snap(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
         """The object's pose fitted to the images of a frame."""
-        entry = self.project.object_of(self.opened(name).name)
-        if entry is None:
-            raise UserError(f"sequence {name!r} names no object")
-        pose = _pose(told)
+        entry, pose = self._object(name), _pose(told)
         opened = self.opened(name)
         with opened.images() as images:
             if not 0 <= pose.frame < images.num_sets:
@@ -186,6 +183,26 @@ class Annotator:
             opened, entry, pose.frame, list(pose.rotation_vector), list(pose.translation)
         )
         return found.__dict__
+
+    def read_surface(self, name: str) -> dict[str, Any]:
+        """Where people are likely to touch the sequence's object."""
+        return surface.read_surface(self.project, self._object(name))
+
+    def surface(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """Keep where people are likely to touch the object, for all sequences that have it."""
+        vertices = told["vertices"]
+        if not isinstance(vertices, list) or not all(type(v) is int for v in vertices):
+            raise UserError("vertices are numbers of the mesh's")
+        digest = str(told["digest"])
+        saved = surface.save_surface(self.project, self._object(name), vertices, digest)
+        self.project = load_project(self.settings)
+        return saved
+
+    def _object(self, name: str) -> ObjectEntry:
+        entry = self.project.object_of(self.opened(name).name)
+        if entry is None:
+            raise UserError(f"sequence {name!r} names no object")
+        return entry
 
     def point(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
         """The point of the room under a pixel."""
@@ -323,12 +340,13 @@ def application(annotator: Annotator, token: str) -> App:
         Route(f"{of}/questions", look(annotator.questions)),
         Route(f"{of}/run", look(annotator.run_state), methods=["GET"]),
         Route(f"{of}/beside", look(beside)),
+        Route(f"{of}/surface", look(annotator.read_surface), methods=["GET"]),
         Route(f"{of}/image/{{camera}}/{{frame:int}}", image),
         Route(f"{of}/viewer", arrays(result.viewer_payload)),
         Route(f"{of}/object", arrays(result.object_payload)),
         *(
             Route(f"{of}/{verb}", change(getattr(annotator, verb)), methods=["POST"])
-            for verb in ("check", "save", "answer", "snap", "point", "run")
+            for verb in ("check", "save", "answer", "snap", "point", "surface", "run")
         ),
     ]
     handlers: Any = {

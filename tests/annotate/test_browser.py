@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -166,6 +167,35 @@ def test_subject_floor_and_dropped_frames_are_clicked(settings: Path) -> None:
     assert set(yaml.safe_load(annotation(settings).read_text())) == {
         "floor", "subject", "drop_frames",
     }  # fmt: skip
+
+
+def test_where_people_touch_is_painted_and_kept_with_the_object(settings: Path) -> None:
+    mesh = Path(yaml.safe_load((settings.parent / "objects.yaml").read_text())["football"]["mesh"])
+    own = settings.parent / mesh.name
+    shutil.copy(mesh, own)
+    (settings.parent / "objects.yaml").write_text(f"football:\n  mesh: {own.name}\n")
+    with served(settings) as server, _open(server) as page:
+        page.page.locator("#tab-object").click()
+        page.page.get_by_text("Paint its contact surface").click()
+        page.wait("document.body.dataset.mode === 'Paint'")
+        box = page.page.locator("#big canvas").first.bounding_box()
+        assert box is not None
+        middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        _drag(page, middle, (30, 0))
+        assert page.page.evaluate("window.annotate.paint.painted.size") > 0
+        page.page.keyboard.press("Control+z")
+        assert page.page.evaluate("window.annotate.paint.painted.size") == 0
+        _drag(page, middle, (-20, 10))
+        painted = page.page.evaluate("[...window.annotate.paint.painted]")
+        page.page.get_by_text("Save the surface").click()
+        page.page.locator('[data-answer="save"]').click()
+        page.wait("!window.annotate.paint.changed")
+    written = json.loads(own.with_suffix(".contact.json").read_text())
+    assert len(written["contact_vertices"]) >= len(painted) > 0
+    assert (
+        f"contact_vertices: {own.stem}.contact.json"
+        in (settings.parent / "objects.yaml").read_text()
+    )
 
 
 def test_a_question_is_answered_by_a_key_and_never_asked_again(settings: Path) -> None:

@@ -1,4 +1,4 @@
-"""A run from the page: what it is asked for, how far it is, what is kept of the result before it."""
+"""A run from the page: what it is asked for, how far it is, what is kept of the old result."""
 
 from __future__ import annotations
 

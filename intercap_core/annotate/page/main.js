@@ -8,6 +8,7 @@ import { Keep } from "./keep.js";
 import { showList } from "./list.js";
 import { DroppedFrames, FloorMarks, SubjectMarks } from "./marks.js";
 import { Overlay } from "./overlay.js";
+import { Paint } from "./paint.js";
 import { Pictures } from "./pictures.js";
 import { PoseEditor, objectPose, poseAt } from "./pose.js";
 import { Questions } from "./questions.js";
@@ -65,6 +66,7 @@ class App {
       try {
         const object = await packed(`${of}/object?v=${this.told.result}`);
         this.pose = new PoseEditor(this, object);
+        this.paint = new Paint(this, object);
         this.overlay?.mesh("object", object.arrays.faces, OBJECT);
         this.overlay?.move("object", object.arrays.vertices);
       } catch (error) { banner("object", error.message); }
@@ -176,7 +178,7 @@ class App {
   things() {
     const { overlay, layers, frame, space } = this;
     if (!overlay) return [];
-    const found = space.bodies(frame, layers);
+    const found = this.paint && this.mode === this.paint ? [] : space.bodies(frame, layers);
     if (!layers.object || !this.pose) return found;
     const old = layers.before && space.before?.object ? objectPose(space.before.object.arrays, frame) : null;
     if (old) found.push({ name: "object", pose: old, colour: BEFORE });
@@ -195,6 +197,7 @@ class App {
       if (this.mode === this.floor || this.draft.get("floor")) this.floor.mark(view, brush);
     }
     if (this.pose?.editing) this.pose.mark(view, brush);
+    if (this.paint && this.mode === this.paint) this.paint.mark(view, brush);
     this.questions?.mark(view, brush);
   }
 
@@ -228,7 +231,12 @@ class App {
     this.saying = setTimeout(() => { box.textContent = this.mode?.hint ?? ""; box.hidden = !this.mode; }, 5000);
   }
 
-  undo() { this.draft.undo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
+  undo() {
+    if (this.paint && this.mode === this.paint) { this.paint.undo(); return; }
+    this.draft.undo();
+    if (this.pose?.editing) this.pose.undone();
+    this.panels();
+  }
 
   redo() { this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
 
@@ -279,7 +287,7 @@ class App {
     const parts = {
       doubts: () => [doubts(this)],
       questions: () => [this.questions?.panel()],
-      object: () => [this.pose?.panel() ?? make("p", {}, "The object's mesh is not there.")],
+      object: () => (this.pose ? [this.pose.panel(), this.pose.editing ? null : this.paint.panel()] : [make("p", {}, "The object's mesh is not there.")]),
       marks: () => [make("h2", {}, "Subject"), this.subject.panel(), make("h2", {}, "Floor"), this.floor.panel(), make("h2", {}, "Frames to drop"), this.dropped.panel()],
       run: () => [this.keep?.panel()],
     };

@@ -3,7 +3,7 @@ import { find, make } from "./dom.js";
 import { apply, project } from "./geometry.js";
 
 const AHEAD = 4; // frames fetched before they are asked for
-const NEAREST = 8; // times the whole image: the largest zoom
+const NEAREST = 16; // times the whole image: the largest zoom
 
 export class Views {
   constructor(app) {

@@ -1,0 +1,81 @@
+"""Where people are likely to touch an object: vertices painted on its mesh, kept in the list that
+objects.yaml names. The list is of the object, so of all sequences that have it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core.annotate import document
+from intercap_core.config import ObjectEntry
+from intercap_core.errors import UserError
+from intercap_core.project import Project, tidy
+from intercap_core.rigid.contact_vertices import contact_list
+from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.rigid.mesh_files import load_mesh
+
+_SAME = 1e-6  # of the object's size: a vertex of the file is this one of the mesh
+
+
+def read_surface(project: Project, entry: ObjectEntry) -> dict[str, Any]:
+    """The painted ``vertices`` of the mesh, where they are kept, and the digest to save them by."""
+    mesh = ObjectMesh.load(entry)
+    ids = mesh.contact_vertices if entry.contact_vertices is not None else np.zeros(0, int)
+    users = [n for n, row in project.sequences.items() if row.object == entry.name]
+    return {
+        "vertices": ids.tolist(), "path": str(_list_of(entry)), "digest": _digest(_list_of(entry)),
+        "sequences": len(users),
+    }  # fmt: skip
+
+
+def save_surface(
+    project: Project, entry: ObjectEntry, vertices: list[int], digest: str
+) -> dict[str, Any]:
+    """Write the painted vertices, by the numbers of the mesh file, and name the list in
+    objects.yaml where it is not named yet.
+
+    Raises UserError where the list is another one than was read, or nothing is painted.
+    """
+    mesh, path = ObjectMesh.load(entry), _list_of(entry)
+    painted = np.zeros(len(mesh.vertices), bool)
+    ids = np.array(vertices, int) if vertices else np.zeros(0, int)
+    if not len(ids) or ids.min() < 0 or ids.max() >= len(painted):
+        raise UserError(f"object {entry.name!r}: paint at least one of its {len(painted)} vertices")
+    painted[ids] = True
+    if _digest(path) != digest:
+        raise UserError(f"{path}: was changed by somebody else meanwhile; load the page again")
+    in_file = np.asarray(load_mesh(Path(entry.mesh)).vertices, np.float64)
+    away, nearest = cKDTree(mesh.vertices).query(np.nan_to_num(in_file, nan=1e9))
+    chosen = np.flatnonzero(painted[nearest] & (away <= _SAME * mesh.diameter))
+    text = json.dumps(contact_list(chosen, in_file)) + "\n"
+    document.replace(path, text)
+    if entry.contact_vertices != path:
+        _name_list(project, entry, path)
+    return read_surface(project, entry.model_copy(update={"contact_vertices": path}))
+
+
+def _list_of(entry: ObjectEntry) -> Path:
+    """The list that the entry names where it is JSON, else one beside the mesh."""
+    named = entry.contact_vertices
+    if named is not None and named.suffix == ".json":
+        return named
+    return Path(entry.mesh).with_suffix(".contact.json")
+
+
+def _name_list(project: Project, entry: ObjectEntry, path: Path) -> None:
+    objects = tidy(project.path.parent / project.config.objects)
+    found = document.read(objects)
+    told = dict(found.sections[entry.name])
+    told["contact_vertices"] = os.path.relpath(path, objects.parent)
+    document.save(found, document.with_section(found.text, entry.name, told))
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else document.NO_FILE

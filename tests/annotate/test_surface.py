@@ -1,0 +1,61 @@
+"""Contact vertices that are painted: kept by the mesh file's numbers, named in objects.yaml."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core.annotate import document, surface
+from intercap_core.errors import UserError
+from intercap_core.project import Project, load_project
+from intercap_core.rigid.mesh import ObjectMesh
+from tests.helpers.fitted_capture import object_entry
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Project:
+    """A cup that nobody has painted yet."""
+    monkeypatch.chdir(tmp_path)
+    mesh = Path(object_entry("cup").mesh)
+    for file in mesh.parent.glob(f"{mesh.stem}.*"):
+        if "contact" not in file.name:
+            shutil.copy(file, tmp_path / f"cup{file.suffix}")
+    (tmp_path / "objects.yaml").write_text("# ours\ncup:\n  mesh: cup.ply # scanned\n")
+    (tmp_path / "subjects.tsv").write_text("subject\tgender\np01\tneutral\n")
+    (tmp_path / "sequences.tsv").write_text(
+        "sequence\tsubject\tobject\trecordings\tcalibration\none\tp01\tcup\trec\tcal\n"
+    )
+    (tmp_path / "config.yaml").write_text("dataset: trial\n")
+    return load_project(Path("config.yaml"))
+
+
+def test_a_first_list_is_written_and_named(project: Project) -> None:
+    entry = project.objects["cup"]
+    told = surface.read_surface(project, entry)
+    assert told["vertices"] == [] and told["digest"] == document.NO_FILE and told["sequences"] == 1
+    saved = surface.save_surface(project, entry, [3, 4, 50], told["digest"])
+    assert saved["vertices"] == [3, 4, 50]
+    assert Path("objects.yaml").read_text() == (
+        "# ours\ncup:\n  mesh: cup.ply # scanned\n  contact_vertices: cup.contact.json\n"
+    )
+    again = load_project(Path("config.yaml")).objects["cup"]
+    assert np.array_equal(ObjectMesh.load(again).contact_vertices, [3, 4, 50])
+
+
+def test_a_list_that_changed_meanwhile_stays(project: Project) -> None:
+    entry = project.objects["cup"]
+    first = surface.read_surface(project, entry)
+    surface.save_surface(project, entry, [3], first["digest"])
+    entry = load_project(Path("config.yaml")).objects["cup"]
+    with pytest.raises(UserError, match="meanwhile"):
+        surface.save_surface(project, entry, [4], first["digest"])
+    assert surface.read_surface(project, entry)["vertices"] == [3]
+
+
+@pytest.mark.parametrize("vertices", [[], [-1], [10**9]])
+def test_what_is_no_vertex_is_refused(project: Project, vertices: list[int]) -> None:
+    with pytest.raises(UserError, match="vertices"):
+        surface.save_surface(project, project.objects["cup"], vertices, document.NO_FILE)
