@@ -24,6 +24,21 @@ from intercap_core.viewer.content import gather
 from intercap_core.viewer.package import payload
 
 DOUBTED = 1.5  # times the part's stated error: a frame that the verdict doubts
+_DRAWN = {
+    "scene",
+    "body_fit",
+    "joint",
+    "metrics",
+    "object_track",
+}  # what the viewer shows is of these
+_LENGTHS = {  # a dataset of each stage with a row a frame
+    "scene": (SCENE, "times"),
+    "person": (PERSON, "missing"),
+    "object_track": (OBJECT_TRACK, "lost"),
+    "body_fit": (BODY_FIT, "failed"),
+    "joint": (JOINT, "flagged"),
+    "metrics": (METRICS, "flagged"),
+}
 _CALL = 'showInterCap("'  # what the page's script hands the data to
 _VIEWER = ("frames", "scene", "body_fit")
 
@@ -47,17 +62,20 @@ def describe(opened: Opened) -> dict[str, Any]:
             found["image_of"] = None
         found["dropped"] = np.flatnonzero(opened.dropped()).tolist()
         found["zup_from_master"] = np.eye(4)[:3].tolist()
+        broken: set[str] = set()
         for look in (_scene, _person, _track, _body, _joint, _metrics):
             stage = look.__name__[1:]
             stage = {"track": "object_track", "body": "body_fit"}.get(stage, stage)
             if not opened.there(stage):
                 continue
             try:
+                _same_recording(opened, stage, found["frames"])
                 rig = look(opened, found) or rig
             except UserError as error:  # an older version, damaged, or another recording's
                 found["notes"].append(str(error))
+                broken.add(stage)
         found["cameras"] = _cameras(rig)
-        found["viewer"] = all(opened.there(stage) for stage in _VIEWER)
+        found["viewer"] = all(opened.there(stage) for stage in _VIEWER) and not broken & _DRAWN
         if not opened.there("joint"):
             found["notes"].append(
                 "there is no joint result yet: "
@@ -139,6 +157,19 @@ def object_payload(opened: Opened) -> str:
         return payload(header, arrays)
 
     return opened.made("object", ("joint", "object_track"), made)
+
+
+def _same_recording(opened: Opened, stage: str, frames: int) -> None:
+    """Raise UserError where an artefact has not as many frames as the images: they were read anew
+    since, and the stage was not run again."""
+    schema, key = _LENGTHS[stage]
+    with artefacts.read(opened.paths[stage], schema) as source:
+        count = source.describe(key)[0][0]
+    if count != frames:
+        raise UserError(
+            f"{opened.paths[stage]}: has {count} frames, and {frames} were read since: it is not "
+            f"shown; re-run stage {stage!r}"
+        )
 
 
 def _scene(opened: Opened, found: dict[str, Any]) -> Rig:

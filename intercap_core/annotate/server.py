@@ -12,6 +12,7 @@ from typing import Any
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
@@ -331,8 +332,8 @@ def application(annotator: Annotator, token: str) -> App:
     routes = [
         Route("/", page),
         Route("/sequence/{name}", page),
-        Mount("/page", StaticFiles(directory=PAGE)),
-        Mount("/viewer", StaticFiles(directory=VIEWER)),
+        Mount("/page", GZipMiddleware(StaticFiles(directory=PAGE), compresslevel=6)),
+        Mount("/viewer", GZipMiddleware(StaticFiles(directory=VIEWER), compresslevel=6)),
         Route("/api/sequences", lambda _: _json(annotator.sequences())),
         Route(of, look(annotator.sequence)),
         Route(f"{of}/annotation", look(annotator.annotation)),

@@ -265,6 +265,30 @@ def test_images_alone_are_shown_and_can_be_annotated(settings: Path) -> None:
         assert _draft(page, "drop_frames") == [1]
 
 
+def test_a_person_alone_has_no_object_to_mend(settings: Path) -> None:
+    table = settings.parent / "sequences.tsv"
+    table.write_text(table.read_text().replace("football", ""))
+    with served(settings) as server, _open(server) as page:
+        assert page.page.locator("#tab-object").count() == 0
+        for key in (
+            "ArrowRight",
+            "o",
+            "s",
+            "f",
+            "f",
+            "n",
+            "c",
+            "k",
+            "Delete",
+            "q",
+            "b",
+            "End",
+            "x",
+        ):
+            page.page.keyboard.press(key)
+        assert _draft(page, "drop_frames") == [9]
+
+
 def test_before_the_first_run_it_says_what_to_do(settings: Path) -> None:
     artefact(settings, "frames").unlink()
     with served(settings) as server, _open(server) as page:

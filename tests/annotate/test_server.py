@@ -158,6 +158,14 @@ def test_a_result_of_an_older_version_is_named_and_the_rest_is_shown(
     assert status == 422 and b"joint" in answer
 
 
+def test_a_result_of_other_frames_is_named_and_not_drawn(page: Served, settings: Path) -> None:
+    other = small_project(settings.parent / "shorter", total=4)
+    shutil.copy(artefact(other, "joint"), artefact(settings, "joint"))
+    told = page.json(OF)
+    assert any("has 4 frames, and 6 were read" in note for note in told["notes"])
+    assert "contact" not in told and not told["viewer"]
+
+
 def test_recordings_that_were_moved_are_named(page: Served) -> None:
     assert any("the recordings are not there" in note for note in page.json(OF)["notes"])
 
