@@ -18,7 +18,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from intercap_core.annotate import document, questions, rerun, result, snap, surface
+from intercap_core.annotate import document, questions, rerun, result, snap, surface, symmetry
 from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened
@@ -199,6 +199,20 @@ class Annotator:
         self.project = load_project(self.settings)
         return saved
 
+    def read_symmetry(self, name: str) -> dict[str, Any]:
+        """How the sequence's object can be turned and look the same."""
+        return symmetry.read_symmetry(self.project, self._object(name))
+
+    def symmetry(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
+        """Keep the object's symmetry, for all sequences that have it."""
+        wanted = told["symmetry"]
+        if not isinstance(wanted, dict):
+            raise UserError("symmetry is discrete, continuous or sphere")
+        entry = self._object(name)
+        saved = symmetry.save_symmetry(self.project, entry, wanted, str(told["digest"]))
+        self.project = load_project(self.settings)
+        return saved
+
     def _object(self, name: str) -> ObjectEntry:
         entry = self.project.object_of(self.opened(name).name)
         if entry is None:
@@ -342,12 +356,13 @@ def application(annotator: Annotator, token: str) -> App:
         Route(f"{of}/run", look(annotator.run_state), methods=["GET"]),
         Route(f"{of}/beside", look(beside)),
         Route(f"{of}/surface", look(annotator.read_surface), methods=["GET"]),
+        Route(f"{of}/symmetry", look(annotator.read_symmetry), methods=["GET"]),
         Route(f"{of}/image/{{camera}}/{{frame:int}}", image),
         Route(f"{of}/viewer", arrays(result.viewer_payload)),
         Route(f"{of}/object", arrays(result.object_payload)),
         *(
             Route(f"{of}/{verb}", change(getattr(annotator, verb)), methods=["POST"])
-            for verb in ("check", "save", "answer", "snap", "point", "surface", "run")
+            for verb in ("check", "save", "answer", "snap", "point", "surface", "symmetry", "run")
         ),
     ]
     handlers: Any = {

@@ -1,4 +1,4 @@
-"""Contact vertices that are painted: kept by the mesh file's numbers, named in objects.yaml."""
+"""What is of the object: painted contact vertices and symmetry, kept in and by objects.yaml."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from intercap_core.annotate import document, surface
+from intercap_core.annotate import document, surface, symmetry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
 from intercap_core.rigid.mesh import ObjectMesh
@@ -59,3 +59,27 @@ def test_a_list_that_changed_meanwhile_stays(project: Project) -> None:
 def test_what_is_no_vertex_is_refused(project: Project, vertices: list[int]) -> None:
     with pytest.raises(UserError, match="vertices"):
         surface.save_surface(project, project.objects["cup"], vertices, document.NO_FILE)
+
+
+def test_a_symmetry_is_written_and_taken_away(project: Project) -> None:
+    entry = project.objects["cup"]
+    before = Path("objects.yaml").read_text()
+    told = symmetry.read_symmetry(project, entry)
+    about_z = {"continuous": [{"axis": [0, 0, 1]}]}
+    saved = symmetry.save_symmetry(project, entry, about_z, told["digest"])
+    assert saved["symmetry"] == about_z
+    assert "# scanned" in Path("objects.yaml").read_text()
+    again = load_project(Path("config.yaml")).objects["cup"]
+    assert again.symmetry.continuous[0].axis == (0.0, 0.0, 1.0)
+    symmetry.save_symmetry(project, again, {}, saved["digest"])
+    assert Path("objects.yaml").read_text() == before
+
+
+def test_an_impossible_symmetry_and_another_file_are_refused(project: Project) -> None:
+    entry = project.objects["cup"]
+    told = symmetry.read_symmetry(project, entry)
+    with pytest.raises(UserError, match="impossible"):
+        symmetry.save_symmetry(project, entry, {"discrete": [[1, 2]]}, told["digest"])
+    Path("objects.yaml").write_text("cup: {mesh: cup.ply}\n")
+    with pytest.raises(UserError, match="meanwhile"):
+        symmetry.save_symmetry(project, entry, {"sphere": True}, told["digest"])

@@ -13,6 +13,7 @@ import { Pictures } from "./pictures.js";
 import { PoseEditor, objectPose, poseAt } from "./pose.js";
 import { Questions } from "./questions.js";
 import { BEFORE, Space } from "./space.js";
+import { SymmetryEditor } from "./symmetry.js";
 import { Timeline } from "./timeline.js";
 import { Views } from "./views.js";
 
@@ -43,6 +44,7 @@ class App {
     this.floor = new FloorMarks(this);
     this.dropped = new DroppedFrames(this);
     this.space = new Space(this);
+    this.symmetry = new SymmetryEditor(this);
     this.views = new Views(this);
     this.timeline = new Timeline(this);
     this.questions = new Questions(this);
@@ -182,7 +184,7 @@ class App {
     if (!layers.object || !this.pose) return found;
     const old = layers.before && space.before?.object ? objectPose(space.before.object.arrays, frame) : null;
     if (old) found.push({ name: "object", pose: old, colour: BEFORE });
-    const pose = this.pose.at(frame);
+    const pose = this.symmetry.turned(this.pose.at(frame));
     if (pose) {
       const own = this.pose.editing || poseAt(this.draft, frame);
       found.push({ name: "object", pose, colour: own ? EDITED : OBJECT });
@@ -287,7 +289,7 @@ class App {
     const parts = {
       doubts: () => [doubts(this)],
       questions: () => [this.questions?.panel()],
-      object: () => (this.pose ? [this.pose.panel(), this.pose.editing ? null : this.paint.panel()] : [make("p", {}, "The object's mesh is not there.")]),
+      object: () => (this.pose ? [this.pose.panel(), ...(this.pose.editing ? [] : [this.paint.panel(), this.symmetry.panel()])] : [make("p", {}, "The object's mesh is not there.")]),
       marks: () => [make("h2", {}, "Subject"), this.subject.panel(), make("h2", {}, "Floor"), this.floor.panel(), make("h2", {}, "Frames to drop"), this.dropped.panel()],
       run: () => [this.keep?.panel()],
     };
