@@ -71,6 +71,7 @@ def _object(page: Visit) -> None:
     page.page.mouse.up()
     _take(page, "annotate_object")
     page.page.keyboard.press("Escape")
+    page.page.keyboard.press("Control+z")
 
 
 def _question(page: Visit) -> None:

@@ -20,7 +20,10 @@ TEMPLATE = Path(__file__).parent / "data" / "architecture.md"
 # import contract in pyproject.toml; a test holds the two together.
 LAYERS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command line's options, nothing else"},
-    {"evaluation": "figures against truth over many recordings: `intercap evaluate`"},
+    {
+        "evaluation": "figures against truth over many recordings: `intercap evaluate`",
+        "annotate": "annotations mended in the browser: a server on the loopback and its page",
+    },
     {
         "commands": "the command line's verbs: run, check, report, view, compare, release, bench "
         "and others"

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from intercap_core.annotate import rerun
+from intercap_core.commands.run import _mark_targets
 from intercap_core.errors import UserError
+from intercap_core.pipeline.plan import Kind, Plan, mark_of
 from intercap_core.project import Project, load_project
 from tests.annotate.served import NAME, annotation, artefact, small_project
 
@@ -117,6 +119,13 @@ def test_the_result_before_is_kept_and_held_against_the_new_one(
 def test_a_sequence_without_results_has_nothing_beside_it(project: Project) -> None:
     shutil.rmtree(project.results / NAME)
     assert not rerun.beside(project, NAME)["there"]
+
+
+def test_what_is_out_of_date_is_marked_before_snakemake_lists_the_marks(project: Project) -> None:
+    plan = Plan(project)
+    _mark_targets(plan, ["--cores", "1", *rerun.targets(project, NAME)])
+    stale = [stage for stage, state in plan.states(NAME).items() if state.kind is Kind.stale]
+    assert stale and all(mark_of(project, NAME, stage).is_file() for stage in stale)
 
 
 def test_the_annotation_decides_what_is_touched(project: Project) -> None:

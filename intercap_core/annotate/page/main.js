@@ -193,7 +193,7 @@ class App {
   }
 
   mark(view, brush) {
-    if (this.layers.contact) this.space.markContact(view, brush);
+    if (this.layers.contact && !(this.paint && this.mode === this.paint)) this.space.markContact(view, brush);
     if (this.layers.marks) {
       this.subject.mark(view, brush);
       if (this.mode === this.floor || this.draft.get("floor")) this.floor.mark(view, brush);

@@ -26,7 +26,7 @@ export class SymmetryEditor {
   /* The object's pose with the turn that is tried. */
   turned(pose) {
     const axis = CHOICES[this.choice]?.[2];
-    if (!pose || !axis || !this.angle || this.app.open !== "object" || this.app.pose.editing) return pose;
+    if (!pose || !axis || !this.angle || this.app.open !== "object" || this.app.mode) return pose;
     return compose(pose, rigid(axis.map((v) => v * this.angle), [0, 0, 0]));
   }
 
