@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from intercap_core.pipeline.job import UNEXPECTED, read_state
+from intercap_core.pipeline.job import ENDED, UNEXPECTED, read_state
 
 from .ledger import Entry, members, stamp
 
@@ -53,6 +53,8 @@ def endings(job: Any, entry: Entry, slurm_log: Path) -> list[Ending]:
             found.append(Ending(name, "waiting", _slurms_reason(slurm_log)))
         else:
             state, words = read_state(log)
+            if words.startswith(ENDED):
+                words += f"; {_slurms_reason(slurm_log)}"
             found.append(Ending(name, state, words or _slurms_reason(slurm_log)))
     return found
 

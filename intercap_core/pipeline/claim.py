@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from intercap_core import disk
 from intercap_core.errors import UserError
 
 log = logging.getLogger(__name__)
@@ -148,12 +149,13 @@ def try_claim(path: Path) -> Claim | Owner:
             _bury(path, held)
             continue
         except OSError as error:
-            raise UserError(
-                f"{path.parent}: cannot be written ({error.strerror}), expected a folder for "
-                "results; make it writable, or name another one by the setting results"
-            ) from None
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(own.__dict__, file)
+            raise UserError(disk.told(error, path.parent)) from None
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                json.dump(own.__dict__, file)
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            raise UserError(disk.told(error, path.parent)) from None
         return Claim(path, own, dead)
 
 
