@@ -133,7 +133,7 @@ def _run(
     try:
         status = run_watched(command, watcher, console)
     except ToldToEnd as end:
-        words = f"{end}: {watcher.steps()} jobs are done and kept; the same command goes on"
+        words = f"{end}: {watcher.steps()} jobs were done, and are kept; the same command goes on"
         console.print(words, highlight=False)
         raise SystemExit(end.status) from None
     failures = watcher.failures()

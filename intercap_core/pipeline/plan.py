@@ -1,7 +1,9 @@
 """What is done, missing or out of date, and why: the one decision on what a run computes.
 
 It compares each output's record with what the output would be made from now. Nothing else counts:
-no file's date, no bookkeeping beside the results, so it holds wherever these lie.
+no file's date, no bookkeeping beside the results, so it holds wherever these lie. These only save
+reading: an artefact of another size or date than it was left with is read through, and is made anew
+where it is damaged.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from intercap_core.pipeline import given
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.given import STUDIO
+from intercap_core.pipeline.intact import damage_of, is_as_left
 from intercap_core.pipeline.job import last_failure
 from intercap_core.pipeline.record import FILE, Record, read_record
 from intercap_core.project import Project
@@ -241,7 +244,8 @@ def _dated(output: Path) -> list[Path]:
 
 
 class _Records:
-    """Records of outputs, each opened once as long as its size and date stay."""
+    """Records of outputs, each opened once as long as its size and date stay. An artefact that is
+    not as it was left is read through, and has no record where it is damaged."""
 
     def __init__(self, results: Path) -> None:
         self._path = results / _KNOWN
@@ -265,6 +269,8 @@ class _Records:
         if isinstance(known, list) and len(known) == 2 and known[0] == stamp:
             return Record.from_text(known[1])
         found = read_record(output)
+        if found is not None and file == output and not is_as_left(output):
+            found = None if damage_of(output) else found
         self._known[key] = [stamp, "" if found is None else found.to_text()]
         self._changed = True
         return found

@@ -17,6 +17,7 @@ from intercap_core.pipeline import given, outcome
 from intercap_core.pipeline.claim import Claim, claim
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
+from intercap_core.pipeline.intact import note
 from intercap_core.pipeline.needs import disk_told
 from intercap_core.pipeline.plan import DATASET, dataset_record_of, failures
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
@@ -128,6 +129,7 @@ def _make(
             folders.put(part, output)
         else:
             os.replace(part, output)
+            note(output)
         return True
     finally:
         if in_folder:

@@ -81,7 +81,7 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
-DATES = (".inputs.json", ".records.json")  # to read nothing twice
+DATES = (".inputs.json", ".outputs.json", ".records.json")  # to read nothing twice
 
 
 def contents(results: Path) -> dict[str, bytes]:
