@@ -311,12 +311,15 @@ class Artefact:
     def keys(self, prefix: str = "") -> list[str]:
         """The sorted names of all datasets whose name starts with ``prefix``."""
         names: list[str] = []
-        self._file.visit(names.append)
 
         def is_dataset(name: str) -> bool:
             return name in self._found or isinstance(self._file[name], h5py.Dataset)
 
-        return sorted(name for name in names if name.startswith(prefix) and is_dataset(name))
+        try:
+            self._file.visit(names.append)
+            return sorted(name for name in names if name.startswith(prefix) and is_dataset(name))
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise self._damaged("its list of datasets is damaged") from error
 
     def __getitem__(self, key: str) -> np.ndarray:
         """Read one whole dataset; text comes back as an object array of ``str``."""
@@ -334,9 +337,8 @@ class Artefact:
                 self._found[key] = self._file[key]
             values = self._found[key][selection]
         except (OSError, RuntimeError) as error:
-            raise Unreadable(
-                f"{self.path}: dataset {key!r} is damaged (its checksum does not match); delete "
-                f"the file and re-run stage '{self._schema.stage}' for this sequence"
+            raise self._damaged(
+                f"dataset {key!r} is damaged (its checksum does not match)"
             ) from error
         if isinstance(values, np.ndarray) and values.dtype.kind == "S":
             return np.array([v.decode() for v in values.ravel()], dtype=object).reshape(
@@ -346,12 +348,21 @@ class Artefact:
 
     def describe(self, key: str) -> tuple[tuple[int, ...], str, str, str]:
         """Shape, type, units and frame of a dataset."""
-        dataset = self._file[key]
-        return (
-            dataset.shape,
-            "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
-            str(_value(dataset.attrs.get("units", ""))),
-            str(_value(dataset.attrs.get("frame", ""))),
+        try:
+            dataset = self._file[key]
+            return (
+                dataset.shape,
+                "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
+                str(_value(dataset.attrs.get("units", ""))),
+                str(_value(dataset.attrs.get("frame", ""))),
+            )
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
+            raise self._damaged(f"dataset {key!r} is damaged") from error
+
+    def _damaged(self, what: str) -> Unreadable:
+        return Unreadable(
+            f"{self.path}: {what}; delete the file and re-run stage '{self._schema.stage}' for "
+            "this sequence"
         )
 
     def text(self, key: str) -> list[str]:

@@ -12,7 +12,7 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -82,7 +82,9 @@ class Plan:
             {name: self.states(name)["summary"].identity for name in self.project.sequences},
             failures(self.project),
         )
-        there = all((self.project.results / name).exists() for name in OF_ALL)
+        files = [self.project.results / name for name in OF_ALL]
+        there = all(file.exists() for file in files)
+        there = there and not any(damage_of(file) for file in noted(files) if not is_as_left(file))
         record = self._records.of(dataset_record_of(self.project)) if there else None
         return _compared(path if there else Path("none"), record, wanted)
 
@@ -205,6 +207,11 @@ def failures(project: Project) -> dict[str, str]:
     """Why the sequences failed that the settings exclude, of those that did."""
     found = {name: last_failure(project.logs / name) for name in project.config.exclude}
     return {name: why for name, why in found.items() if why}
+
+
+def noted(files: Iterable[Path]) -> list[Path]:
+    """Those of the files that are made of all sequences that are known again by their digests."""
+    return [file for file in files if file.parent.name != "site" and file.is_file()]
 
 
 def mark_of(project: Project, sequence: str, stage: str) -> Path:

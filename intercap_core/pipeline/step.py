@@ -19,7 +19,7 @@ from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.intact import note
 from intercap_core.pipeline.needs import disk_told
-from intercap_core.pipeline.plan import DATASET, dataset_record_of, failures
+from intercap_core.pipeline.plan import DATASET, OF_ALL, dataset_record_of, failures, noted
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
@@ -236,5 +236,7 @@ def run_dataset(project: Project) -> Path:
             changed=changed(project.config),
         )
         add_record(dataset_record_of(project), made_from)
+        for file in noted(folder / name for name in OF_ALL):
+            note(file)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first
