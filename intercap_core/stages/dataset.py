@@ -162,8 +162,8 @@ def _unlisted(
 ) -> dict[str, str]:
     """Sequences whose object has no entry any more, and what that means."""
     return {
-        summary.name: f"its object {summary.metrics.object_} has no entry in the list of objects: that "
-        "object's heatmap has no picture; put the entry back, or correct the sequence's row"
+        summary.name: f"its object {summary.metrics.object_} has no entry in the list of objects: "
+        "the object's heatmap has no picture; put the entry back, or correct the sequence's row"
         for summary in summaries
         if summary.metrics.object_ and summary.metrics.object_ not in objects
     }
