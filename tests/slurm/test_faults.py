@@ -374,20 +374,32 @@ def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, by
 def test_a_broken_annotation_fails_once_and_alone(
     run: ClusterRun, local: dict[str, bytes], record_property: Record
 ) -> None:
+    """What was computed stays, in the report too; a sequence that is not complete is left out."""
     record_property("fault", "one sequence's annotation broken")
-    annotation = run.flow.annotation(OTHER)
+    annotation, summary = run.flow.annotation(OTHER), run.flow.artefact(OTHER, "summary")
     annotation.parent.mkdir(exist_ok=True)
     annotation.write_text("floor: [[\n")
-    before, kept = run.slurm.jobs(ended=True).keys(), written(run.flow.results)
-    started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
-    assert started.process.wait(600) == 1, started.said
-    assert "not valid YAML" in started.said
-    assert f"the report leaves out {OTHER}" in started.said
-    jobs = run.slurm.jobs(ended=True)
-    new = sorted(jobs[number][1] for number in jobs.keys() - before)
+    told, new = jobs_of_failed_run(run)
+    assert "the report leaves out" not in told
+    assert new == [f"rule_broken_annotation_wildcards_{OTHER}"]
+    assert contents(run.flow.results) == local
+    summary.unlink()
+    kept = written(run.flow.results)
+    told, new = jobs_of_failed_run(run)
+    assert f"the report leaves out {OTHER}" in told
     assert new == [f"rule_broken_annotation_wildcards_{OTHER}", "rule_dataset"]
     assert "not valid YAML" in (run.flow.results / "site" / "index.html").read_text()
     assert written(run.flow.results) == kept
     annotation.unlink()
     run.start().ends_well()
     assert contents(run.flow.results) == local
+
+
+def jobs_of_failed_run(run: ClusterRun) -> tuple[str, list[str]]:
+    """What `intercap run` says, that ends in failure for the annotation, and what it submitted."""
+    before = run.slurm.jobs(ended=True).keys()
+    started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
+    assert started.process.wait(600) == 1, started.said
+    assert "not valid YAML" in started.said
+    jobs = run.slurm.jobs(ended=True)
+    return started.said, sorted(jobs[number][1] for number in jobs.keys() - before)
