@@ -156,7 +156,8 @@ def test_cancelled(run: ClusterRun, local: dict[str, bytes], record_property: Re
         number, _ = job_runs(run, "joint")
         run.slurm.command("scancel", number)
         said = started.ends_well()
-    assert f"Slurm job {number}, {ONE}: joint: ended without a word: CANCELLED" in said
+    (told,) = [line for line in said.splitlines() if f"Slurm job {number}, {ONE}: joint: " in line]
+    assert told.endswith("CANCELLED")
     assert len(numbers(run, "rule_joint_", ONE) - before) == 2
 
 
