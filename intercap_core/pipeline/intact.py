@@ -7,13 +7,12 @@ checksums where nothing is noted. To read hundreds of gigabytes at every start t
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from pathlib import Path
 
 from intercap_core import artefacts, schemas
+from intercap_core.pipeline.kept import keep, read_kept
 
 NAME = ".outputs.json"  # of a sequence's artefacts
 EXPORT_LIST = "export.json"  # digests of an export's files
@@ -22,12 +21,8 @@ _ROWS = 64  # read at a time, so that memory stays flat
 
 def note(output: Path) -> None:
     """Remember an artefact as it is now; what cannot be remembered is read through later."""
-    part = output.with_name(f"{NAME}.{os.getpid()}.part")
-    with contextlib.suppress(OSError):
-        known = _known(output) | {output.name: [_stamp(output), _digest(output)]}
-        part.write_text(json.dumps(known, indent=0, sort_keys=True), encoding="utf-8")
-        os.replace(part, output.with_name(NAME))
-    part.unlink(missing_ok=True)
+    path = output.with_name(NAME)
+    keep(path, read_kept(path) | {output.name: [_stamp(output), _digest(output)]})
 
 
 def is_as_left(output: Path) -> bool:
@@ -82,18 +77,8 @@ def _digest(path: Path) -> str:
 
 def _noted(output: Path) -> tuple[str, str]:
     """Size with date, and digest; empty where nothing is noted."""
-    found = _known(output).get(output.name)
-    if isinstance(found, list) and len(found) == 2 and all(isinstance(one, str) for one in found):
-        return found[0], found[1]
-    return "", ""
-
-
-def _known(output: Path) -> dict[str, list[str]]:
-    with contextlib.suppress(OSError, ValueError):
-        told = json.loads(output.with_name(NAME).read_text(encoding="utf-8"))
-        if isinstance(told, dict):
-            return told
-    return {}
+    stamp, digest = read_kept(output.with_name(NAME)).get(output.name, ("", ""))
+    return stamp, digest
 
 
 def _stamp(output: Path) -> str:

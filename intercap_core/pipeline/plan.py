@@ -8,7 +8,6 @@ where it is damaged.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 import uuid
@@ -25,6 +24,7 @@ from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.given import STUDIO
 from intercap_core.pipeline.intact import damage_of, is_as_left
 from intercap_core.pipeline.job import last_failure
+from intercap_core.pipeline.kept import keep, read_kept
 from intercap_core.pipeline.record import FILE, Record, read_record
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
@@ -257,11 +257,7 @@ class _Records:
     def __init__(self, results: Path) -> None:
         self._path = results / _KNOWN
         self._results = results
-        try:
-            told = json.loads(self._path.read_text(encoding="utf-8"))
-            self._known: dict[str, list[str]] = told if isinstance(told, dict) else {}
-        except (OSError, ValueError):
-            self._known = {}
+        self._known = read_kept(self._path)
         self._changed = False
 
     def of(self, output: Path) -> Record | None:
@@ -273,7 +269,7 @@ class _Records:
             return None
         key, stamp = str(output), f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ino}"
         known = self._known.get(key)
-        if isinstance(known, list) and len(known) == 2 and known[0] == stamp:
+        if known is not None and known[0] == stamp:
             return Record.from_text(known[1])
         found = read_record(output)
         if found is not None and file == output and not is_as_left(output):
@@ -285,9 +281,4 @@ class _Records:
     def keep(self) -> None:
         if not self._changed or not self._results.is_dir():
             return
-        part = self._path.with_name(f"{_KNOWN}.{os.getpid()}.part")
-        try:
-            part.write_text(json.dumps(self._known), encoding="utf-8")
-            os.replace(part, self._path)
-        except OSError:
-            part.unlink(missing_ok=True)
+        keep(self._path, self._known)
