@@ -84,8 +84,8 @@ class Plan:
         )
         files = [self.project.results / name for name in OF_ALL]
         there = all(file.exists() for file in files)
-        there = there and not any(damage_of(file) for file in noted(files) if not is_as_left(file))
-        record = self._records.of(dataset_record_of(self.project)) if there else None
+        whole = not any(damage_of(file) for file in noted(files) if not is_as_left(file))
+        record = self._records.of(dataset_record_of(self.project)) if there and whole else None
         return _compared(path if there else Path("none"), record, wanted)
 
     def output(self, sequence: str, stage: str) -> Path:
