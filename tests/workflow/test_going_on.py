@@ -13,7 +13,6 @@ import pytest
 from tests.chaos.victim import Victim, damage, identical, kill_in
 from tests.helpers.flow import ONE, OTHER, Flow
 
-pytestmark = pytest.mark.slow
 ENDS_WITHIN_S = 60.0
 
 
