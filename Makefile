@@ -27,6 +27,9 @@
 # make fuzz      10,000 damaged files of every kind that a user supplies, each read in a process of its
 #                own: accepted and plausible, or refused by name; into results/bench.json. A quarter of
 #                an hour on two cores; what it prints reproduces a case
+# make chaos     a small dataset whose runs are killed in every stage, whose disk is full, whose results
+#                are damaged, whose clock jumps; each time one command goes on, and in the end every
+#                byte is as without: into results/bench.json. A quarter of an hour; as root also disks
 # make docs      the generated pages and schemas, and the rule graph
 PYTHON ?= python3
 VENV ?= .venv
@@ -37,8 +40,8 @@ TORCH := torch==2.13.0
 EXTRAS := workflow,test,bench,dev
 
 .PHONY: demo test test-fast test-slurm lint ruff-check ruff-format imports snakefmt mypy \
-    snakemake-lint evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz docs \
-    environment clean
+    snakemake-lint evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz chaos \
+    docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
@@ -106,6 +109,9 @@ scale: $(STAMP)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz.run
+
+chaos: $(STAMP)
+	$(BIN)/python -m tests.chaos.run
 
 docs: $(STAMP)
 	$(BIN)/intercap docs

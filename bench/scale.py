@@ -24,6 +24,7 @@ from bench.command import add_figures, from_command_line
 from intercap_core.errors import UserError
 from intercap_core.pipeline import given
 from intercap_core.pipeline.contents import NAME, Contents
+from intercap_core.pipeline.intact import note
 from intercap_core.pipeline.record import add_record
 from intercap_core.pipeline.step import run_dataset
 from intercap_core.project import Project, load_project
@@ -123,6 +124,8 @@ def _copy(source: Project, before: Path, name: str, project: Project, other: str
         )  # fmt: skip
         identities[stage] = record.identity
         add_record(path, record)
+        if stage in SEQUENCE_STAGES:
+            note(path)
     contents.keep()
 
 

@@ -23,9 +23,11 @@ import h5py
 import hdf5plugin  # registers the depth codec with HDF5 before any file is opened
 import numpy as np
 
+from intercap_core.disk import PartFile
 from intercap_core.errors import UserError
 
 MADE_FROM = "made_from"  # attribute: what the artefact was made from, as pipeline.record writes it
+PART = ".part"  # how the name of what is being written ends
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
 
@@ -96,9 +98,10 @@ def _chunks(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
 class Writer:
     """Fills one artefact. Obtained from :func:`write`; not made directly."""
 
-    def __init__(self, file: h5py.File, schema: Schema) -> None:
+    def __init__(self, file: h5py.File, schema: Schema, raw: PartFile) -> None:
         self._file = file
         self._schema = schema
+        self._raw = raw
         self._dims: dict[str, int] = {}
         self.attributes: dict[str, Any] = {}
 
@@ -122,7 +125,7 @@ class Writer:
         """Write one whole dataset; ``values`` is cast to the declared dtype.
 
         Raises ValueError where the shape contradicts the schema or another dataset's axis, and
-        KeyError where the schema declares no such dataset.
+        KeyError where the schema declares no such dataset, and OSError where the disk is full.
         """
         declared = self._schema.field_of(key)
         if declared.dtype == "str":
@@ -139,12 +142,13 @@ class Writer:
         dataset = self._create(key, declared, array.shape, array.dtype)
         if array.size:
             dataset[...] = array
+        self._raw.check()
 
     def stream(self, key: str, row_shape: tuple[int, ...] = ()) -> RowStream:
         """Open a dataset that grows by rows along its first axis; memory stays flat."""
         declared = self._check(key, (0, *row_shape), free_first=True)
         dataset = self._create(key, declared, (0, *row_shape), np.dtype(declared.dtype))
-        return RowStream(dataset)
+        return RowStream(dataset, self._raw)
 
     def _create(
         self, key: str, declared: Field, shape: tuple[int, ...], dtype: np.dtype
@@ -181,14 +185,16 @@ def _template(schema: Schema, declared: Field) -> str:
 class RowStream:
     """Appends rows to a growing dataset, a chunk's worth at a time."""
 
-    def __init__(self, dataset: h5py.Dataset) -> None:
+    def __init__(self, dataset: h5py.Dataset, raw: PartFile) -> None:
         self._dataset = dataset
+        self._raw = raw
 
     def append(self, rows: np.ndarray) -> None:
-        """Append ``rows`` of shape (n, *row_shape)."""
+        """Append ``rows`` of shape (n, *row_shape); raises OSError where the disk is full."""
         start = self._dataset.shape[0]
         self._dataset.resize(start + len(rows), axis=0)
         self._dataset[start:] = rows
+        self._raw.check()
 
     def __len__(self) -> int:
         return int(self._dataset.shape[0])
@@ -202,18 +208,20 @@ def write(
 
     ``attributes`` are the schema's root attributes (str, int, float or bool); more can be set on
     ``Writer.attributes`` until the block ends. Raises ValueError where the finished file lacks a
-    dataset or attribute that the schema requires.
+    dataset or attribute that the schema requires, and OSError where the disk does not take it.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path if path.suffix == ".part" else part_of(path)
+    temporary = path if path.suffix == PART else part_of(path)
     try:
-        with h5py.File(temporary, "w", libver=_LIBVER, locking="best-effort") as file:
-            writer = Writer(file, schema)
-            writer.attributes.update(attributes)
-            yield writer
-            _finish(file, writer, schema, settings_digest)
-        _sync(temporary)
+        with PartFile(temporary, "w+b") as raw:
+            with h5py.File(raw, "w", libver=_LIBVER) as file:
+                writer = Writer(file, schema, raw)
+                writer.attributes.update(attributes)
+                yield writer
+                _finish(file, writer, schema, settings_digest)
+            raw.check()
+            os.fsync(raw.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -225,14 +233,16 @@ def part_of(path: Path) -> Path:
     writes it."""
     job = os.environ.get("SLURM_JOB_ID")
     writer = f"{socket.gethostname()}.{f'job{job}.' if job else ''}{os.getpid()}"
-    return path.with_name(f".{path.name}.{writer}.part")
+    return path.with_name(f".{path.name}.{writer}{PART}")
 
 
 def put_made_from(path: Path, text: str) -> None:
     """Set what a complete artefact was made from."""
-    with h5py.File(path, "r+", libver=_LIBVER, locking="best-effort") as file:
-        _set(file, MADE_FROM, text)
-    _sync(path)
+    with PartFile(path, "r+b") as raw:
+        with h5py.File(raw, "r+", libver=_LIBVER) as file:
+            _set(file, MADE_FROM, text)
+        raw.check()
+        os.fsync(raw.fileno())
 
 
 def made_from(path: Path) -> str:
@@ -243,11 +253,6 @@ def made_from(path: Path) -> str:
             return _value(file.attrs.get(MADE_FROM, ""))
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):
         raise Unreadable(f"{path}: cannot be read; delete it and re-run its stage") from None
-
-
-def _sync(path: Path) -> None:
-    with open(path, "rb") as handle:
-        os.fsync(handle.fileno())
 
 
 def _set(thing: h5py.File | h5py.Dataset, name: str, value: Any) -> None:
@@ -306,12 +311,15 @@ class Artefact:
     def keys(self, prefix: str = "") -> list[str]:
         """The sorted names of all datasets whose name starts with ``prefix``."""
         names: list[str] = []
-        self._file.visit(names.append)
 
         def is_dataset(name: str) -> bool:
             return name in self._found or isinstance(self._file[name], h5py.Dataset)
 
-        return sorted(name for name in names if name.startswith(prefix) and is_dataset(name))
+        try:
+            self._file.visit(names.append)
+            return sorted(name for name in names if name.startswith(prefix) and is_dataset(name))
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise self._damaged("its list of datasets is damaged") from error
 
     def __getitem__(self, key: str) -> np.ndarray:
         """Read one whole dataset; text comes back as an object array of ``str``."""
@@ -329,9 +337,8 @@ class Artefact:
                 self._found[key] = self._file[key]
             values = self._found[key][selection]
         except (OSError, RuntimeError) as error:
-            raise Unreadable(
-                f"{self.path}: dataset {key!r} is damaged (its checksum does not match); delete "
-                f"the file and re-run stage '{self._schema.stage}' for this sequence"
+            raise self._damaged(
+                f"dataset {key!r} is damaged (its checksum does not match)"
             ) from error
         if isinstance(values, np.ndarray) and values.dtype.kind == "S":
             return np.array([v.decode() for v in values.ravel()], dtype=object).reshape(
@@ -341,12 +348,21 @@ class Artefact:
 
     def describe(self, key: str) -> tuple[tuple[int, ...], str, str, str]:
         """Shape, type, units and frame of a dataset."""
-        dataset = self._file[key]
-        return (
-            dataset.shape,
-            "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
-            str(_value(dataset.attrs.get("units", ""))),
-            str(_value(dataset.attrs.get("frame", ""))),
+        try:
+            dataset = self._file[key]
+            return (
+                dataset.shape,
+                "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
+                str(_value(dataset.attrs.get("units", ""))),
+                str(_value(dataset.attrs.get("frame", ""))),
+            )
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
+            raise self._damaged(f"dataset {key!r} is damaged") from error
+
+    def _damaged(self, what: str) -> Unreadable:
+        return Unreadable(
+            f"{self.path}: {what}; delete the file and re-run stage '{self._schema.stage}' for "
+            "this sequence"
         )
 
     def text(self, key: str) -> list[str]:

@@ -14,7 +14,9 @@ from typing import Annotated
 
 import typer
 
+from intercap_core import disk
 from intercap_core.errors import UserError
+from intercap_core.signals import ToldToEnd, told_to_end
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 WHOLE, SINGLE, LOOK = "A whole dataset", "One step of one sequence", "Look and maintain"
@@ -740,11 +742,21 @@ def _known(sequences: dict, name: str) -> str:
 
 
 def main() -> None:
-    """Entry point: a fault of the input is one line and exit status 1."""
+    """Entry point: a fault of the input or of the disk is one line and exit status 1, and so is
+    being told to end, with the status that shells expect."""
     try:
-        app()
+        with told_to_end():
+            app()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except ToldToEnd as end:
+        print(f"{end}: what was half-written is removed; run it again", file=sys.stderr)
+        raise SystemExit(end.status) from None
+    except OSError as error:
+        if error.errno not in disk.FULL | disk.NOT_WRITABLE:
+            raise
+        print(f"error: {disk.told(error)}", file=sys.stderr)
         raise SystemExit(1) from None
 
 

@@ -8,7 +8,8 @@ whose settings it has under its own prefix. Beyond that:
   where what they compute is asked for otherwise by now, they are cancelled.
 - A controller that does not answer is waited for: no job is lost, no submission fails.
 - A job is one start of Snakemake on its node, not two.
-- A job that Slurm has forgotten is not waited for for ever.
+- A job that Slurm has forgotten, or holds after a failed launch, is not waited for for ever.
+- Ctrl-C cancels all jobs; where the controller does not answer, it says that they go on.
 - Why a job failed is told by stage, also where several went as one submission.
 """
 
@@ -24,16 +25,18 @@ from typing import Any
 from snakemake_executor_plugin_slurm import Executor as SlurmExecutor
 from snakemake_executor_plugin_slurm import ExecutorSettings as SlurmSettings
 from snakemake_executor_plugin_slurm import common_settings as common_settings
+from snakemake_interface_common.exceptions import WorkflowError
 from snakemake_interface_executor_plugins.executors.base import SubmittedJobInfo
 from snakemake_interface_executor_plugins.jobs import JobExecutorInterface
 
 from .ledger import Entry, Ledger, by_outputs, run_name
-from .slurm import LIVE, cancel, states, wait_for_controller
+from .slurm import HELD, LIVE, cancel, states, wait_for_controller
 from .words import Ending, endings
 
 LONGEST_BETWEEN_CHECKS_S = 20.0
 SHARE_BETWEEN_CHECKS = 0.25  # of the time since a job was last submitted: short jobs, short waits
 FORGOTTEN_AFTER_S = 120.0  # longer than a controller takes to come back and read its state
+NOT_REACHED = "Unable to contact slurm controller (connect failure)"  # then nothing was submitted
 ENTRY = "intercap_entry"
 
 
@@ -52,6 +55,8 @@ class Executor(SlurmExecutor):
         self._looking = threading.Lock()
         self._ending = threading.Event()
         self._asked: dict[JobExecutorInterface, Entry] = {}
+        self._not_reached: set[JobExecutorInterface] = set()
+        self._looked_at: list[SubmittedJobInfo] = []
         self._over: set[int] = set()
         self._final: set[JobExecutorInterface] = set()
         self._missing_since: dict[str, float] = {}
@@ -97,6 +102,17 @@ class Executor(SlurmExecutor):
             self._ledger.remove(left.slurm_id)
         self._asked[job] = entry
         super().run_job(job)
+        while job in self._not_reached and not self._ending.is_set():
+            self._not_reached.discard(job)
+            wait_for_controller(self.logger, self._ending)
+            super().run_job(job)
+
+    def _report_job_error_threadsafe(self, job_info: SubmittedJobInfo, msg: str) -> None:
+        """A submission that did not reach the controller has not failed: it is made again."""
+        if NOT_REACHED in msg:
+            self._not_reached.add(job_info.job)
+        else:
+            super()._report_job_error_threadsafe(job_info, msg)
 
     def _left_by_earlier_runs(self) -> dict[tuple[str, ...], Entry]:
         """Jobs in the ledger that Slurm still has, by what they write; looked up once."""
@@ -125,12 +141,14 @@ class Executor(SlurmExecutor):
         self, active_jobs: list[SubmittedJobInfo]
     ) -> AsyncIterator[SubmittedJobInfo]:
         """Jobs that have not ended: all of them where Slurm does not answer."""
+        self._looked_at = active_jobs
         self._over.clear()
-        async for _ in super().check_active_jobs(active_jobs):
-            pass
         known = states(self.run_uuid) if active_jobs else {}
+        if known is not None:  # else the plugin would ask sacct, which may be down as well
+            async for _ in super().check_active_jobs(active_jobs):
+                pass
         for info in active_jobs:
-            if id(info) not in self._over and not self._is_forgotten(info, known):
+            if id(info) not in self._over and not self._is_lost(info, known):
                 yield info
         wait = self.workflow.executor_settings.init_seconds_before_status_checks
         if active_jobs and not self._over:  # else others are about to be submitted
@@ -138,19 +156,28 @@ class Executor(SlurmExecutor):
             wait = max(wait, min(quiet, LONGEST_BETWEEN_CHECKS_S))
         self.next_seconds_between_status_checks = wait
 
-    def _is_forgotten(self, info: SubmittedJobInfo, known: dict[str, str] | None) -> bool:
-        """Whether Slurm has not known the job for long; its logs then tell how it ended."""
+    def _is_lost(self, info: SubmittedJobInfo, known: dict[str, str] | None) -> bool:
+        """Whether Slurm will not end the job: it has not known it for long, or holds it after a
+        failed launch. A controller that crashed does the latter to a job that it had no time to
+        note as running, and that has ended since: so the job's logs tell how it ended."""
         number = str(info.external_jobid)
-        if known is None or number in known:
+        state = None if known is None else known.get(number)
+        if known is None or (state is not None and state != HELD):
             self._missing_since.pop(number, None)
             return False
-        since = self._missing_since.setdefault(number, time.monotonic())
-        if time.monotonic() - since < FORGOTTEN_AFTER_S:
-            return False
+        if state == HELD:
+            why = f"Slurm could not launch job '{number}', and holds it; it is cancelled. "
+            cancel(number, self.run_uuid)
+        else:
+            why = f"Slurm knows nothing of job '{number}' any more. "
+            since = self._missing_since.setdefault(number, time.monotonic())
+            if time.monotonic() - since < FORGOTTEN_AFTER_S:
+                return False
         if all(ending.state == "finished" for ending in _endings(info)):
+            self.logger.info(f"{why}By its log it had finished.")
             self.report_job_success(info)
         else:
-            self.report_job_error(info, msg=f"Slurm knows nothing of job '{number}' any more. ")
+            self.report_job_error(info, msg=why)
         return True
 
     def report_job_success(self, job_info: SubmittedJobInfo) -> None:
@@ -179,6 +206,18 @@ class Executor(SlurmExecutor):
         """On Ctrl-C what waits for the controller gives up, and Slurm's jobs are cancelled."""
         self._ending.set()
         super().cancel()
+
+    def cancel_jobs(self, active_jobs: list[SubmittedJobInfo]) -> None:
+        """Those too that are being looked at just now, and are not among the active for so long."""
+        looked_at = [info for info in self._looked_at if id(info) not in self._over]
+        jobs = {info.external_jobid: info for info in [*active_jobs, *looked_at]}
+        try:
+            super().cancel_jobs(list(jobs.values()))
+        except WorkflowError as error:
+            self.logger.warning(
+                f"{error}\nSlurm's jobs go on, and the next run waits for them; to end them: "
+                f"scancel --name {self.run_uuid}"
+            )
 
     def handle_job_error(self, job: JobExecutorInterface) -> None:
         """Called before Snakemake compares the job's attempts with those that it may have."""

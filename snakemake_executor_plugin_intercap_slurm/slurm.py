@@ -11,8 +11,11 @@ from typing import Any
 ASKED_AGAIN_AFTER_S = 5.0
 CANCELLED_WITHIN_S = 120.0
 ANSWERS_WITHIN_S = 60.0
-# States that a job leaves by itself: it has not ended.
+HELD = "HELD"  # here: by Slurm itself, which could not launch the job, until somebody releases it
+LAUNCH_FAILED = {"launch failed requeued held", "jobholdmaxrequeue"}  # reasons for that
+# States of a job that has not ended.
 LIVE = {
+    HELD,
     *("PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "STOPPED", "SIGNALING", "RESIZING"),
     *("COMPLETING", "STAGE_OUT", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "RESV_DEL_HOLD"),
     "SPECIAL_EXIT",
@@ -22,11 +25,15 @@ LIVE = {
 def states(name: str) -> dict[str, str] | None:
     """State of each job called ``name`` that the controller knows, by number; ended ones too for as
     long as it keeps them (``MinJobAge``). None where it does not answer."""
-    done = _run(["squeue", "--noheader", "--states=all", "--name", name, "--format=%i|%T"])
+    done = _run(["squeue", "--noheader", "--states=all", "--name", name, "--format=%i|%T|%r"])
     if done is None or done.returncode:
         return None
-    pairs = (line.strip().partition("|") for line in done.stdout.splitlines())
-    return {number: state for number, _, state in pairs if number}
+    fields = (line.strip().split("|", 2) for line in done.stdout.splitlines() if "|" in line)
+    return {number: HELD if _is_held(state, reason) else state for number, state, reason in fields}
+
+
+def _is_held(state: str, reason: str) -> bool:
+    return state == "PENDING" and reason.lower().replace("_", " ") in LAUNCH_FAILED
 
 
 def cancel(number: str, name: str) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from intercap_core.pipeline.job import UNEXPECTED, read_state
+from intercap_core.pipeline.job import ENDED, UNEXPECTED, read_state
 
 from .ledger import Entry, members, stamp
 
@@ -21,7 +21,8 @@ REASONS = re.compile(
 @dataclass(frozen=True)
 class Ending:
     """One stage: ``state`` is "finished", "failed", "running" (it has ended without a word) or
-    "waiting" (it has not begun)."""
+    "waiting" (it has not begun). ``words`` say why; of a finished one, why its job failed after it.
+    """
 
     name: str
     state: str
@@ -34,7 +35,7 @@ class Ending:
 
     def line(self, slurm_id: str) -> str:
         said = {
-            "finished": "finished",
+            "finished": f"finished; its job then ended: {self.words}" if self.words else "finished",
             "failed": f"failed: {self.words}",
             "running": f"ended without a word: {self.words}",
             "waiting": f"did not begin: {self.words}",
@@ -43,7 +44,7 @@ class Ending:
 
 
 def endings(job: Any, entry: Entry, slurm_log: Path) -> list[Ending]:
-    """One for each stage of the job, in their order."""
+    """One for each stage of a job that failed, in their order."""
     found = []
     for part in members(job):
         log = Path(str(next(iter(part.log))))
@@ -53,7 +54,15 @@ def endings(job: Any, entry: Entry, slurm_log: Path) -> list[Ending]:
             found.append(Ending(name, "waiting", _slurms_reason(slurm_log)))
         else:
             state, words = read_state(log)
-            found.append(Ending(name, state, words or _slurms_reason(slurm_log)))
+            if state == "finished":
+                words = ""
+            elif not words:
+                words = _slurms_reason(slurm_log)
+            elif words.startswith(ENDED):
+                words += f"; {_slurms_reason(slurm_log)}"
+            found.append(Ending(name, state, words))
+    if all(ending.state == "finished" for ending in found):
+        found[-1] = replace(found[-1], words=_slurms_reason(slurm_log))
     return found
 
 

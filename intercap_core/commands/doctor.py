@@ -13,21 +13,14 @@ from rich.table import Table
 
 from intercap_core.errors import UserError
 from intercap_core.pipeline.claim import living_owner
+from intercap_core.pipeline.needs import needs
 from intercap_core.pipeline.record import libraries, processor
 from intercap_core.project import Project
-from intercap_core.stage_list import STAGES
 from intercap_core.versions import versions
 
 GOOD, NOTE, BAD = "ok", "note", "problem"
 _COLOURS = {GOOD: "green", NOTE: "yellow", BAD: "red"}
 _SPARE = 1.2  # of what is expected to be needed
-# Bytes of a sequence of 300 frame sets by six cameras, where none of the project's is there to go
-# by: as the demo's recordings have them (1080p colour, NFOV depth) in their 45 sets.
-_USUAL = {
-    "frames": 750_000_000, "detections": 5_000_000, "scene": 2_000_000, "person": 7_000_000,
-    "object_track": 200_000, "body_fit": 1_100_000, "joint": 700_000, "metrics": 5_000_000,
-    "summary": 2_500_000, "page": 15_000_000, "export": 60_000_000,
-}  # fmt: skip
 # File systems that several machines see.
 _SHARED = ("nfs", "nfs4", "lustre", "gpfs", "beegfs", "ceph", "cifs", "smb3", "fuse.glusterfs")
 
@@ -95,40 +88,18 @@ def _bodies(project: Project) -> Finding:
 
 def _disk(project: Project) -> Iterator[Finding]:
     """What is there, what the sequences that are missing will need, and what may be dropped."""
-    sizes: dict[str, list[int]] = {stage: [] for stage in STAGES}
-    missing = dict.fromkeys(STAGES, 0)
-    for name in project.sequences:
-        for stage in STAGES:
-            path = project.artefact(name, stage)
-            if path.exists():
-                sizes[stage].append(_bytes(path))
-            else:
-                missing[stage] += 1
-    usual = {
-        stage: sum(found) / len(found) if found else _USUAL[stage] for stage, found in sizes.items()
-    }
-    needed = sum(missing[stage] * usual[stage] for stage in STAGES)
-    free = shutil.disk_usage(_there(project.results)).free
-    used = sum(map(sum, sizes.values()))
+    found = needs(project)
     words = (
-        f"{used / 1e9:.1f} GB of results are there, {needed / 1e9:.1f} GB more are expected, "
-        f"{free / 1e9:.1f} GB are free"
+        f"{found.there / 1e9:.1f} GB of results are there, {found.missing / 1e9:.1f} GB more are "
+        f"expected{found.basis}, {found.free / 1e9:.1f} GB are free"
     )
-    if not any(sizes.values()):
-        words += " (by sequences of 300 frames of six cameras)"
-    yield Finding("disk", BAD if free < _SPARE * needed else GOOD, words)
-    share = 100 * usual["frames"] / max(sum(usual.values()), 1)
+    yield Finding("disk", BAD if found.free < _SPARE * found.missing else GOOD, words)
+    share = 100 * found.usual["frames"] / max(sum(found.usual.values()), 1)
     yield Finding(
         "what may go", NOTE,
         f"frames.h5 ({share:.0f} % of a sequence) when a dataset is done: the next run makes it "
         "again; nothing else is worth it",
     )  # fmt: skip
-
-
-def _bytes(path: Path) -> int:
-    if path.is_file():
-        return path.stat().st_size
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
 def _there(path: Path) -> Path:

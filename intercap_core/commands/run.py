@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -20,11 +21,13 @@ from rich.table import Table
 
 from intercap_core.commands.check import check_bodies
 from intercap_core.commands.closing import print_remarks
+from intercap_core.disk import free_bytes
 from intercap_core.errors import UserError
 from intercap_core.pipeline.claim import Claim, path_of, try_claim
 from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, load_project
+from intercap_core.signals import ToldToEnd
 from intercap_core.stage_list import STAGES
 
 POLL_SECONDS = 0.5
@@ -34,6 +37,8 @@ SAID_EVERY_S = 30.0  # between two lines of progress where no terminal redraws a
 COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
 LAST_LINES = 15
+FULL_BELOW_BYTES = 1_000_000
+ENDS_WITHIN_S = 60.0  # a job, and those that a cluster is told to cancel
 STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # how Snakemake says how far it is
 AGGREGATES = ("site/index.html", "summary.json")
 
@@ -126,14 +131,20 @@ def _run(
         return 0
     command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
     watcher = Watcher(project, console)
-    status = run_watched(command, watcher, console)
+    try:
+        status = run_watched(command, watcher, console)
+    except ToldToEnd as end:
+        words = f"{end}: {watcher.steps()} jobs were done, and are kept; the same command goes on"
+        console.print(words, highlight=False)
+        raise SystemExit(end.status) from None
     failures = watcher.failures()
     for name, words in failures.items():
         console.print(f"[red]{escape(name)}[/red] {escape(words)}", highlight=False, soft_wrap=True)
     if status and not failures:
         lines = watcher.transcript.read_text(encoding="utf-8").splitlines()
         console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
-        raise UserError(f"the workflow stopped; its whole output is in {watcher.transcript}")
+        why = _full_disk(project) or "the workflow stopped"
+        raise UserError(f"{why}; its whole output is in {watcher.transcript}")
     bad = sorted(
         name
         for name in {name.split(":")[0] for name in failures} & set(project.sequences)
@@ -161,6 +172,14 @@ def _mark_targets(plan: Plan, arguments: Sequence[str]) -> None:
     for name in asked & set(plan.project.sequences):
         for stage in plan.states(name):
             plan.mark(name, stage)
+
+
+def _full_disk(project: Project) -> str:
+    """Which disk that a run writes to is full, in words; "" = none."""
+    for place in (project.results, project.logs, Path.cwd()):
+        if free_bytes(place) < FULL_BELOW_BYTES:
+            return f"the disk of {place} is full; free space, then run again: what is done is kept"
+    return ""
 
 
 def _print_report(project: Project, console: Console) -> None:
@@ -228,7 +247,8 @@ class Watcher:
 
     def failures(self) -> dict[str, str]:
         """Jobs that did not finish, with the reason; only once the run has ended."""
-        ended = "ended without a word: killed, perhaps for its memory"
+        why = _full_disk(self._project) or "killed, perhaps for its memory"
+        ended = f"ended without a word: {why}"
         return {
             name: job.words if job.state == "failed" else ended
             for name, job in self.jobs().items()
@@ -250,7 +270,7 @@ class Watcher:
         )
         waiting = sum(not states for states in of_sequence.values())
         counts = (
-            f"{self._steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} have ended, "
+            f"{self.steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} have ended, "
             f"{waiting} wait or are kept"
         )
         table = Table("sequence", *COLUMNS, box=None, header_style="bold")
@@ -285,7 +305,7 @@ class Watcher:
             if job.state != "running" and name not in self._told:
                 self._told.add(name)
                 words = f"{name}: {job.state} {job.words}"
-                self._console.print(words, highlight=False, markup=False)
+                self._console.print(words, highlight=False, markup=False, soft_wrap=True)
         if time.monotonic() - self._said >= SAID_EVERY_S:
             self._said = time.monotonic()
             self._console.print(self.progress(), highlight=False, markup=False, soft_wrap=True)
@@ -298,18 +318,19 @@ class Watcher:
             if job.state == "running"
         ]
         words = ", ".join(running) or "none"
-        return f"{self._steps()} jobs done; {len(running)} run: {words}"
+        return f"{self.steps()} jobs done; {len(running)} run: {words}"
 
-    def _steps(self) -> str:
+    def steps(self) -> str:
+        """How many jobs are done of how many, as Snakemake has said."""
         said = self.transcript.read_text(encoding="utf-8", errors="replace")
         done, of = (STEPS.findall(said) or [("0", "?")])[-1]
         return f"{done} of {of}"
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:
-    """Run a command, its output to the watcher's transcript; returns the exit status.
+    """Run Snakemake, its output to the watcher's transcript; returns the exit status.
 
-    Where this process is interrupted or told to end, so is the command, and it is waited for.
+    Where this process is told to end, so are Snakemake and its jobs, and they are waited for.
     """
     watcher.transcript.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "NO_COLOR": "1"}
@@ -317,21 +338,40 @@ def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> i
         process = subprocess.Popen(
             command, stdout=transcript, stderr=subprocess.STDOUT, env=environment
         )
-        told_to_end = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
             with _display(watcher, console) as refresh:
                 while process.poll() is None:
                     time.sleep(POLL_SECONDS)
                     refresh()
                 refresh()
-        except KeyboardInterrupt:
-            raise SystemExit(130) from None  # Snakemake has got the same signal
         finally:
             if process.poll() is None:
-                process.terminate()
-                process.wait()
-            signal.signal(signal.SIGTERM, told_to_end)
+                _end(process)
     return process.returncode
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End Snakemake and the jobs on this machine, in order, and after a while whatever is left.
+
+    Of SIGTERM Snakemake starts no more jobs, of SIGINT it cancels those of a cluster; those of this
+    machine it would wait for.
+    """
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        jobs = psutil.Process(process.pid).children(recursive=True)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            process.send_signal(number)
+        for job in jobs:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                job.terminate()
+        try:
+            process.wait(ENDS_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            for one in (psutil.Process(process.pid), *jobs):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    one.kill()
+    process.wait()
 
 
 @contextmanager

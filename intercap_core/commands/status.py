@@ -6,15 +6,13 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from intercap_core import artefacts, schemas
-from intercap_core.errors import UserError
 from intercap_core.pipeline.claim import living_owner
+from intercap_core.pipeline.intact import damage_of
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.plan import Kind, Plan, State
 from intercap_core.pipeline.record import read_record
@@ -184,7 +182,7 @@ def _json(found: Status) -> dict[str, object]:
 def print_verification(project: Project) -> bool:
     """Read all data of every artefact and record, name what is damaged; whether all is whole."""
     paths = [
-        (name, stage, project.artefact(name, stage))
+        project.artefact(name, stage)
         for name in project.sequences
         for stage in STAGES
         if project.artefact(name, stage).exists()
@@ -192,25 +190,13 @@ def print_verification(project: Project) -> bool:
     console = Console()
     damaged: list[str] = []
     progress = Progress(log, "verified", len(paths), "files")
-    for _, stage, path in paths:
-        try:
-            if not path.is_dir():
-                _read_all(path, getattr(schemas, stage.upper()))
-            if read_record(path) is None:
-                damaged.append(f"{path}: what it was made from is not recorded, or damaged")
-        except UserError as error:
-            damaged.append(str(error))
+    for path in paths:
+        found = damage_of(path)
+        if not found and read_record(path) is None:
+            found = f"{path}: what it was made from is not recorded, or damaged"
+        damaged += [found] if found else []
         progress.step()
     for words in damaged:
         console.print(words, highlight=False, markup=False, soft_wrap=True)
     console.print(f"{len(paths)} outputs read, {len(damaged)} damaged", highlight=False)
     return not damaged
-
-
-def _read_all(path: Path, schema: artefacts.Schema) -> None:
-    with artefacts.read(path, schema) as source:
-        for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
-            shape, _, _, _ = source.describe(key)
-            if shape and shape[0] > 0:
-                for start in range(0, shape[0], 64):  # memory stays flat
-                    source.rows(key, slice(start, start + 64))

@@ -26,7 +26,7 @@ from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.verdict_figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES, JOINT, TRUTH
-from intercap_core.stages.export import MANIFEST
+from intercap_core.stages.export import MARKER
 from intercap_core.studio.subjects import Subject
 
 NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
@@ -79,9 +79,9 @@ def measure(project: Project, sequence: str) -> FieldSequence:
 
 def exported_alone(folder: Path) -> bool:
     """Whether ``folder`` is a whole export that moves a body and knows of no object."""
-    if not (folder / MANIFEST).is_file():
+    if not (folder / MARKER).is_file():
         return False
-    told = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    told = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     there = all((folder / name).is_file() for name in told["files"])
     named = {Path(name).name for name in told["files"]}
     return there and "body.npz" in named and "object.npz" not in named and not told["object"]

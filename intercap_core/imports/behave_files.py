@@ -104,7 +104,7 @@ def object_fits(frame: Path) -> list[Path]:
 def person_poses_at_30_fps(folder: Path) -> dict[int, np.ndarray]:
     """Rotation vectors (55, 3) in SMPL-X's order by time, microseconds; {} without the file."""
     path = folder / BEHAVE_PERSON
-    if not path.is_file():
+    if not path.exists():
         return {}
     values = _arrays(path)
     poses = _as_smplx(_numbers(values, "poses", path), path)
@@ -117,7 +117,7 @@ def person_poses_at_30_fps(folder: Path) -> dict[int, np.ndarray]:
 def object_poses_at_30_fps(folder: Path) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Rotation vector and translation by time, microseconds; {} without the file."""
     path = folder / BEHAVE_OBJECT
-    if not path.is_file():
+    if not path.exists():
         return {}
     values = _arrays(path)
     angles, trans = (_numbers(values, name, path) for name in ("angles", "trans"))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import sys
 import tokenize
 import zipfile
@@ -21,6 +22,7 @@ from intercap_core.inputs.files import MAX_ARRAYS_BYTES, Unreadable, read_bytes
 from intercap_core.inputs.quotes import printable
 
 MAX_ARRAYS = 10_000  # of one archive
+_ADDRESS = re.compile(r" object at 0x[0-9a-f]+")
 _SUFFIX, _ARRAY = ".npy", b"\x93NUMPY"
 _HEADS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -85,7 +87,8 @@ class Archive:
 
 
 def _told(error: Exception) -> str:
-    return " ".join(printable(str(error)).split())[:200] or type(error).__name__
+    words = _ADDRESS.sub("", printable(str(error)))  # of an object of Python's, which says nothing
+    return " ".join(words.split())[:200] or type(error).__name__
 
 
 def read_arrays(

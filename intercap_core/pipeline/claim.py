@@ -21,12 +21,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from intercap_core import disk
 from intercap_core.errors import UserError
 
 log = logging.getLogger(__name__)
 
 BEAT_S = 5.0
 DEAD_S = 60.0  # without a sign, on another machine: files may arrive there late
+UNSEEN = 0  # start of a process that lives, but is not shown
 _LOOK_S = 1.0
 
 
@@ -51,7 +53,7 @@ class Owner:
             socket.gethostname(),
             _place(),
             pid,
-            _start_of(pid) or 0,
+            _start_of(pid) or UNSEEN,
             os.environ.get("SLURM_JOB_ID", ""),
             time.strftime("%Y-%m-%d %H:%M:%S"),
             uuid.uuid4().hex,
@@ -66,9 +68,12 @@ class Owner:
         return (self.host, self.place) == (socket.gethostname(), _place())
 
     def lives(self, path: Path) -> bool:
-        """Whether the owner of the claim ``path`` still runs."""
+        """Whether the owner of the claim ``path`` still runs: by its process where that can be
+        seen, else by its signs."""
         if self.is_near():
-            return _start_of(self.pid) == self.started
+            started = _start_of(self.pid)
+            if started != UNSEEN:
+                return started == self.started
         age = _age_s(path)
         return age is not None and abs(age) < DEAD_S
 
@@ -148,12 +153,13 @@ def try_claim(path: Path) -> Claim | Owner:
             _bury(path, held)
             continue
         except OSError as error:
-            raise UserError(
-                f"{path.parent}: cannot be written ({error.strerror}), expected a folder for "
-                "results; make it writable, or name another one by the setting results"
-            ) from None
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(own.__dict__, file)
+            raise UserError(disk.told(error, path.parent)) from None
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                json.dump(own.__dict__, file)
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            raise UserError(disk.told(error, path.parent)) from None
         return Claim(path, own, dead)
 
 
@@ -210,23 +216,21 @@ def _place() -> str:
 
 
 def _start_of(pid: int) -> int | None:
-    """When a process of this machine started, in ticks of its clock; None where there is none."""
+    """When a process of this machine started, in ticks of its clock; None where none lives,
+    ``UNSEEN`` where there is no /proc, or it hides the processes of other users (``hidepid``)."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
             fields = file.read().rpartition(")")[2].split()
         return None if fields[0] in "ZX" else int(fields[19])
-    except FileNotFoundError:
-        if os.path.isdir("/proc/self"):
-            return None
     except (OSError, ValueError, IndexError):
-        return None
-    try:  # no /proc: that there is such a process has to do
+        pass
+    try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return None
     except PermissionError:
         pass
-    return 0
+    return UNSEEN
 
 
 def _remove_parts(output: Path) -> None:

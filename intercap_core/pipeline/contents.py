@@ -9,11 +9,11 @@ thousands of images it is not).
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import json
 import os
 from pathlib import Path
+
+from intercap_core.pipeline.kept import keep, read_kept
 
 NAME = ".inputs.json"
 FEW = 200  # files of a folder whose own sizes and dates are looked at
@@ -25,14 +25,7 @@ class Contents:
 
     def __init__(self, store: Path) -> None:
         self._store = store
-        self._known: dict[str, list[str]] = {}
-        with contextlib.suppress(OSError, ValueError):
-            told = json.loads(store.read_text(encoding="utf-8"))
-            self._known = {
-                name: entry
-                for name, entry in told.items()
-                if isinstance(entry, list) and len(entry) == 2
-            }
+        self._known = read_kept(store)
         self._changed = False
 
     def digest(self, path: Path, *, was: str | None = None) -> str:
@@ -60,11 +53,8 @@ class Contents:
         """Write what was learned, whole or not at all; a store that cannot be written is none."""
         if not self._changed or not self._store.parent.is_dir():
             return
-        part = self._store.with_name(f"{self._store.name}.{os.getpid()}.part")
-        with contextlib.suppress(OSError):
-            part.write_text(json.dumps(self._known, indent=0, sort_keys=True), encoding="utf-8")
-            os.replace(part, self._store)
-            self._changed = False
+        keep(self._store, self._known)
+        self._changed = False
 
 
 def _stamp(path: Path) -> tuple[str, int]:

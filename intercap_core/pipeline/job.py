@@ -13,7 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from intercap_core import disk
 from intercap_core.errors import UserError
+from intercap_core.signals import ToldToEnd, told_to_end
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -27,6 +29,7 @@ FINISHED = "finished in"
 FAILED = "failed:"
 WARNED = "warning:"
 UNEXPECTED = "unexpected"  # what a failure begins with that is no fault of the input
+ENDED = f"{UNEXPECTED} end"  # from outside
 
 
 def set_threads(threads: int) -> None:
@@ -39,13 +42,18 @@ def set_threads(threads: int) -> None:
 def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     """Run the block as one job that writes to ``log``.
 
-    A fault of the input is told in one line, in the log and on standard error; any other error
-    leaves its traceback in the log. Both end the process with status 1.
+    A fault of the input or of the disk is told in one line, in the log and on standard error; any
+    other error leaves its traceback in the log. Both end the process with status 1, as does a log
+    that cannot be written. A process that is told to end says so too.
     """
     set_threads(threads)
     log = Path(log)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    handler = logging.FileHandler(log, mode="w", encoding="utf-8")
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(log, mode="w", encoding="utf-8")
+    except OSError as error:
+        _tell(f"{name} failed: {disk.told(error, log)}")
+        raise SystemExit(1) from None
     handler.setFormatter(_Marked("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
     logger = logging.getLogger("intercap_core")
     logger.setLevel(logging.INFO)
@@ -53,12 +61,17 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     start = time.monotonic()
     logger.info("%s started with %d thread(s)", name, threads)
     try:
-        yield
+        with told_to_end():
+            yield
         logger.info("%s %.1f s", FINISHED, time.monotonic() - start)
     except UserError as error:
         logger.error("%s %s", FAILED, error)
         _tell(f"{name} failed: {error}")
         raise SystemExit(1) from None
+    except ToldToEnd as end:
+        logger.error("%s %s, %s", FAILED, ENDED, end)
+        _tell(f"{name} failed: {ENDED}, {end}; what was half-written is removed, run again")
+        raise SystemExit(end.status) from None
     except Exception as error:
         logger.exception("unexpected error")
         told = f"{UNEXPECTED} {type(error).__name__}: {str(error).strip() or 'no message'}"

@@ -1,16 +1,17 @@
 """What is done, missing or out of date, and why: the one decision on what a run computes.
 
 It compares each output's record with what the output would be made from now. Nothing else counts:
-no file's date, no bookkeeping beside the results, so it holds wherever these lie.
+no file's date, no bookkeeping beside the results, so it holds wherever these lie. These only save
+reading: an artefact of another size or date than it was left with is read through, and is made anew
+where it is damaged.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -21,7 +22,9 @@ from intercap_core.pipeline import given
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.given import STUDIO
+from intercap_core.pipeline.intact import damage_of, is_as_left
 from intercap_core.pipeline.job import last_failure
+from intercap_core.pipeline.kept import keep, read_kept
 from intercap_core.pipeline.record import FILE, Record, read_record
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
@@ -79,8 +82,10 @@ class Plan:
             {name: self.states(name)["summary"].identity for name in self.project.sequences},
             failures(self.project),
         )
-        there = all((self.project.results / name).exists() for name in OF_ALL)
-        record = self._records.of(dataset_record_of(self.project)) if there else None
+        files = [self.project.results / name for name in OF_ALL]
+        there = all(file.exists() for file in files)
+        whole = not any(damage_of(file) for file in noted(files) if not is_as_left(file))
+        record = self._records.of(dataset_record_of(self.project)) if there and whole else None
         return _compared(path if there else Path("none"), record, wanted)
 
     def output(self, sequence: str, stage: str) -> Path:
@@ -204,6 +209,11 @@ def failures(project: Project) -> dict[str, str]:
     return {name: why for name, why in found.items() if why}
 
 
+def noted(files: Iterable[Path]) -> list[Path]:
+    """Those of the files that are made of all sequences that are known again by their digests."""
+    return [file for file in files if file.parent.name != "site" and file.is_file()]
+
+
 def mark_of(project: Project, sequence: str, stage: str) -> Path:
     """Where the mark of a stage that is out of date would be."""
     name = f"{sequence}.{stage}" if sequence else stage
@@ -241,16 +251,13 @@ def _dated(output: Path) -> list[Path]:
 
 
 class _Records:
-    """Records of outputs, each opened once as long as its size and date stay."""
+    """Records of outputs, each opened once as long as its size and date stay. An artefact that is
+    not as it was left is read through, and has no record where it is damaged."""
 
     def __init__(self, results: Path) -> None:
         self._path = results / _KNOWN
         self._results = results
-        try:
-            told = json.loads(self._path.read_text(encoding="utf-8"))
-            self._known: dict[str, list[str]] = told if isinstance(told, dict) else {}
-        except (OSError, ValueError):
-            self._known = {}
+        self._known = read_kept(self._path)
         self._changed = False
 
     def of(self, output: Path) -> Record | None:
@@ -262,9 +269,11 @@ class _Records:
             return None
         key, stamp = str(output), f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ino}"
         known = self._known.get(key)
-        if isinstance(known, list) and len(known) == 2 and known[0] == stamp:
+        if known is not None and known[0] == stamp:
             return Record.from_text(known[1])
         found = read_record(output)
+        if found is not None and file == output and not is_as_left(output):
+            found = None if damage_of(output) else found
         self._known[key] = [stamp, "" if found is None else found.to_text()]
         self._changed = True
         return found
@@ -272,9 +281,4 @@ class _Records:
     def keep(self) -> None:
         if not self._changed or not self._results.is_dir():
             return
-        part = self._path.with_name(f"{_KNOWN}.{os.getpid()}.part")
-        try:
-            part.write_text(json.dumps(self._known), encoding="utf-8")
-            os.replace(part, self._path)
-        except OSError:
-            part.unlink(missing_ok=True)
+        keep(self._path, self._known)

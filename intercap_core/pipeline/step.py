@@ -6,6 +6,7 @@ import ctypes
 import importlib
 import logging
 import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,10 +17,13 @@ from intercap_core.pipeline import given, outcome
 from intercap_core.pipeline.claim import Claim, claim
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.plan import DATASET, dataset_record_of, failures
+from intercap_core.pipeline.intact import note
+from intercap_core.pipeline.needs import disk_told
+from intercap_core.pipeline.plan import DATASET, OF_ALL, dataset_record_of, failures, noted
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
+from intercap_core.stages import folders
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +52,7 @@ def run_step(
     _give_back_memory()
     made = False
     while not made:
-        with claim(output) as held:
+        with disk_told(project, output, stage), claim(output) as held:
             made_from = _made_from(stage, project, sequence, annotation, inputs)
             if keep and _is_made(output, made_from):
                 log.info("sequence %s, %s: was made meanwhile, and is kept", sequence, stage)
@@ -109,23 +113,29 @@ def _make(
     process took that place over meanwhile, and nothing was put there."""
     if STAGES[stage].on_device:
         check_device(project)
-    run = importlib.import_module(f"intercap_core.stages.{stage}").run
+    module = importlib.import_module(f"intercap_core.stages.{stage}")
     passed = given.arguments(project, sequence, stage, annotation)
     passed |= {name: inputs[name] for name in STAGES[stage].reads}
-    if STAGES[stage].writes_folder:
-        run(output=output, **passed)
-        add_record(output, made_from)
-        return True
+    in_folder = STAGES[stage].writes_folder
+    if in_folder:
+        folders.check_replaceable(output, marker=module.MARKER, what=stage)
     part = artefacts.part_of(output)
     try:
-        run(output=part, **passed)
+        module.run(output=part, **passed)
         add_record(part, made_from)
         if not held.still_held():
             return False
-        os.replace(part, output)
+        if in_folder:
+            folders.put(part, output)
+        else:
+            os.replace(part, output)
+            note(output)
         return True
     finally:
-        part.unlink(missing_ok=True)
+        if in_folder:
+            shutil.rmtree(part, ignore_errors=True)
+        else:
+            part.unlink(missing_ok=True)
 
 
 def _give_back_memory() -> None:
@@ -176,7 +186,7 @@ def run_studio(project: Project, sequence: str) -> Path:
         )
     from intercap_core.studio.capture import make_capture
 
-    with claim(folder):
+    with disk_told(project, folder), claim(folder):
         contents = Contents(project.results / sequence / CONTENTS_NAME)
         made_from = given.studio_record(project, sequence, contents)
         (folder / FILE).unlink(missing_ok=True)
@@ -208,7 +218,7 @@ def run_dataset(project: Project) -> Path:
         {name: record.identity for name, record in records.items() if record is not None},
         failed,
     )
-    with claim(folder / DATASET):
+    with disk_told(project, folder / DATASET), claim(folder / DATASET):
         (dataset_record_of(project) / FILE).unlink(missing_ok=True)
         first = dataset.run(
             dataset=project.config.dataset,
@@ -226,5 +236,7 @@ def run_dataset(project: Project) -> Path:
             changed=changed(project.config),
         )
         add_record(dataset_record_of(project), made_from)
+        for file in noted(folder / name for name in OF_ALL):
+            note(file)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first

@@ -88,6 +88,7 @@ def run(
     tables.write(tables_folder, written)
     heat = collect(found)
     surfaces, doubts = _body_heat(found, heat, body_models)
+    doubts |= _unlisted(found, objects)
     remarks = {name: "; ".join(reasons) for name, reasons in heat.left_out.items()} | doubts
     for name, why in remarks.items():
         log.warning("sequence %s: %s", name, why)
@@ -104,7 +105,7 @@ def run(
         table=by_sequence,
         groups={name: table for name, table in [*groups.items(), ("cameras", rig)] if len(table)},
         surfaces=surfaces,
-        objects=[_object_heat(name, heat, objects) for name in heat.objects],
+        objects=[_object_heat(name, heat, objects) for name in heat.objects if name in objects],
         body_frames=heat.body_frames,
         page_of={s.name: f"sequences/{s.name}/index.html" for s in found},
         failed=unreported,
@@ -154,6 +155,18 @@ def _body_heat(
 
 def _model(path: Path, told: BodyFile) -> BodyModel:
     return BodyModel.load(path, num_betas=told.num_betas, num_expression=told.num_expression)
+
+
+def _unlisted(
+    summaries: Sequence[SequenceSummary], objects: Mapping[str, ObjectEntry]
+) -> dict[str, str]:
+    """Sequences whose object has no entry any more, and what that means."""
+    return {
+        summary.name: f"its object {summary.metrics.object_} has no entry in the list of objects: "
+        "the object's heatmap has no picture; put the entry back, or correct the sequence's row"
+        for summary in summaries
+        if summary.metrics.object_ and summary.metrics.object_ not in objects
+    }
 
 
 def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) -> Heat:

@@ -35,7 +35,7 @@ from intercap_core.stages.folders import check_replaceable, replaced
 
 log = logging.getLogger(__name__)
 
-MANIFEST = "export.json"
+MARKER = "export.json"
 _OF_IMAGES = {"bop", "coco"}  # formats that say what is in each image
 _OF_BODIES = {"intercap", "amass"}  # formats of parameters, which say nothing without the mesh
 _NO_FRAME = "none: numbers of vertices and regions, distances in metres"
@@ -65,7 +65,7 @@ def run(
     and where ``output`` holds anything but an export.
     """
     output = Path(output)
-    check_replaceable(output, marker=MANIFEST, what="export")
+    check_replaceable(output, marker=MARKER, what="export")
     mesh = None if object_ is None else ObjectMesh.load(object_)
     with artefacts.read(scene, SCENE) as setting:
         given = Rig.from_artefact(setting)
@@ -216,9 +216,9 @@ def _write_manifest(
             for path in files
         },
     }
-    part = output / f".{MANIFEST}.part"
+    part = output / f".{MARKER}.part"
     _dump(part, content)
-    part.replace(output / MANIFEST)
+    part.replace(output / MARKER)
 
 
 def _dump(path: Path, content: Mapping[str, Any]) -> None:

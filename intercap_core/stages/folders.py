@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from intercap_core.artefacts import part_of
+from intercap_core.artefacts import PART, part_of
 from intercap_core.errors import UserError
 
 
@@ -29,23 +29,30 @@ def replaced(output: Path) -> Iterator[Path]:
     """An empty folder that takes the place of ``output`` when the block ends without an error.
 
     It is filled under a temporary name beside its own, and what was there goes only when the new
-    one is complete.
+    one is complete. An ``output`` that has such a name is filled itself.
     """
     output = output.resolve()
-    part = part_of(output)
-    old = part.with_suffix(".old")
+    part = output if output.suffix == PART else part_of(output)
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
         yield part
-        if output.exists():
-            output.rename(old)
-        try:
-            part.rename(output)
-        except OSError:
-            if old.exists():
-                old.rename(output)
-            raise
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
+        if part != output:
+            put(part, output)
+    except BaseException:
         shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def put(part: Path, output: Path) -> None:
+    """Put a complete folder in the place of ``output``, which goes, or stays where this fails."""
+    old = part.with_suffix(".old")
+    if output.exists():
+        output.rename(old)
+    try:
+        part.rename(output)
+    except OSError:
+        if old.exists():
+            old.rename(output)
+        raise
+    shutil.rmtree(old, ignore_errors=True)

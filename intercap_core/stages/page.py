@@ -39,7 +39,7 @@ from intercap_core.viewer import page as viewer
 
 log = logging.getLogger(__name__)
 
-PAGE = "index.html"
+MARKER = "index.html"
 _MAX_CLOSEUPS = 2  # holds drawn; `intercap closeups` draws all
 
 
@@ -73,7 +73,7 @@ def run(
         "object_track": object_track, "body_fit": body_fit, "joint": joint, "metrics": metrics,
     }  # fmt: skip
     output = Path(output)
-    check_replaceable(output, marker=PAGE, what="page")
+    check_replaceable(output, marker=MARKER, what="page")
     measured = SequenceMetrics.read(metrics)
     found = object_ if measured.has_object else None
     with artefacts.read(joint, JOINT) as fit, artefacts.read(scene, SCENE) as setting:
@@ -107,7 +107,7 @@ def run(
         viewer=ViewerParts(viewer.POLICY, viewer.style(), viewer.element(), viewer.load()),
     )
     with replaced(output) as folder:
-        (folder / PAGE).write_text(page(content), encoding="utf-8")
+        (folder / MARKER).write_text(page(content), encoding="utf-8")
         viewer.write_script(
             folder / viewer.SCRIPT,
             paths,

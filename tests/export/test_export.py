@@ -487,7 +487,7 @@ def test_without_a_floor_it_is_said_what_turned_the_export_upright(
         if hint:
             file.attrs["up_source"] = hint
     out = exported.run(replace(capture, paths=capture.paths | {"scene": scene}), tmp_path / "out")
-    manifest = json.loads((out / export.MANIFEST).read_text())["frame"]
+    manifest = json.loads((out / export.MARKER).read_text())["frame"]
     for told in (manifest["amass"], manifest["glb"], (out / "README.txt").read_text()):
         assert words in told and "no floor is known" in told and "gravity-aligned" not in told
 
@@ -498,7 +498,7 @@ def test_same_input_same_bytes_and_old_files_go(
     out = tmp_path / "again"
     out.mkdir()
     (out / "old.txt").write_text("left by an earlier version")
-    (out / export.MANIFEST).write_text("{}")
+    (out / export.MARKER).write_text("{}")
     exported.run(capture, out)
     assert [p.name for p in tmp_path.iterdir()] == ["again"]
     names = sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file())
@@ -524,7 +524,7 @@ def test_an_export_that_fails_leaves_the_earlier_one(
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    (out / export.MANIFEST).write_text("earlier")
+    (out / export.MARKER).write_text("earlier")
 
     def full(*_: Any) -> None:
         raise OSError("no space left on device")
@@ -532,5 +532,5 @@ def test_an_export_that_fails_leaves_the_earlier_one(
     monkeypatch.setattr(export.intercap, "write", full)
     with pytest.raises(OSError, match="no space"):
         exported.run(capture, out, formats=("intercap",))
-    assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MANIFEST]
-    assert (out / export.MANIFEST).read_text() == "earlier"
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MARKER]
+    assert (out / export.MARKER).read_text() == "earlier"

@@ -17,11 +17,18 @@ from intercap_core.body.loading import OPEN_BODY, load_body_file
 from intercap_core.body.maps import load_maps, maps_path
 from intercap_core.body.vposer import VPoser
 from intercap_core.config import ObjectEntry
+from intercap_core.imports.behave_files import (
+    object_poses_at_30_fps,
+    person_poses_at_30_fps,
+    read_object_pose,
+    read_person_pose,
+)
 from intercap_core.imports.release_intercap import read_results
 from intercap_core.rigid.contact_vertices import contact_list, read_contact_vertices
 from intercap_core.rigid.mesh import ObjectMesh, colours_of
 from intercap_core.rigid.mesh_files import load_mesh
 from tests.fuzz.kind import ImplausibleError, Kind, finite, within
+from tests.helpers.behave_results import write_30_fps
 from tests.helpers.lemo_release import random_state, write_release
 
 BOX = np.array([[x, y, z] for x in (0, 0.2) for y in (0, 0.1) for z in (0, 0.3)])
@@ -161,6 +168,32 @@ def _read_results(folder: Path) -> None:
     within(-1e9, 1e9, betas=found.betas[known])
 
 
+def _make_behave(folder: Path) -> None:
+    rng = np.random.default_rng(1)
+    poses, angles, trans = (rng.normal(size=(4, count)) for count in (156, 3, 3))
+    write_30_fps(folder, ["0003.000", "0003.033", "0003.067", "0003.100"], poses, angles, trans)
+    pose = {"pose": poses[0], "betas": np.zeros(10), "trans": np.zeros(3)}
+    (folder / "person_fit.pkl").write_bytes(pickle.dumps(pose, protocol=2))
+    fit = {"angle": angles[0], "trans": trans[0]}
+    (folder / "box_fit.pkl").write_bytes(pickle.dumps(fit, protocol=2))
+
+
+def _read_30_fps(folder: Path) -> None:
+    poses, placed = person_poses_at_30_fps(folder), object_poses_at_30_fps(folder)
+    if not poses or not placed:
+        raise ImplausibleError("there are no poses, and nothing is said of that")
+    for pose in poses.values():
+        within(-101, 101, pose=pose)
+    for angle, trans in placed.values():
+        within(-101, 101, angle=angle, trans=trans)
+
+
+def _read_behave_frame(folder: Path) -> None:
+    within(-101, 101, pose=read_person_pose(folder / "person_fit.pkl"))
+    angle, trans = read_object_pose(folder / "box_fit.pkl")
+    within(-101, 101, angle=angle, trans=trans)
+
+
 KINDS = (
     Kind("mesh-ply", "bytes", _make_mesh("box.ply"), ["box.ply"], _read_mesh("box.ply")),
     Kind("mesh-ply-text", "text", _make_mesh("box.ply", encoding="ascii"), ["box.ply"],
@@ -181,4 +214,8 @@ KINDS = (
     Kind("vposer-old", "bytes", _make_vposer, ["old.pt"], _read_vposer("old.pt")),
     Kind("lemo", "zip", _make_lemo, ["encoder.pkl", "statistics.npz"], _read_lemo, share=0.5),
     Kind("results", "pickle", _make_results, ["res.pkl"], _read_results),
+    Kind("results-30-fps", "zip", _make_behave, ["smpl_fit_all.npz", "object_fit_all.npz"],
+         _read_30_fps),
+    Kind("results-frames", "pickle", _make_behave, ["person_fit.pkl", "box_fit.pkl"],
+         _read_behave_frame),
 )  # fmt: skip

@@ -70,6 +70,8 @@ class ClusterRun:
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
+                # Ctrl-C is to reach it, also where the tests run in a shell's background.
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
         return Started(process, transcript)
 
@@ -81,7 +83,7 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
-DATES = (".inputs.json", ".records.json")  # to read nothing twice
+DATES = (".inputs.json", ".outputs.json", ".records.json")  # to read nothing twice
 
 
 def contents(results: Path) -> dict[str, bytes]:

@@ -79,6 +79,42 @@ def test_another_machine_lives_as_long_as_it_gives_a_sign(tmp_path: Path) -> Non
     taken.release()
 
 
+@pytest.mark.parametrize("hidden", [FileNotFoundError, PermissionError])
+def test_a_process_that_is_hidden_lives_as_long_as_it_gives_a_sign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hidden: type[OSError]
+) -> None:
+    """Another user's, under /proc mounted with hidepid=2 or 1."""
+    output = tmp_path / "joint.h5"
+    first, send = _holder(output, 60.0), os.kill
+
+    def no_stat(path: str, **_: object) -> None:
+        raise hidden(path)
+
+    def not_ours(pid: int, number: int) -> None:
+        if number:
+            send(pid, number)
+        elif pid == first.pid and first.poll() is None:
+            raise PermissionError
+        else:
+            raise ProcessLookupError
+
+    monkeypatch.setattr(claims, "open", no_stat, raising=False)
+    monkeypatch.setattr(os, "kill", not_ours)
+    try:
+        assert isinstance(try_claim(path_of(output)), Owner)
+        then = time.time() - 2 * claims.DEAD_S
+        os.utime(path_of(output), (then, then))
+        assert living_owner(output) is None
+        os.utime(path_of(output))
+        assert living_owner(output) is not None
+    finally:
+        first.terminate()
+        first.wait()
+    taken = try_claim(path_of(output))  # though it gave a sign just before its end
+    assert isinstance(taken, Claim)
+    taken.release()
+
+
 def test_who_lost_its_claim_knows(tmp_path: Path) -> None:
     output = tmp_path / "joint.h5"
     with claim(output) as own:

@@ -273,6 +273,16 @@ def test_what_heatmaps_cannot_take_is_told_and_the_rest_counts(
     assert "right hand, back" in text
 
 
+def test_an_object_that_is_not_listed_any_more_ends_no_merge(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    paths = write_summaries(captures, tmp_path)
+    listed = {"s01_o09": captures["s01_o09"]}
+    text = merge(paths, listed, tmp_path / "out").read_text()
+    assert "2 sequences, 8 frames" in text
+    assert "its object football has no entry in the list of objects" in text
+
+
 def test_overlay_covers_the_person_in_the_image(
     pages: dict[str, _Reader],
 ) -> None:

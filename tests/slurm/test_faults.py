@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import signal
 import threading
 import time
@@ -155,7 +156,8 @@ def test_cancelled(run: ClusterRun, local: dict[str, bytes], record_property: Re
         number, _ = job_runs(run, "joint")
         run.slurm.command("scancel", number)
         said = started.ends_well()
-    assert f"Slurm job {number}, {ONE}: joint: ended without a word: CANCELLED" in said
+    (told,) = [line for line in said.splitlines() if f"Slurm job {number}, {ONE}: joint: " in line]
+    assert told.endswith("CANCELLED")
     assert len(numbers(run, "rule_joint_", ONE) - before) == 2
 
 
@@ -204,12 +206,114 @@ def test_controller_restarted(
     before = numbers(run, ONE)
     with computed_anew(run, local, "joint", "metrics") as targets:
         started = run.start(*targets)
-        job_runs(run, "joint")
-        run.slurm.kill("slurmctld")
+        number, _ = job_runs(run, "joint")
+        run.slurm.stop_one("slurmctld")
         time.sleep(30.0)
         run.slurm.start_one("slurmctld")
         started.ends_well()
+    assert run.slurm.jobs(ended=True)[number][0] == "COMPLETED"
     assert len(numbers(run, ONE) - before) == 2
+
+
+def test_controller_killed(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    """What it has not saved is that the job runs: it starts it again, which its node refuses, and
+    then holds it and drains the node."""
+    record_property("fault", "the controller killed before it notes that a job runs, which ends")
+    before = numbers(run, ONE)
+    saved = run.slurm.folder / "state" / "job_state"
+    with computed_anew(run, local, "joint", "metrics") as targets:
+        # It saves a change at once where it has saved none for five seconds; else later.
+        run.slurm.wait_for(lambda: time.time() - saved.stat().st_mtime > 10.0, "it has saved all")
+        started = run.start(*targets)
+        number, node = run.slurm.wait_for(
+            lambda: run.slurm.running("rule_joint_", ONE), "joint runs", within=300
+        )
+        run.slurm.wait_for(lambda: processes_of(run, number), "the job is on its node")
+        run.slurm.kill("slurmctld")
+        time.sleep(30.0)
+        run.slurm.start_one("slurmctld")
+        said = started.ends_well()
+    assert f"Slurm could not launch job '{number}', and holds it" in said
+    assert run.slurm.jobs(ended=True)[number][0] == "CANCELLED"
+    assert len(numbers(run, ONE) - before) == 2
+    run.slurm.command("scontrol", "update", f"nodename={node}", "state=resume")
+    run.slurm.wait_for(lambda: run.slurm.idle_nodes() == set(NODES), "the node is back")
+
+
+def test_controller_down_when_jobs_are_submitted(
+    run: ClusterRun,
+    local: dict[str, bytes],
+    record_property: Record,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before a submission, and so late that it was seen to answer: as if it went down just then."""
+    record_property("fault", "the controller down when a job is submitted")
+    before = numbers(run, ONE)
+    sbatch, went = run.flow.folder / "bin" / "sbatch", run.flow.folder / "bin" / "went"
+    sbatch.parent.mkdir()
+    sbatch.write_text(
+        f"""#!/bin/sh
+test -e {went} && exec {shutil.which("sbatch")} "$@"
+touch {went}
+echo "sbatch: error: Batch job submission failed: Unable to contact slurm controller" \
+    "(connect failure)" >&2
+exit 1
+"""
+    )
+    sbatch.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{sbatch.parent}:{os.environ['PATH']}")
+    with computed_anew(run, local, "joint") as targets:
+        run.slurm.stop_one("slurmctld")
+        started = run.start(*targets)
+        run.slurm.wait_for(
+            lambda: "Slurm's controller does not answer" in started.said, "it waits", within=300
+        )
+        assert not went.exists()
+        run.slurm.start_one("slurmctld")
+        started.ends_well()
+    assert went.exists()
+    assert len(numbers(run, ONE) - before) == 1
+
+
+def test_interrupted(run: ClusterRun, local: dict[str, bytes], record_property: Record) -> None:
+    record_property("fault", "Ctrl-C while a job runs")
+    with computed_anew(run, local, "joint") as targets:
+        started = run.start(*targets)
+        number, _ = job_runs(run, "joint")
+        send(signal.SIGSTOP, processes_of(run, number))  # so that it cannot end by itself
+        started.process.send_signal(signal.SIGINT)
+        assert started.process.wait(120) == 1, started.said
+        assert "Traceback" not in started.said
+        run.slurm.wait_for(
+            lambda: run.slurm.jobs(ended=True)[number][0] == "CANCELLED", "the job is cancelled"
+        )
+        run.start(*targets).ends_well()
+
+
+def test_interrupted_while_the_controller_is_down(
+    run: ClusterRun, local: dict[str, bytes], record_property: Record
+) -> None:
+    record_property("fault", "Ctrl-C while the controller is down")
+    before = numbers(run, ONE)
+    with computed_anew(run, local, "joint") as targets:
+        started = run.start(*targets)
+        number, _ = job_runs(run, "joint")
+        processes = processes_of(run, number)
+        send(signal.SIGSTOP, processes)
+        run.slurm.stop_one("slurmctld")
+        started.process.send_signal(signal.SIGINT)
+        assert started.process.wait(120) == 1, started.said
+        assert "Slurm's jobs go on, and the next run waits for them" in started.said
+        assert "Traceback" not in started.said
+        run.slurm.start_one("slurmctld")
+        again = run.start(*targets)
+        found = f"Slurm job {number} of an earlier run computes"
+        run.slurm.wait_for(lambda: found in again.said, "the job is found", within=300)
+        send(signal.SIGCONT, processes)
+        again.ends_well()
+    assert len(numbers(run, ONE) - before) == 1
 
 
 def test_submitter_killed(
@@ -271,20 +375,32 @@ def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, by
 def test_a_broken_annotation_fails_once_and_alone(
     run: ClusterRun, local: dict[str, bytes], record_property: Record
 ) -> None:
+    """What was computed stays, in the report too; a sequence that is not complete is left out."""
     record_property("fault", "one sequence's annotation broken")
-    annotation = run.flow.annotation(OTHER)
+    annotation, summary = run.flow.annotation(OTHER), run.flow.artefact(OTHER, "summary")
     annotation.parent.mkdir(exist_ok=True)
     annotation.write_text("floor: [[\n")
-    before, kept = run.slurm.jobs(ended=True).keys(), written(run.flow.results)
-    started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
-    assert started.process.wait(600) == 1, started.said
-    assert "not valid YAML" in started.said
-    assert f"the report leaves out {OTHER}" in started.said
-    jobs = run.slurm.jobs(ended=True)
-    new = sorted(jobs[number][1] for number in jobs.keys() - before)
+    told, new = jobs_of_failed_run(run)
+    assert "the report leaves out" not in told
+    assert new == [f"rule_broken_annotation_wildcards_{OTHER}"]
+    assert contents(run.flow.results) == local
+    summary.unlink()
+    kept = written(run.flow.results)
+    told, new = jobs_of_failed_run(run)
+    assert f"the report leaves out {OTHER}" in told
     assert new == [f"rule_broken_annotation_wildcards_{OTHER}", "rule_dataset"]
     assert "not valid YAML" in (run.flow.results / "site" / "index.html").read_text()
     assert written(run.flow.results) == kept
     annotation.unlink()
     run.start().ends_well()
     assert contents(run.flow.results) == local
+
+
+def jobs_of_failed_run(run: ClusterRun) -> tuple[str, list[str]]:
+    """What `intercap run` says, that ends in failure for the annotation, and what it submitted."""
+    before = run.slurm.jobs(ended=True).keys()
+    started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
+    assert started.process.wait(600) == 1, started.said
+    assert "not valid YAML" in started.said
+    jobs = run.slurm.jobs(ended=True)
+    return started.said, sorted(jobs[number][1] for number in jobs.keys() - before)

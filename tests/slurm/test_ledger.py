@@ -108,6 +108,17 @@ def test_what_the_program_did_not_expect_is_no_mistake(folder: Path) -> None:
     assert not ending.is_mistake
 
 
+def test_a_job_that_is_killed_after_its_stage_is_told(folder: Path) -> None:
+    entry = Entry.of(Job(folder))
+    log(folder, "joint", "finished in 3.0 s")
+    slurm = folder / "slurm.log"
+    slurm.write_text("slurmstepd: error: StepId=5.batch exceeded memory limit (2 > 1)\n")
+    (ending,) = endings(Job(folder), entry, slurm)
+    assert ending.state == "finished"
+    said = "Slurm job 5, walk: joint: finished; its job then ended: exceeded memory limit"
+    assert ending.line("5") == said
+
+
 def test_a_log_that_was_there_before_says_nothing(folder: Path) -> None:
     log(folder, "joint", "failed: no such mesh")
     entry = Entry.of(Job(folder))

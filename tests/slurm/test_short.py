@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +14,7 @@ from tests.helpers.plain_capture import write_rig
 SETTINGS = "config/tiny/config.yaml"
 FRAMES = 3
 NAME = "walk"
+SHORT_WAITS = ("--intercap-slurm-init-seconds-before-status-checks", "1")
 
 
 @pytest.fixture(scope="module")
@@ -47,21 +46,18 @@ def asked_mb(slurm: LoopbackSlurm, numbers: list[str]) -> list[int]:
     return [int(asked[number].removesuffix("M")) for number in sorted(numbers, key=int)]
 
 
-@pytest.mark.skipif(
-    "INTERCAP_TEST_SLURM" not in os.environ,
-    reason="how soon a job of little memory is killed depends on the machine: make test-slurm",
-)
 def test_a_job_killed_for_its_memory_comes_back_with_more(
     tiny: ClusterRun, slurm: LoopbackSlurm
 ) -> None:
     frames = tiny.flow.artefact(NAME, "frames")
     local = frames.read_bytes()
     frames.unlink()
-    # Less than half of what Python and its libraries take; by a user's factor, which still grows
-    scale = "cluster={memory_scale: {frames: 0.3}}"
-    said = tiny.start(tiny.target(NAME, "frames"), "--config", scale).ends_well()
+    # By a user's factor, which still grows: Snakemake and the stage import 500 MB between them. The
+    # first attempt has 220 MB, which is gone before the stage begins; the fourth has 880 MB.
+    scale = ("--retries", "3", "--config", "cluster={memory_scale: {frames: 0.4}}")
+    said = tiny.start(tiny.target(NAME, "frames"), *SHORT_WAITS, *scale).ends_well()
     asked = asked_mb(slurm, slurm.submitted_for("rule_frames", NAME))
-    assert len(asked) in (2, 3)
+    assert len(asked) in (2, 3, 4)
     assert asked[1:] == [asked[0] * attempt for attempt in range(2, 1 + len(asked))]
     lines = [line for line in said.splitlines() if f"{NAME}: frames: " in line]
     assert len(lines) == len(asked) - 1

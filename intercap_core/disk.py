@@ -1,0 +1,121 @@
+"""Disks that are full, over a quota or not writable: found in errors, told in words, and kept from
+HDF5, which ends the process when it cannot write what it holds."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+
+
+class PartFile(io.FileIO):
+    """A file for h5py to write to, which takes every write.
+
+    HDF5 has no way to give up a file whose last writes fail: the process crashes when it ends
+    (h5py's thread 914). So what a full disk does not take is kept in memory, and :meth:`check`
+    raises the error: call it while writing, and after HDF5 has closed the file.
+    """
+
+    def __init__(self, path: Path, mode: str) -> None:
+        super().__init__(path, mode)
+        self._error: OSError | None = None
+        self._kept: list[tuple[int, bytes]] = []  # offsets and bytes, in their order
+        self._at = 0
+
+    def check(self) -> None:
+        """Raise the OSError of the first write that failed, which names the file."""
+        if self._error is not None:
+            raise OSError(self._error.errno, self._error.strerror, str(self.name))
+
+    def write(self, data: Any) -> int:
+        """Write all of ``data``, here or to memory."""
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self._error is None:
+            try:
+                done += super().write(view[done:]) or 0
+            except OSError as error:
+                self._error = error
+        if done < len(view):
+            self._kept.append((self._at + done, bytes(view[done:])))
+        self._at += len(view)
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written, to the disk or to memory."""
+        view = memoryview(buffer).cast("B")
+        start, read = self._at, super().readinto(view) or 0
+        for offset, data in self._kept:
+            first, last = max(offset, start), min(offset + len(data), start + len(view))
+            if first < last:
+                view[first - start : last - start] = data[first - offset : last - offset]
+                read = max(read, last - start)
+        self._at += read
+        return read
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place, also behind what the disk took."""
+        self._at = super().seek(offset, whence)
+        if whence == os.SEEK_END:
+            self._at = max([self._at, *(at + len(data) for at, data in self._kept)])
+        return self._at
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the length, unless the disk is full: the file is of no use then."""
+        size = self._at if size is None else size
+        if self._error is None:
+            try:
+                super().truncate(size)
+            except OSError as error:
+                self._error = error
+        return size
+
+
+def fault_in(error: BaseException) -> OSError | None:
+    """What the system said of a disk, where that is why ``error`` was raised; else None."""
+    for one in _chain(error):
+        if isinstance(one, OSError) and one.errno in FULL | NOT_WRITABLE:
+            return one
+    return None
+
+
+def told(fault: OSError, place: Path | None = None, needed: str = "") -> str:
+    """One sentence: where, what the system said, what is needed, what to do.
+
+    ``place``: what was being written, where ``fault`` does not name it; ``needed``: how much.
+    """
+    named = Path(str(fault.filename)) if fault.filename else place
+    where = f"{place or named}: " if place or named else ""
+    if fault.errno in FULL:
+        free = f", {free_bytes(named) / 1e6:.0f} MB free" if named is not None else ""
+        return (
+            f"{where}the disk is full or a quota is used up ({fault.strerror}{free})"
+            f"{f'; {needed}' if needed else ''}; free space, or name another folder by the setting "
+            "results, then run again: what is complete is kept, nothing is half-written"
+        )
+    at = f" at {named}" if named is not None and place is not None and named != place else ""
+    return (
+        f"{where}cannot be written ({fault.strerror}{at}); make its folder writable, or name "
+        "another one by the setting results, then run again"
+    )
+
+
+def free_bytes(place: Path) -> int:
+    """What the disk of a path takes, which need not be there yet."""
+    there = next(one for one in (place, *place.resolve().parents) if one.exists())
+    return shutil.disk_usage(there).free
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or error.__context__

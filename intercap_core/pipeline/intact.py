@@ -1,0 +1,86 @@
+"""Whether results are as they were left: what has another size or date since is read through once.
+
+An artefact's size, date and digest are noted beside it when it is made. One whose size or date
+differs was copied, touched, cut off or overwritten; which of these its digest tells, or its
+checksums where nothing is noted. To read hundreds of gigabytes at every start they need not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from intercap_core import artefacts, schemas
+from intercap_core.pipeline.kept import keep, read_kept
+
+NAME = ".outputs.json"  # of a sequence's artefacts
+EXPORT_LIST = "export.json"  # digests of an export's files
+_ROWS = 64  # read at a time, so that memory stays flat
+
+
+def note(output: Path) -> None:
+    """Remember an artefact as it is now; what cannot be remembered is read through later."""
+    path = output.with_name(NAME)
+    keep(path, read_kept(path) | {output.name: [_stamp(output), _digest(output)]})
+
+
+def is_as_left(output: Path) -> bool:
+    """Whether size and date are those that were noted."""
+    return _noted(output)[0] == _stamp(output)
+
+
+def damage_of(output: Path) -> str:
+    """Read all of an artefact, or all files of an export, and say what is wrong with them; "" =
+    nothing."""
+    if output.is_dir():
+        return _changed_file(output)
+    digest = _noted(output)[1]
+    if digest:  # HDF5 has not to meet what is damaged: it was seen to hang, and to end the process
+        same = _digest(output) == digest
+        return "" if same else f"{output}: is not as it was written; delete it and run again"
+    if output.suffix != ".h5":
+        return ""
+    try:
+        with artefacts.read(output, getattr(schemas, output.stem.upper())) as source:
+            for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
+                shape, _, _, _ = source.describe(key)
+                if shape and shape[0] > 0:
+                    for start in range(0, shape[0], _ROWS):
+                        source.rows(key, slice(start, start + _ROWS))
+    except artefacts.Unreadable as error:
+        return str(error)
+    return ""
+
+
+def _changed_file(folder: Path) -> str:
+    """Which of the files is not the one that the folder's list of digests names."""
+    if not (folder / EXPORT_LIST).is_file():
+        return ""
+    try:
+        listed = json.loads((folder / EXPORT_LIST).read_text(encoding="utf-8"))["files"]
+        found = [name for name, digest in listed.items() if _digest(folder / name) != digest]
+    except (ValueError, KeyError, AttributeError, TypeError):
+        found = [EXPORT_LIST]
+    if not found:
+        return ""
+    return f"{folder / found[0]}: is not as it was written; delete the folder and re-run its stage"
+
+
+def _digest(path: Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return "missing"
+
+
+def _noted(output: Path) -> tuple[str, str]:
+    """Size with date, and digest; empty where nothing is noted."""
+    stamp, digest = read_kept(output.with_name(NAME)).get(output.name, ("", ""))
+    return stamp, digest
+
+
+def _stamp(output: Path) -> str:
+    stat = output.stat()
+    return f"{stat.st_size} {stat.st_mtime_ns}"

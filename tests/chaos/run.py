@@ -1,0 +1,216 @@
+"""`make chaos`: what a cluster does to a run, and one command that goes on: ``python -m
+tests.chaos.run``.
+
+A small dataset is computed in peace. Copies of it are killed at a random moment of every stage of
+every sequence and while Snakemake plans, run out of disk, have their results damaged, and see the
+clock jump. After each, ``intercap run`` goes on; in the end every file must be the peaceful run's,
+byte for byte. Adds ``chaos.*`` to results/bench.json. Disks need a user who may mount a tmpfs, the
+clock libfaketime (Debian: faketime); where one is missing, that is said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from bench.command import add_figures
+from intercap_core.stage_list import SEQUENCE_STAGES
+from tests.chaos.victim import Victim, damage, identical, kill_after, kill_in
+from tests.helpers.flow import Flow
+
+OUTPUT = Path("results/bench.json")
+KILLS_BEFORE_JOBS = 4
+FIRST_ROOM_MB, MORE_ROOM_MB = 3, 6  # beside the recordings; a sequence takes some 20
+FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1")
+DAY_S = 86_400
+SAID = "the disk is full or a quota is used up"
+
+
+class Fault(Exception):
+    """What should not have happened."""
+
+
+def killed(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+    """Kills of the whole group; returns how many, and after how many the output was identical."""
+    usual = peaceful.seconds()
+    left, killed_in = set(usual), []
+    for _ in range(KILLS_BEFORE_JOBS):
+        kill_after(victim, random.uniform(0.2, 4.0))
+    while left:
+        job = kill_in(victim, left, usual)
+        if job is None:
+            raise Fault(f"these jobs never began: {sorted(left)}\n{_end_of(victim)}")
+        left.remove(job)
+        killed_in.append(job)
+        print(f"killed in {job[1]} of {job[0] or 'all'}", flush=True)
+    _goes_on(victim)
+    same = identical(victim, peaceful)
+    well = [job for job in killed_in if all(same[name] for name in same if _is_of(name, job))]
+    rest = KILLS_BEFORE_JOBS if all(same.values()) else 0
+    _tell(same)
+    return len(killed_in) + KILLS_BEFORE_JOBS, len(well) + rest
+
+
+def full_disk(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+    """Results on a disk that is too small, and grows by little; returns how often a run ended for
+    it and said so, and after how many of these the end was identical."""
+    results = victim.flow.folder / "results"
+    results.mkdir()
+    recordings = peaceful.flow.results / "recordings"
+    taken = sum(file.stat().st_size for file in recordings.rglob("*") if file.is_file()) / 1e6
+    size, ended = taken * 1.05 + FIRST_ROOM_MB, 0
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size:.0f}m", "tmpfs", results], check=True
+    )
+    try:
+        shutil.copytree(recordings, victim.flow.results / "recordings")
+        while True:
+            status, said = victim.go_on()
+            if victim.left_over():
+                raise Fault(f"half-written on a full disk: {victim.left_over()}")
+            if status == 0:
+                break
+            if SAID not in said or "Traceback" in said:
+                raise Fault(f"the full disk is not what was said:\n{said[-3000:]}")
+            ended += 1
+            size += MORE_ROOM_MB
+            print(f"a disk of {size - MORE_ROOM_MB:.0f} MB was full, and it was said", flush=True)
+            subprocess.run(["mount", "-o", f"remount,size={size:.0f}m", results], check=True)
+        same = identical(victim, peaceful)
+        _tell(same)
+        return ended, ended if all(same.values()) else 0
+    finally:
+        subprocess.run(["umount", results], check=False)
+
+
+def damaged(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+    """Each artefact, one at a time and then all at once; returns how many were damaged, and how
+    many were made again as they were."""
+    shutil.copytree(peaceful.flow.results, victim.flow.results)
+    wanted = identical(victim, peaceful)
+    if not all(wanted.values()):
+        raise Fault("a copy is not a copy")
+    paths = [
+        path
+        for stage in SEQUENCE_STAGES
+        for path in sorted(victim.flow.results.glob(f"*/{stage}.h5"))
+    ]
+    paths += [victim.flow.results / name for name in ("heatmaps.h5", "summary.json")]
+    random.shuffle(paths)
+    done = good = 0
+    for some in ([paths[0]], [paths[1]], paths[2:]):
+        for path in some:
+            name = path.relative_to(victim.flow.results)
+            print(f"{name}: {damage(path)}", flush=True)
+        _goes_on(victim)
+        same = identical(victim, peaceful)
+        _tell(same)
+        done += len(some)
+        good += sum(same[path.relative_to(victim.flow.results).as_posix()] for path in some)
+    return done, good
+
+
+def clock_jumps(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+    """A run whose clock is days ahead is killed, one goes on whose clock is days behind and is
+    killed, and one goes on by the true clock; returns jumps, and how many ended identical."""
+    half = sum(peaceful.seconds().values()) / 4
+    for days in (3, -5):
+        run = victim.start({
+            "LD_PRELOAD": str(FAKETIME), "FAKETIME": f"{days * DAY_S:+d}s",
+            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        })  # fmt: skip
+        time.sleep(half)
+        victim.kill(run)
+        print(f"killed by a clock {days:+d} days off", flush=True)
+    _goes_on(victim)
+    same = identical(victim, peaceful)
+    _tell(same)
+    return 2, 2 if all(same.values()) else 0
+
+
+def _goes_on(victim: Victim) -> None:
+    status, said = victim.go_on()
+    if status:
+        raise Fault(f"the run did not go on:\n{said[-4000:]}")
+    if victim.left_over():
+        raise Fault(f"left half-written: {victim.left_over()}")
+
+
+def _is_of(name: str, job: tuple[str, str]) -> bool:
+    """Whether a file of the results is what a job makes."""
+    sequence, stage = job
+    if not sequence:
+        return name.count("/") == 0 or name.startswith("tables/") or name == "site/index.html"
+    places = {
+        "studio": f"recordings/{sequence}/", "page": f"site/sequences/{sequence}/",
+        "export": f"{sequence}/export/",
+    }  # fmt: skip
+    return name.startswith(places.get(stage, f"{sequence}/{stage}.h5"))
+
+
+def _tell(same: dict[str, bool]) -> None:
+    other = sorted(name for name in same if not same[name])
+    print(f"{len(same)} files, {len(other)} of them not identical {other[:8] or ''}", flush=True)
+
+
+def _end_of(victim: Victim) -> str:
+    return victim.flow.transcript.read_text(errors="replace")[-3000:]
+
+
+Round = Callable[[Victim, Victim], tuple[int, int]]
+ROUNDS: dict[str, tuple[Round, str]] = {
+    "kills": (killed, ""),
+    "full_disks": (full_disk, "" if os.geteuid() == 0 else "no tmpfs can be mounted: not root"),
+    "damaged": (damaged, ""),
+    "clock_jumps": (clock_jumps, "" if FAKETIME.is_file() else f"no {FAKETIME}: install faketime"),
+}
+
+
+def main() -> int:
+    """Run the rounds; returns 1 where an end was not identical, or a round could not be run."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seed", type=int, default=None, help="of the random moments")
+    parser.add_argument("--rounds", nargs="*", default=list(ROUNDS), choices=list(ROUNDS))
+    arguments = parser.parse_args()
+    seed = arguments.seed if arguments.seed is not None else random.randrange(10**6)
+    random.seed(seed)
+    print(f"seed {seed}", flush=True)
+    figures: dict[str, float] = {}
+    tried = survived = 0
+    with tempfile.TemporaryDirectory() as folder:
+        peaceful = _copy(Path(folder), "peaceful")
+        _goes_on(peaceful)
+        for name in arguments.rounds:
+            run, missing = ROUNDS[name]
+            if missing:
+                print(f"{name}: {missing}")
+                continue
+            print(f"{name}:", flush=True)
+            try:
+                count, well = run(peaceful, _copy(Path(folder), name))
+            except (Fault, AssertionError) as fault:
+                print(f"{name}: {fault}")
+                count, well = 1, 0
+            figures[name] = count
+            tried, survived = tried + count, survived + well
+    figures |= {"identical": survived / max(tried, 1)}
+    for name, value in figures.items():
+        print(f"chaos.{name}: {value:g}")
+    add_figures(OUTPUT, "chaos", figures)
+    return 0 if survived == tried and tried else 1
+
+
+def _copy(folder: Path, name: str) -> Victim:
+    (folder / name).mkdir()
+    return Victim(Flow.copy(folder / name))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

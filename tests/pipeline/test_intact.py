@@ -1,0 +1,109 @@
+"""Results that changed after they were made are read through; a full disk leaves none behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core import artefacts, schemas
+from intercap_core.pipeline.intact import damage_of, is_as_left, note
+
+WRITES = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from intercap_core import artefacts
+from intercap_core.artefacts import Field, Schema
+from intercap_core.disk import fault_in
+schema = Schema("some", 1, "frames", {"rows": Field(("T", "100"), "float64", "noise")})
+values = np.random.default_rng(0).random((20, 100))
+path, unharmed = Path(sys.argv[1]), Path(sys.argv[2])
+for limit in range(0, 420_000, 7_001):  # bytes that the disk takes
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        with artefacts.write(path, schema) as writer:
+            rows = writer.stream("rows", (100,))
+            for _ in range(20):
+                rows.append(values)
+        artefacts.put_made_from(path, "of this")
+        said = "whole"
+    except OSError as error:
+        said = "full" if fault_in(error) is not None else repr(error)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    print(said, len(list(path.parent.iterdir())))
+    path.unlink(missing_ok=True)
+unharmed.touch()
+"""
+
+
+@pytest.fixture
+def summary(tmp_path: Path) -> Path:
+    """An artefact of some rows, under the name that its stage gives it."""
+    path = tmp_path / "s01" / "object_track.h5"
+    schema = schemas.OBJECT_TRACK
+    with artefacts.write(path, schema, **dict.fromkeys(schema.attributes, "x")) as writer:
+        for key, declared in schema.fields.items():
+            if not declared.optional and "{camera}" not in key:
+                shape = [int(dim) if dim.isdigit() else 40 for dim in declared.dims]
+                text = declared.dtype == "str"
+                writer.put(key, ["words"] * 40 if text else np.ones(shape, declared.dtype))
+    return path
+
+
+def test_a_result_is_known_again_until_it_changes(summary: Path) -> None:
+    assert not is_as_left(summary) and damage_of(summary) == ""
+    note(summary)
+    assert is_as_left(summary)
+    os.utime(summary, (1.0, 1.0))
+    assert not is_as_left(summary) and damage_of(summary) == ""
+    with summary.open("ab") as file:  # which no checksum lies over
+        file.write(b"more")
+    assert "is not as it was written" in damage_of(summary)
+    note(summary)
+    assert is_as_left(summary)
+    (summary.with_name(".outputs.json")).write_text("[1, ")
+    assert not is_as_left(summary)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_a_flipped_bit_and_a_cut_are_found(summary: Path, share: float) -> None:
+    whole = summary.read_bytes()
+    where = whole.rindex(b"\x78\x01", 0, int(share * len(whole)) + 4000)  # of compressed numbers
+    flipped = bytearray(whole)
+    flipped[where + 3] ^= 0x10
+    summary.write_bytes(flipped)
+    assert "delete" in damage_of(summary) and str(summary) in damage_of(summary)
+    summary.write_bytes(whole[: int(share * len(whole))])
+    assert "delete" in damage_of(summary)
+
+
+def test_a_changed_file_of_an_export_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "export"
+    folder.mkdir()
+    (folder / "res.pkl").write_bytes(b"numbers")
+    digest = "2bcd5ff1ab4c3bb3ff8a3ab8c86a0c4e37cbb2f4ea8b9f2f6d9f5e3c4b2a1d0e"
+    (folder / "export.json").write_text(json.dumps({"files": {"res.pkl": digest}}))
+    assert "res.pkl: is not as it was written" in damage_of(folder)
+    (folder / "export.json").write_text(json.dumps({"files": {}}))
+    assert damage_of(folder) == ""
+
+
+def test_wherever_the_disk_ends_nothing_is_left_and_no_process_crashes(tmp_path: Path) -> None:
+    results, unharmed = tmp_path / "results", tmp_path / "unharmed"
+    results.mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", WRITES, str(results / "a.h5"), str(unharmed)],
+        capture_output=True, text=True, cwd=Path(__file__).parents[2],
+    )  # fmt: skip
+    assert done.returncode == 0 and unharmed.is_file(), done.stderr[-2000:]
+    said = done.stdout.split("\n")[:-1]
+    assert set(said) == {"full 0", "whole 1"}
+    assert said == sorted(said), "more room, and yet it failed"

@@ -1,0 +1,68 @@
+"""Killed, told to end, or met with damaged results: the same command goes on to the same bytes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.chaos.victim import Victim, damage, identical, kill_in
+from tests.helpers.flow import ONE, OTHER, Flow
+
+ENDS_WITHIN_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def peaceful(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
+    """The finished run, with what the copy of another path adds or leaves out."""
+    return _copied(flow, tmp_path_factory.mktemp("peaceful"))
+
+
+@pytest.fixture
+def victim(peaceful: Victim, tmp_path_factory: pytest.TempPathFactory) -> Victim:
+    """A copy of it in another place, without Snakemake's own folder."""
+    return _copied(peaceful.flow, tmp_path_factory.mktemp("victim"))
+
+
+def _copied(flow: Flow, folder: Path) -> Victim:
+    other = Victim(Flow.copy(folder))
+    shutil.copytree(flow.results, other.flow.results)
+    return other
+
+
+def test_killed_in_a_stage_and_with_damaged_results_it_goes_on(
+    victim: Victim, peaceful: Victim
+) -> None:
+    victim.flow.artefact(ONE, "person").unlink()
+    assert kill_in(victim, {(ONE, "person")}, {(ONE, "person"): 2.0}) == (ONE, "person")
+    assert not victim.flow.artefact(ONE, "person").exists()
+    cut, flipped = victim.flow.artefact(OTHER, "scene"), victim.flow.results / "heatmaps.h5"
+    cut.write_bytes(cut.read_bytes()[:-1000])
+    damage(flipped)
+    status, said = victim.go_on()
+    assert status == 0, said[-3000:]
+    assert "was killed: going on where it stopped" in said
+    assert victim.left_over() == []
+    assert [name for name, same in identical(victim, peaceful).items() if not same] == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_told_to_end_it_says_so_once_and_leaves_nothing(victim: Victim, number: int) -> None:
+    victim.flow.artefact(ONE, "person").unlink()
+    began = time.time() - 1.0
+    run = victim.start()
+    while not victim.running(began):
+        assert run.poll() is None
+        time.sleep(0.1)
+    os.kill(run.pid, number) if number == signal.SIGTERM else os.killpg(run.pid, number)
+    name = signal.Signals(number).name
+    assert run.wait(ENDS_WITHIN_S) == 128 + number
+    said = victim.flow.transcript.read_text()
+    assert f"told to end ({name}): " in said and "Traceback" not in said
+    told = (victim.logs / ONE / "person.log").read_text()
+    assert told.rstrip().splitlines()[-1].partition("failed: ")[2].startswith("unexpected end")
+    assert victim.left_over() == [] and not victim.flow.artefact(ONE, "person").exists()
