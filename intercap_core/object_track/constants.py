@@ -302,7 +302,10 @@ RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to whic
 UPRIGHT_LOG_RATIO = (
     2.0  # times the cosine of the angle to its standing pose: few mugs are upside down
 )
-ANNOTATION_LOG_RATIO = 10.0  # of the pose that a person gave, of one frame on its own
+# Of the pose that a person gave, of one frame on its own, at that pose; and of its being anywhere in
+# that frame: as much as it costs to appear in it and to leave after it.
+ANNOTATION_LOG_RATIO = 10.0
+ANNOTATED_LOG_RATIO = VANISH_COST + APPEAR_COST + 2 * LEAVE_COST
 UNDONE_LOG_RATIO = 10.0  # nats that a pose loses by the motion through it, and is hardly seen then
 RELOOK_LOG_RATIO = 2.0  # nats by which a smoothed pose may be less likely and is looked at again
 APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite different: lost
@@ -391,6 +394,11 @@ NEAR_TURN_DISTINCT_DEG = 45.0
 
 # Standard deviations that are as good as lost: one frame in six would be off by more.
 UNSURE_M, UNSURE_RAD = 0.035, np.radians(15)
+# Standard deviations of a given pose, beyond what is one pose, at which another one contradicts it.
+GIVEN_SIGMAS = 3.0
+# Standard deviation of its place, metres, up to which a pose is carried from given ones through
+# frames that show nothing: beyond, the joint fit bridges a lost object as well.
+CARRIED_M = 0.15
 # Out of sight for less, seconds, between poses that are as good as one: it stayed there.
 BRIDGED_S = 0.3
 # Nats by which a hand is likelier than any other way of what is lost, from which it surely has it:
