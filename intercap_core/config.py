@@ -711,8 +711,8 @@ class Annotation(Model):
     contact: tuple[ContactInterval, ...] | None = None
     """Frames in which body parts touch the object; absent = find them."""
     object_poses: tuple[ObjectPose, ...] = ()
-    """Where the object is in some frames, for where it is not found or is mistaken; its track agrees
-    with them, and is carried from them where nothing is seen of it. Empty = search."""
+    """Where the object is in some frames; its track agrees with them, and is carried from them
+    where nothing is seen of it; empty = search."""
     object_pose: ObjectPose | None = None
     """The same where there is one frame alone, instead of ``object_poses``."""
     floor: tuple[Position, ...] | None = None
@@ -721,8 +721,7 @@ class Annotation(Model):
     """Who of several people is the subject; more than one point where it left and came back;
     absent = who handles the object, or is seen most."""
     left_right: tuple[ExchangedSides, ...] = ()
-    """Where the subject's left and right are exchanged in the detected keypoints; they are exchanged
-    back before anything is made of them."""
+    """Where a detector exchanged the subject's left and right: they are exchanged back."""
     drop_frames: tuple[FrameNumber, ...] = ()
     """Frame sets to treat as not recorded."""
     starts: dict[CameraName, Start] | None = None

@@ -302,8 +302,8 @@ RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to whic
 UPRIGHT_LOG_RATIO = (
     2.0  # times the cosine of the angle to its standing pose: few mugs are upside down
 )
-# Of the pose that a person gave, of one frame on its own, at that pose; and of its being anywhere in
-# that frame: as much as it costs to appear in it and to leave after it.
+# Nats of one frame on its own for the pose that a person gave of it; and for the object's being in
+# it at all, wherever: as much as it costs to come for that frame alone.
 ANNOTATION_LOG_RATIO = 10.0
 ANNOTATED_LOG_RATIO = VANISH_COST + APPEAR_COST + 2 * LEAVE_COST
 UNDONE_LOG_RATIO = 10.0  # nats that a pose loses by the motion through it, and is hardly seen then
@@ -396,6 +396,9 @@ NEAR_TURN_DISTINCT_DEG = 45.0
 UNSURE_M, UNSURE_RAD = 0.035, np.radians(15)
 # Standard deviations of a given pose, beyond what is one pose, at which another one contradicts it.
 GIVEN_SIGMAS = 3.0
+# Nats that a frame's images say against it, at which they contradict it clearly: two or three views
+# see past it. One in which something else hides it says up to 6, and so much is chance.
+DENIED_LOG_RATIO = -25.0
 # Standard deviation of its place, metres, up to which a pose is carried from given ones through
 # frames that show nothing: beyond, the joint fit bridges a lost object as well.
 CARRIED_M = 0.15

@@ -102,7 +102,9 @@ class GivenEvidence:
         for given in held:
             t = given.frame
             found.about[t] = mesh.symmetry.nearest_equivalent_pose(given.pose, poses[t])
-            found.information[t] = _information(mesh, found.about[t], given.sigma_m, given.sigma_rad)
+            found.information[t] = _information(
+                mesh, found.about[t], given.sigma_m, given.sigma_rad
+            )
         since = seconds_since([given.frame for given in held], unseen, times)
         for t in np.flatnonzero(np.isfinite(since)).tolist():
             found.reached[t] = unseen[t]
@@ -174,7 +176,9 @@ def against(
     )
 
 
-def _information(mesh: ObjectMesh, pose: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
+def _information(
+    mesh: ObjectMesh, pose: np.ndarray, sigma_m: float, sigma_rad: float
+) -> np.ndarray:
     """Information (6, 6) of (turn on the left, shift of the origin) of a pose (4, 4) whose centre
     and turn have these deviations."""
     arm = pose[:3, :3] @ mesh.centre_of_mass

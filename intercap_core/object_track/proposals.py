@@ -10,7 +10,7 @@ import numpy as np
 from intercap_core.object_track.constants import (
     ANNOTATION_FRAMES,
     BASIN,
-    CONTRADICTED_LOG_RATIO,
+    DENIED_LOG_RATIO,
     DOUBTFUL_PROBABILITY,
     DOUBTFUL_SHARE,
     FIT_ROUNDS,
@@ -112,7 +112,7 @@ class Proposals:
         found = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
         if not found or not given.holds(self._observer.mesh, wide.pose):
             own = self._observer.fit(t, pose, given.prior, FIT_ROUNDS)
-            if own.log_ratio > CONTRADICTED_LOG_RATIO:
+            if own.log_ratio > DENIED_LOG_RATIO:
                 found.append(own)
         if not found:
             return self._annotated_beside(given)

@@ -137,7 +137,9 @@ class Tracker:
         # a recording that is shorter than one independent look is one all the same
         share = max(self._share, 1 / max(len(final), 1))
         evidence = share * sum(frame.fit.log_ratio for frame in final if not frame.lost)
-        doubts = [told for one, taken in annotated if (told := against(self._mesh, one, taken, final))]
+        doubts = [
+            told for one, taken in annotated if (told := against(self._mesh, one, taken, final))
+        ]
         borne_out = not given or any(
             one.holds(self._mesh, final[one.frame].fit.pose) for one in placed
         )

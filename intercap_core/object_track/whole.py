@@ -13,6 +13,7 @@ from intercap_core.object_track.constants import (
     BRIDGED_S,
     COMMON_ERROR_VARIANCE,
     CONTRADICTED_LOG_RATIO,
+    DENIED_LOG_RATIO,
     FREE_AXIS_SIGMA_RAD,
     RELOOK_LOG_RATIO,
     REST_FRAMES_SEEN_AGAIN,
@@ -56,7 +57,7 @@ class WholeTrack:
         contradict, or where those around for a moment are at like poses. A frame that smoothing
         moves far from its own fit becomes lost, unless they support the smoothed pose, and so does
         one whose final pose they contradict. Where they show nothing, from a given pose on, it is
-        carried from there.
+        carried from there, and in doubt in all frames but those that poses are given of.
         """
         lost = np.array([frame.lost for frame in frames])
         lost[[given.frame for given in held]] = False
@@ -68,7 +69,10 @@ class WholeTrack:
         # what was decided may have fitted one moment and not the motion through it
         undone = (ratio < SEEN_LOG_RATIO) & (ratio < decided - UNDONE_LOG_RATIO)
         contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
+        contradicted &= ~reached | (ratio < DENIED_LOG_RATIO)
         lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
+        doubtful = reached.copy()
+        doubtful[[given.frame for given in held]] = False
         poses = np.array([fit.pose for fit in fits])
         lost &= contradicted | ~(in_hand | reached | self._nowhere(poses, lost))
         return [
@@ -79,10 +83,11 @@ class WholeTrack:
                 gone=frame.gone and bool(unseen),
                 resting=bool(number >= 0),
                 free_axis=axis,
-                carried=bool(given and not unseen),
+                ambiguous=frame.ambiguous or bool(doubt),
+                carried=bool(nothing),
             )
-            for frame, fit, number, axis, unseen, given in zip(
-                frames, fits, segment, free_axis, lost, reached, strict=True
+            for frame, fit, number, axis, unseen, nothing, doubt in zip(
+                frames, fits, segment, free_axis, lost, reached, doubtful, strict=True
             )
         ]
 

@@ -43,9 +43,9 @@ def run(
     """Track the object through the recording and write the object_track artefact.
 
     Where ``object_`` is None, a person alone, or the images show nothing of it, it says so: lost in
-    every frame, without a pose. It agrees with the annotated ``poses`` of some frames where the images do
-    not contradict them; without any, it is searched for. Raises UserError where the mesh or an
-    input artefact is unusable, or a pose is of a frame that is not there.
+    every frame, without a pose. The track agrees with the annotated ``poses`` of some frames unless
+    the images contradict them clearly; without any, it is searched for. Raises UserError where the
+    mesh or an input artefact is unusable, or a pose is of a frame that is not there.
     """
     if object_ is None:
         with Frames.open(frames) as recording:

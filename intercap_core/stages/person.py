@@ -49,9 +49,9 @@ def run(
     """Find the subject by geometry and write the person artefact.
 
     Of several people it is who is at the annotation's ``subject_points``, or who handles the object
-    (its entry tells the labels of its candidates), or who is seen most near the middle. Its left and
-    right are exchanged where ``left_right`` says that a detector exchanged them. A set in
-    which one view alone sees the subject takes its points from that view's depth; sets in which
+    (its entry tells the labels of its candidates), or who is seen most near the middle. Its left
+    and right are exchanged where ``left_right`` says that a detector exchanged them. A set in which
+    one view alone sees the subject takes its points from that view's depth; sets in which
     neither two views nor depth place it are flagged ``missing``. Raises UserError where that is so
     in every set, the inputs are of different captures, or a point names nobody.
     """

@@ -145,7 +145,7 @@ def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
     agree = np.zeros_like(lost)
     return TrackedPoses.from_track(
         state.rotation, state.translation, covariance, lost, agree, agree,
-        visible=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
+        carried=agree, visible=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
         time_offset=np.zeros(3),
     )  # fmt: skip
 
@@ -160,7 +160,8 @@ def test_tracked_poses_follow_the_views_that_they_rest_on():
     lost = np.arange(6) == 5
     tracked = TrackedPoses.from_track(
         np.repeat(np.eye(3)[None], 6, 0), way, np.repeat(np.eye(6)[None], 6, 0), lost, lost,
-        np.zeros(6, bool), visible=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
+        np.zeros(6, bool), carried=np.zeros(6, bool), visible=seen, times=times,
+        time_offset=np.array([0.0, 0.001, 0.0]),
     )  # fmt: skip
     found = tracked.at(np.array([0.0, 0.003, 0.004])).translation - way
     late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
