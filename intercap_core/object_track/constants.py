@@ -302,10 +302,10 @@ RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to whic
 UPRIGHT_LOG_RATIO = (
     2.0  # times the cosine of the angle to its standing pose: few mugs are upside down
 )
-# Nats of one frame on its own for the pose that a person gave of it; and for the object's being in
-# it at all, wherever: as much as it costs to come for that frame alone.
+# Nats of one frame on its own for the pose that a person gave of it; and for all poses within reach
+# of that one: as much as it costs to come there for that frame alone, from elsewhere or from none.
 ANNOTATION_LOG_RATIO = 10.0
-ANNOTATED_LOG_RATIO = VANISH_COST + APPEAR_COST + 2 * LEAVE_COST
+ANNOTATED_LOG_RATIO = 2 * (JUMP_COST + EXCURSION_COST)
 UNDONE_LOG_RATIO = 10.0  # nats that a pose loses by the motion through it, and is hardly seen then
 RELOOK_LOG_RATIO = 2.0  # nats by which a smoothed pose may be less likely and is looked at again
 APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite different: lost

@@ -118,18 +118,20 @@ class GivenEvidence:
                 )
         return replace(found, held=tuple(held))
 
-    def elsewhere(self, mesh: ObjectMesh, poses: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Reached frames (T,) bool in which the object does not rest, as a given pose among them is
-        another one than that of its rest: of poses (T, 4, 4), ``segment`` (T,) numbers the rests.
-        """
+    def moving(self, mesh: ObjectMesh, poses: np.ndarray, segment: np.ndarray) -> np.ndarray:
+        """Reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4) whose
+        rests ``segment`` (T,) numbers: nothing of the rest is seen, or a given pose of it is
+        another one."""
         found = np.zeros(len(segment), bool)
-        for given in self.held:
-            t = given.frame
-            rest = np.flatnonzero((segment == segment[t]) & (segment >= 0) & ~self.reached)
-            if self.reached[t] and len(rest):
-                nearest = rest[np.abs(rest - t).argmin()]
-                if not given.holds(mesh, poses[nearest]):
-                    found |= np.isfinite(seconds_since([t], self.reached, np.arange(len(found))))
+        for number in set(segment[self.reached & (segment >= 0)].tolist()):
+            rest = segment == number
+            seen = np.flatnonzero(rest & ~self.reached)
+            for given in self.held:
+                if rest[given.frame] and len(seen):
+                    nearest = seen[np.abs(seen - given.frame).argmin()]
+                    seen = seen if given.holds(mesh, poses[nearest]) else seen[:0]
+            if not len(seen):
+                found |= rest & self.reached
         return found
 
     def gradient(self, looked: np.ndarray) -> np.ndarray:

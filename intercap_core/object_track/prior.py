@@ -7,11 +7,13 @@ import numpy as np
 from intercap_core.object_track.constants import (
     ANNOTATED_LOG_RATIO,
     ANNOTATION_LOG_RATIO,
+    REACH_M,
     UPRIGHT_LOG_RATIO,
 )
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.steps import apart
 
 
 class Prior:
@@ -46,9 +48,11 @@ class Prior:
             up = self._observer.up / np.linalg.norm(self._observer.up)
             found += UPRIGHT_LOG_RATIO * np.array([fit.pose[:3, 2] @ up for fit in fits])
         if t in self.given and fits:
-            squared = self.given[t].squared(mesh, np.array([fit.pose for fit in fits]))
-            own = np.maximum(ANNOTATION_LOG_RATIO - 0.5 * squared, 0.0)
-            found += (ANNOTATED_LOG_RATIO + own) / self._share
+            poses = np.array([fit.pose for fit in fits])
+            _, shift = apart(mesh, self.given[t].pose[None], poses)
+            squared = self.given[t].squared(mesh, poses)
+            near = np.maximum(ANNOTATION_LOG_RATIO - 0.5 * squared, 0.0)
+            found += (ANNOTATED_LOG_RATIO * (shift[0] < REACH_M) + near) / self._share
         return found
 
 

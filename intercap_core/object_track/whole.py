@@ -28,7 +28,12 @@ from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.free_turns import free_turns, without_turns
-from intercap_core.object_track.given_poses import TURNS_LESS, GivenEvidence, GivenPose
+from intercap_core.object_track.given_poses import (
+    TURNS_LESS,
+    GivenEvidence,
+    GivenPose,
+    seconds_since,
+)
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
@@ -60,9 +65,12 @@ class WholeTrack:
         carried from there, and in doubt in all frames but those that poses are given of.
         """
         lost = np.array([frame.lost for frame in frames])
-        lost[[given.frame for given in held]] = False
         fits = [frame.fit for frame in frames]
         decided = np.array([fit.log_ratio for fit in fits])
+        # what was followed without being seen is left to the given poses
+        at = [given.frame for given in held]
+        lost |= np.isfinite(seconds_since(at, decided < SEEN_LOG_RATIO, self._times))
+        lost[at] = False
         fits, segment, free_axis, pulled, in_hand, reached = self._smoothed(fits, lost, held)
         ratio = np.array([fit.log_ratio for fit in fits])
         reached &= ratio < SEEN_LOG_RATIO
@@ -72,7 +80,7 @@ class WholeTrack:
         contradicted &= ~reached | (ratio < DENIED_LOG_RATIO)
         lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
         doubtful = reached.copy()
-        doubtful[[given.frame for given in held]] = False
+        doubtful[at] = False
         poses = np.array([fit.pose for fit in fits])
         lost &= contradicted | ~(in_hand | reached | self._nowhere(poses, lost))
         return [
@@ -187,7 +195,7 @@ class WholeTrack:
         combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
         centre = self._mesh.centre_of_mass
         segment = resting(combined, self._times, centre)
-        segment[stated.elsewhere(self._mesh, looked, segment)] = -1
+        segment[stated.moving(self._mesh, looked, segment)] = -1
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])
         unseen = [evidence is None for evidence in found]

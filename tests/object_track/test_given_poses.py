@@ -90,6 +90,15 @@ def test_nothing_given_says_nothing():
     assert not found.information.any() and not found.reached.any()
 
 
+def test_a_rest_holds_where_it_is_seen_and_agrees_with_the_given_pose(mesh):
+    poses, segment = np.tile(at(), (6, 1, 1)), np.array([0, 0, 0, 0, 0, -1])
+    for x, seen, moving in ((0.0, True, []), (0.3, True, [2, 3]), (0.0, False, [0, 1, 2, 3, 4])):
+        reached = np.array([not seen, not seen, True, True, not seen, False])
+        held = (GivenPose(2, at(x), 0.01, FIVE),)
+        given = GivenEvidence(poses, np.zeros((6, 6, 6)), reached, held)
+        assert np.flatnonzero(given.moving(mesh, poses, segment)).tolist() == moving
+
+
 def frame(pose: np.ndarray, sigma_m: float = 0.001, **flags) -> FrameResult:
     covariance = np.diag(np.repeat([1e-6, sigma_m**2], 3))
     return FrameResult(Fit(pose, covariance, ()), flags.pop("lost", False), **flags)
