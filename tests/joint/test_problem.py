@@ -169,6 +169,23 @@ def test_tracked_poses_follow_the_views_that_they_rest_on():
     assert np.array_equal(tracked.at(tracked.time_offset).translation, way)
 
 
+def test_carried_poses_keep_their_own_deviations():
+    """They are neither bridged as a lost frame's nor widened as ambiguous, nor looked at."""
+    sigma = np.diag(np.repeat([0.1, 0.02], 3) ** 2)
+    lost, carried, ambiguous = (np.arange(4) == t for t in (1, 2, 3))
+    ambiguous |= carried
+    tracked = TrackedPoses.from_track(
+        np.repeat(np.eye(3)[None], 4, 0), np.zeros((4, 3)), np.repeat(sigma[None], 4, 0), lost,
+        ambiguous, np.zeros(4, bool), carried=carried, visible=np.ones((4, 1), bool),
+        times=np.arange(4.0), time_offset=np.zeros(1),
+    )  # fmt: skip
+    turn, shift = np.linalg.inv(tracked.information)[:, [0, 3], [0, 3]].T ** 0.5
+    assert turn[[0, 2]] == pytest.approx(0.1, rel=0.01)
+    assert shift[[0, 2]] == pytest.approx(0.02, rel=0.01)
+    assert shift[1] > 0.1 and turn[3] > 0.15
+    assert tracked.seen.tolist() == [True, False, False, True]
+
+
 def test_an_object_at_rest_moves_as_one(model, box):
     """A hand that comes down onto it frame by frame moves it once, in all of them."""
     state = _state(model, 0.012)

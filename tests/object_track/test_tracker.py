@@ -327,6 +327,25 @@ def test_stage_says_what_is_wrong(written, tmp_path):
     assert not (tmp_path / "x.h5").exists()
 
 
+def test_stage_writes_what_speaks_against_an_annotated_pose(written, capture, tmp_path, caplog):
+    """One that is right, one that is a metre off."""
+    entry, output = catalogue()["suitcase"], tmp_path / "x.h5"
+    poses = []
+    for t, off in ((1, 0.0), (4, 1.0)):
+        place = capture.poses[t, :3, 3] + off * capture.master_from_room[:3, 2]
+        turn = Rotation.from_matrix(capture.poses[t, :3, :3]).as_rotvec()
+        poses.append(ObjectPose(frame=t, rotation_vector=turn, translation=place))
+    object_track.run(**written, output=output, object_=entry, settings=SETTINGS, poses=poses)
+    with artefacts.read(output, OBJECT_TRACK) as track:
+        assert (
+            track.attributes["seed_source"] == "annotated" and track.attributes["seed_frame"] == 1
+        )
+        told = track.attributes["doubts"]
+        assert "annotated pose of frame 4 (stated to 10 mm" in told and "of frame 1" not in told
+        assert not track["carried"].any() and not track["lost"].any()
+    assert "annotated pose of frame 4" in caplog.text
+
+
 def test_an_object_that_nothing_shows_is_absent(written, tmp_path, caplog):
     """A cup looked for where there is a suitcase: no pose, every frame lost, the reason told."""
     output = tmp_path / "x.h5"
