@@ -628,7 +628,7 @@ class ContactInterval(Model):
         return self
 
 
-class InitialObjectPose(Model):
+class ObjectPose(Model):
     """The object's pose in one frame, in the master camera's frame."""
 
     frame: FrameNumber = 0
@@ -637,6 +637,27 @@ class InitialObjectPose(Model):
     """Axis times angle of master_from_object, radians."""
     translation: Position
     """Of the mesh's origin, metres."""
+    sigma_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.01
+    """Standard deviation of where the object's centre is, along each axis, metres."""
+    sigma_degrees: Annotated[float, Field(gt=0.0, le=90.0)] = 5.0
+    """Standard deviation of the rotation about each axis, degrees."""
+
+
+class ExchangedSides(Model):
+    """Frames in which a detector took the subject's left for its right."""
+
+    start: FrameNumber
+    """First frame set of them, from 0."""
+    end: FrameNumber
+    """First frame set after them."""
+    camera: CameraName | None = None
+    """Name of the camera, as in the calibration; absent = in all cameras."""
+
+    @model_validator(mode="after")
+    def _forward(self) -> ExchangedSides:
+        if self.end <= self.start:
+            raise ValueError(f"no frame from start {self.start} to end {self.end}")
+        return self
 
 
 class SubjectPoint(Model):
@@ -689,13 +710,18 @@ class Annotation(Model):
 
     contact: tuple[ContactInterval, ...] | None = None
     """Frames in which body parts touch the object; absent = find them."""
-    object_pose: InitialObjectPose | None = None
-    """Where the object is in one frame; absent = search."""
+    object_poses: tuple[ObjectPose, ...] = ()
+    """Where the object is in some frames; its track agrees with them, and is carried from them
+    where nothing is seen of it; empty = search."""
+    object_pose: ObjectPose | None = None
+    """The same where there is one frame alone, instead of ``object_poses``."""
     floor: tuple[Position, ...] | None = None
     """Three or more points of the floor, master camera frame, metres; absent = fit."""
     subject: tuple[SubjectPoint, ...] = ()
     """Who of several people is the subject; more than one point where it left and came back;
     absent = who handles the object, or is seen most."""
+    left_right: tuple[ExchangedSides, ...] = ()
+    """Where a detector exchanged the subject's left and right: they are exchanged back."""
     drop_frames: tuple[FrameNumber, ...] = ()
     """Frame sets to treat as not recorded."""
     starts: dict[CameraName, Start] | None = None
@@ -722,10 +748,30 @@ class Annotation(Model):
             raise ValueError("the floor points lie on one line; a plane needs one beside it")
         return self
 
+    @model_validator(mode="after")
+    def _one_pose_a_frame(self) -> Annotation:
+        if self.object_pose is not None and self.object_poses:
+            raise ValueError("object_pose and object_poses are both given; move it into the list")
+        first: dict[int, int] = {}
+        for index, pose in enumerate(self.object_poses):
+            other = first.setdefault(pose.frame, index)
+            if other != index:
+                raise ValueError(
+                    f"object_poses[{other}] and object_poses[{index}] are both of frame "
+                    f"{pose.frame}; keep one"
+                )
+        return self
+
+    @property
+    def poses(self) -> tuple[ObjectPose, ...]:
+        """The object's annotated poses, by frame."""
+        given = self.object_poses if self.object_pose is None else (self.object_pose,)
+        return tuple(sorted(given, key=lambda pose: pose.frame))
+
     def check_object(self, name: str | None) -> str | None:
         """Say which section speaks of an object where the sequence's ``name`` of one is None."""
         if name is None:
-            for section in ("contact", "object_pose"):
+            for section in ("contact", "object_pose", "object_poses"):
                 if getattr(self, section):
                     return f"{section} is annotated, and the sequence names no object"
         return None
@@ -742,7 +788,14 @@ class Annotation(Model):
         return stated
 
     def check_cameras(self, names: Sequence[str], master: str) -> str | None:
-        """Say which start is of none of the cameras ``names``, or that the ``master``'s lacks."""
+        """Say which entry is of none of the cameras ``names``, or that the ``master``'s start
+        lacks."""
+        for index, sides in enumerate(self.left_right):
+            if sides.camera is not None and sides.camera not in names:
+                return (
+                    f"left_right[{index}] names camera {sides.camera!r}, the cameras are "
+                    f"{', '.join(names)}"
+                )
         for name in self.starts or ():
             if name not in names:
                 return f"starts names camera {name!r}, the cameras are {', '.join(names)}"
@@ -762,6 +815,14 @@ class Annotation(Model):
             return (
                 f"object_pose.frame is {self.object_pose.frame}, the recording has {count} frames"
             )
+        for index, pose in enumerate(self.object_poses):
+            if pose.frame >= count:
+                return (
+                    f"object_poses[{index}].frame is {pose.frame}, the recording has {count} frames"
+                )
+        for index, sides in enumerate(self.left_right):
+            if sides.end > count:
+                return f"left_right[{index}].end is {sides.end}, the recording has {count} frames"
         for index, point in enumerate(self.subject):
             if point.frame >= count:
                 return f"subject[{index}].frame is {point.frame}, the recording has {count} frames"

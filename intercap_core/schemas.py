@@ -212,6 +212,7 @@ OBJECT_TRACK = Schema(
         "ambiguous": Field(("T",), "bool", "a quite different pose may be the true one, by images and motion of all frames"),
         "resting": Field(("T",), "bool", "the object does not move"),
         "free_axis": Field(("T", "3"), "float64", "unit axis through the object's origin about which a turn changes nothing that was seen; 0 = none", "1", "master"),
+        "carried": Field(("T",), "bool", "the images show nothing of the object, and its pose follows from annotated ones, in this frame or carried from theirs, as closely as the covariance says; absent: none is annotated", optional=True),
     },
 )  # fmt: skip
 

@@ -16,6 +16,7 @@ from intercap_core.project import Project, load_project
 
 ROOT = Path(__file__).resolve().parents[1]
 HEADER = "sequence\tsubject\tobject\trecordings\tcalibration\n"
+POSE = "{frame: %d, rotation_vector: [0, 0, 0], translation: [0, 0, 1]}"
 
 
 @pytest.fixture
@@ -242,6 +243,28 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
             ["object_pose.translation.2", "millimetres"],
         ),
         ("object_pose: {frame: 0, translation: [0, 0, 1]}\n", ["rotation_vector", "required"]),
+        (
+            f"object_poses: [{POSE % 1}, {POSE % 4}, {POSE % 1}]\n",
+            ["object_poses[0] and object_poses[2] are both of frame 1"],
+        ),
+        (
+            f"object_pose: {POSE % 1}\nobject_poses: [{POSE % 2}]\n",
+            ["object_pose and object_poses are both given"],
+        ),
+        (
+            "object_poses: [{frame: 0, rotation_vector: [0, 0, 0], translation: [0, 0, 1], "
+            "sigma_m: 10}]\n",
+            ["object_poses.0.sigma_m", "1", "10"],
+        ),
+        (
+            "object_poses: [{frame: 0, rotation_vector: [0, 0, 0], translation: [0, 0, 1], "
+            "sigma_degrees: 0}]\n",
+            ["object_poses.0.sigma_degrees", "greater", "0"],
+        ),
+        ("object_poses: {frame: 0}\n", ["object_poses"]),
+        ("left_right: [{start: 3, end: 3}]\n", ["left_right.0", "no frame", "3"]),
+        ("left_right: [{start: 0, end: 3, camera: k/1}]\n", ["left_right.0.camera", "letters"]),
+        ("left_right: [{end: 3}]\n", ["left_right.0.start", "required"]),
         ("drop_frames: [x]\n", ["drop_frames.0", "'x'"]),
         ("subject: [{camera: k1, frame: 0, x: 612}]\n", ["subject.0.y", "required"]),
         ("subject: [{camera: k1, frame: 0, x: .nan, y: 1}]\n", ["subject.0.x", "finite"]),
@@ -305,6 +328,27 @@ def test_a_row_can_name_its_annotation(folder: Path) -> None:
     assert project.annotation("two") == Annotation()
 
 
+def test_one_pose_is_a_list_of_one() -> None:
+    pose = {"frame": 3, "rotation_vector": [0, 0, 1], "translation": [0, 0, 2]}
+    one = Annotation.model_validate({"object_pose": pose})
+    several = Annotation.model_validate({"object_poses": [pose | {"frame": 5}, pose]})
+    assert one.poses == several.poses[:1] and [p.frame for p in several.poses] == [3, 5]
+    assert (one.poses[0].sigma_m, one.poses[0].sigma_degrees) == (0.01, 5.0)
+    assert Annotation().poses == ()
+    assert several.check_object("cup") is None
+    assert "object_poses is annotated" in str(several.check_object(None))
+    assert several.check_frames(6) is None
+    assert "object_poses[0].frame is 5" in str(several.check_frames(5))
+
+
+def test_stated_sides_of_frames_and_cameras_that_are_not_there() -> None:
+    sides = [{"start": 0, "end": 4}, {"start": 2, "end": 9, "camera": "k2"}]
+    stated = Annotation.model_validate({"left_right": sides})
+    assert stated.check_frames(9) is None and stated.check_cameras(["k1", "k2"], "k1") is None
+    assert "left_right[1].end is 9" in str(stated.check_frames(8))
+    assert "left_right[1] names camera 'k2'" in str(stated.check_cameras(["k1", "k3"], "k1"))
+
+
 def test_annotation_past_the_end(folder: Path) -> None:
     annotation = Annotation.model_validate(
         {
@@ -355,7 +399,7 @@ def test_the_default_settings_are_the_defaults() -> None:
 
 def test_the_example_annotation_is_valid() -> None:
     values = yaml.safe_load((ROOT / "config" / "annotations.example.yaml").read_text())
-    assert set(values) == set(Annotation.model_fields)
+    assert {*values, "object_pose"} == set(Annotation.model_fields)  # which is a list of one
     Annotation.model_validate(values)
 
 

@@ -26,7 +26,7 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
 from intercap_core.joint.problem import Problem, joint_terms
-from intercap_core.joint.result import CONTRADICTED
+from intercap_core.joint.result import CARRIED, CONTRADICTED
 from intercap_core.joint.sequential import Flags
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData, Residuals
@@ -284,7 +284,8 @@ def _flag_reasons(
         (flags.filled, "body not seen well enough, filled in"),
         (flags.uncertain, "body not determined by what was seen"),
         (flags.lost, lost),
-        (flags.ambiguous, "object pose ambiguous"),
+        (flags.ambiguous & flags.carried, CARRIED),
+        (flags.ambiguous & ~flags.carried, "object pose ambiguous"),
         (deep, "body deep inside the object"),
         (sunk, "object deep inside the body"),
         *estimate.distrust(),

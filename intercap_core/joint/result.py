@@ -15,7 +15,9 @@ from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State
 from intercap_core.schemas import JOINT
 
-CONTRADICTED = "the images contradict the object's pose"  # among the reasons of a flag
+# Among the reasons of a flag.
+CONTRADICTED = "the images contradict the object's pose"
+CARRIED = "object not seen, carried from annotated poses"
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,15 +31,16 @@ class Flags:
     """Frames (T,) that a sequential fit has flagged.
 
     ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
-    was seen; ``lost`` and ``ambiguous``: the object track's, where an object is named. ``hands``
-    (T, 2), left and right: the hand is not determined by what was seen, or not fitted at all; no
-    reason to flag the frame.
+    was seen; ``lost``, ``ambiguous`` and ``carried``: the object track's, where an object is named.
+    ``hands`` (T, 2), left and right: the hand is not determined by what was seen, or not fitted at
+    all; no reason to flag the frame.
     """
 
     filled: np.ndarray
     uncertain: np.ndarray
     lost: np.ndarray
     ambiguous: np.ndarray
+    carried: np.ndarray
     hands: np.ndarray
 
 
@@ -71,6 +72,7 @@ class SequentialFits:
             uncertain=body["uncertain"],
             lost=lost & named,
             ambiguous=track["ambiguous"],
+            carried=_carried(track),
             hands=_undetermined_hands(body) | filled[:, None],
         )
         resting = track["resting"]
@@ -85,6 +87,7 @@ class SequentialFits:
                 lost,
                 flags.ambiguous,
                 resting,
+                carried=flags.carried,
                 visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
                 times=scene["times"],
                 time_offset=scene["time_offset"],
@@ -98,6 +101,11 @@ class SequentialFits:
             joint_sigma=body["joint_sigma"].astype(float),
             object_sigma=np.where(lost | ~np.isfinite(sigma), UNTRACKED_SIGMA, sigma),
         )
+
+
+def _carried(track: Artefact) -> np.ndarray:
+    """Frames (T,) bool whose pose of the object follows from annotated ones alone."""
+    return np.asarray(track["carried"] if "carried" in track else np.zeros_like(track["lost"]))
 
 
 def _undetermined_hands(body: Artefact) -> np.ndarray:

@@ -302,7 +302,10 @@ RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to whic
 UPRIGHT_LOG_RATIO = (
     2.0  # times the cosine of the angle to its standing pose: few mugs are upside down
 )
-ANNOTATION_LOG_RATIO = 10.0  # of the pose that a person gave, of one frame on its own
+# Nats of one frame on its own for the pose that a person gave of it; and for all poses within reach
+# of that one: as much as it costs to come there for that frame alone, from elsewhere or from none.
+ANNOTATION_LOG_RATIO = 10.0
+ANNOTATED_LOG_RATIO = 2 * (JUMP_COST + EXCURSION_COST)
 UNDONE_LOG_RATIO = 10.0  # nats that a pose loses by the motion through it, and is hardly seen then
 RELOOK_LOG_RATIO = 2.0  # nats by which a smoothed pose may be less likely and is looked at again
 APART_M, APART_RAD = 0.05, np.radians(20)  # poses farther apart are quite different: lost
@@ -391,6 +394,14 @@ NEAR_TURN_DISTINCT_DEG = 45.0
 
 # Standard deviations that are as good as lost: one frame in six would be off by more.
 UNSURE_M, UNSURE_RAD = 0.035, np.radians(15)
+# Standard deviations of a given pose, beyond what is one pose, at which another one contradicts it.
+GIVEN_SIGMAS = 3.0
+# Nats that a frame's images say against it, at which they contradict it clearly: two or three views
+# see past it. One in which something else hides it says up to 6, and so much is chance.
+DENIED_LOG_RATIO = -25.0
+# Standard deviation of its place, metres, up to which a pose is carried from given ones through
+# frames that show nothing: beyond, the joint fit bridges a lost object as well.
+CARRIED_M = 0.15
 # Out of sight for less, seconds, between poses that are as good as one: it stayed there.
 BRIDGED_S = 0.3
 # Nats by which a hand is likelier than any other way of what is lost, from which it surely has it:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from intercap_core.object_track.constants import UNSURE_M, UNSURE_RAD
+from intercap_core.object_track.constants import CARRIED_M, UNSURE_M, UNSURE_RAD
 from intercap_core.object_track.fit import Fit
 from intercap_core.rigid.mesh import ObjectMesh
 
@@ -21,7 +21,7 @@ class FrameResult:
     covariance of (turn on the left, shift) that the other hypotheses add to the fit's;
     ``recovered``: the first frame that is not lost after lost ones; ``free_axis`` (3,), master
     frame: a turn about it through the object's origin changes nothing that was seen, 0 = there is
-    none.
+    none; ``carried``: nothing shows the object, and the pose follows from given ones.
     """
 
     fit: Fit
@@ -33,19 +33,32 @@ class FrameResult:
     recovered: bool = False
     resting: bool = False
     free_axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    carried: bool = False
 
 
 def flagged(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
     """The frames (T) of a final track, lost where their covariance leaves the place open and
-    ambiguous where it leaves the turn; the first after lost ones is recovered."""
+    ambiguous where it leaves the turn; the first after lost ones is recovered.
+
+    One that is carried from given poses is ambiguous where either is open, and lost where it is as
+    good as unknown.
+    """
     result: list[FrameResult] = []
     for frame in frames:
         # other hypotheses count by their probability, not by how far away they are
         shift, turn = _deviations(mesh, frame.fit.pose, frame.fit.covariance)
-        lost = frame.lost or shift > UNSURE_M
-        unsure = frame.ambiguous or turn > UNSURE_RAD
+        lost = frame.lost or shift > (CARRIED_M if frame.carried else UNSURE_M)
+        unsure = frame.ambiguous or turn > UNSURE_RAD or shift > UNSURE_M
         recovered = bool(result) and result[-1].lost and not lost
-        result.append(replace(frame, lost=lost, ambiguous=unsure and not lost, recovered=recovered))
+        result.append(
+            replace(
+                frame,
+                lost=lost,
+                ambiguous=unsure and not lost,
+                recovered=recovered,
+                carried=frame.carried and not lost,
+            )
+        )
     return result
 
 

@@ -61,6 +61,10 @@ class Hypotheses:
         """What speaks for frame t's likeliest hypothesis, nats; 0 where nothing does."""
         return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
 
+    def shown(self, t: int) -> bool:
+        """Whether the images of frame t support any of its hypotheses."""
+        return any(fit.log_ratio > SEEN_LOG_RATIO for fit in self.fits[t])
+
     def add(self, t: int, fit: Fit) -> None:
         """Add a hypothesis of frame t; of two at one pose the likelier stays. Of too many one goes,
         so that turns that nothing tells apart stay spread."""

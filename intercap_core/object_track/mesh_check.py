@@ -23,7 +23,7 @@ from intercap_core.rigid.mesh import ObjectMesh
 def mesh_doubts(observer: Observer, frames: list[FrameResult]) -> list[str]:
     """What speaks against the mesh, in words, none where nothing does; ``frames`` (T) are the final
     track."""
-    believed = [t for t, frame in enumerate(frames) if not frame.lost]
+    believed = [t for t, frame in enumerate(frames) if not (frame.lost or frame.carried)]
     found = []
     if believed:
         likely = float(np.median([frames[t].fit.log_ratio for t in believed]))

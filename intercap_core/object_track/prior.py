@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.object_track.constants import ANNOTATION_LOG_RATIO, UPRIGHT_LOG_RATIO
+from intercap_core.object_track.constants import (
+    ANNOTATED_LOG_RATIO,
+    ANNOTATION_LOG_RATIO,
+    REACH_M,
+    UPRIGHT_LOG_RATIO,
+)
 from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.search import same_pose
+from intercap_core.object_track.steps import apart
 
 
 class Prior:
     """Adds to the likelihoods of hypotheses what all frames and a person say.
 
     ``share`` is how many independent observations a frame is: errors last longer than a frame.
-    ``annotated`` is the frame and the pose (4, 4) that a person gave, fitted.
+    ``given`` are the poses that a person gave, by the frame that they are of.
     """
 
     def __init__(self, observer: Observer, share: float) -> None:
         self._observer = observer
         self._share = share
-        self.annotated: tuple[int, np.ndarray] | None = None
+        self.given: dict[int, GivenPose] = {}
 
     def weigh(self, t: int, fits: list[Fit]) -> np.ndarray:
         """What speaks for hypotheses (K,) of frame t, against that none of them is true, nats.
@@ -41,9 +47,12 @@ class Prior:
         if self._observer.up is not None:
             up = self._observer.up / np.linalg.norm(self._observer.up)
             found += UPRIGHT_LOG_RATIO * np.array([fit.pose[:3, 2] @ up for fit in fits])
-        if self.annotated is not None and self.annotated[0] == t:
-            given = [same_pose(mesh, fit.pose, self.annotated[1]) for fit in fits]
-            found += ANNOTATION_LOG_RATIO / self._share * np.array(given, bool)
+        if t in self.given and fits:
+            poses = np.array([fit.pose for fit in fits])
+            _, shift = apart(mesh, self.given[t].pose[None], poses)
+            squared = self.given[t].squared(mesh, poses)
+            near = np.maximum(ANNOTATION_LOG_RATIO - 0.5 * squared, 0.0)
+            found += (ANNOTATED_LOG_RATIO * (shift[0] < REACH_M) + near) / self._share
         return found
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
 from intercap_core.object_track.constants import (
     ANNOTATION_FRAMES,
     BASIN,
+    DENIED_LOG_RATIO,
     DOUBTFUL_PROBABILITY,
     DOUBTFUL_SHARE,
     FIT_ROUNDS,
@@ -30,6 +32,7 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded
 from intercap_core.object_track.fit import Fit, MotionPrior
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.motion import about
 from intercap_core.object_track.observer import Observer
@@ -97,28 +100,54 @@ class Proposals:
         log.info("first frame %d, %.0f nats", first, best)
         return first
 
-    def annotated(self, frame: int, pose: np.ndarray) -> int | None:
-        """The frame, at or beside the annotated one, in which the annotated ``pose`` (4, 4) is
-        seen, after following it; None where the images show it in none."""
+    def annotated(self, given: GivenPose) -> GivenPose | None:
+        """Follow a pose that a person gave, and take it for its frame's where the images do not
+        contradict it clearly.
+
+        Returns it where they show it there or hide what is there; where they contradict it and show
+        it in a frame beside, as of that frame; None where they show it in none.
+        """
+        t, pose = given.frame, given.pose
+        wide = self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0)
+        found = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
+        if not found or not given.holds(self._observer.mesh, wide.pose):
+            own = self._observer.fit(t, pose, given.prior, FIT_ROUNDS)
+            if own.log_ratio > DENIED_LOG_RATIO:
+                found.append(own)
+        if not found:
+            return self._annotated_beside(given)
+        self._take(given, found)
+        return given
+
+    def _annotated_beside(self, given: GivenPose) -> GivenPose | None:
+        """The given pose as of the frame beside its own that shows it, after following it."""
+        t, pose = given.frame, given.pose
         near = range(
-            max(frame - ANNOTATION_FRAMES, 0),
-            min(frame + ANNOTATION_FRAMES + 1, self._observer.count),
+            max(t - ANNOTATION_FRAMES, 0), min(t + ANNOTATION_FRAMES + 1, self._observer.count)
         )
         found: tuple[int, Fit] | None = None
-        for t in sorted(near, key=lambda t: abs(t - frame)):
-            fit = self._observer.fit(t, pose, MotionPrior(pose), rounds=FIT_ROUNDS, scale=1.0)
+        for u in sorted(near, key=lambda u: abs(u - t)):
+            fit = self._observer.fit(u, pose, MotionPrior(pose), rounds=FIT_ROUNDS, scale=1.0)
             if found is None or fit.log_ratio > found[1].log_ratio + RIVAL_LOG_RATIO:
-                found = t, fit
+                found = u, fit
             if found[1].log_ratio > SEED_SURE_LOG_RATIO:
                 break
-        if found is None or found[1].log_ratio < SEEN_LOG_RATIO:
+        if found is None or found[1].log_ratio < SEEN_LOG_RATIO or found[0] in self._prior.given:
             return None
-        t, fit = found
-        self._prior.annotated = (t, fit.pose)
-        self._searched.add(t)
-        self._observer.places.claim(self._observer.mesh.centre_at(fit.pose))
-        self._hypotheses.follow(t, fit)
-        return t
+        seen = replace(given, frame=found[0], pose=found[1].pose)
+        self._take(seen, [found[1]])
+        return seen
+
+    def _take(self, given: GivenPose, fits: list[Fit]) -> None:
+        """Follow fits of a given pose's frame; the first says where the object is handled."""
+        t = given.frame
+        self._prior.given[t] = given
+        if fits[0].log_ratio > SEEN_LOG_RATIO:
+            self._searched.add(t)
+            self._observer.places.claim(self._observer.mesh.centre_at(fits[0].pose))
+        for fit in fits:
+            if self._hypotheses.known(t, fit.pose) is None:
+                self._hypotheses.follow(t, fit)
 
     # --- where it is not sure ------------------------------------------------------------------
 

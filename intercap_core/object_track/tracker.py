@@ -7,7 +7,7 @@ continuous estimates follow from it: rest, smoothness, covariance (:mod:`.whole`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,13 +31,13 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult, flagged
+from intercap_core.object_track.given_poses import GivenPose, against
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.mesh_check import mesh_doubts
 from intercap_core.object_track.motion import HandMotion, hand_motions
 from intercap_core.object_track.observer import Observer, Pictures
 from intercap_core.object_track.prior import Prior, things
 from intercap_core.object_track.proposals import NotFound, Proposals
-from intercap_core.object_track.search import same_pose
 from intercap_core.object_track.steps import excursions, step_costs, with_excursions
 from intercap_core.object_track.view import View
 from intercap_core.object_track.whole import WholeTrack
@@ -49,9 +49,9 @@ from intercap_core.rigid.twist import step_between
 @dataclass(frozen=True)
 class Track:
     """All frames (T), the frame that the track started from and how its pose was found:
-    ``borne_out``, whether the images support the annotation. ``evidence``: nats that the images of
-    all believed frames say for it, as independent looks. ``doubts`` say in words what speaks
-    against the mesh."""
+    ``borne_out``, whether the track agrees with an annotated pose. ``evidence``: nats that the
+    images of all believed frames say for it, as independent looks. ``doubts`` say in words what
+    speaks against the mesh and against annotated poses."""
 
     frames: list[FrameResult]
     seed_frame: int
@@ -105,14 +105,14 @@ class Tracker:
         self._emissions: list[np.ndarray] = []
         self._steps: list[np.ndarray] = []
 
-    def run(self, initial: tuple[int, np.ndarray] | None = None) -> Track:
-        """Track from an annotated (frame, pose (4, 4)), or from what is searched for.
+    def run(self, given: Sequence[GivenPose] = ()) -> Track:
+        """Track from ``given`` poses, or from what is searched for.
 
         Raises NotFound where no frame shows what could be the object.
         """
-        seed = None if initial is None else self._proposals.annotated(*initial)
-        if seed is None:
-            seed = self._proposals.start()
+        annotated = [(one, self._proposals.annotated(one)) for one in given]
+        placed = [taken for _, taken in annotated if taken is not None]
+        seed = self._start([one.frame for one in placed])
         decoded = self._decode()
         decoded = self._look(decoded)
         if self._proposals.turn(decoded):
@@ -127,17 +127,40 @@ class Tracker:
         if (decoded.path == NOT_SEEN).all():
             raise NotFound
         frames = self._results(decoded)
-        given = self._prior.annotated
-        borne_out = initial is None or (
-            given is not None and same_pose(self._mesh, frames[seed].fit.pose, given[1])
-        )
-        refined = WholeTrack(self._observer, self._times, self._share).refine(frames)
+        held = [
+            one
+            for one, taken in annotated
+            if taken is one and one.holds(self._mesh, frames[one.frame].fit.pose)
+        ]
+        refined = WholeTrack(self._observer, self._times, self._share).refine(frames, held)
         final = flagged(self._mesh, refined)
         # a recording that is shorter than one independent look is one all the same
         share = max(self._share, 1 / max(len(final), 1))
         evidence = share * sum(frame.fit.log_ratio for frame in final if not frame.lost)
-        doubts = mesh_doubts(self._observer, final)
-        return Track(final, seed, initial is not None, evidence, borne_out, tuple(doubts))
+        doubts = [
+            told for one, taken in annotated if (told := against(self._mesh, one, taken, final))
+        ]
+        borne_out = not given or any(
+            one.holds(self._mesh, final[one.frame].fit.pose) for one in placed
+        )
+        doubts += mesh_doubts(self._observer, final)
+        return Track(final, seed, bool(given), evidence, borne_out, tuple(doubts))
+
+    def _start(self, frames: list[int]) -> int:
+        """The frame to start from: the first of the given ``frames`` that shows the object, else
+        one that is searched for, else the first of them.
+
+        Raises NotFound where there is none.
+        """
+        for t in frames:
+            if self._hypotheses.shown(t):
+                return t
+        try:
+            return self._proposals.start()
+        except NotFound:
+            if not frames:
+                raise
+            return frames[0]
 
     def _look(self, decoded: Decoded) -> Decoded:
         """Decide anew until nothing more is found in the frames in doubt."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,8 +12,8 @@ from intercap_core.object_track.constants import (
     BASIN,
     BRIDGED_S,
     COMMON_ERROR_VARIANCE,
-    COMMON_TURN_VARIANCE,
     CONTRADICTED_LOG_RATIO,
+    DENIED_LOG_RATIO,
     FREE_AXIS_SIGMA_RAD,
     RELOOK_LOG_RATIO,
     REST_FRAMES_SEEN_AGAIN,
@@ -27,13 +28,17 @@ from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.free_turns import free_turns, without_turns
+from intercap_core.object_track.given_poses import (
+    TURNS_LESS,
+    GivenEvidence,
+    GivenPose,
+    seconds_since,
+)
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
 from intercap_core.object_track.steps import apart
 from intercap_core.rigid.twist import twists
-
-_TURNS_LESS = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
 
 
 class WholeTrack:
@@ -46,26 +51,38 @@ class WholeTrack:
         self._times = times
         self._share = share
 
-    def refine(self, frames: list[FrameResult]) -> list[FrameResult]:
-        """The frames with the poses, covariances, rests and free axes that all together show.
+    def refine(
+        self, frames: list[FrameResult], held: Sequence[GivenPose] = ()
+    ) -> list[FrameResult]:
+        """The frames with the poses, covariances, rests and free axes that all together show, and
+        that the given poses say that are ``held``.
 
         A lost frame is found again where the likeliest way from the frames before to those after
         leads to a pose that the images support, where a hand surely carried it and they do not
         contradict, or where those around for a moment are at like poses. A frame that smoothing
         moves far from its own fit becomes lost, unless they support the smoothed pose, and so does
-        one whose final pose they contradict.
+        one whose final pose they contradict. Where they show nothing, from a given pose on, it is
+        carried from there, and in doubt in all frames but those that poses are given of.
         """
         lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
         decided = np.array([fit.log_ratio for fit in fits])
-        fits, segment, free_axis, pulled, carried = self._smoothed(fits, lost)
+        # what was followed without being seen is left to the given poses
+        at = [given.frame for given in held]
+        lost |= np.isfinite(seconds_since(at, decided < SEEN_LOG_RATIO, self._times))
+        lost[at] = False
+        fits, segment, free_axis, pulled, in_hand, reached = self._smoothed(fits, lost, held)
         ratio = np.array([fit.log_ratio for fit in fits])
+        reached &= ratio < SEEN_LOG_RATIO
         # what was decided may have fitted one moment and not the motion through it
         undone = (ratio < SEEN_LOG_RATIO) & (ratio < decided - UNDONE_LOG_RATIO)
         contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
+        contradicted &= ~reached | (ratio < DENIED_LOG_RATIO)
         lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
+        doubtful = reached.copy()
+        doubtful[at] = False
         poses = np.array([fit.pose for fit in fits])
-        lost &= contradicted | ~(carried | self._nowhere(poses, lost))
+        lost &= contradicted | ~(in_hand | reached | self._nowhere(poses, lost))
         return [
             replace(
                 frame,
@@ -74,9 +91,11 @@ class WholeTrack:
                 gone=frame.gone and bool(unseen),
                 resting=bool(number >= 0),
                 free_axis=axis,
+                ambiguous=frame.ambiguous or bool(doubt),
+                carried=bool(nothing),
             )
-            for frame, fit, number, axis, unseen in zip(
-                frames, fits, segment, free_axis, lost, strict=True
+            for frame, fit, number, axis, unseen, nothing, doubt in zip(
+                frames, fits, segment, free_axis, lost, reached, doubtful, strict=True
             )
         ]
 
@@ -92,21 +111,25 @@ class WholeTrack:
     # --- all frames together -------------------------------------------------------------------
 
     def _smoothed(
-        self, fits: list[Fit], lost: np.ndarray
-    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        self, fits: list[Fit], lost: np.ndarray, held: Sequence[GivenPose]
+    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
-        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show and
-        in which lost ones a hand surely carries it."""
+        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show, in
+        which lost ones a hand surely carries it, and which are reached from the poses ``held``."""
         poses = np.array([fit.pose for fit in fits])
         filled = fill(self._observer, poses, lost, self._times, self._share)
         poses = filled.poses
         motion = twists(poses, ~lost, self._times)
+        blind = lost.copy()
+        for given in held:
+            blind[given.frame] |= fits[given.frame].log_ratio < SEEN_LOG_RATIO
         found = [
-            None if lost[t] else self._observer.evidence(t, poses[t], motion[t])
+            None if blind[t] else self._observer.evidence(t, poses[t], motion[t])
             for t in range(len(fits))
         ]
+        stated = self._stated(held, poses, found)
         looked = poses.copy()
-        track, covariance, segment = self._solved(looked, found, filled, poses)
+        track, covariance, segment = self._solved(looked, found, filled, stated, poses)
         motion = twists(track, np.ones(len(fits), bool), self._times)
         motion[segment >= 0] = 0
         for t in reversed(
@@ -117,8 +140,8 @@ class WholeTrack:
             least = SEEN_LOG_RATIO if before is None else _ratio(before) - RELOOK_LOG_RATIO
             if _ratio(again) > least:
                 found[t], looked[t] = again, track[t]
-        track, covariance, segment = self._solved(looked, found, filled, track)
-        covariance *= np.outer(_TURNS_LESS, _TURNS_LESS)
+        track, covariance, segment = self._solved(looked, found, filled, stated, track)
+        covariance *= np.outer(TURNS_LESS, TURNS_LESS)
         free = self._free_axes(track, covariance)
         result = [
             Fit(pose, own, seen.reports if seen else fit.views, twist)
@@ -130,10 +153,20 @@ class WholeTrack:
         known = np.array([seen is not None for seen in found])
         pulled = (shift > UNSURE_M) & known
         differs = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1])))
-        for t in map(int, np.flatnonzero(differs | lost)):
+        for t in map(int, np.flatnonzero(differs | blind)):
             seen = self._observer.assess(t, track[t], twist=motion[t])
             result[t] = replace(result[t], views=seen.views)
-        return result, segment, free, pulled, filled.sure
+        return result, segment, free, pulled, filled.sure, stated.reached
+
+    def _stated(
+        self, held: Sequence[GivenPose], poses: np.ndarray, found: list[PoseEvidence | None]
+    ) -> GivenEvidence:
+        """What the given poses ``held`` say beside the ``poses`` (T, 4, 4), at which this was
+        ``found``."""
+        if not held:
+            return GivenEvidence.none(poses)
+        unseen = np.array([seen is None or _ratio(seen) < SEEN_LOG_RATIO for seen in found])
+        return GivenEvidence.of(self._mesh, held, poses, unseen, self._times, self._share)
 
     def _between(self, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far (T,) two tracks' poses (T, 4, 4) are turned, radians, and their centres apart,
@@ -147,10 +180,11 @@ class WholeTrack:
         looked: np.ndarray,
         found: list[PoseEvidence | None],
         filled: Filled,
+        stated: GivenEvidence,
         start: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
-        rests, for which what is ``filled`` in does not count."""
+        rests, for which what is ``filled`` in or ``stated`` does not count."""
         count = len(looked)
         noise = COMMON_ERROR_VARIANCE * views_noise([e for e in found if e is not None])
         information, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
@@ -161,6 +195,7 @@ class WholeTrack:
         combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
         centre = self._mesh.centre_of_mass
         segment = resting(combined, self._times, centre)
+        segment[stated.moving(self._mesh, looked, segment)] = -1
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])
         unseen = [evidence is None for evidence in found]
@@ -168,6 +203,8 @@ class WholeTrack:
         hand = self._share * filled.hand
         information[unseen] = (hand + filled.images / noise)[unseen]
         gradient[unseen] = filled.pull[unseen] * (self._share - 1 / noise)
+        information += stated.information
+        gradient += stated.gradient(looked)
         combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
         poses, covariance = smooth(combined, start, node, self._times, centre)
         return poses, covariance, segment

@@ -68,9 +68,10 @@ def arguments(
         "frames_to_drop": annotation.drop_frames,
         "floor": annotation.floor,
         "starts": annotation.stated_starts,
-        "initial": annotation.object_pose,
+        "poses": annotation.poses,
         "contact": annotation.contact,
         "subject_points": annotation.subject,
+        "left_right": annotation.left_right,
     }
     return {name: known[name] for name in stage_code(stage).parameters if name in known}
 

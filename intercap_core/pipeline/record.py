@@ -181,9 +181,10 @@ _LABELS = {
     "frames_to_drop": "annotation, drop_frames",
     "floor": "annotation, floor",
     "starts": "annotation, starts",
-    "initial": "annotation, object_pose",
+    "poses": "annotation, object_poses",
     "contact": "annotation, contact",
     "subject_points": "annotation, subject",
+    "left_right": "annotation, left_right",
 }
 
 

@@ -39,6 +39,7 @@ TRACK_STATES = {
     "moving": "tracked",
     "resting": "at rest",
     "doubtful": "another pose may be the true one",
+    "carried": "not seen, carried from annotated poses",
     "lost": "lost",
     "gone": "not seen for so long that it seems to have left",
 }
@@ -100,7 +101,13 @@ def read_track(
             overlap=track["overlap"],
             depth=track["depth_residual"],
             contour=track["silhouette_residual"],
-            state=_states(track["gone"], track["lost"], track["ambiguous"], track["resting"]),
+            state=_states(
+                gone=track["gone"],
+                lost=track["lost"],
+                carried=track["carried"] if "carried" in track else np.zeros_like(track["lost"]),
+                doubtful=track["ambiguous"],
+                resting=track["resting"],
+            ),
             sigma_mm=1e3 * _largest(covariance[:, 3:, 3:]),
             sigma_deg=np.degrees(_largest(covariance[:, :3, :3])),
             recovered=np.flatnonzero(track["recovered"]).tolist(),
@@ -167,12 +174,11 @@ def context(facts: TrackFacts) -> dict[str, Any]:
     }
 
 
-def _states(
-    gone: np.ndarray, lost: np.ndarray, doubtful: np.ndarray, resting: np.ndarray
-) -> list[str]:
+def _states(**flags: np.ndarray) -> list[str]:
+    """The state (T,) of each frame: the first of the ``flags`` (T,) that is set, by their names."""
     return [
-        "gone" if g else "lost" if a else "doubtful" if b else "resting" if c else "moving"
-        for g, a, b, c in zip(gone, lost, doubtful, resting, strict=True)
+        next((name for name, own in zip(flags, of_frame, strict=True) if own), "moving")
+        for of_frame in zip(*flags.values(), strict=True)
     ]
 
 
@@ -183,7 +189,7 @@ def _grade(overlap: float) -> str:
 def _counted(facts: TrackFacts) -> str:
     parts = [
         f"{n} {word}"
-        for word in ("gone", "lost", "doubtful", "resting")
+        for word in ("gone", "lost", "carried", "doubtful", "resting")
         if (n := facts.state.count(word))
     ]
     return " · ".join(parts) or "no frame in doubt"

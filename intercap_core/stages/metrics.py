@@ -21,6 +21,7 @@ from intercap_core.config import (
     SubjectEntry,
     digest,
 )
+from intercap_core.joint.result import CARRIED
 from intercap_core.metrics import body, motion, object_pose
 from intercap_core.metrics import truth as truths
 from intercap_core.metrics.exchanged import exchanged
@@ -173,6 +174,7 @@ def _stated(
     with artefacts.read(object_track, OBJECT_TRACK) as artefact:
         named = bool(artefact.attributes["object"])
         lost, ambiguous = artefact["lost"] & named, artefact["ambiguous"]
+        carried = artefact["carried"] if "carried" in artefact else np.zeros_like(lost)
     with artefacts.read(body_fit, BODY_FIT) as artefact:
         failed, bridged = artefact["failed"], artefact["bridged"]
         uncertain = artefact["uncertain"]
@@ -186,7 +188,8 @@ def _stated(
             (unseen, "no images"),
             (missing & ~unseen, "person seen in fewer than two views, without depth"),
             (lost & alone, "object lost"),
-            (ambiguous & ~lost & alone, "object pose ambiguous"),
+            (ambiguous & carried & alone, CARRIED),
+            (ambiguous & ~lost & ~carried & alone, "object pose ambiguous"),
             (failed & alone, "body fit failed"),
             (bridged & ~failed & alone, "body filled in from neighbouring frames"),
             (uncertain & alone, "body not determined by what was seen"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.camera.transforms import rigid
 from intercap_core.capture.frames import Frames
-from intercap_core.config import InitialObjectPose, ObjectEntry, ObjectTrackSettings, digest
+from intercap_core.config import ObjectEntry, ObjectPose, ObjectTrackSettings, digest
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
 from intercap_core.object_track.absent import NOT_NAMED, SOURCE, absent_track
 from intercap_core.object_track.constants import NOTHING_LOG_RATIO, TOLD_SHARE, TRACKING_FACES
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.recording import ObjectRecording
@@ -36,13 +38,14 @@ def run(
     output: Path,
     object_: ObjectEntry | None,
     settings: ObjectTrackSettings,
-    initial: InitialObjectPose | None = None,
+    poses: Sequence[ObjectPose] = (),
 ) -> None:
     """Track the object through the recording and write the object_track artefact.
 
     Where ``object_`` is None, a person alone, or the images show nothing of it, it says so: lost in
-    every frame, without a pose. The start is ``initial`` where annotated, else searched for. Raises
-    UserError where the mesh or an input artefact is unusable.
+    every frame, without a pose. The track agrees with the annotated ``poses`` of some frames unless
+    the images contradict them clearly; without any, it is searched for. Raises UserError where the
+    mesh or an input artefact is unusable, or a pose is of a frame that is not there.
     """
     if object_ is None:
         with Frames.open(frames) as recording:
@@ -78,7 +81,7 @@ def run(
             paint=Paint.load(Path(object_.mesh), mesh),
         )
         try:
-            track = tracker.run(_start(initial, recording.num_sets, sequence))
+            track = tracker.run(_given(poses, recording.num_sets, sequence))
             nothing = _nothing(track)
         except NotFound:
             nothing = (
@@ -87,7 +90,7 @@ def run(
             )
         if nothing:
             nothing += (
-                ": no frame has a pose of it; check the candidates, annotate 'object_pose', or "
+                ": no frame has a pose of it; check the candidates, annotate 'object_poses', or "
                 "clear the column 'object' where there is none"
             )
             log.warning("sequence %s: object %r: %s", sequence, object_.name, nothing)
@@ -152,18 +155,25 @@ def _write_absent(
         writer.put("camera_names", names)
 
 
-def _start(
-    initial: InitialObjectPose | None, count: int, sequence: str
-) -> tuple[int, np.ndarray] | None:
-    if initial is None:
-        return None
-    if initial.frame >= count:
+def _given(poses: Sequence[ObjectPose], count: int, sequence: str) -> list[GivenPose]:
+    """The annotated poses as the tracker takes them, of a recording of ``count`` frame sets."""
+    beyond = [pose.frame for pose in poses if pose.frame >= count]
+    if beyond:
         raise UserError(
-            f"sequence {sequence}: the annotated object_pose is in frame {initial.frame}, the "
+            f"sequence {sequence}: an annotated pose of the object is in frame {beyond[0]}, the "
             f"recording has {count} frame sets; correct 'frame' in the annotation"
         )
-    rotation = Rotation.from_rotvec(initial.rotation_vector).as_matrix()
-    return initial.frame, rigid(rotation, np.array(initial.translation))
+    return [
+        GivenPose(
+            pose.frame,
+            rigid(
+                Rotation.from_rotvec(pose.rotation_vector).as_matrix(), np.array(pose.translation)
+            ),
+            pose.sigma_m,
+            float(np.radians(pose.sigma_degrees)),
+        )
+        for pose in poses
+    ]
 
 
 def _source(track: Track) -> str:
@@ -178,17 +188,10 @@ def _tell(track: Track, sequence: str) -> None:
     lost = sum(frame.lost for frame in track.frames)
     gone = sum(frame.gone for frame in track.frames)
     doubtful = sum(frame.ambiguous for frame in track.frames)
-    if not track.borne_out:
-        log.warning(
-            "sequence %s: the images do not agree with the annotated object_pose (frame %d looked "
-            "at); check its frame and pose",
-            sequence,
-            track.seed_frame,
-        )
     if gone:
         log.warning(
             "sequence %s: in %d of %d frames no camera shows the object for so long that it seems "
-            "to have left; if it was there, check the candidates, or annotate 'object_pose'",
+            "to have left; if it was there, check the candidates, or annotate 'object_poses'",
             sequence,
             gone,
             count,
@@ -196,7 +199,7 @@ def _tell(track: Track, sequence: str) -> None:
     if lost > TOLD_SHARE * count:
         log.warning(
             "sequence %s: the object is lost in %d of %d frames; check the candidates, or "
-            "annotate 'object_pose'",
+            "annotate 'object_poses'",
             sequence,
             lost,
             count,
@@ -204,7 +207,7 @@ def _tell(track: Track, sequence: str) -> None:
     elif lost + doubtful > TOLD_SHARE * count:
         log.warning(
             "sequence %s: of %d frames the object is lost in %d, and quite different poses explain "
-            "%d alike; annotate 'object_pose' to decide",
+            "%d alike; annotate 'object_poses' to decide",
             sequence,
             count,
             lost,
@@ -224,6 +227,7 @@ def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndar
             depth[t, c] = view.depth_residual_m
             contour[t, c] = view.contour_residual_px
     poses = np.array([frame.fit.pose for frame in track.frames])
+    carried = {"carried": np.array([frame.carried for frame in track.frames])}
     return {
         "rotation": poses[:, :3, :3],
         "translation": poses[:, :3, 3],
@@ -241,4 +245,5 @@ def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndar
         "ambiguous": np.array([frame.ambiguous for frame in track.frames]),
         "resting": np.array([frame.resting for frame in track.frames]),
         "free_axis": np.array([frame.free_axis for frame in track.frames]),
+        **(carried if track.annotated else {}),
     }

@@ -12,7 +12,7 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.triangulation import Triangulation, reproject, spread
 from intercap_core.capture.frames import Frames
-from intercap_core.config import ObjectEntry, PersonSettings, SubjectPoint, digest
+from intercap_core.config import ExchangedSides, ObjectEntry, PersonSettings, SubjectPoint, digest
 from intercap_core.detections.read import (
     FROM_DETECTOR,
     FROM_IMAGES,
@@ -27,6 +27,7 @@ from intercap_core.person.masks import choose_mask, others_beside
 from intercap_core.person.middles import fill_middles
 from intercap_core.person.named import named_people
 from intercap_core.person.sides import BODY_POINTS
+from intercap_core.person.stated_sides import exchanged_back, hold_sides, stated_images
 from intercap_core.person.subject import Subject, find_subject
 from intercap_core.person.swaps import steady_sides, triangulate_people
 from intercap_core.person.touching import touches_of
@@ -43,12 +44,14 @@ def run(
     settings: PersonSettings,
     object_: ObjectEntry | None = None,
     subject_points: Sequence[SubjectPoint] = (),
+    left_right: Sequence[ExchangedSides] = (),
 ) -> None:
     """Find the subject by geometry and write the person artefact.
 
     Of several people it is who is at the annotation's ``subject_points``, or who handles the object
-    (its entry tells the labels of its candidates), or who is seen most near the middle. A set in
-    which one view alone sees the subject takes its points from that view's depth; sets in which
+    (its entry tells the labels of its candidates), or who is seen most near the middle. Its left
+    and right are exchanged where ``left_right`` says that a detector exchanged them. A set in which
+    one view alone sees the subject takes its points from that view's depth; sets in which
     neither two views nor depth place it are flagged ``missing``. Raises UserError where that is so
     in every set, the inputs are of different captures, or a point names nobody.
     """
@@ -78,6 +81,8 @@ def run(
         )
         person = subject.people
         keypoints = subject_keypoints(found, person)
+        stated = stated_images(left_right, rig.names, image_of, found.sequence)
+        keypoints = given = exchanged_back(keypoints, stated)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
         # rays of one moment meet; what is written down is where each camera saw the points
         moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
@@ -88,7 +93,7 @@ def run(
             min_confidence=confident,
             max_error_px=settings.max_reprojection_px,
         )
-        keypoints = moved[..., [3, 4, 2]]
+        keypoints, points = hold_sides(moved[..., [3, 4, 2]], points, given, stated)
         lifted = lifter.fill(person, keypoints, points)
         fill_middles(points.points.reshape(found.num_sets, NUM_KEYPOINTS, 3))
         missing = ((person != NOBODY).sum(1) < 2) & ~lifted

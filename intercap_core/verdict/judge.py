@@ -156,5 +156,5 @@ def _known(fits: SequentialFits, result: JointResult, part: Part) -> np.ndarray:
     """Frames (T,) in which the part was measured, and is where it was measured."""
     flags = fits.flags
     if part == Part.OBJECT:
-        return ~flags.lost & ~result.contradicted
+        return ~(flags.lost | flags.carried) & ~result.contradicted
     return ~flags.filled

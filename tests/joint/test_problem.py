@@ -145,7 +145,7 @@ def _tracked(state: State, sigma: float, lost: np.ndarray) -> TrackedPoses:
     agree = np.zeros_like(lost)
     return TrackedPoses.from_track(
         state.rotation, state.translation, covariance, lost, agree, agree,
-        visible=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
+        carried=agree, visible=np.ones((len(state), 3), bool), times=np.arange(len(state)) / 15,
         time_offset=np.zeros(3),
     )  # fmt: skip
 
@@ -160,12 +160,30 @@ def test_tracked_poses_follow_the_views_that_they_rest_on():
     lost = np.arange(6) == 5
     tracked = TrackedPoses.from_track(
         np.repeat(np.eye(3)[None], 6, 0), way, np.repeat(np.eye(6)[None], 6, 0), lost, lost,
-        np.zeros(6, bool), visible=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
+        np.zeros(6, bool), carried=np.zeros(6, bool), visible=seen, times=times,
+        time_offset=np.array([0.0, 0.001, 0.0]),
     )  # fmt: skip
     found = tracked.at(np.array([0.0, 0.003, 0.004])).translation - way
     late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
     assert found == pytest.approx(-late[:, None] * [1.0, 0.0, 0.5])
     assert np.array_equal(tracked.at(tracked.time_offset).translation, way)
+
+
+def test_carried_poses_keep_their_own_deviations():
+    """They are neither bridged as a lost frame's nor widened as ambiguous, nor looked at."""
+    sigma = np.diag(np.repeat([0.1, 0.02], 3) ** 2)
+    lost, carried, ambiguous = (np.arange(4) == t for t in (1, 2, 3))
+    ambiguous |= carried
+    tracked = TrackedPoses.from_track(
+        np.repeat(np.eye(3)[None], 4, 0), np.zeros((4, 3)), np.repeat(sigma[None], 4, 0), lost,
+        ambiguous, np.zeros(4, bool), carried=carried, visible=np.ones((4, 1), bool),
+        times=np.arange(4.0), time_offset=np.zeros(1),
+    )  # fmt: skip
+    turn, shift = np.linalg.inv(tracked.information)[:, [0, 3], [0, 3]].T ** 0.5
+    assert turn[[0, 2]] == pytest.approx(0.1, rel=0.01)
+    assert shift[[0, 2]] == pytest.approx(0.02, rel=0.01)
+    assert shift[1] > 0.1 and turn[3] > 0.15
+    assert tracked.seen.tolist() == [True, False, False, True]
 
 
 def test_an_object_at_rest_moves_as_one(model, box):

@@ -5,9 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
-from intercap_core.config import InitialObjectPose, ObjectTrackSettings
+from intercap_core.config import ObjectPose, ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.object_track.fit import MotionPrior, assess_all, fit_pose
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.search import rank_frames, rotation_grid, search
 from intercap_core.object_track.tracker import Tracker
@@ -201,7 +202,11 @@ def test_frames_with_more_likely_views_are_searched_first():
     assert order[0] == 2 and sorted(order) == [0, 1, 2, 3]
 
 
-def _track(capture, mesh, initial=None, timed=True):
+def _given(frame, pose, sigma_m=0.01, sigma_degrees=5.0):
+    return GivenPose(frame, pose, sigma_m, np.radians(sigma_degrees))
+
+
+def _track(capture, mesh, *given, timed=True):
     count = len(capture.poses)
     images = [_views(capture, t, timed) for t in range(count)]
     labels = [[[c.label for c in view.candidates] for view in views] for views in images]
@@ -209,7 +214,7 @@ def _track(capture, mesh, initial=None, timed=True):
         mesh, images.__getitem__, labels, SETTINGS, times=capture.times, labels=LABELS,
         up=capture.master_from_room[:3, 2],
     )  # fmt: skip
-    return tracker.run(initial)
+    return tracker.run(given)
 
 
 def test_track_through_misses_and_an_absence(mesh):
@@ -229,7 +234,7 @@ def test_track_through_misses_and_an_absence(mesh):
 
 def test_track_from_an_annotation_that_is_a_little_wrong(mesh):
     capture = ObjectCapture.make(mesh, 4)
-    track = _track(capture, mesh, (2, _disturbed(capture.poses[2], 0.01, 5, 3)))
+    track = _track(capture, mesh, _given(2, _disturbed(capture.poses[2], 0.01, 5, 3)))
     assert track.annotated and track.seed_frame == 2
     for t, frame in enumerate(track.frames):
         assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 3
@@ -238,7 +243,7 @@ def test_track_from_an_annotation_that_is_a_little_wrong(mesh):
 def test_an_annotation_of_another_frame_is_found_in_its_own(mesh):
     """Five frames off while the object moves by 7 cm a frame."""
     capture = ObjectCapture.make(mesh, 6, speed=0.07, turn_deg=4)
-    track = _track(capture, mesh, (5, capture.poses[0]))
+    track = _track(capture, mesh, _given(5, capture.poses[0]))
     assert track.annotated and track.borne_out
     for t, frame in enumerate(track.frames):
         assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 4
@@ -248,7 +253,7 @@ def test_an_annotation_that_the_images_contradict_does_not_poison_the_track(mesh
     capture = ObjectCapture.make(mesh, 3)
     wrong = capture.poses[1].copy()
     wrong[:3, 3] += capture.master_from_room[:3, :3] @ (0.1, -0.9, 0.3)
-    track = _track(capture, mesh, (1, wrong))
+    track = _track(capture, mesh, _given(1, wrong))
     assert track.annotated and not track.borne_out
     for t, frame in enumerate(track.frames):
         assert _error(mesh, frame.fit.pose, capture.poses[t])[0] < 4
@@ -260,7 +265,7 @@ def test_known_offsets_of_the_exposures_make_a_moving_object_better(mesh):
     capture.time_offset = np.array([0.0, 0.008, 0.008, -0.003])
     errors = {}
     for timed in (True, False):
-        track = _track(capture, mesh, (2, capture.poses[2]), timed)
+        track = _track(capture, mesh, _given(2, capture.poses[2]), timed=timed)
         found = zip(track.frames, capture.poses, strict=True)
         errors[timed] = np.array([_error(mesh, frame.fit.pose, true) for frame, true in found])
     # the median: ten centimetres and eleven degrees from frame to frame may lose the track's end
@@ -299,7 +304,7 @@ def test_stage_writes_the_track_and_repeats_byte_for_byte(written, capture, tmp_
     outputs = []
     for name in ("one", "two"):
         output = tmp_path / name / "object_track.h5"
-        object_track.run(**written, output=output, object_=entry, settings=SETTINGS, initial=None)
+        object_track.run(**written, output=output, object_=entry, settings=SETTINGS)
         outputs.append(output)
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
     with artefacts.read(outputs[0], OBJECT_TRACK) as track:
@@ -317,9 +322,28 @@ def test_stage_says_what_is_wrong(written, tmp_path):
     with pytest.raises(UserError, match="frame 99"):
         object_track.run(
             **written, output=tmp_path / "x.h5", object_=entry, settings=SETTINGS,
-            initial=InitialObjectPose(frame=99, rotation_vector=(0, 0, 0), translation=(0, 0, 2)),
+            poses=[ObjectPose(frame=99, rotation_vector=(0, 0, 0), translation=(0, 0, 2))],
         )  # fmt: skip
     assert not (tmp_path / "x.h5").exists()
+
+
+def test_stage_writes_what_speaks_against_an_annotated_pose(written, capture, tmp_path, caplog):
+    """One that is right, one that is a metre off."""
+    entry, output = catalogue()["suitcase"], tmp_path / "x.h5"
+    poses = []
+    for t, off in ((1, 0.0), (4, 1.0)):
+        place = capture.poses[t, :3, 3] + off * capture.master_from_room[:3, 2]
+        turn = Rotation.from_matrix(capture.poses[t, :3, :3]).as_rotvec()
+        poses.append(ObjectPose(frame=t, rotation_vector=turn, translation=place))
+    object_track.run(**written, output=output, object_=entry, settings=SETTINGS, poses=poses)
+    with artefacts.read(output, OBJECT_TRACK) as track:
+        assert (
+            track.attributes["seed_source"] == "annotated" and track.attributes["seed_frame"] == 1
+        )
+        told = track.attributes["doubts"]
+        assert "annotated pose of frame 4 (stated to 10 mm" in told and "of frame 1" not in told
+        assert not track["carried"].any() and not track["lost"].any()
+    assert "annotated pose of frame 4" in caplog.text
 
 
 def test_an_object_that_nothing_shows_is_absent(written, tmp_path, caplog):
@@ -346,7 +370,7 @@ def test_a_track_that_hardly_any_image_shows_is_not_believed(
         assert track["lost"].all() and track.attributes["object"] == "suitcase"
         assert "is not believed" in track.attributes["doubts"]
     assert "hardly show it" in caplog.text
-    given = InitialObjectPose(frame=0, rotation_vector=(0, 0, 0), translation=(0, 0, 2))
-    object_track.run(**written, output=output, object_=entry, settings=SETTINGS, initial=given)
+    given = ObjectPose(frame=0, rotation_vector=(0, 0, 0), translation=(0, 0, 2))
+    object_track.run(**written, output=output, object_=entry, settings=SETTINGS, poses=[given])
     with artefacts.read(output, OBJECT_TRACK) as track:  # who annotates it knows that it is there
         assert not track["lost"].all()

@@ -59,6 +59,14 @@ def test_states_of_track_and_views(made: fitted.Capture) -> None:
     assert "2: found again" in timeline and "0 % kept" in timeline
 
 
+def test_a_carried_frame_is_told_as_such_before_it_is_doubtful() -> None:
+    none, all_ = np.zeros(3, bool), np.ones(3, bool)
+    found = track._states(
+        gone=none, lost=np.arange(3) == 0, carried=np.arange(3) < 2, doubtful=all_, resting=none
+    )
+    assert found == ["lost", "carried", "doubtful"] and set(found) <= set(track.TRACK_STATES)
+
+
 def test_the_sheet_shows_both_outlines_in_every_camera(made: fitted.Capture) -> None:
     sheet = _facts(made).sheet
     assert sheet is not None and len(sheet.frames) == 5

@@ -7,7 +7,8 @@ there. E_O is taken as the quadratic form of the two,
 
 so the joint fit need not compare images again. What other possible poses add to a covariance is
 left out: between two of them the images support nothing. A frame in which the object is lost has a
-wide C: it stays near the interpolated pose unless contact or its neighbours move it. No setting
+wide C: it stays near the interpolated pose unless contact or its neighbours move it; one whose pose
+follows from annotated ones has theirs. No setting
 weighs E_O: its strength is the covariance.
 """
 
@@ -70,19 +71,21 @@ class TrackedPoses:
         ambiguous: np.ndarray,
         resting: np.ndarray,
         *,
+        carried: np.ndarray,
         visible: np.ndarray,
         times: np.ndarray,
         time_offset: np.ndarray,
     ) -> TrackedPoses:
         """Take over an object track whose lost frames are interpolated.
 
-        ``covariance`` (T, 6, 6) around these poses alone; ``lost``, ``ambiguous`` and ``resting``
-        (T,); ``visible`` (T, C) the views that show the object; ``times`` (T,) and ``time_offset``
-        (C,) seconds.
+        ``covariance`` (T, 6, 6) around these poses alone; ``lost``, ``ambiguous``, ``resting`` and
+        ``carried`` (T,), of which the images show nothing; ``visible`` (T, C) the views that show
+        the object; ``times`` (T,) and ``time_offset`` (C,) seconds.
         """
         tracked = ~lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
-        floor = np.where(ambiguous[:, None], np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
+        other = (ambiguous & ~carried)[:, None]  # of what is carried, the covariance says it
+        floor = np.where(other, np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
         spread = np.where(tracked[:, None], floor, _BRIDGED) ** 2
         total += np.eye(6) * spread[:, None, :]
         twist = twists(rigid(rotation, translation), ~lost, times)
@@ -95,7 +98,7 @@ class TrackedPoses:
             twist,
             share,
             time_offset,
-            tracked,
+            tracked & ~carried,
             resting,
             times,
             spread,
