@@ -122,7 +122,6 @@ def _run(
 ) -> int:
     plan = Plan(project)
     done = not arguments and plan.all_done()
-    _mark_targets(plan, arguments)
     plan.keep()
     if done:
         count = len(project.sequences)
@@ -160,18 +159,6 @@ def _run(
     print_remarks(project, console)
     _print_report(project, console)
     return status
-
-
-def _mark_targets(plan: Plan, arguments: Sequence[str]) -> None:
-    """Mark what is out of date of the sequences that are asked for by the names of their files.
-
-    Of several targets Snakemake lists the folder of the marks at the first one, and takes marks
-    that are written for the others for missing.
-    """
-    asked = {part for argument in arguments for part in Path(argument).parts}
-    for name in asked & set(plan.project.sequences):
-        for stage in plan.states(name):
-            plan.mark(name, stage)
 
 
 def _full_disk(project: Project) -> str:

@@ -139,6 +139,14 @@ class Plan:
             os.utime(path, (newest + _LATER_S, newest + _LATER_S))
         return [path]
 
+    def mark_all(self) -> None:
+        """Write all marks that there will be: Snakemake lists their folder once, and takes those
+        that are written later for missing."""
+        for name in self.project.sequences:
+            for stage in self.states(name):
+                self.mark(name, stage)
+        self.mark("", DATASET)
+
     def _state(self, sequence: str, stage: str) -> State:
         return self.dataset if stage == DATASET else self.states(sequence)[stage]
 

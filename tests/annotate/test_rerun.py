@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from intercap_core.annotate import rerun
-from intercap_core.commands.run import _mark_targets
 from intercap_core.errors import UserError
 from intercap_core.pipeline.plan import Kind, Plan, mark_of
 from intercap_core.project import Project, load_project
@@ -123,7 +122,7 @@ def test_a_sequence_without_results_has_nothing_beside_it(project: Project) -> N
 
 def test_what_is_out_of_date_is_marked_before_snakemake_lists_the_marks(project: Project) -> None:
     plan = Plan(project)
-    _mark_targets(plan, ["--cores", "1", *rerun.targets(project, NAME)])
+    plan.mark_all()
     stale = [stage for stage, state in plan.states(NAME).items() if state.kind is Kind.stale]
     assert stale and all(mark_of(project, NAME, stage).is_file() for stage in stale)
 

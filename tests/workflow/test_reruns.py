@@ -88,6 +88,17 @@ def test_a_new_annotation_re_runs_its_sequence_from_the_stage_that_reads_it(
     assert pending == {(OTHER, stage) for stage in stages} | ({DATASET} if stages else set())
 
 
+def test_several_targets_after_an_edit_are_each_made_anew(flow: Flow) -> None:
+    targets = [
+        str(flow.artefact(ONE, stage).relative_to(flow.folder)) for stage in ("joint", "summary")
+    ]
+    with edited(flow.annotation(ONE), CONTACT):
+        done = flow.run("--dry-run", *targets)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for stage in ("joint", "metrics", "summary"):
+        assert f"rule {stage}:" in done.stdout + done.stderr
+
+
 def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None:
     """The run has contact and floor annotated; then one of the two is edited or both touched."""
     path = flow.annotation(OTHER)

@@ -39,6 +39,7 @@ SETTINGS = PROJECT.config
 SEQUENCES = list(PROJECT.sequences)
 PLAN = Plan(PROJECT)
 if workflow.is_main_process:
+    PLAN.mark_all()
     atexit.register(PLAN.keep)
 VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
 NOTHING = "(?!)"  # a pattern that no text matches
