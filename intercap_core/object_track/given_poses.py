@@ -119,21 +119,21 @@ class GivenEvidence:
         return replace(found, held=tuple(held))
 
     def moving(self, mesh: ObjectMesh, poses: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4) whose
+        """Given and reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4) whose
         rests ``segment`` (T,) numbers: in no other frame of the rest it is seen, or a given pose of
         it is another one."""
         found = np.zeros(len(segment), bool)
-        seeing = ~self.reached
-        seeing[[given.frame for given in self.held]] = False
-        for number in set(segment[self.reached & (segment >= 0)].tolist()):
+        stated = self.reached.copy()
+        stated[[given.frame for given in self.held]] = True
+        for number in set(segment[stated & (segment >= 0)].tolist()):
             rest = segment == number
-            seen = np.flatnonzero(rest & seeing)
+            seen = np.flatnonzero(rest & ~stated)
             for given in self.held:
                 if rest[given.frame] and len(seen):
                     nearest = seen[np.abs(seen - given.frame).argmin()]
                     seen = seen if given.holds(mesh, poses[nearest]) else seen[:0]
             if not len(seen):
-                found |= rest & self.reached
+                found |= rest & stated
         return found
 
     def gradient(self, looked: np.ndarray) -> np.ndarray:
