@@ -119,9 +119,9 @@ class GivenEvidence:
         return replace(found, held=tuple(held))
 
     def moving(self, mesh: ObjectMesh, poses: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Given and reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4) whose
-        rests ``segment`` (T,) numbers: in no other frame of the rest it is seen, or a given pose of
-        it is another one."""
+        """Given and reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4)
+        whose rests ``segment`` (T,) numbers: in no other frame of the rest it is seen, or a given
+        pose of it is another one."""
         found = np.zeros(len(segment), bool)
         stated = self.reached.copy()
         stated[[given.frame for given in self.held]] = True
