@@ -90,13 +90,13 @@ class GivenEvidence:
         poses: np.ndarray,
         unseen: np.ndarray,
         times: np.ndarray,
-        share: float,
     ) -> GivenEvidence:
         """What the ``held`` poses say beside a track (T, 4, 4) in which the frames ``unseen`` (T,)
         show nothing.
 
         There the track's poses stand for it, with deviations that grow by the seconds ``times``
-        (T,) since the nearest given one; such frames are each a ``share`` of an observation.
+        (T,) since the nearest given one; all such frames of that one are as good as one
+        observation, of how fast it moves.
         """
         found = cls.none(poses.copy())
         for given in held:
@@ -106,32 +106,34 @@ class GivenEvidence:
                 mesh, found.about[t], given.sigma_m, given.sigma_rad
             )
         since = seconds_since([given.frame for given in held], unseen, times)
-        for t in np.flatnonzero(np.isfinite(since)).tolist():
-            found.reached[t] = unseen[t]
-            if since[t] > 0:
-                nearest = min(held, key=lambda one: abs(times[one.frame] - times[t]))
-                found.information[t] = share * _information(
-                    mesh,
-                    poses[t],
-                    nearest.sigma_m + GROWTH_LOST_M_S * since[t],
-                    nearest.sigma_rad + GROWTH_LOST_RAD_S * since[t],
-                )
+        found.reached[:] = unseen & np.isfinite(since)
+        frames = np.flatnonzero(found.reached & (since > 0)).tolist()
+        nearest = {t: min(held, key=lambda one: abs(times[one.frame] - times[t])) for t in frames}
+        for t, given in nearest.items():
+            found.information[t] = _information(
+                mesh,
+                poses[t],
+                given.sigma_m + GROWTH_LOST_M_S * since[t],
+                given.sigma_rad + GROWTH_LOST_RAD_S * since[t],
+            ) / sum(other is given for other in nearest.values())
         return replace(found, held=tuple(held))
 
     def moving(self, mesh: ObjectMesh, poses: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4) whose
-        rests ``segment`` (T,) numbers: nothing of the rest is seen, or a given pose of it is
-        another one."""
+        """Given and reached frames (T,) bool in which the object does not rest, of poses (T, 4, 4)
+        whose rests ``segment`` (T,) numbers: in no other frame of the rest it is seen, or a given
+        pose of it is another one."""
         found = np.zeros(len(segment), bool)
-        for number in set(segment[self.reached & (segment >= 0)].tolist()):
+        stated = self.reached.copy()
+        stated[[given.frame for given in self.held]] = True
+        for number in set(segment[stated & (segment >= 0)].tolist()):
             rest = segment == number
-            seen = np.flatnonzero(rest & ~self.reached)
+            seen = np.flatnonzero(rest & ~stated)
             for given in self.held:
                 if rest[given.frame] and len(seen):
                     nearest = seen[np.abs(seen - given.frame).argmin()]
                     seen = seen if given.holds(mesh, poses[nearest]) else seen[:0]
             if not len(seen):
-                found |= rest & self.reached
+                found |= rest & stated
         return found
 
     def gradient(self, looked: np.ndarray) -> np.ndarray:

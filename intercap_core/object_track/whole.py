@@ -166,7 +166,7 @@ class WholeTrack:
         if not held:
             return GivenEvidence.none(poses)
         unseen = np.array([seen is None or _ratio(seen) < SEEN_LOG_RATIO for seen in found])
-        return GivenEvidence.of(self._mesh, held, poses, unseen, self._times, self._share)
+        return GivenEvidence.of(self._mesh, held, poses, unseen, self._times)
 
     def _between(self, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far (T,) two tracks' poses (T, 4, 4) are turned, radians, and their centres apart,

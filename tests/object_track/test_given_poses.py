@@ -67,7 +67,7 @@ def test_evidence_has_the_stated_deviations_and_grows_with_time(mesh):
     poses = np.tile(at(), (4, 1, 1))
     held = [GivenPose(1, at(0.03), 0.01, FIVE)]
     unseen = np.array([False, True, True, False])
-    found = GivenEvidence.of(mesh, held, poses, unseen, times, 0.5)
+    found = GivenEvidence.of(mesh, held, poses, unseen, times)
     np.testing.assert_array_equal(found.reached, [False, True, True, False])
     assert not found.information[[0, 3]].any()
     # the solver's covariance of turns is stated less by TURNS_LESS, which is undone here
@@ -79,7 +79,7 @@ def test_evidence_has_the_stated_deviations_and_grows_with_time(mesh):
     np.testing.assert_allclose(covariance[:3, :3], np.eye(3) * FIVE**2, atol=1e-9)
     later = np.linalg.inv(found.information[2]) * np.outer(TURNS_LESS, TURNS_LESS)
     centre = to_centre @ later @ to_centre.T
-    np.testing.assert_allclose(np.diag(centre), (0.01 + GROWTH_LOST_M_S) ** 2 / 0.5, rtol=1e-6)
+    np.testing.assert_allclose(np.diag(centre), (0.01 + GROWTH_LOST_M_S) ** 2, rtol=1e-6)
     # the gradient leads back to the given pose
     step = np.linalg.solve(found.information[1], -found.gradient(poses)[1])
     np.testing.assert_allclose(step, [0, 0, 0, 0.03, 0, 0], atol=1e-9)

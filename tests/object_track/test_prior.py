@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from intercap_core.object_track.constants import (
+    ANNOTATED_LOG_RATIO,
     ANNOTATION_LOG_RATIO,
     UNHANDLED_LOG_RATIO,
     UPRIGHT_LOG_RATIO,
 )
 from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.places import Places, Standing
 from intercap_core.object_track.prior import Prior, things
 from intercap_core.object_track.view_report import ViewReport
@@ -69,9 +71,11 @@ def test_upright_and_annotated(mesh: ObjectMesh) -> None:
     prior = prior_of(mesh, up)
     found = prior.weigh(3, [stands, hangs])
     assert found[0] - found[1] == pytest.approx(2 * UPRIGHT_LOG_RATIO)
-    prior.annotated = (3, hangs.pose)
+    prior.given[3] = GivenPose(3, hangs.pose, 0.01, np.radians(5))
     told = prior.weigh(3, [stands, hangs])
-    assert told[1] - found[1] == pytest.approx(ANNOTATION_LOG_RATIO / SHARE)
+    most = ANNOTATED_LOG_RATIO + ANNOTATION_LOG_RATIO
+    assert told[1] - found[1] == pytest.approx(most / SHARE)
+    assert told[0] - found[0] <= ANNOTATED_LOG_RATIO / SHARE  # turned over: within reach at most
     np.testing.assert_allclose(prior.weigh(4, [stands, hangs]), found)
 
 
