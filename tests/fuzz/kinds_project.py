@@ -17,7 +17,10 @@ from tests.test_project import HEADER
 ROOT = Path(__file__).resolve().parents[2]
 ANNOTATION = """contact:
 - {part: right_hand, start: 3, end: 20}
-object_pose: {frame: 0, rotation_vector: [0.1, 0.2, 0.3], translation: [0.5, -0.2, 2.1]}
+object_poses:
+- {frame: 0, rotation_vector: [0.1, 0.2, 0.3], translation: [0.5, -0.2, 2.1]}
+- {frame: 9, rotation_vector: [0.1, 0, 0], translation: [0, 0, 2], sigma_m: 0.02, sigma_degrees: 9}
+left_right: [{start: 3, end: 9, camera: k3}, {start: 12, end: 14}]
 floor: [[0, 1.2, 2], [1, 1.2, 2], [0, 1.1, 3]]
 subject: [{camera: k1, frame: 0, x: 612.5, y: 340}]
 drop_frames: [7, 8]
@@ -56,6 +59,9 @@ def _read(folder: Path) -> None:
         annotation = project.annotation(name)
         if annotation.floor is not None:
             within(-50, 50, floor=annotation.floor)
+        for pose in annotation.poses:
+            within(-101, 101, translation=pose.translation, turn=pose.rotation_vector)
+            within(1e-9, 90, sigma=[pose.sigma_m, pose.sigma_degrees])
         for start in annotation.stated_starts.values():
             within(-1e10, 1e10, start=start)
     within(0.4, 2.7, height=[s.height or 1.7 for s in project.subjects.values()])
