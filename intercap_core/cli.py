@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -618,10 +619,11 @@ def annotate(
 
     if sequence is None and not settings.exists() and settings.suffix == "":
         settings, sequence = DEFAULT_SETTINGS, str(settings)  # a name alone is a sequence's
-    serve(
-        settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show,
-        say=lambda line: typer.echo(line),
-    )  # fmt: skip
+    with suppress(ToldToEnd):  # which is how it ends
+        serve(
+            settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show,
+            say=lambda line: typer.echo(line),
+        )  # fmt: skip
 
 
 @app.command(rich_help_panel=LOOK)

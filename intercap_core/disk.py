@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from intercap_core.signals import raise_pending, unbroken
+
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 
@@ -20,7 +22,8 @@ class PartFile(io.FileIO):
 
     HDF5 has no way to give up a file whose last writes fail: the process crashes when it ends
     (h5py's thread 914). So what a full disk does not take is kept in memory, and :meth:`check`
-    raises the error: call it while writing, and after HDF5 has closed the file.
+    raises the error: call it while writing, and after HDF5 has closed the file. So it is with a
+    signal that would raise in the midst of a write.
     """
 
     def __init__(self, path: Path, mode: str) -> None:
@@ -30,7 +33,9 @@ class PartFile(io.FileIO):
         self._at = 0
 
     def check(self) -> None:
-        """Raise the OSError of the first write that failed, which names the file."""
+        """Raise the OSError of the first write that failed, which names the file, or what the
+        process was told by a signal while it wrote."""
+        raise_pending()
         if self._error is not None:
             raise OSError(self._error.errno, self._error.strerror, str(self.name))
 
@@ -78,6 +83,9 @@ class PartFile(io.FileIO):
         return size
 
 
+unbroken(PartFile.write, PartFile.readinto, PartFile.seek, PartFile.truncate)
+
+
 def fault_in(error: BaseException) -> OSError | None:
     """What the system said of a disk, where that is why ``error`` was raised; else None."""
     for one in _chain(error):
@@ -93,18 +101,28 @@ def told(fault: OSError, place: Path | None = None, needed: str = "") -> str:
     """
     named = Path(str(fault.filename)) if fault.filename else place
     where = f"{place or named}: " if place or named else ""
+    elsewhere = named is not None and place is not None and named != place
+    at = f" at {named}" if elsewhere else ""
+    kept = "then run again: what is complete is kept, nothing is half-written"
+    if fault.errno == errno.EFBIG:
+        return f"{where}{fault.strerror}{at}: raise the limit (ulimit -f), {kept}"
     if fault.errno in FULL:
         free = f", {free_bytes(named) / 1e6:.0f} MB free" if named is not None else ""
         return (
-            f"{where}the disk is full or a quota is used up ({fault.strerror}{free})"
-            f"{f'; {needed}' if needed else ''}; free space, or name another folder by the setting "
-            "results, then run again: what is complete is kept, nothing is half-written"
+            f"{where}the disk is full or a quota is used up ({fault.strerror}{at}{free})"
+            f"{f'; {needed}' if needed else ''}; free space there, or name another folder by the "
+            f"setting results, {kept}"
         )
-    at = f" at {named}" if named is not None and place is not None and named != place else ""
+    if elsewhere and place is not None and not _is_beside(named, place):
+        return f"{where}needs what cannot be opened ({fault.strerror}{at}); make it readable"
     return (
         f"{where}cannot be written ({fault.strerror}{at}); make its folder writable, or name "
         "another one by the setting results, then run again"
     )
+
+
+def _is_beside(named: Path | None, place: Path) -> bool:
+    return named is not None and named.is_relative_to(place if place.is_dir() else place.parent)
 
 
 def free_bytes(place: Path) -> int:
@@ -118,4 +136,4 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None and id(error) not in seen:
         seen.add(id(error))
         yield error
-        error = error.__cause__ or error.__context__
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
+from types import CodeType, FrameType
+from typing import Any
 
+_UNBROKEN: set[CodeType] = set()
+_pending: list[int] = []
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -25,6 +28,26 @@ class ToldToEnd(BaseException):
         return 128 + self.number
 
 
+def unbroken(*functions: Callable[..., Any]) -> None:
+    """From these functions, which other languages call, no signal raises: it waits for
+    :func:`raise_pending`."""
+    _UNBROKEN.update(function.__code__ for function in functions)
+
+
+def raise_pending() -> None:
+    """Raise :class:`ToldToEnd` where a signal came in the midst of what may not be broken."""
+    if _pending:
+        raise ToldToEnd(_pending.pop())
+
+
+def _is_within(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code in _UNBROKEN:
+            return True
+        frame = frame.f_back
+    return False
+
+
 @contextmanager
 def told_to_end() -> Iterator[None]:
     """Raise :class:`ToldToEnd` in the block at the first Ctrl-C, SIGTERM or hang-up; later ones are
@@ -35,13 +58,17 @@ def told_to_end() -> Iterator[None]:
         yield
         return
 
-    def end(number: int, _: FrameType | None) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
+        if _is_within(frame):
+            _pending.append(number)
+            return
         for other in before:
             signal.signal(other, signal.SIG_IGN)
         raise ToldToEnd(number)
 
     before = {one: signal.getsignal(one) for one in _ENDING}
-    before = {one: handler for one, handler in before.items() if handler is not signal.SIG_IGN}
+    before = {one: h for one, h in before.items() if h is not None and h is not signal.SIG_IGN}
+    _pending.clear()
     for one in before:
         signal.signal(one, end)
     try:

@@ -224,7 +224,7 @@ class Executor(SlurmExecutor):
         super().handle_job_error(job)
         if job in self._final:
             self._final.discard(job)
-            self.logger.info("It is not tried again: what is wrong is in the input.")
+            self.logger.info("It is not tried again: what is wrong has to be put right first.")
             job.attempt = job.restart_times + 1
 
 

@@ -38,7 +38,9 @@ COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
 LAST_LINES = 15
 FULL_BELOW_BYTES = 1_000_000
-ENDS_WITHIN_S = 60.0  # a job, and those that a cluster is told to cancel
+ENDS_WITHIN_S = 90.0  # a job, and those that a cluster is told to cancel, for which it has 60
+SLURM_COMMANDS = {"sbatch", "scancel", "squeue", "sacct", "scontrol"}  # which end by themselves
+GO_ON = "Slurm's jobs go on"  # what the executor says where it could not cancel them
 STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # how Snakemake says how far it is
 AGGREGATES = ("site/index.html", "summary.json")
 
@@ -134,7 +136,10 @@ def _run(
         status = run_watched(command, watcher, console)
     except ToldToEnd as end:
         words = f"{end}: {watcher.steps()} jobs were done, and are kept; the same command goes on"
-        console.print(words, highlight=False)
+        console.print(words, highlight=False, soft_wrap=True)
+        said = watcher.transcript.read_text(encoding="utf-8", errors="replace").splitlines()
+        for line in dict.fromkeys(line for line in said if line.startswith(GO_ON)):
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
         raise SystemExit(end.status) from None
     failures = watcher.failures()
     for name, words in failures.items():
@@ -331,34 +336,48 @@ def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> i
                     time.sleep(POLL_SECONDS)
                     refresh()
                 refresh()
+        except ToldToEnd as end:
+            _end(process, interrupted=end.number == signal.SIGINT and _in_foreground())
+            raise
         finally:
             if process.poll() is None:
                 _end(process)
     return process.returncode
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _end(process: subprocess.Popen[bytes], *, interrupted: bool = False) -> None:
     """End Snakemake and the jobs on this machine, in order, and after a while whatever is left.
 
     Of SIGTERM Snakemake starts no more jobs, of SIGINT it cancels those of a cluster; those of this
-    machine it would wait for.
+    machine it would wait for. ``interrupted`` by a terminal, it has got that, and a second one
+    would break off the cancelling.
     """
     import psutil
 
     with contextlib.suppress(psutil.NoSuchProcess):
-        jobs = psutil.Process(process.pid).children(recursive=True)
-        for number in (signal.SIGTERM, signal.SIGINT):
+        snakemake = psutil.Process(process.pid)
+        for number in (signal.SIGTERM,) if interrupted else (signal.SIGTERM, signal.SIGINT):
             process.send_signal(number)
-        for job in jobs:
+        for job in snakemake.children(recursive=True):
             with contextlib.suppress(psutil.NoSuchProcess):
-                job.terminate()
+                if job.name() not in SLURM_COMMANDS:
+                    job.terminate()
         try:
             process.wait(ENDS_WITHIN_S)
         except subprocess.TimeoutExpired:
-            for one in (psutil.Process(process.pid), *jobs):
+            for one in (snakemake, *snakemake.children(recursive=True)):
                 with contextlib.suppress(psutil.NoSuchProcess):
                     one.kill()
     process.wait()
+
+
+def _in_foreground() -> bool:
+    """Whether a terminal's Ctrl-C goes to all processes of this one's group."""
+    try:
+        with open("/dev/tty", "rb") as terminal:
+            return os.tcgetpgrp(terminal.fileno()) == os.getpgrp()
+    except OSError:
+        return False
 
 
 @contextmanager

@@ -75,7 +75,7 @@ class Owner:
             if started != UNSEEN:
                 return started == self.started
         age = _age_s(path)
-        return age is not None and abs(age) < DEAD_S
+        return age is None or abs(age) < DEAD_S  # of whom nothing can be told, he lives
 
 
 class Claim:
@@ -89,9 +89,15 @@ class Claim:
         self._thread.start()
 
     def still_held(self) -> bool:
-        """False where another one has taken it over."""
-        held = _owner_of(self._path)
-        return held is not None and held.token == self._owner.token
+        """False where another one has taken it over, or it is gone; one that cannot be read just now
+        is held."""
+        try:
+            text = self._path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return True
+        return self._owner.token in text
 
     def release(self) -> None:
         """Give it up; nothing where it is another's by now."""
@@ -146,7 +152,13 @@ def try_claim(path: Path) -> Claim | Owner:
             held = _owner_of(path)
             if held is not None and held.lives(path):
                 return held
-            if held is None and (_age_s(path) or 0.0) < _LOOK_S:
+            age = _age_s(path)
+            if held is None and age is None and path.exists():
+                raise UserError(
+                    f"{path}: nothing can be written beside it, so whether its owner lives cannot "
+                    "be told; free space or make the folder writable, then run again"
+                ) from None
+            if held is None and (age or 0.0) < _LOOK_S:
                 time.sleep(_LOOK_S)  # it is being written
                 continue
             dead = held

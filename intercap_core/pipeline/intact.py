@@ -7,6 +7,7 @@ checksums where nothing is noted. To read hundreds of gigabytes at every start t
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from pathlib import Path
@@ -14,25 +15,34 @@ from pathlib import Path
 from intercap_core import artefacts, schemas
 from intercap_core.pipeline.kept import keep, read_kept
 
-NAME = ".outputs.json"  # of a sequence's artefacts
+SUFFIX = ".left"  # of what is noted of an output
 EXPORT_LIST = "export.json"  # digests of an export's files
 _ROWS = 64  # read at a time, so that memory stays flat
 
 
+def forget(output: Path) -> None:
+    """Remove what is noted of an output, before another one takes its place: a note is right, or
+    there is none."""
+    _note_of(output).unlink(missing_ok=True)
+
+
 def note(output: Path) -> None:
-    """Remember an artefact as it is now; what cannot be remembered is read through later."""
-    path = output.with_name(NAME)
-    keep(path, read_kept(path) | {output.name: [_stamp(output), _digest(output)]})
+    """Remember an output as it is now; what cannot be remembered is read through later."""
+    with contextlib.suppress(OSError):
+        keep(_note_of(output), {output.name: [_stamp(output), _digest(output)]})
 
 
 def is_as_left(output: Path) -> bool:
     """Whether size and date are those that were noted."""
-    return _noted(output)[0] == _stamp(output)
+    try:
+        return _noted(output)[0] == _stamp(output)
+    except FileNotFoundError:
+        return False
 
 
 def damage_of(output: Path) -> str:
     """Read all of an artefact, or all files of an export, and say what is wrong with them; "" =
-    nothing."""
+    nothing. Raises OSError where they cannot be read."""
     if output.is_dir():
         return _changed_file(output)
     digest = _noted(output)[1]
@@ -59,7 +69,11 @@ def _changed_file(folder: Path) -> str:
         return ""
     try:
         listed = json.loads((folder / EXPORT_LIST).read_text(encoding="utf-8"))["files"]
-        found = [name for name, digest in listed.items() if _digest(folder / name) != digest]
+        found = [
+            name
+            for name, digest in listed.items()
+            if not (folder / name).is_file() or _digest(folder / name) != digest
+        ]
     except (ValueError, KeyError, AttributeError, TypeError):
         found = [EXPORT_LIST]
     if not found:
@@ -68,17 +82,18 @@ def _changed_file(folder: Path) -> str:
 
 
 def _digest(path: Path) -> str:
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return "missing"
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _noted(output: Path) -> tuple[str, str]:
     """Size with date, and digest; empty where nothing is noted."""
-    stamp, digest = read_kept(output.with_name(NAME)).get(output.name, ("", ""))
+    stamp, digest = read_kept(_note_of(output)).get(output.name, ("", ""))
     return stamp, digest
+
+
+def _note_of(output: Path) -> Path:
+    return output.with_name(f".{output.name}{SUFFIX}")
 
 
 def _stamp(output: Path) -> str:

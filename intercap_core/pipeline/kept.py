@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from intercap_core.artefacts import part_of
+
 
 def read_kept(path: Path) -> dict[str, list[str]]:
     """Pairs of texts by name; those that are none, and a file that cannot be read, are left out."""
@@ -21,13 +23,14 @@ def read_kept(path: Path) -> dict[str, list[str]]:
 
 def keep(path: Path, pairs: dict[str, list[str]]) -> None:
     """Write them whole or not at all; where nothing can be written, results can be looked at."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    part = part_of(path)
     with contextlib.suppress(OSError):
         try:
             part.write_text(json.dumps(pairs, indent=0, sort_keys=True), encoding="utf-8")
             os.replace(part, path)
-        except OSError:
+        except BaseException:
             part.unlink(missing_ok=True)
+            raise
 
 
 def _is_pair(pair: Any) -> bool:

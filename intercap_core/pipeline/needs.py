@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,11 +72,14 @@ def disk_told(project: Project, output: Path, stage: str = "") -> Iterator[None]
         fault = fault_in(error)
         if fault is None:
             raise
-        found = needs(project)
-        words = f"all that is missing takes about {found.missing / 1e6:,.0f} MB"
-        if stage in found.usual:
-            words = f"{stage} takes about {found.usual[stage] / 1e6:,.1f} MB here, {words}"
-        raise UserError(told(fault, output, words + found.basis)) from error
+        words = ""
+        with suppress(OSError):  # results come and go while they are added up
+            found = needs(project)
+            words = f"all that is missing takes about {found.missing / 1e6:,.0f} MB"
+            if stage in found.usual:
+                words = f"{stage} takes about {found.usual[stage] / 1e6:,.1f} MB here, {words}"
+            words += found.basis
+        raise UserError(told(fault, output, words)) from error
 
 
 def _guess(project: Project) -> tuple[float, str]:

@@ -22,7 +22,7 @@ from intercap_core.pipeline import given
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.given import STUDIO
-from intercap_core.pipeline.intact import damage_of, is_as_left
+from intercap_core.pipeline.intact import damage_of, is_as_left, note
 from intercap_core.pipeline.job import last_failure
 from intercap_core.pipeline.kept import keep, read_kept
 from intercap_core.pipeline.record import FILE, Record, read_record
@@ -132,11 +132,12 @@ class Plan:
         if stage != DATASET:
             output = self.output(sequence, stage)
         path.parent.mkdir(parents=True, exist_ok=True)
-        newest = max(time.time(), *(one.stat().st_mtime for one in _dated(output)))
-        if not path.is_file() or path.stat().st_mtime < newest:
+        newest = max([one.stat().st_mtime for one in _dated(output)], default=0.0)
+        if not path.is_file() or path.stat().st_mtime <= newest:
             told = [*state.reasons, uuid.uuid4().hex]  # as no earlier mark, whatever is compared
             path.write_text("\n".join(told) + "\n", encoding="utf-8")
-            os.utime(path, (newest + _LATER_S, newest + _LATER_S))
+            later = max(newest, time.time()) + _LATER_S
+            os.utime(path, (later, later))
         return [path]
 
     def mark_all(self) -> None:
@@ -272,18 +273,27 @@ class _Records:
         """The output's record; None where it has none."""
         file = output if output.suffix == ".h5" else output / FILE
         try:
-            stat = file.stat()
-        except OSError:
+            with open(file, "rb") as opened:
+                stat = os.fstat(opened.fileno())
+        except FileNotFoundError:
             return None
+        except OSError as error:
+            raise UserError(
+                f"{file}: cannot be read ({error.strerror}); make it readable, or delete it, then "
+                "run again"
+            ) from None
         key, stamp = str(output), f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ino}"
         known = self._known.get(key)
         if known is not None and known[0] == stamp:
             return Record.from_text(known[1])
         found = read_record(output)
         if found is not None and file == output and not is_as_left(output):
-            found = None if damage_of(output) else found
-        self._known[key] = [stamp, "" if found is None else found.to_text()]
-        self._changed = True
+            if damage_of(output):
+                return None
+            note(output)
+        if found is not None:  # that there is none may be a fault that passes
+            self._known[key] = [stamp, found.to_text()]
+            self._changed = True
         return found
 
     def keep(self) -> None:

@@ -17,7 +17,7 @@ from intercap_core.pipeline import given, outcome
 from intercap_core.pipeline.claim import Claim, claim
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.intact import note
+from intercap_core.pipeline.intact import forget, note
 from intercap_core.pipeline.needs import disk_told
 from intercap_core.pipeline.plan import DATASET, OF_ALL, dataset_record_of, failures, noted
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
@@ -128,6 +128,7 @@ def _make(
         if in_folder:
             folders.put(part, output)
         else:
+            forget(output)
             os.replace(part, output)
             note(output)
         return True
@@ -220,6 +221,8 @@ def run_dataset(project: Project) -> Path:
     )
     with disk_told(project, folder / DATASET), claim(folder / DATASET):
         (dataset_record_of(project) / FILE).unlink(missing_ok=True)
+        for name in OF_ALL:
+            forget(folder / name)
         first = dataset.run(
             dataset=project.config.dataset,
             summaries={name: project.artefact(name, "summary") for name in project.sequences},

@@ -47,12 +47,12 @@ def replaced(output: Path) -> Iterator[Path]:
 def put(part: Path, output: Path) -> None:
     """Put a complete folder in the place of ``output``, which goes, or stays where this fails."""
     old = part.with_suffix(".old")
-    if output.exists():
-        output.rename(old)
     try:
+        if output.exists():
+            output.rename(old)
         part.rename(output)
-    except OSError:
-        if old.exists():
+    except BaseException:
+        if old.exists() and not output.exists():
             old.rename(output)
         raise
     shutil.rmtree(old, ignore_errors=True)

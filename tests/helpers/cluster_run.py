@@ -83,7 +83,7 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
-DATES = (".inputs.json", ".outputs.json", ".records.json")  # to read nothing twice
+DATES = (".inputs.json", ".records.json")  # to read nothing twice
 
 
 def contents(results: Path) -> dict[str, bytes]:
@@ -92,6 +92,7 @@ def contents(results: Path) -> dict[str, bytes]:
         path.relative_to(results).as_posix(): path.read_bytes()
         for path in sorted(results.rglob("*"))
         if path.is_file() and path.name not in (".snakemake_timestamp", *DATES)
+        if path.suffix != ".left"
     }
 
 

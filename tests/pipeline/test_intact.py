@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts, schemas
-from intercap_core.pipeline.intact import damage_of, is_as_left, note
+from intercap_core.pipeline.intact import damage_of, forget, is_as_left, note
 
 WRITES = """
 import resource, sys
@@ -69,7 +69,10 @@ def test_a_result_is_known_again_until_it_changes(summary: Path) -> None:
     assert "is not as it was written" in damage_of(summary)
     note(summary)
     assert is_as_left(summary)
-    (summary.with_name(".outputs.json")).write_text("[1, ")
+    (summary.with_name(f".{summary.name}.left")).write_text("[1, ")
+    assert not is_as_left(summary) and damage_of(summary) == ""
+    note(summary)
+    forget(summary)
     assert not is_as_left(summary)
 
 

@@ -39,7 +39,10 @@ SETTINGS = PROJECT.config
 SEQUENCES = list(PROJECT.sequences)
 PLAN = Plan(PROJECT)
 if workflow.is_main_process:
-    PLAN.mark_all()
+    try:
+        PLAN.mark_all()
+    except (UserError, OSError) as error:
+        raise WorkflowError(str(error)) from None
     atexit.register(PLAN.keep)
 VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
 NOTHING = "(?!)"  # a pattern that no text matches
