@@ -34,6 +34,7 @@ from intercap_core.evaluation.objects import measure
 from intercap_core.metrics import figures, hold_figures
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.metrics.flags import ranges
+from intercap_core.metrics.object_errors import ObjectErrors
 from intercap_core.metrics.times import match_times
 from intercap_core.project import Project, load_project
 from intercap_core.rigid.mesh import ObjectMesh
@@ -45,6 +46,7 @@ SIZE = (1440, 900)
 _TURN = 0.008  # radians that a pixel of a drag turns the object by
 _REACH = 260.0  # pixels of one drag
 _NEAR_PX, _NEAR_DEG = 1.5, 4.0  # as close as a person places it
+_SEEN_DEG = 8.0  # a turn that is drawn wrong by more is seen to be
 _MAX_EDITS = 120  # of contact; more would mean that the driver goes in circles
 Interval = tuple[int, int]
 
@@ -226,7 +228,7 @@ def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
     posed: set[int] = set()
     after = before
     for apart in APART:
-        placed = _answered(placing, errors.lost)
+        placed = _answered(placing, errors)
         for frame in _to_place(errors.lost & (eye.views > 0), posed | placed, apart):
             placing.place(frame)
             placed.add(frame)
@@ -237,16 +239,19 @@ def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
         errors = measure(project, name)
         after = float(errors.lost.mean())
         print(
-            f"{name}: {len(posed)} poses, run in {seconds:.0f} s, then lost in frames "
+            f"{name}: {len(posed)} times placed, run in {seconds:.0f} s, then lost in frames "
             f"{np.flatnonzero(errors.lost).tolist()}"
         )
         if not errors.lost.any():
             break
-    return {"annotate.object_lost_before": before, "annotate.object_lost_after": after,
-            "annotate.object_poses": float(len(posed))}  # fmt: skip
+    return {
+        "annotate.object_lost_before": before,
+        "annotate.object_lost_after": after,
+        "annotate.object_poses": float(len(project.annotation(name).poses)),
+    }
 
 
-def _answered(placing: Placing, lost: np.ndarray) -> set[int]:
+def _answered(placing: Placing, errors: ObjectErrors) -> set[int]:
     """Answer what is asked about the object; the frames in which it was placed."""
     hand, found = placing.hand, set()
     for _ in range(12):
@@ -257,7 +262,8 @@ def _answered(placing: Placing, lost: np.ndarray) -> set[int]:
         frame = int(asked["frame"])
         seen = placing.eye.views[frame] > 0
         if asked["kind"] == "turn":
-            answer = "2" if seen and lost[frame] else "1" if seen else "3"
+            wrong = errors.lost[frame] or errors.rotation[frame] > _SEEN_DEG
+            answer = "3" if not seen else "2" if wrong else "1"
         else:
             answer = "1" if seen else "2"
         hand.key(answer)
