@@ -121,8 +121,9 @@ class Hand:
                 self.visit.page.wait_for_timeout(500)
             if self.see("window.annotate.keep.run.state") != "done":
                 raise UserError(f"the run failed: {self.see('window.annotate.keep.run.words')}")
-            self.visit.wait("window.annotate.keep.beside !== null")
-            self.visit.page.wait_for_timeout(1500)
+            self.visit.wait(
+                "document.getElementById('hint').textContent.startsWith('the new result')"
+            )
             return time.monotonic() - begin
 
     @contextmanager
