@@ -8,8 +8,8 @@
 # make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
 #                of config/object to the object's track and the body's fit, those of config/body to
 #                the latter), tables and results/evaluation.json; about an hour on two cores, goes
-#                on where it was ended. Last, on three of them, the joint fit's oracle floors and what
-#                a mesh with holes costs it
+#                on where it was ended. Then, on three of them, the joint fit's oracle floors and what
+#                a mesh with holes costs it; last, two recordings mended in a real browser
 # make evaluate-quick  six recordings to the end within ten minutes, beside the recorded figures
 # make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker,
 #                the body's fit and the joint stage beside the paper's recipe, the joint stage's memory
@@ -81,6 +81,7 @@ evaluate: $(STAMP)
 	$(BIN)/python -m bench.oracle config/object/config.yaml --output results/evaluation.json \
 	    --sequences cup_drink_s02 suitcase_carry_s10 stool_sit_s07 --cores $(CORES) \
 	    --variants "as it is" "true mesh" "starts at the truth" "open mesh"
+	$(BIN)/python -m bench.annotate_driven --cores $(CORES)
 
 evaluate-quick: $(STAMP)
 	$(BIN)/intercap evaluate --quick --output results/evaluation-quick.json --cores $(CORES)

@@ -23,7 +23,7 @@ from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sequences import SequenceList
-from intercap_core.config import Annotation, ObjectEntry
+from intercap_core.config import Annotation, ObjectEntry, ObjectPose
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 from intercap_core.schemas import CONTACT_REGIONS
@@ -279,13 +279,11 @@ def _changes(told: dict[str, Any]) -> dict[str, Any]:
     return changes
 
 
-def _pose(told: dict[str, Any]) -> Any:
-    from intercap_core.config import InitialObjectPose
-
-    faults = document.faults({"object_pose": told})
+def _pose(told: dict[str, Any]) -> ObjectPose:
+    faults = document.faults({"object_poses": [told]})
     if faults:
         raise UserError(f"{faults[0]['where']}: {faults[0]['words']}")
-    return InitialObjectPose.model_validate(told)
+    return ObjectPose.model_validate(told)
 
 
 # --- routes ----------------------------------------------------------------------------------

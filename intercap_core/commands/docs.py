@@ -105,7 +105,8 @@ def settings_page() -> str:
         "",
         "`demo/` holds the settings of `make demo`; `evaluation/`, `capture/`, `object/` and",
         "`body/` those of `make evaluate`, to the end, to the scene, to the object's track and to",
-        "the body's fit; `bench/` those of `make bench`, `test/` a tiny capture for the tests.",
+        "the body's fit; `annotate/` those that it mends in a browser; `bench/` those of",
+        "`make bench`, `test/` a tiny capture for the tests.",
         "`objects/` holds the meshes of `objects.yaml`.",
     ]
     for model, file, purpose in ENTRIES.values():

@@ -73,6 +73,18 @@ def _drag(page: Visit, start: tuple[float, float], by: tuple[float, float]) -> N
     mouse.up()
 
 
+def _middle_of_the_object(page: Visit) -> tuple[float, float]:
+    """Where the object's middle is in the first large view, pixels of the window."""
+    box = page.page.locator("#big canvas").first.bounding_box()
+    assert box is not None
+    x, y, wide = page.page.evaluate(
+        """() => { const a = window.annotate, view = a.views.views[0];
+          return [...a.views.place(view, a.pose.middle()), view.width]; }"""
+    )
+    scale = box["width"] / wide
+    return box["x"] + x * scale, box["y"] + y * scale
+
+
 def _save(page: Visit, answer: str = "save") -> None:
     page.page.keyboard.press("Control+s")
     page.wait("document.getElementById('dialog').open")
@@ -115,14 +127,12 @@ def test_the_object_is_moved_in_a_view_where_the_pointer_goes(settings: Path) ->
         assert box is not None
         told = page.page.evaluate(
             """() => { const a = window.annotate, view = a.views.views[0];
-              return { at: a.views.place(view, a.pose.middle()), wide: view.width,
-                       pose: a.pose.pose, focal: view.camera.lens[0],
+              return { pose: a.pose.pose, focal: view.camera.lens[0],
                        size: view.camera.size[0] }; }"""
         )
-        scale = box["width"] / told["wide"]
-        start = (box["x"] + told["at"][0] * scale, box["y"] + told["at"][1] * scale)
+        start = _middle_of_the_object(page)
         _drag(page, start, (40, -20))
-        pose = _draft(page, "object_pose")
+        [pose] = _draft(page, "object_poses")
         depth = told["pose"][2][3]
         metres = depth / told["focal"] * told["size"] / box["width"]
         moved = np.array(pose["translation"]) - np.array(told["pose"])[:, 3]
@@ -130,13 +140,52 @@ def test_the_object_is_moved_in_a_view_where_the_pointer_goes(settings: Path) ->
         keys.down("Shift")
         _drag(page, start, (50, 0))
         keys.up("Shift")
-        turned = Rotation.from_rotvec(_draft(page, "object_pose")["rotation_vector"])
+        turned = Rotation.from_rotvec(_draft(page, "object_poses")[0]["rotation_vector"])
         assert 0.3 < turned.magnitude() < 0.5  # about the vertical of the view, 0.008 rad a pixel
         keys.press("Escape")
         _save(page)
         page.wait("document.getElementById('status').textContent === 'saved'")
     told = yaml.safe_load(annotation(settings).read_text())
-    assert told["object_pose"]["frame"] == 0
+    assert [one["frame"] for one in told["object_poses"]] == [0]
+
+
+def test_the_object_is_placed_in_several_frames_and_a_single_pose_joins_them(
+    settings: Path,
+) -> None:
+    single = (
+        "object_pose: {frame: 4, rotation_vector: [0, 0, 0], translation: [0, 0, 2], sigma_m: 0.02}"
+    )
+    annotation(settings).write_text(f"# kept\n{single}\n")
+
+    def frames(page: Visit) -> list[int]:
+        return [one["frame"] for one in _draft(page, "object_poses") or ()]
+
+    with served(settings) as server, _open(server) as page:
+        keys = page.page.keyboard
+        assert page.page.locator(".mark.posed").count() == 1
+        for frame in (0, 6):
+            page.page.evaluate(f"window.annotate.show({frame})")
+            keys.press("o")
+            middle = _middle_of_the_object(page)
+            _drag(page, middle, (25, 5))
+            keys.press("Escape")
+        assert frames(page) == [0, 4, 6] and _draft(page, "object_pose") is None
+        assert _draft(page, "object_poses")[1]["sigma_m"] == 0.02
+        assert page.page.locator(".mark.posed").count() == 3
+        keys.press("Control+z")
+        keys.press("Control+z")
+        assert frames(page) == [] and _draft(page, "object_pose")["frame"] == 4
+        keys.press("Control+Shift+z")
+        keys.press("Control+Shift+z")
+        page.page.locator("#tab-object").click()
+        page.page.get_by_role("button", name="Remove the pose").click()  # of frame 6, the shown one
+        assert frames(page) == [0, 4]
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'saved'")
+    text = annotation(settings).read_text()
+    told = yaml.safe_load(text)
+    assert text.startswith("# kept\n") and set(told) == {"object_poses"}
+    assert [one["frame"] for one in told["object_poses"]] == [0, 4]
 
 
 def test_subject_floor_and_dropped_frames_are_clicked(settings: Path) -> None:

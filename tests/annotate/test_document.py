@@ -71,16 +71,16 @@ def test_each_section_can_be_changed_taken_away_and_added(path: Path) -> None:
 def test_a_new_file_reads_like_the_example(path: Path) -> None:
     changes = {
         "contact": [{"part": "seat", "start": 1, "end": 5}],
-        "object_pose": {
-            "frame": 3,
-            "rotation_vector": [0.1, 0.2, 0.3],
-            "translation": [0, 0.5, 2.25],
-        },
+        "object_poses": [
+            {"frame": 3, "rotation_vector": [0.1, 0.2, 0.3], "translation": [0, 0.5, 2.25]},
+            {"frame": 5, "rotation_vector": [0.1, 0.2, 0.4], "translation": [0, 0.5, 2.5]},
+        ],
     }
     new = document.patched(document.read(path), changes)
     assert new == (
-        "contact:\n  - {part: seat, start: 1, end: 5}\n\nobject_pose:\n  frame: 3\n"
-        "  rotation_vector: [0.1, 0.2, 0.3]\n  translation: [0, 0.5, 2.25]\n"
+        "contact:\n  - {part: seat, start: 1, end: 5}\n\nobject_poses:\n"
+        "  - {frame: 3, rotation_vector: [0.1, 0.2, 0.3], translation: [0, 0.5, 2.25]}\n"
+        "  - {frame: 5, rotation_vector: [0.1, 0.2, 0.4], translation: [0, 0.5, 2.5]}\n"
     )
 
 

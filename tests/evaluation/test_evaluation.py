@@ -39,7 +39,8 @@ def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
     of_config = ("no_detector", "redrawn_1", "redrawn_2")
     objects = [path for path in OBJECT_SETTINGS if path.stem not in of_config]
     others = [
-        Path(f"config/{other}/config.yaml") for other in ("demo", "test", "bench", "evaluation")
+        Path(f"config/{other}/config.yaml")
+        for other in ("demo", "test", "bench", "evaluation", "annotate")
     ]
     others += [QUICK_SETTINGS, Path("config/evaluation/long.yaml")]
     others += sorted(Path("config/field").glob("*.yaml"))

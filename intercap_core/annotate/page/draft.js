@@ -1,6 +1,6 @@
 /* The annotation as it is edited: its sections, undo and redo, and a copy in this browser, so that a
  * tab that closes or a tunnel that breaks loses nothing. */
-export const SECTIONS = ["contact", "object_pose", "floor", "subject", "drop_frames"];
+export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames"];
 const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
 const empty = (value) => value === null || value === undefined || (Array.isArray(value) && !value.length);
 
@@ -24,12 +24,16 @@ export class Draft extends EventTarget {
   get(section) { return this.sections[section] ?? null; }
 
   /* One step that can be undone; what is said of it is shown. */
-  set(section, value, says = "") {
-    const next = empty(value) ? null : structuredClone(value);
-    if (same(next, this.sections[section])) return;
+  set(section, value, says = "") { this.put({ [section]: value }, says); }
+
+  /* The same of several sections at once. */
+  put(values, says = "") {
+    const next = {};
+    for (const [name, value] of Object.entries(values)) next[name] = empty(value) ? null : structuredClone(value);
+    if (Object.keys(next).every((name) => same(next[name], this.sections[name]))) return;
     this.done.push({ sections: this.sections, says });
     this.undone = [];
-    this.sections = { ...this.sections, [section]: next };
+    this.sections = { ...this.sections, ...next };
     this.told();
   }
 

@@ -5,6 +5,7 @@ import { ask, banner, button, diff, find, make, words } from "./dom.js";
 const CHECK_MS = 250;
 const LOOK_MS = 4000;
 const RUN_MS = 1000;
+const POSES = ["object_poses", "object_pose"]; // two forms of the same: never one of each
 
 export class Keep {
   constructor(app) {
@@ -90,6 +91,7 @@ export class Keep {
   /* Somebody else saved meanwhile: their change is shown, and nothing of either is lost. */
   async conflict(told) {
     const { app } = this, theirs = told.now.sections, mine = app.draft.changes();
+    if (POSES.some((name) => name in mine)) for (const name of POSES) mine[name] = app.draft.get(name);
     const both = Object.keys(mine).filter((name) => JSON.stringify(theirs[name] ?? null) !== JSON.stringify(app.draft.saved[name] ?? null));
     const answer = await ask("Somebody else changed this annotation meanwhile", [
       make("p", {}, "Their change, which is in the file:"), diff(told.difference || "(only the layout changed)"),

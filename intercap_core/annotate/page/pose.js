@@ -7,23 +7,38 @@ import { IDENTITY, apply, invert, rigid, rotationVector, rows, turnOnly, turnedA
 const TURN = 0.008; // radians a pixel
 const NEARER = 0.01; // of the distance, a notch of the wheel
 
-/* --- how the annotation has it: one pose today ------------------------------------------------ */
+/* --- how the annotation has them: a list of poses, one a frame; a file may have a single one instead - */
+const posesOf = (draft) => {
+  const single = draft.get("object_pose");
+  return [...(draft.get("object_poses") ?? []), ...(single ? [single] : [])]
+    .map((one) => ({ ...one, frame: one.frame ?? 0 })).sort((a, b) => a.frame - b.frame);
+};
+
 export function poseAt(draft, frame) {
-  const told = draft.get("object_pose");
-  return told && (told.frame ?? 0) === frame ? rigid(told.rotation_vector, told.translation) : null;
+  const told = posesOf(draft).find((one) => one.frame === frame);
+  return told ? rigid(told.rotation_vector, told.translation) : null;
 }
 
 export function putPose(draft, frame, pose, says) {
-  draft.set("object_pose", {
+  const all = posesOf(draft), old = all.find((one) => one.frame === frame);
+  put(draft, [...all.filter((one) => one !== old), {
+    ...old, // how well it is known stays
     frame,
     rotation_vector: rotationVector(pose).map((v) => Number(v.toFixed(6))),
     translation: pose.map((row) => Number(row[3].toFixed(5))),
-  }, says);
+  }], says);
 }
 
-export const takePose = (draft) => draft.set("object_pose", null, "object pose removed");
+export const takePose = (draft, frame) => put(draft, posesOf(draft).filter((one) => one.frame !== frame), "object pose removed");
 
-export const posedFrames = (draft) => (draft.get("object_pose") ? [draft.get("object_pose").frame ?? 0] : []);
+export const posedFrames = (draft) => posesOf(draft).map((one) => one.frame);
+
+/* Both sections together are an error: a single one stays as the file has it as long as it is alone. */
+function put(draft, poses, says) {
+  const single = draft.get("object_pose"), alone = single && poses.length === 1 && poses[0].frame === (single.frame ?? 0);
+  poses.sort((a, b) => a.frame - b.frame);
+  draft.put({ object_pose: alone ? poses[0] : null, object_poses: alone ? null : poses }, says);
+}
 
 /* Where a result has the object at a frame: the joint fit, else the track; null = nowhere. */
 export function objectPose(arrays, frame) {
@@ -177,7 +192,7 @@ export class PoseEditor {
   }
 
   remove() {
-    takePose(this.app.draft);
+    takePose(this.app.draft, this.app.frame);
     this.app.setMode(null);
   }
 
@@ -188,12 +203,12 @@ export class PoseEditor {
   panel() {
     const box = this.box ??= make("div", { class: "pose" });
     const { app } = this, stated = posedFrames(app.draft);
-    const where = stated.length ? `The annotation has a pose at frame ${stated.join(", ")}.` : "The annotation has no pose of the object.";
+    const where = stated.length ? `The annotation has a pose at frame${stated.length > 1 ? "s" : ""} ${stated.join(", ")}.` : "The annotation has no pose of the object.";
     if (!this.editing) {
       box.replaceChildren(make("p", {}, where),
         button("Place the object at this frame", () => this.start(), { class: "main", title: "O" }),
         ...stated.map((frame) => button(`Go to frame ${frame}`, () => app.show(frame))),
-        ...(stated.length ? [button("Remove the pose", () => this.remove())] : []));
+        ...(stated.includes(app.frame) ? [button("Remove the pose", () => this.remove())] : []));
       return box;
     }
     const vector = rotationVector(this.pose);

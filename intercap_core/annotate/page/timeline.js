@@ -1,6 +1,7 @@
 /* One time for all: flags, doubts and dropped frames, and a row of contact for each body part. */
 import { button, find, make, words } from "./dom.js";
 import { id } from "./contact.js";
+import { posedFrames } from "./pose.js";
 
 const SHOWN = 0.25; // a part has a row where its probability reaches this
 
@@ -62,6 +63,12 @@ export class Timeline {
       for (const [first, last] of runs(dropped)) {
         lane.append(this.#mark(first, last + 1, "mark dropped", `frames ${first} to ${last} are dropped`, () => app.show(first)));
       }
+      list.push(row);
+    }
+    const posed = posedFrames(app.draft);
+    if (posed.length) {
+      const { row, lane } = this.#lane("posed", "Object poses");
+      for (const t of posed) lane.append(this.#mark(t, t + 1, "mark posed", `the object was placed at frame ${t}`, () => app.show(t)));
       list.push(row);
     }
     if (told.object) for (const part of this.parts()) list.push(this.#part(part));
