@@ -89,8 +89,8 @@ class Claim:
         self._thread.start()
 
     def still_held(self) -> bool:
-        """False where another one has taken it over, or it is gone; one that cannot be read just now
-        is held."""
+        """False where another one has taken it over, or it is gone; one that cannot be read at the
+        moment is held."""
         try:
             text = self._path.read_text(encoding="utf-8")
         except FileNotFoundError:

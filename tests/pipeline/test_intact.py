@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +43,33 @@ for limit in range(0, 420_000, 7_001):  # bytes that the disk takes
     print(said, len(list(path.parent.iterdir())))
     path.unlink(missing_ok=True)
 unharmed.touch()
+"""
+
+
+TOLD = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from intercap_core import artefacts, disk
+from intercap_core.artefacts import Field, Schema
+from intercap_core.signals import ToldToEnd, told_to_end
+schema = Schema("some", 1, "frames", {"rows": Field(("T", "100"), "float64", "noise")})
+
+class Slow(disk.PartFile):
+    def write(self, data):
+        time.sleep(0.01)  # as a busy file server
+        return super().write(data)
+
+artefacts.PartFile = Slow
+disk.unbroken(Slow.write)
+try:
+    with told_to_end(), artefacts.write(Path(sys.argv[1]), schema) as writer:
+        rows = writer.stream("rows", (100,))
+        print("begun", flush=True)
+        while True:
+            rows.append(np.random.default_rng(0).random((2000, 100)))
+except ToldToEnd as end:
+    raise SystemExit(end.status)
 """
 
 
@@ -110,3 +139,18 @@ def test_wherever_the_disk_ends_nothing_is_left_and_no_process_crashes(tmp_path:
     said = done.stdout.split("\n")[:-1]
     assert set(said) == {"full 0", "whole 1"}
     assert said == sorted(said), "more room, and yet it failed"
+
+
+def test_a_signal_in_the_midst_of_a_write_ends_the_process_in_order(tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    results.mkdir()
+    for number in range(5):
+        run = subprocess.Popen(
+            [sys.executable, "-c", TOLD, str(results / "a.h5")],
+            stdout=subprocess.PIPE, cwd=Path(__file__).parents[2],
+        )  # fmt: skip
+        assert run.stdout is not None and run.stdout.readline()
+        time.sleep(0.05 + 0.07 * number)
+        run.terminate()
+        assert run.wait(30) == 128 + signal.SIGTERM
+        assert list(results.iterdir()) == []
