@@ -1,8 +1,9 @@
 """Whether results are as they were left: what has another size or date since is read through once.
 
 An artefact's size, date and digest are noted beside it when it is made. One whose size or date
-differs was copied, touched, cut off or overwritten; which of these its digest tells, or its
-checksums where nothing is noted. To read hundreds of gigabytes at every start they need not.
+differs was copied, touched, cut off or overwritten, which its digest tells: the same record, the
+same bytes. Where nothing is noted, or an artefact with another record was put there, its checksums
+tell. To read hundreds of gigabytes at every start they need not.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from intercap_core import artefacts, schemas
 from intercap_core.pipeline.kept import keep, read_kept
 
 SUFFIX = ".left"  # of what is noted of an output
+RECORD = "record"  # of the note: digest of what the output says that it was made from
 EXPORT_LIST = "export.json"  # digests of an export's files
 _ROWS = 64  # read at a time, so that memory stays flat
 
@@ -27,15 +29,16 @@ def forget(output: Path) -> None:
 
 
 def note(output: Path) -> None:
-    """Remember an output as it is now; what cannot be remembered is read through later."""
-    with contextlib.suppress(OSError):
-        keep(_note_of(output), {output.name: [_stamp(output), _digest(output)]})
+    """Remember an output as it is now, a folder not; what cannot be remembered is read later."""
+    with contextlib.suppress(OSError, artefacts.Unreadable):
+        now = {output.name: [_stamp(output), _digest(output)], RECORD: [_record(output), ""]}
+        keep(_note_of(output), now)
 
 
 def is_as_left(output: Path) -> bool:
     """Whether size and date are those that were noted."""
     try:
-        return _noted(output)[0] == _stamp(output)
+        return read_kept(_note_of(output)).get(output.name, ["", ""])[0] == _stamp(output)
     except FileNotFoundError:
         return False
 
@@ -45,13 +48,15 @@ def damage_of(output: Path) -> str:
     nothing. Raises OSError where they cannot be read."""
     if output.is_dir():
         return _changed_file(output)
-    digest = _noted(output)[1]
-    if digest:  # HDF5 has not to meet what is damaged: it was seen to hang, and to end the process
-        same = _digest(output) == digest
-        return "" if same else f"{output}: is not as it was written; delete it and run again"
-    if output.suffix != ".h5":
-        return ""
+    noted = read_kept(_note_of(output))
     try:
+        if output.name in noted:
+            if _digest(output) == noted[output.name][1]:
+                return ""
+            if noted.get(RECORD, ["", ""])[0] == _record(output):  # else another one was put there
+                return f"{output}: is not as it was written; delete it and run again"
+        if output.suffix != ".h5":
+            return ""
         with artefacts.read(output, getattr(schemas, output.stem.upper())) as source:
             for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
                 shape, _, _, _ = source.describe(key)
@@ -86,10 +91,11 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _noted(output: Path) -> tuple[str, str]:
-    """Size with date, and digest; empty where nothing is noted."""
-    stamp, digest = read_kept(_note_of(output)).get(output.name, ("", ""))
-    return stamp, digest
+def _record(output: Path) -> str:
+    """Digest of what an artefact says that it was made from, "" of other files."""
+    if output.suffix != ".h5":
+        return ""
+    return hashlib.sha256(artefacts.made_from(output).encode()).hexdigest()
 
 
 def _note_of(output: Path) -> Path:

@@ -53,21 +53,22 @@ import numpy as np
 from intercap_core import artefacts, disk
 from intercap_core.artefacts import Field, Schema
 from intercap_core.signals import ToldToEnd, told_to_end
-schema = Schema("some", 1, "frames", {"rows": Field(("T", "100"), "float64", "noise")})
+schema = Schema("some", 1, "frames", {"rows": Field(("T", "5000"), "float64", "noise")})
 
 class Slow(disk.PartFile):
     def write(self, data):
-        time.sleep(0.01)  # as a busy file server
+        time.sleep(0.005)  # as a busy file server
         return super().write(data)
 
 artefacts.PartFile = Slow
 disk.unbroken(Slow.write)
+values = np.random.default_rng(0).random((4, 5000))
 try:
     with told_to_end(), artefacts.write(Path(sys.argv[1]), schema) as writer:
-        rows = writer.stream("rows", (100,))
+        rows = writer.stream("rows", (5000,))
         print("begun", flush=True)
         while True:
-            rows.append(np.random.default_rng(0).random((2000, 100)))
+            rows.append(values)
 except ToldToEnd as end:
     raise SystemExit(end.status)
 """
@@ -154,3 +155,13 @@ def test_a_signal_in_the_midst_of_a_write_ends_the_process_in_order(tmp_path: Pa
         run.terminate()
         assert run.wait(30) == 128 + signal.SIGTERM
         assert list(results.iterdir()) == []
+
+
+def test_another_result_that_is_put_back_is_no_damage(summary: Path) -> None:
+    note(summary)
+    artefacts.put_made_from(summary, "other settings")
+    assert not is_as_left(summary) and damage_of(summary) == ""
+    note(summary)
+    artefacts.put_made_from(summary, "settings of another one")
+    summary.write_bytes(summary.read_bytes()[:-2000])
+    assert "delete" in damage_of(summary)
