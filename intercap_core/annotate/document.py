@@ -71,7 +71,12 @@ def read(path: Path) -> Document:
     try:
         text = data.decode("utf-8-sig")
         sections = _sections(text)
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError) as error:
+        told_as = json.dumps(sections, allow_nan=False, ensure_ascii=False)
+        told_as.encode()  # raises where a page cannot be told the values
+    except TypeError:
+        words = f"{path}: holds a value that no annotation has, as a date; correct it in an editor"
+        return Document(path, text, digest, {}, words, note)
+    except (UnicodeError, yaml.YAMLError, ValueError) as error:
         shown = data.decode("utf-8", "replace")
         words = f"{path}: not valid YAML{told(error)}; correct it in an editor"
         return Document(path, shown, digest, {}, words, note)
@@ -88,17 +93,22 @@ def patched(document: Document, changes: Mapping[str, Any]) -> str:
     unknown = sorted(set(changes) - set(Annotation.model_fields))
     if unknown:
         raise UserError(f"{document.path}: an annotation has no section {unknown[0]!r}")
+    layout = UserError(
+        f"{document.path}: its layout does not let sections be changed one by one; change it in an "
+        "editor"
+    )
     text = document.text.replace("\r\n", "\n")
-    for section in Annotation.model_fields:
-        if section in changes:
-            text = with_section(text, section, changes[section])
     kept = {k: v for k, v in document.sections.items() if k not in changes}
     wanted = kept | {k: v for k, v in changes.items() if v not in (None, [], ())}
-    if _plain(_sections(text)) != _plain(wanted):
-        raise UserError(
-            f"{document.path}: its layout does not let sections be changed one by one; change it "
-            "in an editor"
-        )
+    try:
+        for section in Annotation.model_fields:
+            if section in changes:
+                text = with_section(text, section, changes[section])
+        same = _plain(_sections(text)) == _plain(wanted)
+    except yaml.YAMLError:  # an alias of what was taken away
+        raise layout from None
+    if not same:
+        raise layout
     return text.replace("\n", "\r\n") if "\r\n" in document.text else text
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import secrets
+import shutil
 import socket
+import tempfile
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -59,7 +62,7 @@ def serve(
         say(f"from another machine: {tunnel}, then the same address")
         say("who has the address may change annotations; Ctrl+C ends it")
         if show:
-            webbrowser.open(address)
+            _show(address)
         options = uvicorn.Config(
             application(annotator, token), log_level="error", access_log=False,
             server_header=False, timeout_graceful_shutdown=2, ws="none",
@@ -68,3 +71,13 @@ def serve(
             uvicorn.Server(options).run(sockets=[listening])
         finally:
             annotator.runs.stop()
+
+
+def _show(address: str) -> None:
+    """Open the default browser by a file that only its user reads: other users of the machine see
+    the arguments of programs, and the address has the token."""
+    folder = Path(tempfile.mkdtemp(prefix="intercap-annotate-"))  # of this user alone
+    page = folder / "open.html"
+    page.write_text(f'<meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    webbrowser.open(page.as_uri())

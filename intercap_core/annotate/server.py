@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import threading
 from collections import OrderedDict
@@ -30,6 +31,7 @@ from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.viewer.package import DATA as VIEWER
 
 PAGE = Path(__file__).parent / "page"
+_MOST = 1e9  # of a number that a page tells
 OPEN_SEQUENCES = 3  # with their images and meshes in memory
 _KEEP = {
     "cache-control": "private, max-age=86400, immutable"
@@ -156,7 +158,8 @@ class Annotator:
         saved = document.save(now, document.patched(now, changes))
         if self.by:
             told = {"kind": "saved", "sections": sorted(changes)}
-            questions.keep_answer(self._answers(name), told, self.by)
+            with contextlib.suppress(OSError):  # the annotation is saved, whoever did it
+                questions.keep_answer(self._answers(name), told, self.by)
         return _told(saved)
 
     def answer(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
@@ -164,12 +167,11 @@ class Annotator:
         opened = self.opened(name)
         del opened
         kept = {key: told.get(key) for key in ("kind", "part", "answer", "first", "last", "frame")}
-        for key in ("from_s", "to_s"):
-            if not isinstance(told.get(key), int | float):
-                raise UserError(f"an answer tells {key}, seconds")
-            kept[key] = float(told[key])
-        if any(isinstance(v, str) and len(v) > 80 for v in kept.values()):
+        if any(v is not None and not isinstance(v, str | int) for v in kept.values()):
+            raise UserError("an answer has words and frames")
+        if any(len(str(v)) > 80 for v in kept.values()):
             raise UserError("an answer's words are too long")
+        kept |= {key: _number(told, key) for key in ("from_s", "to_s")}
         questions.keep_answer(self._answers(name), kept, self.by or None)
         return {"questions": self.questions(name)}
 
@@ -194,6 +196,8 @@ class Annotator:
         vertices = told["vertices"]
         if not isinstance(vertices, list) or not all(type(v) is int for v in vertices):
             raise UserError("vertices are numbers of the mesh's")
+        if any(not 0 <= v < _MOST for v in vertices):
+            raise UserError("a vertex is not one of the mesh's")
         digest = str(told["digest"])
         saved = surface.save_surface(self.project, self._object(name), vertices, digest)
         self.project = load_project(self.settings)
@@ -222,7 +226,7 @@ class Annotator:
     def point(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
         """The point of the room under a pixel."""
         opened = self.opened(name)
-        frame, x, y = int(told["frame"]), float(told["x"]), float(told["y"])
+        frame, x, y = int(_number(told, "frame")), _number(told, "x"), _number(told, "y")
         with opened.images() as images:
             if not 0 <= frame < images.num_sets:
                 raise UserError(f"there is no frame {frame}")
@@ -263,6 +267,13 @@ class Annotator:
                 pass
         return [{"where": words.partition(".")[0].partition("[")[0].split(" ")[0], "words": words}
                 for words in told if words]  # fmt: skip
+
+
+def _number(told: dict[str, Any], key: str) -> float:
+    value = told.get(key)
+    if not isinstance(value, int | float) or not -_MOST < value < _MOST:
+        raise UserError(f"{key} is to be a number")
+    return float(value)
 
 
 def _told(found: document.Document) -> dict[str, Any]:
@@ -329,7 +340,7 @@ def application(annotator: Annotator, token: str) -> App:
             annotator.opened(name)
             try:
                 told = json.loads(await request.body())
-            except ValueError:
+            except (ValueError, RecursionError):
                 told = None
             if not isinstance(told, dict):
                 raise HTTPException(400, "expected a JSON object")

@@ -135,6 +135,7 @@ def _run(
     try:
         status = run_watched(command, watcher, console)
     except ToldToEnd as end:
+        _unlock(settings)
         words = f"{end}: {watcher.steps()} jobs were done, and are kept; the same command goes on"
         console.print(words, highlight=False, soft_wrap=True)
         said = watcher.transcript.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -164,6 +165,12 @@ def _run(
     print_remarks(project, console)
     _print_report(project, console)
     return status
+
+
+def _unlock(settings: Path) -> None:
+    """Clear what Snakemake has left locked, which was ended by this run, where none goes on."""
+    if any(Path(".snakemake/locks").glob("*")) and _snakemake_here() is None:
+        subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
 
 
 def _full_disk(project: Project) -> str:

@@ -175,3 +175,28 @@ def test_dropping_frames_leaves_intervals_where_they_are_in_time(path: Path) -> 
     """A dropped frame keeps its number, so that nothing else of the annotation moves."""
     new = _patched(path, WRITTEN, drop_frames=[0, 1, 2, 3, 4])
     assert yaml.safe_load(new)["contact"] == yaml.safe_load(WRITTEN)["contact"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "drop_frames: 2020-01-01\n", "floor: [[.nan, 0, 1], [1, 0, 1], [0, 1, 1]]\n",
+        "subject: [{camera: \"\\ud800\", x: 1, y: 2}]\n", "starts: {k1: .inf, k2: 0}\n",
+    ],
+)  # fmt: skip
+def test_values_that_no_page_can_be_told_are_said_and_never_written(path: Path, text: str) -> None:
+    path.write_text(text)
+    found = document.read(path)
+    assert str(path) in found.problem and "correct it in an editor" in found.problem
+    with pytest.raises(UserError, match="correct it in an editor"):
+        document.patched(found, {"drop_frames": [1]})
+
+
+def test_an_alias_of_what_is_taken_away_is_left_to_an_editor(path: Path) -> None:
+    text = (
+        "floor:\n  - &p [0, 0, 1]\n  - [1, 0, 1]\n  - [0, 1, 1]\n"
+        "object_pose: {frame: 0, rotation_vector: [0, 0, 0], translation: *p}\n"
+    )
+    with pytest.raises(UserError, match="change it in an editor"):
+        _patched(path, text, floor=[[0, 0, 2], [1, 0, 2], [0, 1, 2]])
+    assert path.read_text() == text

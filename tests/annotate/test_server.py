@@ -124,6 +124,31 @@ def test_who_and_when_are_kept_by_choice_alone(settings: Path) -> None:
     assert named["by"] == "ann" and named["at"]
 
 
+def test_a_save_stands_where_who_did_it_cannot_be_kept(settings: Path) -> None:
+    path = annotation(settings)
+    path.with_name(f"{NAME}.answers.jsonl").mkdir(parents=True)
+    with served(settings, by="ann") as page:
+        told = {"digest": "none", "text": "", "changes": {"drop_frames": [1]}}
+        assert page.post(f"{OF}/save", told)[0] == 200
+    assert "drop_frames: [1]" in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("verb", "told"),
+    [
+        ("point", {"camera": "k1", "frame": None, "x": 1, "y": 2}),
+        ("point", {"camera": "k1", "frame": 0, "x": [1], "y": 2}),
+        ("point", {"camera": "k1", "frame": 0, "x": 10**400, "y": 2}),
+        ("answer", {"kind": "turn", "part": "", "answer": "yes", "from_s": 10**400, "to_s": 1}),
+        ("answer", {"kind": ["turn"], "part": "", "answer": "yes", "from_s": 0, "to_s": 1}),
+        ("answer", {"kind": "turn", "part": "", "answer": "yes", "from_s": 0, "to_s": 1e300}),
+    ],
+)
+def test_what_is_no_number_or_word_is_refused(page: Served, verb: str, told: dict) -> None:
+    status, words = page.post(f"{OF}/{verb}", told)
+    assert status == 422 and "unexpected" not in str(words)
+
+
 def test_images_alone_are_shown_where_nothing_else_is_there(page: Served, settings: Path) -> None:
     for path in artefact(settings, "joint").parent.glob("*.h5"):
         if path.stem != "frames":

@@ -14,8 +14,10 @@ export class Draft extends EventTarget {
     this.sections = structuredClone(this.saved);
   }
 
-  /* What the file holds by now; the edits stay. */
-  base(annotation) {
+  /* What the file holds by now; the edits stay. Of theirs no step back leads out: an earlier step
+   * would take away what they saved. */
+  base(annotation, theirs = false) {
+    if (theirs) { this.done = []; this.undone = []; }
     this.file = annotation;
     this.saved = {};
     for (const name of SECTIONS) this.saved[name] = annotation.sections[name] ?? null;

@@ -99,7 +99,7 @@ export class Keep {
     [["mine", both.length ? "Keep mine there, theirs elsewhere" : "Keep both", !both.length], ["theirs", "Take theirs, drop mine"], ["", "Decide later", both.length > 0]]);
     if (!answer) return;
     const edited = structuredClone(mine);
-    app.draft.base(told.now);
+    app.draft.base(told.now, true);
     app.told.annotation = told.now;
     if (answer === "theirs") { app.draft.takeFile("theirs taken"); banner("changed", ""); return; }
     app.draft.sections = { ...structuredClone(app.draft.saved), ...edited };
@@ -131,7 +131,7 @@ export class Keep {
 
   async showChange() {
     const { app } = this, now = await get(`${this.path}/annotation`);
-    if (!app.draft.dirty) { app.saved(now); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
+    if (!app.draft.dirty) { app.saved(now, true); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
     await this.conflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
   }
 

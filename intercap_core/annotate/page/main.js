@@ -242,10 +242,10 @@ class App {
 
   redo() { this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
 
-  saved(annotation) {
+  saved(annotation, theirs = false) {
     this.told.annotation = annotation;
     const untouched = !this.draft.dirty;
-    this.draft.base(annotation);
+    this.draft.base(annotation, theirs);
     if (untouched) this.draft.sections = structuredClone(this.draft.saved);
     this.draft.told();
   }
@@ -378,4 +378,6 @@ async function begin() {
   } catch (error) { stop(error.message); }
 }
 
+/* The address that a new server has printed, put into this tab: its token is taken. */
+addEventListener("hashchange", () => { if (/[#&]token=/.test(location.hash) && takeToken()) location.reload(); });
 begin();
