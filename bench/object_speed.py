@@ -37,6 +37,7 @@ from intercap_core.errors import UserError
 from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
 from intercap_core.object_track.constants import FIT_ROUNDS
 from intercap_core.object_track.fit import MotionPrior
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.motion import expected, extrapolated
 from intercap_core.object_track.view import View
 from intercap_core.project import load_project
@@ -123,13 +124,18 @@ class Run:
         return near and self.lost <= other.lost
 
 
+def _given(start: np.ndarray) -> GivenPose:
+    """The first frame's pose as an annotation has it, with the deviations of one."""
+    return GivenPose(0, start, 0.01, np.radians(5.0))
+
+
 def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEATS) -> Run:
     """All that the stage does: hypotheses, decision, exposure times, flags; no start: a search."""
     seconds, poses = [], np.zeros(0)
     for _ in range(repeats if start is not None else 1):
         tracker = clip.tracker()
         begin = time.perf_counter()
-        track = tracker.run(None if start is None else (0, start))
+        track = tracker.run([] if start is None else [_given(start)])
         seconds.append(time.perf_counter() - begin)
         poses = np.array([frame.fit.pose for frame in track.frames])
     return Run.of(clip, poses, statistics.median(seconds))
@@ -213,7 +219,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     clip = ObjectClip.load(project, sequence, frames)
     start = clip.annotated
     warm = ObjectClip.load(project, sequence, 2)  # compiles and imports
-    warm.tracker().run((0, start))
+    warm.tracker().run([_given(start)])
     milliseconds_a_step(warm, start, Recipe(), 3)
 
     ours, single = whole_track(clip, start), one_pass(clip, start)

@@ -18,7 +18,7 @@ def absent_track(frames: int, cameras: int) -> dict[str, np.ndarray]:
     lengths = {"T": frames, "C": cameras}
     found = {}
     for key, field in OBJECT_TRACK.fields.items():
-        if field.dtype != "str":
+        if field.dtype != "str" and not field.optional:
             shape = [lengths[dim] if dim in lengths else int(dim) for dim in field.dims]
             dtype = np.dtype(field.dtype)
             found[key] = np.full(shape, _UNKNOWN[dtype.kind], dtype)

@@ -13,6 +13,7 @@ from intercap_core.object_track.constants import MAX_HYPOTHESES
 from intercap_core.object_track.decoder import Decoded
 from intercap_core.object_track.fit import Fit, seen_by
 from intercap_core.object_track.frame_result import FrameResult
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.motion import about, unwrapped
 from intercap_core.object_track.observer import Observer
@@ -220,7 +221,7 @@ def test_what_reappears_turned_is_found_turned() -> None:
         labels=("suitcase",),
         up=capture.master_from_room[:3, 2],
     )
-    frames = tracker.run((0, capture.poses[0])).frames
+    frames = tracker.run([GivenPose(0, capture.poses[0], 0.01, np.radians(5.0))]).frames
     assert [frame.lost for frame in frames] == [t in capture.hidden for t in range(15)]
     for t in set(range(15)) - capture.hidden:
         found, true = frames[t].fit.pose, capture.poses[t]

@@ -8,6 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings, Symmetry
+from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.turns import near_turns
 from intercap_core.object_track.view import View, ViewGeometry
@@ -111,7 +112,7 @@ def test_rest_and_what_symmetry_hides(name: str) -> None:
     )
     start = capture.poses[0].copy()
     start[:3, 3] += 0.005
-    frames = tracker.run((0, start)).frames
+    frames = tracker.run([GivenPose(0, start, 0.01, np.radians(5.0))]).frames
     poses = np.array([frame.fit.pose for frame in frames])
     resting = np.array([frame.resting for frame in frames])
     assert resting[:5].all() and not resting[7:].any()

@@ -42,7 +42,6 @@ def test_killed_in_a_stage_and_with_damaged_results_it_goes_on(
 ) -> None:
     victim.flow.artefact(ONE, "person").unlink()
     assert kill_in(victim, {(ONE, "person")}, {(ONE, "person"): 2.0}) == (ONE, "person")
-    assert not victim.flow.artefact(ONE, "person").exists()
     cut, flipped = victim.flow.artefact(OTHER, "scene"), victim.flow.results / "heatmaps.h5"
     cut.write_bytes(cut.read_bytes()[:-1000])
     damage(flipped)
