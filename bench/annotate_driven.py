@@ -12,7 +12,6 @@ truth is the eye of the person: where the object and the contact are to be seen,
 from __future__ import annotations
 
 import argparse
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -42,7 +41,6 @@ from intercap_core.schemas import METRIC_REGIONS, SCENE, TRUTH
 
 OBJECT, CONTACT = "racquet_swing_s11", "bottle_drink_s02"
 APART = (4, 2, 1)  # frames between poses: at first, where it is still lost after a run, and again
-SIZE = (1440, 900)
 _TURN = 0.008  # radians that a pixel of a drag turns the object by
 _REACH = 260.0  # pixels of one drag
 _NEAR_PX, _NEAR_DEG = 1.5, 4.0  # as close as a person places it
@@ -391,23 +389,9 @@ def _drag_end(hand: Hand, part: str, one: Interval, end: str, frames: int) -> No
 @contextmanager
 def opened(settings: Path, sequence: str, cores: int) -> Iterator[Hand]:
     """The sequence's page in a browser, served by a process of its own."""
-    from tests.helpers.browser import visit
-
-    command = [sys.executable, "-m", "intercap_core.cli", "annotate", str(settings), sequence]
-    command += ["--cores", str(cores)] if cores else []
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert server.stdout is not None
-    try:
-        address = re.search(r"http\S+", server.stdout.readline())
-        if address is None:
-            raise UserError("the page's server did not start")
-        with visit(address.group(0), size=SIZE) as found:
-            found.wait(annotate_page.READY)
-            found.page.wait_for_timeout(1000)
-            yield Hand(found)
-    finally:
-        server.terminate()
-        server.wait()
+    with annotate_page.served_page(settings, sequence, cores) as found:
+        found.page.wait_for_timeout(1000)
+        yield Hand(found)
 
 
 def made_plain(project: Project, cores: int) -> None:

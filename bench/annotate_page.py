@@ -16,16 +16,22 @@ import argparse
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from intercap_core.commands.bench import put_figures
+from intercap_core.errors import UserError
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
+    from tests.helpers.browser import Visit
+
+SIZE = (1440, 900)  # of the browser, px
 PAUSE_MS = 160  # between keys
 READY = "document.body.dataset.ready === 'yes'"
 # A step begins with the key, before the page hears of it, and ends when all is painted.
@@ -69,31 +75,42 @@ def steps_ms(page: Page, steps: int, key: str = "ArrowRight") -> np.ndarray:
     return np.array(page.evaluate("window.stepMs"), float)
 
 
-def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
-    """Figures of one sequence, served by a process of its own."""
+@contextmanager
+def served_page(settings: Path, sequence: str, cores: int = 0) -> Iterator[Visit]:
+    """The sequence's page in a browser, ready, served by a process of its own.
+
+    Raises UserError where the server does not start.
+    """
     from tests.helpers.browser import visit
 
     command = [sys.executable, "-m", "intercap_core.cli", "annotate", str(settings), sequence]
+    command += ["--cores", str(cores)] if cores else []
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     try:
         address = re.search(r"http\S+", server.stdout.readline())
         if address is None:
-            raise SystemExit("the server did not start")
-        with visit(address.group(0), size=(1440, 900)) as page:
+            raise UserError(f"{settings}: the server of {sequence}'s page did not start")
+        with visit(address.group(0), size=SIZE) as page:
             page.wait(READY)
-            page.page.wait_for_timeout(1500)
-            page.page.evaluate(WATCH)
-            steps = min(steps, page.page.evaluate("window.annotate.told.frames") - 1)
-            on = steps_ms(page.page, steps)
-            page.page.reload()
-            page.wait(READY)
-            page.page.wait_for_timeout(1500)
-            page.page.evaluate(WATCH)
-            jump = steps_ms(page.page, 1, "End")
+            yield page
     finally:
         server.terminate()
         server.wait()
+
+
+def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
+    """Figures of one sequence, served by a process of its own."""
+    with served_page(settings, sequence) as page:
+        page.page.wait_for_timeout(1500)
+        page.page.evaluate(WATCH)
+        steps = min(steps, page.page.evaluate("window.annotate.told.frames") - 1)
+        on = steps_ms(page.page, steps)
+        page.page.reload()
+        page.wait(READY)
+        page.page.wait_for_timeout(1500)
+        page.page.evaluate(WATCH)
+        jump = steps_ms(page.page, 1, "End")
     return {
         "annotate.page_ms_per_step": round(float(np.median(on[:, 0])), 1),
         "annotate.page_ms_per_step_p95": round(float(np.percentile(on[:, 0], 95)), 1),
@@ -110,7 +127,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
     told = parser.parse_args()
-    found = measure(told.settings, told.sequence, told.steps)
+    try:
+        found = measure(told.settings, told.sequence, told.steps)
+    except UserError as error:
+        raise SystemExit(str(error)) from None
     for name, value in found.items():
         print(f"{name}: {value}")
     put_figures(told.output, found, instead_of=("annotate.page_",))

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from intercap_core import artefacts, schemas
 from intercap_core.pipeline.kept import keep, read_kept
+from intercap_core.stages.folders import EXPORT_MARKER
 
 SUFFIX = ".left"  # of what is noted of an output
 RECORD = "record"  # of the note: digest of what the output says that it was made from
-EXPORT_LIST = "export.json"  # digests of an export's files
 _ROWS = 64  # read at a time, so that memory stays flat
 
 
@@ -70,17 +70,17 @@ def damage_of(output: Path) -> str:
 
 def _changed_file(folder: Path) -> str:
     """Which of the files is not the one that the folder's list of digests names."""
-    if not (folder / EXPORT_LIST).is_file():
+    if not (folder / EXPORT_MARKER).is_file():
         return ""
     try:
-        listed = json.loads((folder / EXPORT_LIST).read_text(encoding="utf-8"))["files"]
+        listed = json.loads((folder / EXPORT_MARKER).read_text(encoding="utf-8"))["files"]
         found = [
             name
             for name, digest in listed.items()
             if not (folder / name).is_file() or _digest(folder / name) != digest
         ]
     except (ValueError, KeyError, AttributeError, TypeError):
-        found = [EXPORT_LIST]
+        found = [EXPORT_MARKER]
     if not found:
         return ""
     return f"{folder / found[0]}: is not as it was written; delete the folder and re-run its stage"

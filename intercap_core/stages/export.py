@@ -31,11 +31,11 @@ from intercap_core.export.verdict import Verdict
 from intercap_core.metrics.figures import SequenceMetrics
 from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, SCENE
-from intercap_core.stages.folders import check_replaceable, replaced
+from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, replaced
 
 log = logging.getLogger(__name__)
 
-MARKER = "export.json"
+MARKER = EXPORT_MARKER
 _OF_IMAGES = {"bop", "coco"}  # formats that say what is in each image
 _OF_BODIES = {"intercap", "amass"}  # formats of parameters, which say nothing without the mesh
 _NO_FRAME = "none: numbers of vertices and regions, distances in metres"

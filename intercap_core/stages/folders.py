@@ -10,6 +10,8 @@ from pathlib import Path
 from intercap_core.artefacts import PART, part_of
 from intercap_core.errors import UserError
 
+EXPORT_MARKER = "export.json"  # of an export, and the digests of its files
+
 
 def check_replaceable(output: Path, *, marker: str, what: str) -> None:
     """Raise UserError where ``output`` holds anything but an earlier ``what``, which has a file

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 import threading
 import time
@@ -32,6 +33,14 @@ def small_project(folder: Path, total: int = 6) -> Path:
     settings = fitted.write_project(folder / "project", capture, NAME)
     (folder / "project" / "annotations").mkdir()
     return settings
+
+
+def copied(made: Path, folder: Path) -> Path:
+    """Settings of a copy of the project in ``folder``, which a test may change."""
+    shutil.copytree(made.parent, folder)
+    path = folder / "config.yaml"
+    path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
+    return path
 
 
 def annotation(settings: Path) -> Path:

@@ -15,7 +15,16 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from tests.annotate.served import NAME, TOKEN, Served, annotation, artefact, served, small_project
+from tests.annotate.served import (
+    NAME,
+    TOKEN,
+    Served,
+    annotation,
+    artefact,
+    copied,
+    served,
+    small_project,
+)
 from tests.helpers.browser import Visit, needs_chromium, serious_faults, visit
 
 pytestmark = needs_chromium
@@ -45,11 +54,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def settings(made: Path, tmp_path: Path) -> Path:
-    folder = tmp_path / "project"
-    shutil.copytree(made.parent, folder)
-    path = folder / "config.yaml"
-    path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
-    return path
+    return copied(made, tmp_path / "project")
 
 
 @contextmanager

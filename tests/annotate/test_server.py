@@ -16,7 +16,7 @@ import yaml
 from intercap_core.annotate import rerun
 from intercap_core.config import Annotation
 from intercap_core.viewer.package import unpacked
-from tests.annotate.served import NAME, Served, annotation, artefact, served, small_project
+from tests.annotate.served import NAME, Served, annotation, artefact, copied, served, small_project
 
 OF = f"sequences/{NAME}"
 
@@ -28,12 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def settings(made: Path, tmp_path: Path) -> Path:
-    """The project, to be changed."""
-    folder = tmp_path / "project"
-    shutil.copytree(made.parent, folder)
-    path = folder / "config.yaml"
-    path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
-    return path
+    return copied(made, tmp_path / "project")
 
 
 @pytest.fixture
