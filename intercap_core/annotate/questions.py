@@ -15,6 +15,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
+from intercap_core.annotate.sides import doubts
 from intercap_core.errors import UserError
 from intercap_core.metrics.flags import ranges
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
@@ -43,7 +44,7 @@ def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[
         with opened.images() as images:
             times = images.time_s
         object_ = opened.project.sequences[opened.name].object or ""
-        for look in (_of_subject, _of_object, _of_contact):
+        for look in (_of_subject, _of_sides, _of_object, _of_contact):
             try:
                 found += look(opened, object_.replace("_", " "), times)
             except UserError:  # not there, or of an older version: told by the result
@@ -135,6 +136,21 @@ def _of_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
             f"Several people are seen. Is the marked one the subject?{why}",
             len(times), choices, camera=camera, x=round(float(x), 1), y=round(float(y), 1),
         )
+    ]  # fmt: skip
+
+
+def _of_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    return [
+        _question(
+            "sides", "", one.first, one.last, one.frame,
+            "Are L and R, as the views' points have them, the subject's own left and right?",
+            2.0 * (one.last - one.first + 1),
+            (("yes", "Yes, in every view"), ("view", f"Exchanged in {one.camera}"),
+             ("all", "Exchanged in every view"), ("mark", "I mark where"),
+             ("unsure", "Cannot be seen")),
+            camera=one.camera, why=one.words,
+        )
+        for one in doubts(opened)
     ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Running again what an edit touches, and the new result beside the old one.
+"""Running again what an edit touches.
 
 What is touched is decided by ``pipeline.plan``, as for ``intercap run``, which is also what runs.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 import threading
@@ -18,21 +17,17 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from intercap_core import artefacts
+from intercap_core.annotate import before
+from intercap_core.commands.run import ENDS_WITHIN_S
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.metrics.verdict_figures import stated_errors
 from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.plan import Kind, Plan
 from intercap_core.project import Project
-from intercap_core.schemas import JOINT, OBJECT_TRACK
-from intercap_core.stage_list import SEQUENCE_STAGES
 
 LEAVES = ("summary", "page", "export")  # what nothing else of a sequence is made of
 _LAST_LINES = 12
+_PATIENCE_S = 10.0  # beyond what `intercap run` takes at most to end in order
 
 
 @dataclass(frozen=True)
@@ -84,17 +79,6 @@ def command(
     ]  # fmt: skip
 
 
-def before_folder(project: Project, sequence: str) -> Path:
-    """Where the result before the last run from the page is kept."""
-    return project.results / ".annotate" / sequence / "before"
-
-
-def before_paths(project: Project, sequence: str) -> dict[str, Path]:
-    """Artefacts by stage as they were before the last run from the page."""
-    folder = before_folder(project, sequence)
-    return {stage: folder / f"{stage}.h5" for stage in SEQUENCE_STAGES}
-
-
 class Runs:
     """The one run that the page may have started, of one sequence at a time."""
 
@@ -106,12 +90,18 @@ class Runs:
         self._stages: list[str] = []
         self._start = 0.0
         self._ended = 0.0
+        self._told_to_end = 0.0  # when, by time.monotonic; 0 = it was not
         self._said: Path | None = None
 
     @property
     def going_on(self) -> bool:
         """Whether a run that was started here has not ended."""
         return self._process is not None and self._process.poll() is None
+
+    @property
+    def sequence(self) -> str:
+        """Of the run that was started last, "" = none was."""
+        return self._sequence
 
     def start(self, project: Project, sequence: str) -> None:
         """Run what is out of date of a sequence; what is there now is kept beside.
@@ -127,10 +117,12 @@ class Runs:
             self._stages = [one["stage"] for one in touched(project, sequence)]
             if not self._stages:
                 raise UserError(f"nothing to run: all results of {sequence} are up to date")
-            _keep(project, sequence)
+            self._note_end(project)
+            before.keep(project, sequence, self._stages)
             self._said = project.logs / "annotate.txt"  # no .log: those are of jobs
             self._said.parent.mkdir(parents=True, exist_ok=True)
             self._sequence, self._start, self._ended = sequence, time.time(), 0.0
+            self._told_to_end = 0.0
             with open(self._said, "wb") as said:
                 self._process = subprocess.Popen(
                     [sys.executable, "-m", "intercap_core.cli", *told[1:]],
@@ -139,22 +131,38 @@ class Runs:
                 )  # fmt: skip
 
     def stop(self) -> None:
-        """End the run, which ends its jobs; what they had finished is kept."""
+        """Tell the run to end, with its jobs; what they had finished is kept. It is not waited for.
+
+        Telling it again changes nothing as long as it may take to end in order; after that, it is
+        killed.
+        """
         with self._lock:
-            if self._process is not None and self.going_on:
+            if self._process is None or not self.going_on:
+                return
+            if not self._told_to_end:
+                self._told_to_end = time.monotonic()
                 self._process.terminate()
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(timeout=20)
+            elif time.monotonic() - self._told_to_end > ENDS_WITHIN_S + _PATIENCE_S:
+                _kill(self._process)
+
+    def wait(self) -> None:
+        """Until a run that was told to end has ended, or is taken for one that does not."""
+        if self._process is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(ENDS_WITHIN_S + _PATIENCE_S)
 
     def progress(self, project: Project) -> dict[str, Any]:
         """How far the last run is: the sequence, each of its stages' states and last words."""
         if self._process is None:
             return {"state": "none"}
         status = self._process.poll()
-        if status is not None and not self._ended:
-            self._ended = time.time()
+        self._note_end(project)
         stages = [{"stage": stage, **self._stage(project, stage)} for stage in self._stages]
-        state = "running" if status is None else ("done" if status == 0 else "failed")
+        told = bool(self._told_to_end)
+        if status is None:
+            state = "ending" if told else "running"
+        else:
+            state = "done" if status == 0 else ("stopped" if told else "failed")
         words = ""
         if state == "failed" and self._said is not None and self._said.is_file():
             lines = self._said.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -162,7 +170,16 @@ class Runs:
         return {
             "state": state, "sequence": self._sequence, "stages": stages, "words": words,
             "seconds": round((self._ended or time.time()) - self._start, 1),
+            "ending_s": round(time.monotonic() - self._told_to_end, 1) if told else 0.0,
+            "ends_within_s": ENDS_WITHIN_S + _PATIENCE_S,
         }  # fmt: skip
+
+    def _note_end(self, project: Project) -> None:
+        if self._process is None or self.going_on or self._ended:
+            return
+        self._ended = time.time()
+        if self._process.returncode == 0:
+            before.ended_well(project, self._sequence)
 
     def _stage(self, project: Project, stage: str) -> dict[str, str]:
         log = project.logs / self._sequence / f"{stage}.log"
@@ -175,61 +192,11 @@ class Runs:
             return {"state": "waits", "words": ""}
 
 
-def _keep(project: Project, sequence: str) -> None:
-    """Hold on to the artefacts that are there, without a copy where the file system has links."""
-    folder = before_folder(project, sequence)
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for stage in SEQUENCE_STAGES:
-        path = project.artefact(sequence, stage)
-        if path.is_file():
-            try:
-                os.link(path, folder / path.name)
-            except OSError:
-                shutil.copy2(path, folder / path.name)
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """The process and all that it has started."""
+    import psutil
 
-
-def beside(project: Project, sequence: str) -> dict[str, Any]:
-    """The new result beside the one before the last run: figures of the verdict, and by how much
-    body and object moved, millimetres. Empty where there was none."""
-    old = before_paths(project, sequence)
-    new = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
-    rows: list[dict[str, Any]] = []
-    found: dict[str, Any] = {"rows": rows, "there": old["joint"].is_file()}
-    figures = [_figures(old), _figures(new)]
-    for name in dict.fromkeys([*figures[0], *figures[1]]):
-        rows.append({"name": name, "old": figures[0].get(name), "new": figures[1].get(name)})
-    try:
-        with artefacts.read(old["joint"], JOINT) as a, artefacts.read(new["joint"], JOINT) as b:
-            if a["joints"].shape == b["joints"].shape:
-                moved = np.linalg.norm(a["joints"] - b["joints"], axis=2).mean(1)
-                found["body_moved_mm"] = (1e3 * moved).round(1).tolist()
-                shift = np.linalg.norm(a["translation"] - b["translation"], axis=1)
-                if np.isfinite(shift).all():
-                    found["object_moved_mm"] = (1e3 * shift).round(1).tolist()
-    except artefacts.Unreadable:
-        pass
-    return found
-
-
-def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
-    rows: dict[str, float | None] = {}
-    try:
-        metrics = SequenceMetrics.read(paths["metrics"])
-        for error in stated_errors(metrics):
-            stated = error.stated if np.isfinite(error.stated) else None
-            rows[f"{error.part}, stated error, mm"] = None if stated is None else round(stated, 1)
-        rows["flagged frames"] = int(metrics.values["flagged"].sum())
-        if metrics.has_object:
-            rows["frames in contact"] = int(metrics.values["contact_frame"].sum())
-            depth = metrics.values["penetration_mean"]
-            rows["penetration, mm"] = round(1e3 * float(np.nanmean(depth)), 2)
-    except artefacts.Unreadable:
-        pass
-    with (
-        contextlib.suppress(artefacts.Unreadable),
-        artefacts.read(paths["object_track"], OBJECT_TRACK) as track,
-    ):
-        rows["frames with the object lost"] = int(track["lost"].sum())
-        rows["frames with an ambiguous turn"] = int(track["ambiguous"].sum())
-    return rows
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for one in (*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                one.kill()

@@ -12,6 +12,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
+from intercap_core.annotate.sides import doubts
 from intercap_core.camera.rig import Rig
 from intercap_core.camera.transforms import rigid
 from intercap_core.errors import UserError
@@ -191,6 +192,9 @@ def _person(opened: Opened, found: dict[str, Any]) -> None:
         }
         missing = person["missing"]
     found["places"] += _runs(missing, "subject", "fewer than two views see the subject", 1.0)
+    found["places"] += [
+        _place(one.first, one.last, "sides", one.words, 2.0, one.frame) for one in doubts(opened)
+    ]
 
 
 def _track(opened: Opened, found: dict[str, Any]) -> None:

@@ -71,6 +71,9 @@ def serve(
             uvicorn.Server(options).run(sockets=[listening])
         finally:
             annotator.runs.stop()
+            if annotator.runs.going_on:
+                say(f"the run of {annotator.runs.sequence} is ending; what is done is kept")
+                annotator.runs.wait()
 
 
 def _show(address: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import shlex
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from intercap_core.annotate import document, questions, rerun, result, snap, surface, symmetry
+from intercap_core.annotate import before, document, questions, rerun, result, sides, snap, surface, symmetry
 from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened
@@ -68,7 +69,7 @@ class Annotator:
         key = f"{version}/{name}"
         with self._lock:
             if key not in self._opened:
-                paths = rerun.before_paths(self.project, name) if version == "before" else None
+                paths = before.before_paths(self.project, name) if version == "before" else None
                 self._opened[key] = Opened(self.project, name, paths)
             self._opened.move_to_end(key)
             while len(self._opened) > 2 * OPEN_SEQUENCES:
@@ -79,13 +80,14 @@ class Annotator:
         """Everything but images and meshes."""
         opened = self.opened(name)
         if not opened.there("frames"):
-            told = (
-                "no images have been read of this recording yet: run it, or "
-                f"`intercap run {self.settings} -- --until frames`"
-            )
+            by_hand = shlex.join(["intercap", "run", str(self.settings), "--", "--until", "frames"])
+            told = f"no images have been read of this recording yet: run it, or `{by_hand}`"
             found: dict[str, Any] = {"sequence": name, "frames": 0, "notes": [told]}
         else:
-            found = result.describe(opened)
+            try:
+                found = result.describe(opened)
+            except UserError as error:  # a run can make the images anew
+                found = {"sequence": name, "frames": 0, "notes": [str(error)]}
         row = self.project.sequences[name]
         made = self.project.annotation_made(name)
         found |= {
@@ -249,7 +251,7 @@ class Annotator:
         self.opened(name)
         told = rerun.command(self.project, name, cores=self.runs.cores, profile=self.runs.profile)
         progress = self.runs.progress(self.project)
-        return progress | {"command": " ".join(told), "cluster": self.runs.profile is not None}
+        return progress | {"command": shlex.join(told), "cluster": self.runs.profile is not None}
 
     def _answers(self, name: str) -> Path:
         return questions.answers_path(self.project.annotation_path(name))
@@ -349,7 +351,7 @@ def application(annotator: Annotator, token: str) -> App:
         return endpoint
 
     def beside(name: str) -> dict[str, Any]:
-        return rerun.beside(annotator.project, name)
+        return before.beside(annotator.project, name)
 
     of = "/api/sequences/{name}"
     routes = [
@@ -369,6 +371,7 @@ def application(annotator: Annotator, token: str) -> App:
         Route(f"{of}/image/{{camera}}/{{frame:int}}", image),
         Route(f"{of}/viewer", arrays(result.viewer_payload)),
         Route(f"{of}/object", arrays(result.object_payload)),
+        Route(f"{of}/sides", arrays(sides.sides_payload)),
         *(
             Route(f"{of}/{verb}", change(getattr(annotator, verb)), methods=["POST"])
             for verb in ("check", "save", "answer", "snap", "point", "surface", "symmetry", "run")

@@ -54,6 +54,14 @@ def mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | None) ->
     return result
 
 
+def against_build(points: np.ndarray) -> np.ndarray:
+    """By how much (T,) another way of exchanging arms, legs and head suits the body's build better
+    than triangulated points (T, 135, 3) as they are; negative log likelihood, 0 = none does.
+    """
+    cost = _build(points)
+    return np.asarray(cost[:, 0] - cost.min(1))
+
+
 def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Cost (T, 8) of contradicting the detector, by the share of views."""
     known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)

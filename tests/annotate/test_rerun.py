@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import h5py
 import numpy as np
 import pytest
 
-from intercap_core.annotate import rerun
+from intercap_core.annotate import before, rerun
 from intercap_core.errors import UserError
 from intercap_core.pipeline.plan import Kind, Plan, mark_of
 from intercap_core.project import Project, load_project
+from intercap_core.stage_list import SEQUENCE_STAGES
 from tests.annotate.served import NAME, annotation, artefact, small_project
 
 
@@ -47,10 +49,15 @@ def _pretend(monkeypatch: pytest.MonkeyPatch, script: str) -> list[list[str]]:
     return asked
 
 
-def _ended(runs: rerun.Runs) -> None:
+def _until(holds: Callable[[], bool]) -> None:
     end = time.monotonic() + 30
-    while runs.going_on and time.monotonic() < end:
+    while not holds() and time.monotonic() < end:
         time.sleep(0.02)
+    assert holds()
+
+
+def _ended(runs: rerun.Runs) -> None:
+    _until(lambda: not runs.going_on)
 
 
 def test_a_run_asks_for_one_sequence_and_tells_how_far_it_is(
@@ -92,7 +99,77 @@ def test_one_run_at_a_time_and_it_can_be_stopped(
     with pytest.raises(UserError, match="goes on"):
         runs.start(project, NAME)
     runs.stop()
-    assert not runs.going_on and runs.progress(project)["state"] == "failed"
+    _ended(runs)
+    assert not runs.going_on and runs.progress(project)["state"] == "stopped"
+
+
+def test_a_run_that_takes_its_time_to_end_is_not_waited_for_and_told_once(
+    project: Project, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    said = tmp_path / "said"
+    _pretend(
+        monkeypatch,
+        "import signal, time, pathlib; said = pathlib.Path(%r); told = []\n"
+        "signal.signal(15, lambda *_: (told.append(1), said.write_text(f'told {len(told)}')))\n"
+        "said.write_text('ready'); time.sleep(60)" % str(said),
+    )
+    runs = rerun.Runs()
+    runs.start(project, NAME)
+    _until(lambda: said.is_file() and said.read_text() == "ready")
+    begin = time.monotonic()
+    runs.stop()
+    runs.stop()
+    assert time.monotonic() - begin < 2.0
+    _until(lambda: said.read_text().startswith("told"))
+    assert runs.progress(project)["state"] == "ending" and said.read_text() == "told 1"
+    with pytest.raises(UserError, match="goes on"):
+        runs.start(project, NAME)
+    monkeypatch.setattr(rerun, "ENDS_WITHIN_S", -rerun._PATIENCE_S)  # it has had its time
+    runs.stop()
+    _ended(runs)
+    assert runs.progress(project)["state"] == "stopped"
+
+
+def test_the_result_before_stays_until_a_run_has_ended_well(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped, failed, then done: the old result is that of before the first; then the next."""
+    joint = project.artefact(NAME, "joint")
+    kept = before.before_paths(project, NAME)["joint"]
+    contents = []
+    for number, status in enumerate((1, 1, 0, 0)):
+        old = joint.read_bytes()
+        _pretend(monkeypatch, f"import sys; sys.exit({status})")
+        runs = rerun.Runs()
+        runs.start(project, NAME)
+        _ended(runs)
+        runs.progress(project)
+        assert before.beside(project, NAME)["unfinished"] == bool(status)
+        contents.append((old, kept.read_bytes()))
+        new = joint.with_suffix(".new")
+        new.write_bytes(old + bytes([number]))  # what the run has made, whole or not
+        new.replace(joint)
+        monkeypatch.undo()
+        monkeypatch.chdir(project.path.parent.parent)
+    first = contents[0][0]
+    assert [held for _, held in contents] == [first, first, first, contents[3][0]]
+    told = before.beside(project, NAME)
+    assert told["made_at"] <= told["kept_at"]
+
+
+def test_a_run_that_ended_on_a_terminal_counts_as_ended(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _pretend(monkeypatch, "import sys; sys.exit(1)")
+    runs = rerun.Runs()
+    runs.start(project, NAME)
+    _ended(runs)
+    later = time.time() + 5
+    for stage in SEQUENCE_STAGES:
+        path = project.artefact(NAME, stage)
+        path.touch()
+        os.utime(path, (later, later))
+    assert not before.beside(project, NAME)["unfinished"]
 
 
 def test_the_result_before_is_kept_and_held_against_the_new_one(
@@ -103,21 +180,21 @@ def test_the_result_before_is_kept_and_held_against_the_new_one(
     runs.start(project, NAME)
     _ended(runs)
     joint = project.artefact(NAME, "joint")
-    kept = rerun.before_paths(project, NAME)["joint"]
+    kept = before.before_paths(project, NAME)["joint"]
     assert os.path.samefile(joint, kept)  # without a copy
     new = joint.with_suffix(".new")
     shutil.copy(joint, new)
     with h5py.File(new, "r+") as file:
         file["joints"][...] += np.float32([0.0, 0.0, 0.01])
     new.replace(joint)
-    found = rerun.beside(project, NAME)
+    found = before.beside(project, NAME)
     assert found["there"] and found["body_moved_mm"] == pytest.approx([10.0] * 6, abs=0.1)
     assert found["object_moved_mm"] == [0.0] * 6
 
 
 def test_a_sequence_without_results_has_nothing_beside_it(project: Project) -> None:
     shutil.rmtree(project.results / NAME)
-    assert not rerun.beside(project, NAME)["there"]
+    assert not before.beside(project, NAME)["there"]
 
 
 def test_what_is_out_of_date_is_marked_before_snakemake_lists_the_marks(project: Project) -> None:

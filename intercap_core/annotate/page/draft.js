@@ -1,6 +1,6 @@
 /* The annotation as it is edited: its sections, undo and redo, and a copy in this browser, so that a
  * tab that closes or a tunnel that breaks loses nothing. */
-export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames"];
+export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames", "left_right"];
 const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
 const empty = (value) => value === null || value === undefined || (Array.isArray(value) && !value.length);
 

@@ -5,6 +5,7 @@ import { ask, banner, button, diff, find, make, words } from "./dom.js";
 const CHECK_MS = 250;
 const LOOK_MS = 4000;
 const RUN_MS = 1000;
+const GOES_ON = ["running", "ending"];
 const POSES = ["object_poses", "object_pose"]; // two forms of the same: never one of each
 
 export class Keep {
@@ -123,7 +124,7 @@ export class Keep {
       this.known = now.annotation;
       banner("changed", "The annotation was changed meanwhile, in another tab or by somebody else.", [["Show", () => this.showChange()]]);
     }
-    if (now.result !== app.told.result && this.run.state !== "running" && this.seen !== now.result) {
+    if (now.result !== app.told.result && !GOES_ON.includes(this.run.state) && this.seen !== now.result) {
       this.seen = now.result;
       banner("result", "The results are others by now.", [["Load them", () => app.reload()]]);
     }
@@ -153,27 +154,42 @@ export class Keep {
     clearTimeout(this.timer);
     const { app } = this, before = this.run.state;
     try { this.run = await get(`${this.path}/run`); } catch { /* told by look() */ }
-    if (before === "running" && this.run.state !== "running" && this.run.sequence === app.told.sequence) {
+    if (GOES_ON.includes(before) && !GOES_ON.includes(this.run.state) && this.run.sequence === app.told.sequence) {
       this.touched = null;
       await app.reload();
-      this.beside = await get(`${this.path}/beside`);
-      app.panels();
-      await app.loadBefore();
-      app.say(this.run.state === "done" ? "the new result is drawn; B shows the old one beside it" : "the run failed");
+      await this.compare();
+      app.say({ done: "the new result is drawn; B shows the old one beside it", stopped: "the run was stopped; what was done is kept" }[this.run.state] ?? "the run failed");
     }
-    if (this.run.state === "running") this.timer = setTimeout(() => this.progress(), RUN_MS);
+    if (GOES_ON.includes(this.run.state)) this.timer = setTimeout(() => this.progress(), RUN_MS);
     if (before !== "none" || this.run.state !== "none") app.panels();
+  }
+
+  async stop() {
+    try { this.run = await post(`${this.path}/run`, { do: "stop" }); } catch (error) { this.app.say(error.message); }
+    this.app.panels();
+  }
+
+  /* The new result beside the old one. */
+  async compare() {
+    const { app } = this;
+    try {
+      this.beside = await get(`${this.path}/beside`);
+      if (this.beside.there) await app.loadBefore(); else app.say("no run from this page has replaced a result yet");
+    } catch (error) { app.say(error.message); }
+    app.panels();
   }
 
   panel() {
     const { app, run } = this, parts = [];
     const own = run.sequence === app.told.sequence;
-    if (run.state === "running") {
-      parts.push(make("p", {}, own ? `Running, ${run.seconds.toFixed(0)} s` : `A run of ${run.sequence} goes on.`),
+    if (GOES_ON.includes(run.state)) {
+      const ending = run.state === "ending";
+      parts.push(make("p", {}, ending ? `Ending… for ${run.ending_s.toFixed(0)} s; what is half done is cleared up, which takes ${run.ends_within_s.toFixed(0)} s at most.` : own ? `Running, ${run.seconds.toFixed(0)} s` : `A run of ${run.sequence} goes on.`),
         make("ol", { class: "stages" }, run.stages.map((one) => make("li", { data: { state: one.state } }, make("b", {}, words(one.stage)), ` ${one.state === "waits" ? "" : one.state} `, make("span", { class: "dim" }, one.words)))),
-        button("Stop", async () => { this.run = await post(`${this.path}/run`, { do: "stop" }); }));
+        ending && run.ending_s <= run.ends_within_s ? null : button(ending ? "Kill it" : "Stop", () => this.stop()));
       return make("div", { class: "run" }, parts);
     }
+    if (own && run.state === "stopped") parts.push(make("p", {}, "The run was stopped; what was done is kept."));
     if (own && run.state === "failed") parts.push(make("p", { class: "fault" }, "The run failed:"), make("pre", { tabIndex: 0 }, run.words));
     if (own && run.state === "done") parts.push(make("p", {}, `Done in ${run.seconds.toFixed(0)} s.`));
     if (this.touched) parts.push(this.touched.length ? make("div", {}, make("p", {}, "A run makes anew:"),
@@ -183,17 +199,16 @@ export class Keep {
     parts.push(button("What would run?", () => this.plan()));
     if (!run.cluster && run.command) parts.push(make("details", {}, make("summary", {}, "The same on a terminal"), make("pre", { tabIndex: 0 }, run.command)));
     if (this.beside?.there) {
+      const when = (text) => new Date(text).toLocaleString();
+      parts.push(make("p", { class: "dim", data: { part: "before" } }, `Old: the result of ${when(this.beside.made_at)}, kept before the run of ${when(this.beside.kept_at)}`,
+        this.beside.unfinished ? ". That run did not end well: the next one keeps this old result." : "."));
       const show = (value) => (value === null || value === undefined ? "–" : String(value));
       parts.push(make("table", { class: "beside" }, make("tr", {}, make("th", {}, "verdict"), make("th", {}, "old"), make("th", {}, "new")),
         this.beside.rows.map((row) => make("tr", { class: row.old === row.new ? "" : "differs" }, make("td", {}, row.name), make("td", {}, show(row.old)), make("td", {}, show(row.new))))));
       const moved = (name, by) => (by ? make("p", { class: "dim" }, `${name} moved by ${Math.max(...by).toFixed(1)} mm at the most, in frame ${by.indexOf(Math.max(...by))}.`) : null);
       parts.push(moved("The body", this.beside.body_moved_mm), moved("The object", this.beside.object_moved_mm));
     } else if (!this.beside) {
-      parts.push(button("New beside old", async () => {
-        this.beside = await get(`${this.path}/beside`);
-        if (this.beside.there) await app.loadBefore(); else app.say("nothing was run from this page yet");
-        app.panels();
-      }));
+      parts.push(button("New beside old", () => this.compare()));
     }
     return make("div", { class: "run" }, parts);
   }

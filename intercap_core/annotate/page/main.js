@@ -1,10 +1,11 @@
 /* The page: one frame for all views, the viewer and the timeline; layers, modes, keys. */
 import { get, packed, takeToken } from "./api.js";
-import { ask, banner, button, find, make } from "./dom.js";
+import { banner, button, find, make } from "./dom.js";
 import { Contact } from "./contact.js";
 import { Draft } from "./draft.js";
 import { apply, invert } from "./geometry.js";
 import { Keep } from "./keep.js";
+import { help, pressed } from "./keys.js";
 import { showList } from "./list.js";
 import { DroppedFrames, FloorMarks, SubjectMarks } from "./marks.js";
 import { Overlay } from "./overlay.js";
@@ -12,28 +13,21 @@ import { Paint } from "./paint.js";
 import { Pictures } from "./pictures.js";
 import { PoseEditor, objectPose, poseAt } from "./pose.js";
 import { Questions } from "./questions.js";
-import { BEFORE, Space } from "./space.js";
+import { Sides, legend } from "./sides.js";
+import { sidesPanel } from "./sides_panel.js";
+import { BEFORE, GREY, Space } from "./space.js";
 import { SymmetryEditor } from "./symmetry.js";
 import { Timeline } from "./timeline.js";
 import { Views } from "./views.js";
 
 const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45];
-const KEYS = [
-  ["← →", "a frame back or on; with Shift ten"], ["Home End", "first and last frame"], ["Space", "play"],
-  ["N P", "next and previous flag or doubt"], ["F", "near the object, and all again"], ["1 2 3 4", "layers: body, object, contact, marks"],
-  ["B", "the result before the last run"], ["O", "place the object"], ["S", "fit it to the images"],
-  ["C", "confirm contact"], ["[ ]", "contact starts or ends at this frame"], ["K", "split contact"], ["Delete", "delete contact"],
-  ["U", "click the subject"], ["G", "click floor points"], ["X", "drop the frame, or keep it"],
-  ["Q", "next question; then 1, 2, 3 answer it"], ["Ctrl+Z", "undo; with Shift redo"], ["Ctrl+S", "save"], ["Esc", "end what is going on"],
-];
-
 class App {
   constructor(told) {
     this.told = told;
     this.frame = 0;
     this.direction = 1;
     this.opacity = 0.62;
-    this.layers = { body: true, object: true, contact: true, marks: true, before: false };
+    this.layers = { body: true, object: true, contact: true, marks: true, sides: false, before: false };
     this.mode = null;
     this.steps = []; // milliseconds from a wish for a frame to all views drawn
     this.draft = new Draft(told.sequence, told.annotation);
@@ -43,6 +37,7 @@ class App {
     this.subject = new SubjectMarks(this);
     this.floor = new FloorMarks(this);
     this.dropped = new DroppedFrames(this);
+    this.sides = new Sides(this);
     this.space = new Space(this);
     this.symmetry = new SymmetryEditor(this);
     this.views = new Views(this);
@@ -56,8 +51,8 @@ class App {
     });
     this.#bar();
     this.#tabs();
-    document.addEventListener("keydown", (event) => this.key(event));
-    find("help").onclick = () => this.help();
+    document.addEventListener("keydown", (event) => pressed(this, event));
+    find("help").onclick = help;
   }
 
   // ---------------------------------------------------------------- what is loaded
@@ -77,7 +72,7 @@ class App {
     this.redraw();
     this.questions.load();
     if (this.told.viewer) await this.space.load();
-    else find("space").replaceChildren(make("p", { class: "dim" }, "No body yet: the 4D viewer comes with stage body_fit."));
+    else this.space.none("No body to show: the 4D viewer comes with stage body_fit.");
     document.body.dataset.ready = "yes";
   }
 
@@ -89,8 +84,18 @@ class App {
   }
 
   async reload() {
-    const told = await get(`sequences/${this.told.sequence}`);
+    const again = [["Try again", () => this.reload()]];
+    let told;
+    try {
+      told = await get(`sequences/${this.told.sequence}`);
+      if (!told.frames) throw new Error(told.notes.join("; "));
+    } catch (error) {
+      banner("result", `${error.message} The page goes on with what it has; your edits are kept.`, again);
+      return;
+    }
+    banner("result", "");
     const frame = this.frame;
+    for (const key of Object.keys(this.told)) delete this.told[key]; // of what is not there any more
     Object.assign(this.told, told);
     this.pictures = new Pictures(told.sequence, told.stamp);
     this.contact = Object.assign(new Contact(this), { fromFound: this.contact.fromFound });
@@ -100,6 +105,7 @@ class App {
     if (told.annotation.digest !== this.draft.file.digest && !this.draft.dirty) this.saved(told.annotation);
     facts(told);
     await this.load();
+    await this.sides.again();
     this.timeline.draw();
     this.show(Math.min(frame, told.frames - 1));
   }
@@ -187,19 +193,20 @@ class App {
     const pose = this.symmetry.turned(this.pose.at(frame));
     if (pose) {
       const own = this.pose.editing || poseAt(this.draft, frame);
-      found.push({ name: "object", pose, colour: own ? EDITED : OBJECT });
+      found.push({ name: "object", pose, colour: own ? EDITED : layers.sides ? GREY : OBJECT });
     }
     return found;
   }
 
   mark(view, brush) {
-    if (this.layers.contact && !(this.paint && this.mode === this.paint)) this.space.markContact(view, brush);
+    if (this.layers.contact && !this.layers.sides && !(this.paint && this.mode === this.paint)) this.space.markContact(view, brush);
     if (this.layers.marks) {
       this.subject.mark(view, brush);
       if (this.mode === this.floor || this.draft.get("floor")) this.floor.mark(view, brush);
     }
     if (this.pose?.editing) this.pose.mark(view, brush);
     if (this.paint && this.mode === this.paint) this.paint.mark(view, brush);
+    if (this.layers.sides) this.sides.mark(view, brush);
     this.questions?.mark(view, brush);
   }
 
@@ -251,9 +258,10 @@ class App {
   }
 
   #bar() {
-    const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", before: this.space.before ? "before" : null };
-    find("layers").replaceChildren(...Object.entries(names).filter(([, text]) => text).map(([name, text], k) => make("label", { title: name === "before" ? "B" : String(k + 1) },
-      make("input", { type: "checkbox", checked: this.layers[name], data: { layer: name }, onchange: (event) => this.layer(name, event.target.checked) }), ` ${text}`)));
+    const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", sides: "left/right", before: this.space.before ? "before" : null };
+    const numbers = Object.keys(this.layers);
+    find("layers").replaceChildren(...Object.entries(names).filter(([, text]) => text).map(([name, text]) => make("label", { title: name === "before" ? "B" : String(numbers.indexOf(name) + 1) },
+      make("input", { type: "checkbox", checked: this.layers[name], data: { layer: name }, onchange: (event) => this.layer(name, event.target.checked) }), ` ${text} `, name === "sides" ? legend() : null)));
   }
 
   layer(name, on) {
@@ -261,10 +269,13 @@ class App {
     this.space.layers(this.layers);
     this.#bar();
     this.redraw();
+    if (name !== "sides") return;
+    if (on) this.sides.load();
+    this.timeline.draw();
   }
 
   #tabs() {
-    const panels = { doubts: "Doubts", questions: "Questions", object: "Object", marks: "Marks", run: "Run" };
+    const panels = { doubts: "Doubts", questions: "Questions", object: "Object", marks: "Marks", sides: "Sides", run: "Run" };
     if (!this.told.object) delete panels.object;
     find("tabs").replaceChildren(...Object.entries(panels).map(([name, text]) => {
       const tab = button(text, () => this.tab(name), { id: `tab-${name}`, role: "tab", data: { tab: name } });
@@ -277,6 +288,7 @@ class App {
 
   tab(name) {
     this.open = name;
+    if (name === "sides" && !this.layers.sides) this.layer("sides", true);
     for (const tab of find("tabs").children) tab.setAttribute("aria-selected", String(tab.dataset.tab === name));
     find("panels").setAttribute("aria-labelledby", `tab-${name}`);
     this.panels();
@@ -291,54 +303,10 @@ class App {
       questions: () => [this.questions?.panel()],
       object: () => (this.pose ? [this.pose.panel(), ...(this.pose.editing ? [] : [this.paint.panel(), this.symmetry.panel()])] : [make("p", {}, "The object's mesh is not there.")]),
       marks: () => [make("h2", {}, "Subject"), this.subject.panel(), make("h2", {}, "Floor"), this.floor.panel(), make("h2", {}, "Frames to drop"), this.dropped.panel()],
+      sides: () => [sidesPanel(this)],
       run: () => [this.keep?.panel()],
     };
     box.replaceChildren(...(parts[this.open]?.() ?? []).filter(Boolean));
-  }
-
-  help() {
-    ask("Keys", make("table", { class: "keys" }, KEYS.map(([key, says]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, says)))), [["", "Close", true]]);
-  }
-
-  key(event) {
-    if (find("dialog").open) return;
-    const control = event.ctrlKey || event.metaKey, typed = event.target.tagName, letter = event.key.toLowerCase();
-    if (control && letter === "s") { event.preventDefault(); this.keep.save(); return; }
-    if (["INPUT", "SELECT", "TEXTAREA"].includes(typed) && event.target.type !== "checkbox" && event.target.type !== "range") return;
-    if (control && letter === "z") { event.preventDefault(); if (event.shiftKey) this.redo(); else this.undo(); return; }
-    if (control && letter === "y") { event.preventDefault(); this.redo(); return; }
-    if (control || event.altKey || event.target.closest?.(".viewer")) return;
-    const one = this.contact.selected && this.contact.under(this.frame);
-    const far = event.shiftKey ? 10 : 1;
-    const names = Object.keys(this.layers);
-    const act = {
-      arrowleft: () => this.show(this.frame - far), arrowright: () => this.show(this.frame + far),
-      home: () => this.show(0), end: () => this.show(this.told.frames - 1),
-      n: () => this.jump(1), p: () => this.jump(-1),
-      f: () => (this.near ? this.whole() : this.nearby()),
-      o: () => { if (this.pose) { this.tab("object"); this.pose.start(); } },
-      s: () => { if (this.pose) { this.tab("object"); this.pose.snap(); } },
-      u: () => { this.tab("marks"); this.setMode(this.subject); },
-      g: () => { this.tab("marks"); this.setMode(this.floor); },
-      x: () => this.dropped.toggle(this.frame),
-      q: () => this.questions.next(),
-      b: () => this.layer("before", !this.layers.before),
-      c: () => one && this.contact.confirm(one), k: () => one && this.contact.split(one, this.frame),
-      "[": () => one && this.contact.change(one, this.frame, one.end), "]": () => one && this.contact.change(one, one.start, this.frame + 1),
-      delete: () => one && this.contact.remove(one), backspace: () => one && this.contact.remove(one),
-      escape: () => { this.setMode(null); this.questions.current = null; this.contact.selected = null; this.timeline.draw(); this.panels(); },
-      "?": () => this.help(),
-      " ": () => this.play(),
-    }[letter];
-    if (/^[1-9]$/.test(event.key)) {
-      const number = Number(event.key);
-      if (this.open !== "questions" || !this.questions.key(number)) {
-        const name = names[number - 1];
-        if (name) this.layer(name, !this.layers[name]);
-      }
-    } else if (act && !(event.key === " " && typed === "BUTTON")) act();
-    else return;
-    event.preventDefault();
   }
 }
 

@@ -39,10 +39,11 @@ export class Questions {
   ask(question) {
     const { app } = this;
     this.current = question;
-    if (question.kind === "subject") app.views.prefer([question.camera]);
+    if (question.camera) app.views.prefer([question.camera]);
+    if (question.kind === "sides") app.layer("sides", true);
     app.show(question.frame);
     app.tab("questions");
-    if (question.kind !== "subject") app.nearby();
+    if (question.camera) app.whole(); else app.nearby();
     app.panels();
   }
 
@@ -50,8 +51,8 @@ export class Questions {
 
   async answer(question, answer) {
     const { app } = this, { contact, pose, draft } = app;
-    const edits = ["yes", "no", "place"].includes(answer);
-    const opens = { place: pose, no: question.kind === "turn" ? pose : question.kind === "subject" ? app.subject : null }[answer];
+    const edits = (question.kind === "sides" ? ["view", "all", "mark"] : ["yes", "no", "place"]).includes(answer);
+    const opens = { mark: app.sides, place: pose, no: question.kind === "turn" ? pose : question.kind === "subject" ? app.subject : null }[answer];
     const told = { ...question, answer };
     // before the edit, so that the steps tell whether it is there
     if (edits) this.pending.push({ told, depth: draft.done.length + (opens ? 1 : 0) });
@@ -60,6 +61,7 @@ export class Questions {
     if (question.kind === "turn" && answer === "yes" && pose?.found(question.frame)) {
       putPose(draft, question.frame, pose.found(question.frame), "turn confirmed");
     }
+    if (answer === "view" || answer === "all") app.sides.change(answer === "view" ? question.camera : null, question.first, question.last, true);
     if (question.kind === "subject" && answer === "yes") {
       const { camera, frame, x, y } = question;
       const set = app.setOf(app.told.cameras.findIndex((one) => one.name === camera), frame);
@@ -74,6 +76,7 @@ export class Questions {
     this.current = null;
     app.panels();
     if (opens === pose && pose) { app.show(question.frame); pose.start(); app.tab("object"); }
+    else if (opens === app.sides) app.tab("sides");
     else if (opens) { app.setMode(opens); app.tab("marks"); }
     else if (this.list.length) this.ask(this.list[0]);
     else app.say("all questions are answered: save, then run");
@@ -100,7 +103,7 @@ export class Questions {
     const seconds = (q) => `${q.from_s.toFixed(1)}–${q.to_s.toFixed(1)} s`;
     return make("div", { class: "questions" },
       one ? make("div", { class: "question" }, make("p", { class: "ask" }, one.words),
-        make("p", { class: "dim" }, `frames ${one.first} to ${one.last}`),
+        make("p", { class: "dim" }, `frames ${one.first} to ${one.last}${one.why ? `; ${one.why}` : ""}`),
         make("div", {}, one.choices.map((choice, k) => button(`${k + 1}  ${choice.label}`, () => this.answer(one, choice.answer), { data: { answer: choice.answer } }))))
         : make("p", {}, this.list.length ? `${this.list.length} questions, those first that change most.` : "No question is open."),
       this.list.length && !one ? button("Ask me", () => this.next(), { class: "main", title: "Q" }) : null,

@@ -5,6 +5,7 @@ import { find, make } from "./dom.js";
 import { apply, compose, invert } from "./geometry.js";
 import { posedFrames } from "./pose.js";
 
+export const GREY = [0.62, 0.62, 0.64]; // beside colours that tell left from right
 const BODY = [0.42, 0.66, 0.92], TOUCHING = [0.86, 0.2, 0.26], STATED = [0.95, 0.62, 0.25];
 export const BEFORE = [0.72, 0.5, 0.95];
 
@@ -44,6 +45,12 @@ export class Space {
     app.redraw();
   }
 
+  /* Nothing to show, for a reason. */
+  none(words) {
+    this.viewer = null;
+    find("space").replaceChildren(make("p", { class: "dim" }, words));
+  }
+
   /* The result before the last run, to be drawn beside the new one. */
   async loadBefore() {
     const { app } = this, found = {};
@@ -73,7 +80,7 @@ export class Space {
     if (this.viewer) {
       const body = this.viewer.versions[this.main];
       body.pose(frame);
-      overlay.move("body", body.mesh.geometry.attributes.position.array, this.skin(frame, layers.contact));
+      overlay.move("body", body.mesh.geometry.attributes.position.array, this.skin(frame, layers.contact && !layers.sides, layers.sides ? GREY : BODY));
       found.push({ name: "body", pose: this.master_from_zup });
     }
     return found;
@@ -173,9 +180,9 @@ function skinPaint(header, arrays) {
   const region = arrays["contact/region"], probability = arrays["contact/probability"], touching = arrays["contact/touching"];
   const count = header.regions?.length ?? 0, total = arrays.faces.reduce((most, v) => Math.max(most, v), 0) + 1;
   const colours = new Float32Array(3 * total), width = touching ? touching.length / header.frames : 0;
-  return (frame, shown) => {
+  return (frame, shown, plain) => {
     for (let v = 0; v < total; v += 1) {
-      let colour = BODY;
+      let colour = plain;
       if (shown && touching && (touching[frame * width + (v >> 3)] >> (v & 7)) & 1) colour = TOUCHING;
       else if (shown && region && region[v] < 255 && probability[frame * count + region[v]] >= 128) colour = STATED;
       colours[3 * v] = colour[0];

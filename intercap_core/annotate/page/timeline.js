@@ -2,6 +2,7 @@
 import { button, find, make, words } from "./dom.js";
 import { id } from "./contact.js";
 import { posedFrames } from "./pose.js";
+import { sidesRows } from "./sides_panel.js";
 
 const SHOWN = 0.25; // a part has a row where its probability reaches this
 
@@ -11,7 +12,6 @@ export class Timeline {
     this.contact = app.contact;
     this.extra = new Set();
     const slider = find("frame");
-    slider.max = Math.max(0, app.told.frames - 1);
     slider.oninput = () => app.show(Number(slider.value));
     find("play").onclick = () => app.play();
     find("previous").onclick = () => app.jump(-1);
@@ -50,6 +50,7 @@ export class Timeline {
 
   draw() {
     const { app } = this, { told } = app;
+    find("frame").max = Math.max(0, told.frames - 1);
     const kept = document.activeElement?.dataset?.interval;
     const marks = this.#lane("doubts", "Flags and doubts");
     for (const place of told.places) {
@@ -71,6 +72,7 @@ export class Timeline {
       for (const t of posed) lane.append(this.#mark(t, t + 1, "mark posed", `the object was placed at frame ${t}`, () => app.show(t)));
       list.push(row);
     }
+    for (const one of sidesRows(app)) list.push(this.#sides(one));
     if (told.object) for (const part of this.parts()) list.push(this.#part(part));
     this.rows.replaceChildren(...list, make("div", { class: "cursor-lane" }, make("div", { class: "cursor" })));
     if (told.object) this.#bar();
@@ -91,19 +93,67 @@ export class Timeline {
     return mark;
   }
 
+  /* A shade by frame, shares of 0 to 1. */
+  #heat(share) {
+    const { frames } = this.app.told;
+    const heat = make("canvas", { width: frames, height: 1 });
+    heat.setAttribute("aria-hidden", "true");
+    const brush = heat.getContext("2d");
+    for (let t = 0; t < frames; t += 1) {
+      brush.fillStyle = `rgba(237, 128, 16, ${(0.75 * share(t)).toFixed(3)})`;
+      brush.fillRect(t, 0, 1, 1);
+    }
+    return heat;
+  }
+
+  /* Where a camera, or all, is stated to have left and right exchanged; shaded where its points are on
+   * other sides than the body's. */
+  #sides({ label, camera, entries, open, shade }) {
+    const { app } = this, { sides } = app;
+    const { row, lane } = this.#lane("sides", label);
+    row.dataset.sides = camera ?? "all";
+    if (shade) lane.append(this.#heat((t) => (shade[t] ? 1 : 0)));
+    for (const one of entries) {
+      const [start, end] = sides.moments(one);
+      const says = `left and right exchanged in ${camera ?? "all views"}, frames ${start} to ${end - 1}`;
+      const bar = this.#ended(says, `sides:${camera ?? ""}:${start}:${end}`, "stated", "exchanged");
+      this.#put(bar, start, end);
+      bar.onfocus = () => { app.contact.selected = null; sides.selected = one; };
+      bar.onblur = () => { if (sides.selected === one) sides.selected = null; };
+      bar.onpointerdown = (event) => this.#drag(event, bar, { start, end }, (from, to) => {
+        sides.move(one, from, to);
+        return `sides:${camera ?? ""}:${from}:${to}`;
+      });
+      lane.append(bar);
+    }
+    if (open) {
+      const begun = make("div", { class: "bar found begun" });
+      this.#put(begun, Math.min(open.from, app.frame), Math.max(open.from, app.frame) + 1);
+      begun.dataset.from = open.from;
+      lane.append(begun);
+    }
+    return row;
+  }
+
+  #put(bar, start, end) {
+    bar.style.left = this.at(start);
+    bar.style.width = this.at(end - start);
+  }
+
+  /* A bar whose ends are dragged. */
+  #ended(says, interval, kind, text) {
+    const bar = make("button", { type: "button", class: `bar ${kind}`, title: says, data: { interval } },
+      make("i", { class: "end left", data: { end: "start" } }), make("span", {}, text), make("i", { class: "end right", data: { end: "end" } }));
+    bar.setAttribute("aria-label", says);
+    return bar;
+  }
+
   #part(part) {
     const { app, contact } = this;
     const { row, lane } = this.#lane("contact", words(part));
     row.dataset.part = part;
     if (part !== "any" && contact.probability) {
-      const heat = make("canvas", { width: app.told.frames, height: 1 });
-      heat.setAttribute("aria-hidden", "true");
-      const brush = heat.getContext("2d");
-      for (let t = 0; t < app.told.frames; t += 1) {
-        brush.fillStyle = `rgba(237, 128, 16, ${(0.75 * contact.p(part, t)).toFixed(3)})`;
-        brush.fillRect(t, 0, 1, 1);
-      }
-      lane.append(heat);
+      lane.append(this.#heat((t) => contact.p(part, t)));
     }
     for (const one of contact.intervals()) if (one.part === part) lane.append(this.#interval(one));
     return row;
@@ -113,36 +163,39 @@ export class Timeline {
     const { app, contact } = this;
     const looked = contact.looked(one), share = Math.round(100 * contact.mean(one));
     const says = `${words(one.part)}, frames ${one.start} to ${one.end - 1}, ${looked ? "stated" : `found, ${share} % likely`}`;
-    const bar = make("button", { type: "button", class: `bar ${looked ? "stated" : "found"}`, title: says, data: { interval: id(one) } },
-      make("i", { class: "end left", data: { end: "start" } }), make("span", {}, looked ? "" : `${share} %`), make("i", { class: "end right", data: { end: "end" } }));
-    bar.setAttribute("aria-label", says);
+    const bar = this.#ended(says, id(one), looked ? "stated" : "found", looked ? "" : `${share} %`);
     bar.setAttribute("aria-pressed", String(contact.selected !== null && id(contact.selected) === id(one)));
-    bar.style.left = this.at(one.start);
-    bar.style.width = this.at(one.end - one.start);
+    this.#put(bar, one.start, one.end);
     bar.onfocus = () => { contact.selected = one; this.#bar(); };
-    bar.onpointerdown = (event) => this.#drag(event, bar, one);
+    bar.onpointerdown = (event) => {
+      contact.selected = one;
+      this.#drag(event, bar, one, (start, end) => {
+        contact.change(one, start, end);
+        return id(contact.selected ?? one);
+      });
+    };
     return bar;
   }
 
-  #drag(event, bar, one) {
-    const { app, contact } = this;
-    contact.selected = one;
+  /* `done` with the new ends, where they are others, returns by which name the bar is found again. */
+  #drag(event, bar, one, done) {
+    const { app } = this;
     const end = event.target.dataset.end, from = this.#frameAt(event);
     let [start, stop] = [one.start, one.end];
     const move = (next) => {
       const by = Math.round(this.#frameAt(next) - from);
       start = end === "end" ? one.start : Math.min(Math.max(0, one.start + by), end ? one.end - 1 : app.told.frames - 1);
       stop = end === "start" ? one.end : Math.max(Math.min(app.told.frames, one.end + by), end ? one.start + 1 : 1);
-      bar.style.left = this.at(start);
-      bar.style.width = this.at(stop - start);
+      this.#put(bar, start, stop);
       app.show(end === "end" ? stop - 1 : start);
     };
     const up = () => {
       window.removeEventListener("pointermove", move);
       window.removeEventListener("pointerup", up);
-      if (start !== one.start || stop !== one.end) contact.change(one, start, stop);
-      else { this.#bar(); if (app.frame < one.start || app.frame >= one.end) app.show(one.start); }
-      this.rows.querySelector(`[data-interval="${id(contact.selected ?? one)}"]`)?.focus({ preventScroll: true });
+      const same = start === one.start && stop === one.end;
+      const name = same ? bar.dataset.interval : done(start, stop);
+      if (same && (app.frame < one.start || app.frame >= one.end)) app.show(one.start);
+      this.rows.querySelector(`[data-interval="${name}"]`)?.focus({ preventScroll: true });
     };
     window.addEventListener("pointermove", move);
     window.addEventListener("pointerup", up);
@@ -176,8 +229,11 @@ export class Timeline {
     find("frame").value = app.frame;
     const cursor = this.rows.querySelector(".cursor");
     if (cursor) {
-      cursor.style.left = this.at(app.frame);
-      cursor.style.width = this.at(1);
+      this.#put(cursor, app.frame, app.frame + 1);
+    }
+    for (const bar of this.rows.querySelectorAll(".begun")) {
+      const from = Number(bar.dataset.from);
+      this.#put(bar, Math.min(from, app.frame), Math.max(from, app.frame) + 1);
     }
   }
 }

@@ -41,6 +41,7 @@ export class Views {
     canvas.addEventListener("keydown", (event) => {
       if (event.key === "Enter" && !this.app.mode) { this.enlarge(view); event.preventDefault(); }
     });
+    for (const what of ["pointerenter", "focus"]) canvas.addEventListener(what, () => { this.active = view; });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     return view;
   }
@@ -114,6 +115,9 @@ export class Views {
     this.order = [view.index, ...this.order.filter((index) => index !== view.index)];
     this.arrange();
   }
+
+  /* The view that a key is of: under the pointer or in focus, else the first large one. */
+  get chosen() { return this.active ?? this.views[this.order[0]]; }
 
   /* Those cameras first. */
   prefer(names) {
