@@ -15,6 +15,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.metrics.exchanged import exchanged
 from intercap_core.metrics.flags import ranges
 from intercap_core.person.facing import against_build
 from intercap_core.person.sides import ARMS, LEGS, swapped
@@ -43,7 +44,8 @@ class Sides:
     called left, then right; -1 = not seen. ``exchanged`` (T, C, 2): whether stage ``person`` took
     arms and legs for the other side's: 1 yes, 0 no, -1 not seen. ``result`` (T, 14, 3) of
     ``source``, metres in the master's frame; NaN = none. ``against`` (T,): how much better another
-    way suits the body's build. ``image_of`` (T, C): the set whose image shows each moment.
+    way suits the body's build; ``jumped`` (T,): the result's limbs jump to the other side and back.
+    ``image_of`` (T, C): the set whose image shows each moment.
     """
 
     cameras: list[str]
@@ -52,6 +54,7 @@ class Sides:
     result: np.ndarray
     source: str
     against: np.ndarray
+    jumped: np.ndarray
     image_of: np.ndarray
 
 
@@ -90,8 +93,9 @@ def sides_payload(opened: Opened) -> str:
 
 
 def doubts(opened: Opened) -> list[Doubt]:
-    """Where stage ``person`` contradicted the detector in most views, or the body's build speaks
-    against its choice; what the annotation states to be exchanged is no contradiction."""
+    """Where stage ``person`` contradicted the detector in most views, the body's build speaks against
+    its choice, or the result's limbs jump from side to side; what the annotation states to be
+    exchanged is no contradiction."""
     found = sides_of(opened)
     stated = np.zeros(found.image_of.shape, bool)
     with contextlib.suppress(UserError):  # an annotation that is none is told elsewhere
@@ -100,7 +104,7 @@ def doubts(opened: Opened) -> list[Doubt]:
             annotation.left_right, found.cameras, found.image_of, opened.name
         )
     limbs = np.where(found.exchanged < 0, -1, found.exchanged ^ stated[..., None])
-    return _runs(limbs, found.against, found.cameras)
+    return _runs(limbs, found)
 
 
 def _sides(opened: Opened) -> Sides:
@@ -123,10 +127,10 @@ def _sides(opened: Opened) -> Sides:
     limbs = np.stack([_exchanged(given, used, limb, confident) for limb in (ARMS, LEGS)], 2)
     points = given[:, :, _KEYPOINTS]
     pixels = np.where(points[..., 2:] >= confident, np.rint(points[..., :2]), _NOWHERE)
-    source, result = _result(opened, joints)
+    source, result, jumped = _result(opened, joints)
     return Sides(
         cameras, np.clip(pixels, _NOWHERE, 32767).astype(np.int16), limbs, result, source,
-        against_build(joints.astype(np.float64)), image_of,
+        against_build(joints.astype(np.float64)), jumped, image_of,
     )  # fmt: skip
 
 
@@ -140,24 +144,26 @@ def _exchanged(
     return np.where(seen, exchanged.astype(int), -1)
 
 
-def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray]:
-    """The best body that there is, else the triangulated keypoints."""
+def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
+    """The limbs (T, 14, 3) of the best body that there is, else of the triangulated keypoints; and
+    the frames in which they jumped to the other side."""
     for stage, schema in (("joint", JOINT), ("body_fit", BODY_FIT)):
         try:
             with artefacts.read(opened.paths[stage], schema) as body:
-                found = body["joints"][:, _JOINTS]
+                found = body["joints"]
         except artefacts.Unreadable:
             continue
         if len(found) == len(joints):
-            return stage, found
-    return "person", joints[:, _KEYPOINTS]
+            return stage, found[:, _JOINTS], np.any(list(exchanged(found).values()), 0)
+    return "person", joints[:, _KEYPOINTS], np.zeros(len(joints), bool)
 
 
-def _runs(limbs: np.ndarray, against: np.ndarray, cameras: list[str]) -> list[Doubt]:
+def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
+    against, jumped = sides.against, sides.jumped
     seen = (limbs >= 0).sum(1)
     share = (limbs > 0).sum(1) / np.maximum(seen, 1)  # (T, 2)
     contradicted = ((seen > 1) & (share >= MOST_VIEWS)).any(1)
-    doubted = contradicted | (against >= AGAINST_BUILD)
+    doubted = contradicted | (against >= AGAINST_BUILD) | jumped
     marks = np.flatnonzero(doubted)
     for first, second in zip(marks[:-1], marks[1:], strict=True):
         if second - first <= JOINED + 1:
@@ -170,8 +176,10 @@ def _runs(limbs: np.ndarray, against: np.ndarray, cameras: list[str]) -> list[Do
             why.append("the detector is contradicted in half of the views or more")
         if (against[run] >= AGAINST_BUILD).any():
             why.append("knees, feet or head speak for the other way")
+        if jumped[run].any():
+            why.append("the body's limbs jump to the other side and back")
         worst = first + int((against[run] + WEIGHT * share[run].max(1)).argmax())
         most = int((limbs[run] > 0).sum((0, 2)).argmax())
-        words = f"left and right: {', and '.join(why)}"
-        found.append(Doubt(first, last, worst, cameras[most], words))
+        words = f"left and right: {'; '.join(why)}"
+        found.append(Doubt(first, last, worst, sides.cameras[most], words))
     return found

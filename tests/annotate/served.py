@@ -9,16 +9,18 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import uvicorn
 
 from intercap_core.annotate.guard import TOKEN_HEADER
 from intercap_core.annotate.server import Annotator, application
+from intercap_core.person.sides import swapped
 from tests.helpers import fitted_capture as fitted
 
 NAME = "s01_o03"
@@ -46,6 +48,20 @@ def copied(made: Path, folder: Path) -> Path:
 def annotation(settings: Path) -> Path:
     """Where the sequence's annotation is, or would be."""
     return settings.parent / "annotations" / f"{NAME}.yaml"
+
+
+def detect(settings: Path, exchanged: Mapping[str, Sequence[int]]) -> None:
+    """Have the subject detected where it is, left for right in frames of some cameras; the stage
+    person has exchanged them back."""
+    with (
+        h5py.File(artefact(settings, "person")) as person,
+        h5py.File(artefact(settings, "detections"), "r+") as detections,
+    ):
+        for c, name in enumerate(person["camera_names"].asstr()):
+            people = person["keypoints"][:, c]
+            at = list(exchanged.get(name, ()))
+            people[at] = swapped(people[at])
+            detections[f"cameras/{name}/people"][...] = people
 
 
 def artefact(settings: Path, stage: str) -> Path:

@@ -15,7 +15,7 @@ export function sidesPanel(app) {
     const text = begun ? `${on ? "Exchanged" : "As detected"} ${Math.min(begun.from, frame)} to ${Math.max(begun.from, frame)}` : `${on ? "Exchanged" : "As detected"} from ${frame}…`;
     return button(text, () => sides.press(camera), { class: begun ? "main" : "", data: { sides: camera ?? "all" }, title: camera ? "E, with the pointer in this view" : "Shift+E" });
   };
-  const state = (c) => (sides.against(c, frame) ? make("span", { class: "fault" }, "other than the body") : make("span", { class: "dim" }, sides.stated(c, frame) ? "exchanged, as you state" : sides.data ? "as the body" : ""));
+  const state = (c) => (sides.against(c, frame) ? make("span", { class: "fault" }, "not as the body") : make("span", { class: "dim" }, sides.stated(c, frame) ? "exchanged, as you state" : sides.data ? "as the body" : ""));
   const other = sides.data ? told.cameras.flatMap((camera, c) => intervals(Array.from({ length: told.frames }, (_, t) => sides.against(c, t))).map(([a, b]) => ({ camera: camera.name, a, b }))).sort((p, q) => q.b - q.a - (p.b - p.a)) : [];
   return make("div", { class: "sides" },
     make("p", {}, legend(), " Thick: the result's body. Thin, with letters: what a detector named left and right, exchanged where you state it. On the wrong side of the person? State from which frame to which."),

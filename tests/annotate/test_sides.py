@@ -1,0 +1,79 @@
+"""Left and right as detected, as the result has them, and where they are in doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core.annotate import questions, result, sides
+from intercap_core.annotate.opened import Opened
+from intercap_core.errors import UserError
+from intercap_core.project import load_project
+from intercap_core.viewer.package import unpacked
+from tests.annotate.served import NAME, annotation, artefact, copied, detect, small_project
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_project(tmp_path_factory.mktemp("sides"))
+
+
+@pytest.fixture
+def opened(made: Path, tmp_path: Path) -> Iterator[Opened]:
+    found = Opened(load_project(copied(made, tmp_path / "project")), NAME)
+    yield found
+    found.close()
+
+
+def _doubted(opened: Opened) -> list[tuple[int, int, str]]:
+    return [(one.first, one.last, one.camera) for one in sides.doubts(opened)]
+
+
+def test_points_are_as_detected_and_the_result_beside_them(opened: Opened) -> None:
+    detect(opened.project.path, {"k2": [1, 2]})
+    header, arrays = unpacked(sides.sides_payload(opened))
+    assert header["cameras"] == ["k1", "k2", "k3"] and header["source"] == "joint"
+    detected, half = arrays["detected"], len(header["points"])
+    others = np.r_[half : 2 * half, :half]
+    np.testing.assert_allclose(detected[1, 1], detected[0, 1][others], atol=4)  # a moving person
+    np.testing.assert_allclose(detected[3, 1], detected[0, 1], atol=12)
+    assert arrays["exchanged"].nonzero()[0].tolist() == [1, 2]
+    assert arrays["exchanged"].nonzero()[1].tolist() == [1, 1]
+    with h5py.File(artefact(opened.project.path, "joint")) as joint:
+        left_shoulder = joint["joints"][:, 16]
+    np.testing.assert_array_equal(arrays["result"][:, 0], left_shoulder)
+
+
+def test_one_view_of_three_is_no_doubt_but_two_are_until_it_is_stated(opened: Opened) -> None:
+    detect(opened.project.path, {"k2": [1, 2]})
+    assert _doubted(opened) == []
+    detect(opened.project.path, {"k2": [1, 2, 5], "k3": [2, 5]})
+    assert _doubted(opened) == [(2, 5, "k2")]  # a gap of two frames is one place
+    assert [p["kind"] for p in result.describe(opened)["places"]].count("sides") == 1
+    asked = [q for q in questions.propose(opened, []) if q["kind"] == "sides"]
+    assert [(q["first"], q["last"], q["camera"]) for q in asked] == [(2, 5, "k2")]
+    annotation(opened.project.path).write_text("left_right: [{start: 2, end: 6, camera: k3}]\n")
+    assert _doubted(opened) == []
+
+
+def test_a_result_that_jumps_to_the_other_side_is_doubted(opened: Opened) -> None:
+    detect(opened.project.path, {})
+    assert _doubted(opened) == []
+    with h5py.File(artefact(opened.project.path, "joint"), "r+") as joint:
+        moved = joint["joints"][...]
+        arms = np.array([16, 17, 18, 19, 20, 21])
+        moved[3:5, arms] = moved[3:5, arms[[1, 0, 3, 2, 5, 4]]]
+        joint["joints"][...] = moved
+    assert [(first, last) for first, last, _ in _doubted(opened)] == [(3, 4)]
+
+
+def test_a_person_of_other_detections_is_named(opened: Opened) -> None:
+    with h5py.File(artefact(opened.project.path, "person"), "r+") as person:
+        person["person"][2, 1] = 4
+    with pytest.raises(UserError, match="re-run stage 'person'"):
+        sides.sides_payload(opened)
+    assert any("re-run stage 'person'" in note for note in result.describe(opened)["notes"])
