@@ -98,7 +98,11 @@ def beside(project: Project, sequence: str) -> dict[str, Any]:
     old = before_paths(project, sequence)
     new = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
     rows: list[dict[str, Any]] = []
-    found: dict[str, Any] = {"rows": rows, "there": old["joint"].is_file(), **_when(project, sequence)}
+    found: dict[str, Any] = {
+        "rows": rows,
+        "there": old["joint"].is_file(),
+        **_when(project, sequence),
+    }
     figures = [_figures(old), _figures(new)]
     for name in dict.fromkeys([*figures[0], *figures[1]]):
         rows.append({"name": name, "old": figures[0].get(name), "new": figures[1].get(name)})

@@ -30,7 +30,7 @@ from intercap_core.inputs.yaml_files import parse_yaml, told
 NO_FILE = "none"  # the digest where there is no file
 _PART = ".part"
 _WIDTH = 10_000  # characters of a line, before one is broken: what a user wrote in one stays so
-_FLOW_ITEMS = {"contact", "floor", "subject", "object_poses"}  # lists with one short entry a line
+_FLOW_ITEMS = {"contact", "floor", "subject", "object_poses", "left_right"}  # one entry a line
 _FLOW_LISTS = {"drop_frames", "rotation_vector", "translation"}
 
 

@@ -197,6 +197,9 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
     import psutil
 
     with contextlib.suppress(psutil.NoSuchProcess):
-        for one in (*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)):
+        for one in (
+            *psutil.Process(process.pid).children(recursive=True),
+            psutil.Process(process.pid),
+        ):
             with contextlib.suppress(psutil.NoSuchProcess):
                 one.kill()

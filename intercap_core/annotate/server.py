@@ -20,7 +20,17 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from intercap_core.annotate import before, document, questions, rerun, result, sides, snap, surface, symmetry
+from intercap_core.annotate import (
+    before,
+    document,
+    questions,
+    rerun,
+    result,
+    sides,
+    snap,
+    surface,
+    symmetry,
+)
 from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened

@@ -100,9 +100,7 @@ def doubts(opened: Opened) -> list[Doubt]:
     stated = np.zeros(found.image_of.shape, bool)
     with contextlib.suppress(UserError):  # an annotation that is none is told elsewhere
         annotation = opened.project.annotation(opened.name, look_at_frames=False)
-        stated = stated_images(
-            annotation.left_right, found.cameras, found.image_of, opened.name
-        )
+        stated = stated_images(annotation.left_right, found.cameras, found.image_of, opened.name)
     limbs = np.where(found.exchanged < 0, -1, found.exchanged ^ stated[..., None])
     return _runs(limbs, found)
 

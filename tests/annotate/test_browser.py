@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from intercap_core.annotate import rerun
 from tests.annotate.served import (
     NAME,
     TOKEN,
@@ -22,6 +24,7 @@ from tests.annotate.served import (
     annotation,
     artefact,
     copied,
+    detect,
     served,
     small_project,
 )
@@ -223,6 +226,140 @@ def test_subject_floor_and_dropped_frames_are_clicked(settings: Path) -> None:
     }  # fmt: skip
 
 
+def test_left_and_right_are_seen_and_mended(settings: Path) -> None:
+    """k1 and k2 were detected left for right in frames 3 to 6."""
+    detect(settings, {"k1": range(3, 7), "k2": range(3, 7)})
+    annotation(settings).write_text("# kept\ndrop_frames: [9]\n")
+
+    def against(page: Visit, frame: int) -> list[bool]:
+        return page.page.evaluate(
+            f"[0, 1, 2].map((c) => window.annotate.sides.against(c, {frame}))"
+        )
+
+    def colour(page: Visit, side: int) -> list[int]:
+        """Where the first large view has the letter of the left (0) or right (7) wrist's points, as
+        they were detected: one of its pixels, to the left of the letter."""
+        return page.page.evaluate(
+            """(side) => { const a = window.annotate, view = a.views.views[0], d = a.sides.data.arrays;
+              const k = 2 * ((a.frame * 3 + 0) * 14 + 2 + side);
+              const [x, y] = a.views.spot(view, d.detected[k], d.detected[k + 1]);
+              const one = new OffscreenCanvas(1, 1).getContext("2d");
+              one.drawImage(view.canvas, x - 6, y, 1, 1, 0, 0, 1, 1);
+              return [...one.getImageData(0, 0, 1, 1).data].slice(0, 3); }""",
+            side,
+        )
+
+    with served(settings) as server, _open(server) as page:
+        keys = page.page.keyboard
+        page.wait("window.annotate.questions.list.some((q) => q.kind === 'sides')")
+        keys.press("l")
+        page.wait("window.annotate.sides.data !== null")
+        assert against(page, 4) == [True, True, False] and not any(against(page, 2))
+        assert page.page.locator('[data-sides="k1"] canvas').count() == 1  # shaded on the timeline
+        page.page.locator('[data-camera="k1"] canvas').hover()
+        page.page.evaluate("window.annotate.show(3)")
+        page.wait("document.body.dataset.drawn === '3'")
+        named_left = colour(page, 0)
+        assert named_left[2] > 200 > named_left[0]  # blue
+        keys.press("e")
+        page.page.evaluate("window.annotate.show(5)")
+        page.wait("document.querySelectorAll('.begun').length === 1")
+        keys.press("e")
+        stated = [{"start": 3, "end": 6, "camera": "k1"}]
+        assert _draft(page, "left_right") == stated
+        assert [against(page, t)[0] for t in (3, 4, 5, 6)] == [False, False, False, True]
+        page.page.evaluate("window.annotate.show(3)")
+        page.wait("window.annotate.waits === false")
+        named_left = colour(page, 0)
+        assert named_left[0] > 200 > named_left[2]  # orange
+        keys.press("Control+z")
+        assert _draft(page, "left_right") is None and against(page, 4)[0]
+        keys.press("Control+Shift+z")
+        bar = page.page.locator('[data-sides="k1"] .bar')
+        box = bar.bounding_box()
+        assert box is not None
+        _drag(page, (box["x"] + box["width"] - 4, box["y"] + 8), (box["width"] / 3, 2))
+        stated[0]["end"] = 7
+        assert _draft(page, "left_right") == stated and not any(against(page, 6)[:1])
+        bar.focus()
+        keys.press("Delete")
+        assert _draft(page, "left_right") is None
+        page.page.evaluate("window.annotate.show(8)")
+        keys.press("Shift+E")
+        page.page.locator("#tab-sides").click()
+        page.page.locator('button[data-sides="all"]').click()
+        assert _draft(page, "left_right") == [{"start": 8, "end": 9}]
+        keys.press("Control+z")
+        keys.press("q")
+        page.page.evaluate(
+            "(({ list }) => window.annotate.questions.ask(list.find((q) => q.kind === 'sides')))"
+            "(window.annotate.questions)"
+        )
+        keys.press("3")  # in every view
+        assert _draft(page, "left_right") == [{"start": 3, "end": 7}]
+        keys.press("Control+z")
+        page.wait("window.annotate.questions.list.some((q) => q.kind === 'sides')")
+        page.page.evaluate(
+            "(({ list }) => window.annotate.questions.ask(list.find((q) => q.kind === 'sides')))"
+            "(window.annotate.questions)"
+        )
+        keys.press("2")  # in the view that is shown first
+        assert _draft(page, "left_right") == [{"start": 3, "end": 7, "camera": "k1"}]
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'saved'")
+        page.wait("window.annotate.questions.pending.length === 0")
+        assert not [q for q in server.json(f"sequences/{NAME}/questions") if q["kind"] == "sides"]
+    text = annotation(settings).read_text()
+    assert text.startswith("# kept\n") and "left_right:\n  - {start: 3, end: 7, camera: k1}" in text
+
+
+def test_results_that_cannot_be_loaded_are_named_and_edits_stay(settings: Path) -> None:
+    frames, joint = artefact(settings, "frames"), artefact(settings, "joint")
+    with served(settings) as server, _open(server) as page:
+        page.page.keyboard.press("x")
+        whole = frames.read_bytes()
+        for damage in (lambda: frames.write_bytes(whole[:2000]), frames.unlink):
+            damage()
+            page.page.evaluate("window.annotate.reload()")
+            page.wait(
+                "document.querySelector('[data-banner=result]')?.textContent.includes('edits')"
+            )
+            assert _draft(page, "drop_frames") == [0]
+            assert "frames" in page.page.locator("[data-banner=result]").inner_text()
+            page.page.keyboard.press("ArrowRight")
+            page.page.keyboard.press("ArrowLeft")
+        frames.write_bytes(whole)
+        joint.write_bytes(joint.read_bytes()[:2000])
+        page.page.locator("[data-banner=result]").get_by_text("Try again").click()
+        page.wait("document.getElementById('banners').textContent.includes('joint.h5')")
+        page.wait("window.annotate.told.frames === 10")
+        assert _draft(page, "drop_frames") == [0]
+
+
+def test_a_run_that_is_told_to_end_is_shown_to_be_ending(
+    settings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = (
+        "import signal, sys, time; signal.signal(15, lambda *_: None); time.sleep(4); sys.exit(1)"
+    )
+    real = rerun.subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> Any:
+        return real([sys.executable, "-c", script], **options)
+
+    with served(settings) as server, _open(server) as page:
+        monkeypatch.setattr(rerun.subprocess, "Popen", start)
+        page.page.locator("#tab-run").click()
+        page.page.get_by_text("Run what is out of date").click()
+        page.wait("window.annotate.keep.run.state === 'running'")
+        page.page.wait_for_timeout(700)  # until the process minds signals
+        page.page.get_by_role("button", name="Stop").click()
+        page.wait("document.getElementById('panels').textContent.includes('Ending…')")
+        assert page.page.get_by_role("button", name="Stop").count() == 0
+        page.wait("window.annotate.keep.run.state === 'stopped'")
+        page.wait("document.getElementById('panels').textContent.includes('was stopped')")
+
+
 def test_where_people_touch_is_painted_and_kept_with_the_object(settings: Path) -> None:
     mesh = Path(yaml.safe_load((settings.parent / "objects.yaml").read_text())["football"]["mesh"])
     own = settings.parent / mesh.name
@@ -364,7 +501,7 @@ def test_it_can_be_used_with_assistive_technology(settings: Path, dark: bool) ->
             page.wait("document.querySelectorAll('#sequences a').length === 1")
             assert serious_faults(page) == []
         with _open(server, dark=dark) as page:
-            for tab in ("doubts", "questions", "object", "marks", "run"):
+            for tab in ("doubts", "questions", "object", "marks", "sides", "run"):
                 page.page.locator(f"#tab-{tab}").click()
                 assert serious_faults(page) == []
 
