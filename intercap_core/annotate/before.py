@@ -1,7 +1,7 @@
 """The result before the last runs from the page: what is kept of it, and the new one beside it.
 
-A run that was stopped or failed leaves results of two annotations; so what was there before it stays
-"the result before" until a run has ended well and the next one starts.
+A run that was stopped or failed leaves results of two annotations; so what was there before it
+stays "the result before" until a run has ended well and the next one starts.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
 from intercap_core.viewer import page as page_of
 from intercap_core.viewer.content import gather
-from intercap_core.viewer.package import payload
+from intercap_core.viewer.package import payload, unpacked
 
 DOUBTED = 1.5  # times the part's stated error: a frame that the verdict doubts
 _DRAWN = {
@@ -100,20 +100,31 @@ def viewer_payload(opened: Opened) -> str:
     def made() -> str:
         drawn = _of_page(opened)
         if drawn:
-            return drawn
+            return payload(*_the_result_alone(*unpacked(drawn)))
         content = gather(
             opened.paths,
             object_=project.object_of(opened.name),
             body_models=project.config.body_models,
             gender=project.subjects[row.subject].gender,
         )
-        return payload(content.header, content.arrays)
+        return payload(*_the_result_alone(content.header, content.arrays))
 
     missing = [stage for stage in _VIEWER if not opened.there(stage)]
     if missing:
         raise UserError(f"sequence {opened.name!r} has no body yet: stage {missing[0]!r} lacks")
     stages = (*_VIEWER, "joint", "metrics", "object_track", "person", "detections")
     return opened.made("viewer", stages, made)
+
+
+def _the_result_alone(
+    header: dict[str, Any], arrays: dict[str, np.ndarray]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Without earlier fits and the studio's truth: half of what goes through a tunnel."""
+    shown, *others = header["versions"]
+    left_out = tuple(f"{name}/" for name in (*others, "truth"))
+    versions = {shown: header["versions"][shown]}
+    kept = {name: values for name, values in arrays.items() if not name.startswith(left_out)}
+    return header | {"versions": versions}, kept
 
 
 def _of_page(opened: Opened) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -364,13 +365,14 @@ def application(annotator: Annotator, token: str) -> App:
         return before.beside(annotator.project, name)
 
     of = "/api/sequences/{name}"
+    squeezed = [Middleware(GZipMiddleware, compresslevel=6)]
     routes = [
         Route("/", page),
         Route("/sequence/{name}", page),
         Mount("/page", GZipMiddleware(StaticFiles(directory=PAGE), compresslevel=6)),
         Mount("/viewer", GZipMiddleware(StaticFiles(directory=VIEWER), compresslevel=6)),
-        Route("/api/sequences", lambda _: _json(annotator.sequences())),
-        Route(of, look(annotator.sequence)),
+        Route("/api/sequences", lambda _: _json(annotator.sequences()), middleware=squeezed),
+        Route(of, look(annotator.sequence), middleware=squeezed),
         Route(f"{of}/annotation", look(annotator.annotation)),
         Route(f"{of}/state", look(annotator.state)),
         Route(f"{of}/questions", look(annotator.questions)),

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -93,9 +94,9 @@ def sides_payload(opened: Opened) -> str:
 
 
 def doubts(opened: Opened) -> list[Doubt]:
-    """Where stage ``person`` contradicted the detector in most views, the body's build speaks against
-    its choice, or the result's limbs jump from side to side; what the annotation states to be
-    exchanged is no contradiction."""
+    """Where stage ``person`` contradicted the detector in most views, the body's build speaks
+    against its choice, or the result's limbs jump from side to side; what the annotation states to
+    be exchanged is no contradiction."""
     found = sides_of(opened)
     stated = np.zeros(found.image_of.shape, bool)
     with contextlib.suppress(UserError):  # an annotation that is none is told elsewhere
@@ -163,7 +164,7 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
     contradicted = ((seen > 1) & (share >= MOST_VIEWS)).any(1)
     doubted = contradicted | (against >= AGAINST_BUILD) | jumped
     marks = np.flatnonzero(doubted)
-    for first, second in zip(marks[:-1], marks[1:], strict=True):
+    for first, second in pairwise(marks):
         if second - first <= JOINED + 1:
             doubted[first:second] = True
     found = []

@@ -240,7 +240,8 @@ def test_left_and_right_are_seen_and_mended(settings: Path) -> None:
         """Where the first large view has the letter of the left (0) or right (7) wrist's points, as
         they were detected: one of its pixels, to the left of the letter."""
         return page.page.evaluate(
-            """(side) => { const a = window.annotate, view = a.views.views[0], d = a.sides.data.arrays;
+            """(side) => { const a = window.annotate, view = a.views.views[0];
+              const d = a.sides.data.arrays;
               const k = 2 * ((a.frame * 3 + 0) * 14 + 2 + side);
               const [x, y] = a.views.spot(view, d.detected[k], d.detected[k + 1]);
               const one = new OffscreenCanvas(1, 1).getContext("2d");

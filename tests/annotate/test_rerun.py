@@ -107,12 +107,12 @@ def test_a_run_that_takes_its_time_to_end_is_not_waited_for_and_told_once(
     project: Project, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     said = tmp_path / "said"
-    _pretend(
-        monkeypatch,
-        "import signal, time, pathlib; said = pathlib.Path(%r); told = []\n"
+    script = (
+        f"import signal, time, pathlib; said = pathlib.Path({str(said)!r}); told = []\n"
         "signal.signal(15, lambda *_: (told.append(1), said.write_text(f'told {len(told)}')))\n"
-        "said.write_text('ready'); time.sleep(60)" % str(said),
+        "said.write_text('ready'); time.sleep(60)"
     )
+    _pretend(monkeypatch, script)
     runs = rerun.Runs()
     runs.start(project, NAME)
     _until(lambda: said.is_file() and said.read_text() == "ready")

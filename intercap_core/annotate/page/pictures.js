@@ -58,13 +58,13 @@ export class Pictures {
     return job.promise;
   }
 
-  /* Forget what was asked for ahead of time and has not begun. */
+  /* Forget what was asked for and has not begun: another frame is wanted by now. */
   calm() {
-    for (const job of this.queue.filter((one) => !one.urgent)) {
+    for (const job of this.queue) {
       this.waiting.delete(job.key);
       job.resolve(undefined);
     }
-    this.queue = this.queue.filter((one) => one.urgent);
+    this.queue = [];
   }
 
   async #next() {

@@ -18,7 +18,7 @@ export class Space {
 
   async load() {
     const { app } = this;
-    find("space").replaceChildren(make("p", { class: "dim" }, "Loading the 4D viewer…"));
+    find("space").replaceChildren(make("p", { class: "dim" }, "Loading the body and the 4D viewer, some MB… Images and marks are there meanwhile."));
     try {
       const { header, arrays, data } = await packed(`sequences/${app.told.sequence}/viewer?v=${app.told.result}`);
       find("space").replaceChildren(viewerElement());

@@ -5,6 +5,8 @@ import { apply, project } from "./geometry.js";
 const AHEAD = 4; // frames fetched before they are asked for
 const NEAREST = 16; // times the whole image: the largest zoom
 
+const QUALITY = "intercap-images"; // as chosen, kept by the browser
+
 export class Views {
   constructor(app) {
     this.app = app;
@@ -12,7 +14,8 @@ export class Views {
     this.order = this.views.map((view) => view.index);
     this.large = Number(find("large").value);
     find("large").onchange = () => { this.large = Number(find("large").value); this.arrange(); };
-    find("quality").onchange = () => app.show(app.frame);
+    find("quality").value = remembered() ?? "1";
+    find("quality").onchange = () => { remember(find("quality").value); app.show(app.frame); };
     new ResizeObserver(() => app.redraw()).observe(find("views"));
     this.arrange();
   }
@@ -218,4 +221,12 @@ export class Views {
       ((x + 0.5 - view.crop[0]) / view.crop[2]) * view.width,
       ((y + 0.5 - view.crop[1]) / view.crop[3]) * view.height];
   }
+}
+
+function remembered() {
+  try { return localStorage.getItem(QUALITY); } catch { return null; } // a browser that keeps nothing
+}
+
+function remember(value) {
+  try { localStorage.setItem(QUALITY, value); } catch { /* as above */ }
 }
