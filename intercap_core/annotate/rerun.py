@@ -27,6 +27,7 @@ from intercap_core.project import Project
 
 LEAVES = ("summary", "page", "export")  # what nothing else of a sequence is made of
 _LAST_LINES = 12
+_PLANNING = threading.Lock()  # Python 3.11 fails where two threads parse source at a time
 _PATIENCE_S = 10.0  # beyond what `intercap run` takes at most to end in order
 
 
@@ -51,15 +52,16 @@ class EditedProject(Project):
 
 def touched(project: Project, sequence: str) -> list[dict[str, Any]]:
     """Stages that a run would make anew, in their order, with the reasons."""
-    plan = Plan(project)
-    found = [
-        {"stage": stage, "state": str(state.kind), "reasons": list(state.reasons)}
-        for stage, state in plan.states(sequence).items()
-        if state.kind is not Kind.done
-    ]
-    if not isinstance(project, EditedProject):
-        plan.keep()
-    return found
+    with _PLANNING:
+        plan = Plan(project)
+        found = [
+            {"stage": stage, "state": str(state.kind), "reasons": list(state.reasons)}
+            for stage, state in plan.states(sequence).items()
+            if state.kind is not Kind.done
+        ]
+        if not isinstance(project, EditedProject):
+            plan.keep()
+        return found
 
 
 def targets(project: Project, sequence: str) -> list[str]:

@@ -119,7 +119,7 @@ export class Keep {
       this.lost = true;
       return;
     }
-    if (this.lost) { banner("server", ""); this.lost = false; }
+    if (this.lost) { banner("server", ""); this.lost = false; app.redraw(); this.check(); }
     if (now.annotation !== app.draft.file.digest && this.known !== now.annotation) {
       this.known = now.annotation;
       banner("changed", "The annotation was changed meanwhile, in another tab or by somebody else.", [["Show", () => this.showChange()]]);

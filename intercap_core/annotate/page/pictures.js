@@ -1,5 +1,5 @@
 /* Images by camera, frame and width: fetched once, decoded, the next ones ahead of time. */
-import { blob } from "./api.js";
+import { Refused, blob } from "./api.js";
 
 const KEPT_BYTES = 300e6;
 const AT_ONCE = 6; // requests: what a browser sends to one server
@@ -36,7 +36,7 @@ export class Pictures {
     return undefined;
   }
 
-  /* Fetch an image; those that are `urgent` first. */
+  /* Fetch an image; those that are `urgent` first. Resolves to undefined where nothing is known of it. */
   want(camera, frame, width, urgent = true) {
     const key = this.#key(camera, frame, width);
     if (this.kept.has(key)) return Promise.resolve(this.kept.get(key).bitmap);
@@ -75,9 +75,12 @@ export class Pictures {
     try {
       bitmap = await createImageBitmap(
         await blob(`${this.path}/${encodeURIComponent(job.camera)}/${job.frame}?width=${job.width}&v=${this.stamp}`));
-    } catch { /* a gap in the recording, or an image that does not decode: none is shown */ }
+    } catch (error) {
+      if (error instanceof Refused && error.status === 0) bitmap = undefined; // the server is away: it is asked again
+    } // else a gap in the recording, or an image that does not decode: none is shown
     this.running -= 1;
     this.waiting.delete(job.key);
+    if (bitmap === undefined) { job.resolve(bitmap); this.#next(); return; }
     const size = bitmap ? 4 * bitmap.width * bitmap.height : 0;
     this.kept.set(job.key, { bitmap, size });
     this.bytes += size;

@@ -26,7 +26,7 @@ export class Views {
     const figure = make("figure", { class: "view", data: { camera: camera.name } }, canvas,
       make("figcaption", {}, camera.name));
     const [w, h] = camera.size;
-    const view = { camera, index, figure, canvas, brush: canvas.getContext("2d"), crop: [0, 0, w, h], shown: -1 };
+    const view = { camera, index, figure, canvas, brush: canvas.getContext("2d"), crop: [0, 0, w, h], last: null };
     view.pixel = (event) => { // of the image as recorded
       const box = canvas.getBoundingClientRect();
       const [x, y, wide, high] = view.crop;
@@ -176,7 +176,7 @@ export class Views {
       image = pictures.now(name, frame, view.fetched);
       if (image === undefined) {
         right = false;
-        pictures.want(name, frame, view.fetched).then(() => { if (app.frame === frame) app.redraw(); });
+        pictures.want(name, frame, view.fetched).then((bitmap) => { if (bitmap !== undefined && app.frame === frame) app.redraw(); });
         image = pictures.any(name, frame);
       }
     }
@@ -184,14 +184,18 @@ export class Views {
     if (image) {
       const scale = image.width / view.camera.size[0];
       brush.drawImage(image, ...view.crop.map((v) => v * scale), 0, 0, w, h);
-      view.shown = frame;
-    } else if (right || view.shown < 0) {
+      view.last = image;
+    } else {
       brush.fillStyle = "#30343b";
       brush.fillRect(0, 0, w, h);
+      if (!right && view.last?.width) { // of another frame, and not to be taken for this one
+        brush.globalAlpha = 0.3;
+        brush.drawImage(view.last, ...view.crop.map((v) => (v * view.last.width) / view.camera.size[0]), 0, 0, w, h);
+        brush.globalAlpha = 1;
+      }
       brush.fillStyle = "#e7eaef";
       brush.font = "13px system-ui";
-      brush.fillText(right ? "no image" : "…", 10, h - 12);
-      view.shown = frame;
+      brush.fillText(right ? "no image" : `image of frame ${frame}…`, 10, h - 12);
     }
     if (overlaid && app.overlay && view.camera.pose) {
       brush.globalAlpha = app.opacity;
