@@ -7,7 +7,9 @@ The arrow key is pressed as a person does, with a pause between; a step ends whe
 drawn the new frame, the graphics process has ended its work on them and the browser has painted.
 Into the JSON go ``annotate.page_ms_per_step``, the median of steps on, their 95th percentile
 (``..._p95``), the median until the 3D viewer has followed (``..._3d``, two frames later at the
-least), and ``annotate.page_ms_per_jump``, to the last frame, whose images nobody fetched ahead.
+least), ``annotate.page_ms_per_jump``, to the last frame, whose images nobody fetched ahead,
+``annotate.page_ms_to_open``, from the address to the 4D viewer, and ``annotate.page_ms_per_edit``, for
+which the page stands still. Of a long sequence: config/evaluation/long.yaml, once it is computed.
 """
 
 from __future__ import annotations
@@ -62,6 +64,15 @@ WATCH = """
 })()
 """
 
+# A frame is dropped and kept again; nothing is saved.
+_EDITS = """
+[...Array(10)].map(() => {
+  const start = performance.now();
+  window.annotate.dropped.toggle(0);
+  return performance.now() - start;
+})
+"""
+
 
 def steps_ms(page: Page, steps: int, key: str = "ArrowRight") -> np.ndarray:
     """Milliseconds (N, 2) of so many steps, one after the other, of a page that is watched (WATCH):
@@ -108,7 +119,9 @@ def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
         on = steps_ms(page.page, steps)
         page.page.reload()
         page.wait(READY)
+        to_open = page.page.evaluate("performance.now()")
         page.page.wait_for_timeout(1500)
+        edits = page.page.evaluate(_EDITS)
         page.page.evaluate(WATCH)
         jump = steps_ms(page.page, 1, "End")
     return {
@@ -116,6 +129,8 @@ def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
         "annotate.page_ms_per_step_p95": round(float(np.percentile(on[:, 0], 95)), 1),
         "annotate.page_ms_per_step_3d": round(float(np.median(on[:, 1])), 1),
         "annotate.page_ms_per_jump": round(float(jump[0, 0]), 1),
+        "annotate.page_ms_to_open": round(float(to_open), 1),
+        "annotate.page_ms_per_edit": round(float(np.median(edits)), 1),
     }
 
 
