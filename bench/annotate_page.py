@@ -8,8 +8,9 @@ drawn the new frame, the graphics process has ended its work on them and the bro
 Into the JSON go ``annotate.page_ms_per_step``, the median of steps on, their 95th percentile
 (``..._p95``), the median until the 3D viewer has followed (``..._3d``, two frames later at the
 least), ``annotate.page_ms_per_jump``, to the last frame, whose images nobody fetched ahead,
-``annotate.page_ms_to_open``, from the address to the 4D viewer, and ``annotate.page_ms_per_edit``, for
-which the page stands still. Of a long sequence: config/evaluation/long.yaml, once it is computed.
+``annotate.page_ms_to_open``, from the address to the 4D viewer, and
+``annotate.page_ms_per_edit``, for which the page stands still. Of a long sequence:
+config/evaluation/long.yaml, once it is computed.
 """
 
 from __future__ import annotations

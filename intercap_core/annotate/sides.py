@@ -83,9 +83,9 @@ def sides_payload(opened: Opened) -> str:
         found = sides_of(opened)
         header = {"cameras": found.cameras, "bones": [list(b) for b in BONES],
                   "points": list(POINTS), "source": found.source}  # fmt: skip
-        arrays = {
+        arrays: dict[str, np.ndarray] = {
             "detected": found.detected,
-            "exchanged": (found.exchanged > 0).any(2).astype(np.uint8),
+            "exchanged": np.any(found.exchanged > 0, axis=2).astype(np.uint8),
             "result": found.result.astype(np.float32),
         }
         return payload(header, arrays)
@@ -163,10 +163,9 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
     share = (limbs > 0).sum(1) / np.maximum(seen, 1)  # (T, 2)
     contradicted = ((seen > 1) & (share >= MOST_VIEWS)).any(1)
     doubted = contradicted | (against >= AGAINST_BUILD) | jumped
-    marks = np.flatnonzero(doubted)
-    for first, second in pairwise(marks):
-        if second - first <= JOINED + 1:
-            doubted[first:second] = True
+    for before, after in pairwise(np.flatnonzero(doubted).tolist()):
+        if after - before <= JOINED + 1:
+            doubted[before:after] = True
     found = []
     for first, last, _ in ranges(["x" if one else "" for one in doubted]):
         run = slice(first, last + 1)

@@ -337,6 +337,29 @@ def test_results_that_cannot_be_loaded_are_named_and_edits_stay(settings: Path) 
         assert _draft(page, "drop_frames") == [0]
 
 
+def test_what_a_cut_tunnel_leaves_open_is_asked_for_again(settings: Path) -> None:
+    with served(settings) as server, _open(server) as page:
+        keys, context = page.page.keyboard, page.page.context
+        page.wait("document.body.dataset.drawn === '0'")
+        context.set_offline(True)
+        keys.press("x")
+        keys.press("End")
+        page.wait("document.getElementById('status').textContent.includes('tunnel')")
+        page.wait("window.annotate.pictures.waiting.size === 0")
+        keys.press("Control+s")
+        page.wait("!document.getElementById('hint').hidden")
+        assert page.page.evaluate("document.body.dataset.drawn") == "0"
+        page.page.evaluate("window.annotate.keep.look()")
+        page.wait("document.querySelector('[data-banner=server]') !== null")
+        context.set_offline(False)
+        page.page.evaluate("window.annotate.keep.look()")
+        page.wait("document.body.dataset.drawn === '9'")
+        page.wait("document.getElementById('status').textContent.startsWith('not saved')")
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'saved'")
+    assert annotation(settings).read_text() == "drop_frames: [0]\n"
+
+
 def test_a_run_that_is_told_to_end_is_shown_to_be_ending(
     settings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
+import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,8 +59,6 @@ def test_images_come_as_large_as_they_are_shown(page: Served) -> None:
 
 
 def test_the_objects_poses_are_the_joint_fits(page: Served, settings: Path) -> None:
-    import base64
-
     _, data = page.get(f"/api/{OF}/object")
     _, arrays = unpacked(base64.b64encode(data).decode())
     with h5py.File(artefact(settings, "joint")) as joint:
@@ -218,3 +219,32 @@ def test_on_a_cluster_the_command_is_told_instead(settings: Path) -> None:
         status, told = page.post(f"{OF}/run", {"do": "start"})
         assert status == 422 and "intercap run" in told["error"]
         assert page.json(f"{OF}/run")["cluster"]
+
+
+def test_the_command_is_as_a_shell_takes_it(made: Path, tmp_path: Path) -> None:
+    settings = copied(made, tmp_path / "two words; $(x)")
+    with served(settings) as page:
+        told = page.json(f"{OF}/run")["command"]
+        assert shlex.split(told)[:3] == ["intercap", "run", str(settings)]
+        artefact(settings, "frames").unlink()
+        assert shlex.quote(str(settings)) in page.json(OF)["notes"][0]
+
+
+def test_images_that_cannot_be_read_are_named_and_a_run_is_offered(
+    page: Served, settings: Path
+) -> None:
+    path = artefact(settings, "frames")
+    path.write_bytes(path.read_bytes()[:3000])
+    told = page.json(OF)
+    assert told["frames"] == 0 and "frames.h5" in told["notes"][0]
+    assert page.json(f"{OF}/run")["command"]
+
+
+def test_what_goes_through_a_tunnel_is_the_result_alone_and_packed(page: Served) -> None:
+    status, data = page.get(f"/api/{OF}/viewer")
+    header, arrays = unpacked(base64.b64encode(data).decode())
+    assert status == 200 and list(header["versions"]) == ["joint"]
+    assert "joint/transforms" in arrays
+    assert not [name for name in arrays if name.startswith(("sequential/", "truth/"))]
+    _, told = page.get(f"/api/{OF}", **{"accept-encoding": "gzip"})
+    assert json.loads(gzip.decompress(told))["frames"] == 6
