@@ -310,6 +310,16 @@ def test_left_and_right_are_seen_and_mended(settings: Path) -> None:
         page.wait("document.getElementById('status').textContent === 'saved'")
         page.wait("window.annotate.questions.pending.length === 0")
         assert not [q for q in server.json(f"sequences/{NAME}/questions") if q["kind"] == "sides"]
+        # a camera that slips: its images are stated by the sets that they are of
+        moments = page.page.evaluate(
+            """() => { const a = window.annotate, { sides, told } = a;
+              told.image_of[1] = told.image_of[1].map((set) => set - 1);
+              sides.change("k2", 7, 8, true);
+              return sides.moments(sides.entries().find((one) => one.camera === "k2")); }"""
+        )
+        assert moments == [7, 9]
+        assert {"start": 6, "end": 8, "camera": "k2"} in _draft(page, "left_right")
+        page.page.keyboard.press("Control+z")
     text = annotation(settings).read_text()
     assert text.startswith("# kept\n") and "left_right:\n  - {start: 3, end: 7, camera: k1}" in text
 

@@ -2,7 +2,7 @@
  * frames in which a person states that the detector exchanged them. */
 import { packed } from "./api.js";
 import { apply, project } from "./geometry.js";
-import { find, make } from "./dom.js";
+import { make } from "./dom.js";
 
 export const LEFT = "#56b4ff", RIGHT = "#ff8c1a"; // told apart in all common kinds of colour blindness
 const LETTERED = [2, 5]; // of a side's points: wrist and ankle
@@ -92,7 +92,7 @@ export class Sides {
     const c = Math.max(0, this.#index(one.camera));
     const next = { ...one, start: this.#set(c, start), end: this.#set(c, end - 1) + 1 };
     if (next.end > next.start) for (const row of chosen) row.fill(1, next.start, next.end);
-    this.selected = next.end > next.start ? next : null;
+    this.selected = null; // until its bar is in focus again
     this.#put(rows, next.end > next.start ? "left and right: frames moved" : "left and right: frames removed");
   }
 

@@ -166,7 +166,7 @@ export class Timeline {
     const bar = this.#ended(says, id(one), looked ? "stated" : "found", looked ? "" : `${share} %`);
     bar.setAttribute("aria-pressed", String(contact.selected !== null && id(contact.selected) === id(one)));
     this.#put(bar, one.start, one.end);
-    bar.onfocus = () => { contact.selected = one; this.#bar(); };
+    bar.onfocus = () => { app.sides.selected = null; contact.selected = one; this.#bar(); };
     bar.onpointerdown = (event) => {
       contact.selected = one;
       this.#drag(event, bar, one, (start, end) => {
