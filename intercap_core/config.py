@@ -705,11 +705,15 @@ Start = Annotated[
 ]
 
 
+STATED_EMPTY = ("contact",)  # sections of an annotation in which an empty list states something
+
+
 class Annotation(Model):
     """annotations/<sequence>.yaml; every section is optional."""
 
     contact: tuple[ContactInterval, ...] | None = None
-    """Frames in which body parts touch the object; absent = find them."""
+    """Frames in which body parts touch the object; absent = find them, an empty list = nothing
+    touches in the whole sequence."""
     object_poses: tuple[ObjectPose, ...] = ()
     """Where the object is in some frames; its track agrees with them, and is carried from them
     where nothing is seen of it; empty = search."""

@@ -109,15 +109,6 @@ class Project:
                 raise UserError(f"{path}: {problem}; correct the entry")
         return annotation
 
-    def annotation_sections(self, sequence: str) -> dict[str, Any]:
-        """The filled sections of the sequence's annotation file as written, unchecked.
-
-        Raises UserError where the file is not YAML.
-        """
-        path = self.annotation_path(sequence)
-        values = read_yaml(path) if path.exists() else {}
-        return {k: v for k, v in values.items() if v} if isinstance(values, dict) else {}
-
     def annotation_made(self, sequence: str) -> bool:
         """Whether the studio writes this sequence's annotation, beside the recordings."""
         captures = self.config.studio.captures if self.config.studio else {}
