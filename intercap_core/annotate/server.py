@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import hashlib
 import json
 import threading
 from collections import OrderedDict
@@ -99,6 +100,7 @@ class Annotator:
             if made
             else document.locked(self.project.annotation_path(name)),
             "profile": str(self.runs.profile or ""),
+            "project": hashlib.sha256(str(self.settings.resolve()).encode()).hexdigest()[:16],
         }
         return found
 

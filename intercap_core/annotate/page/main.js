@@ -2,6 +2,7 @@
 import { get, packed, takeToken } from "./api.js";
 import { ask, banner, button, find, make } from "./dom.js";
 import { Contact } from "./contact.js";
+import { Copies } from "./copies.js";
 import { Draft } from "./draft.js";
 import { apply, invert } from "./geometry.js";
 import { Keep } from "./keep.js";
@@ -28,7 +29,7 @@ const KEYS = [
 ];
 
 class App {
-  constructor(told) {
+  constructor(told, copies) {
     this.told = told;
     this.frame = 0;
     this.direction = 1;
@@ -36,7 +37,7 @@ class App {
     this.layers = { body: true, object: true, contact: true, marks: true, before: false };
     this.mode = null;
     this.steps = []; // milliseconds from a wish for a frame to all views drawn
-    this.draft = new Draft(told.sequence, told.annotation);
+    this.draft = new Draft(told.annotation, copies);
     this.pictures = new Pictures(told.sequence, told.stamp);
     this.contact = new Contact(this);
     try { this.overlay = new Overlay(); } catch (error) { banner("overlay", error.message); }
@@ -91,6 +92,11 @@ class App {
   async reload() {
     const told = await get(`sequences/${this.told.sequence}`);
     const frame = this.frame;
+    if (!this.told.frames) { // views, time and all else come with the first frames
+      this.told.result = told.result;
+      if (told.frames) location.reload(); else facts(told);
+      return;
+    }
     Object.assign(this.told, told);
     this.pictures = new Pictures(told.sequence, told.stamp);
     this.contact = Object.assign(new Contact(this), { fromFound: this.contact.fromFound });
@@ -300,13 +306,27 @@ class App {
     ask("Keys", make("table", { class: "keys" }, KEYS.map(([key, says]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, says)))), [["", "Close", true]]);
   }
 
+  /* What is being typed into a field counts before a key of the whole page does. */
+  #typed(field, act) {
+    const fields = () => [...find("panels").querySelectorAll("input")], at = fields().indexOf(field);
+    if (at >= 0) field.blur();
+    act();
+    if (at >= 0 && !find("dialog").open) fields()[at]?.focus();
+  }
+
   key(event) {
     if (find("dialog").open) return;
     const control = event.ctrlKey || event.metaKey, typed = event.target.tagName, letter = event.key.toLowerCase();
-    if (control && letter === "s") { event.preventDefault(); this.keep.save(); return; }
+    if (control && /^[szy]$/.test(letter)) {
+      event.preventDefault();
+      this.#typed(event.target, () => {
+        if (letter === "s") this.keep.save();
+        else if (letter === "y" || event.shiftKey) this.redo();
+        else this.undo();
+      });
+      return;
+    }
     if (["INPUT", "SELECT", "TEXTAREA"].includes(typed) && event.target.type !== "checkbox" && event.target.type !== "range") return;
-    if (control && letter === "z") { event.preventDefault(); if (event.shiftKey) this.redo(); else this.undo(); return; }
-    if (control && letter === "y") { event.preventDefault(); this.redo(); return; }
     if (control || event.altKey || event.target.closest?.(".viewer")) return;
     const one = this.contact.selected && this.contact.under(this.frame);
     const far = event.shiftKey ? 10 : 1;
@@ -371,9 +391,9 @@ async function begin() {
     find("editor").hidden = false;
     facts(told);
     if (!told.frames) {
-      Object.assign(told, { cameras: [], places: [], images: [], times: [], fps: 1, result: "", stamp: "" });
+      Object.assign(told, { cameras: [], places: [], images: [], times: [], fps: 1, stamp: "" });
     }
-    window.annotate = new App(told);
+    window.annotate = new App(told, await Copies.open(told.project, told.sequence));
     await window.annotate.load();
   } catch (error) { stop(error.message); }
 }
