@@ -25,6 +25,7 @@ from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sequences import SequenceList
+from intercap_core.commands.check import fault_of_cameras
 from intercap_core.config import Annotation, ObjectEntry, ObjectPose
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
@@ -269,14 +270,12 @@ class Annotator:
     def _faults(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
         """What the recording says against an annotation."""
         told = [annotation.check_object(self.project.sequences[name].object)]
-        opened = self.opened(name)
-        if opened.there("frames"):
-            try:
-                with opened.images() as images:
-                    told.append(annotation.check_frames(images.num_sets))
-                    told.append(annotation.check_cameras(images.rig.names, images.master))
-            except UserError:  # of an older version: a run reads the frames anew
-                pass
+        recorded = self.project.recorded(name)
+        told.append(
+            annotation.check_recording(recorded)
+            if recorded
+            else fault_of_cameras(self.project, name, annotation)
+        )
         return [{"where": words.partition(".")[0].partition("[")[0].split(" ")[0], "words": words}
                 for words in told if words]  # fmt: skip
 
