@@ -182,21 +182,25 @@ def paired(name: str, old: Sequence[Any], new: Sequence[Any]) -> list[int | None
     found: dict[int, int] = {}
     for block in difflib.SequenceMatcher(None, a, b, autojunk=False).get_matching_blocks():
         found |= {block.b + i: block.a + i for i in range(block.size)}
-    for j, one in enumerate(b):  # those that were moved
-        if j not in found and one in a:
-            free = [k for k, other in enumerate(a) if other == one and k not in found.values()]
-            found |= {j: free[0]} if free else {}
+    left = set(range(len(old))) - set(found.values())
+    moved: defaultdict[str, list[int]] = defaultdict(list)
+    for k in sorted(left, reverse=True):
+        moved[a[k]].append(k)
+    for j, one in enumerate(b):
+        if j not in found and moved[one]:
+            found[j] = moved[one].pop()
     keys, numbers = _KNOWN_BY.get(name, ((), ()))
-    if keys:
-        apart = sorted(
-            (_distance(old[k], new[j], numbers), j, k)
-            for j in range(len(new))
-            for k in range(len(old))
-            if j not in found and k not in found.values() and _alike(old[k], new[j], keys)
-        )
-        for _, j, k in apart:
-            if j not in found and k not in found.values():
-                found[j] = k
+    left -= set(found.values())
+    apart = sorted(
+        (_distance(old[k], new[j], numbers), j, k)
+        for j in sorted(set(range(len(new))) - set(found))
+        for k in sorted(left)
+        if keys and _alike(old[k], new[j], keys)
+    )
+    for _, j, k in apart:
+        if j not in found and k in left:
+            found[j] = k
+            left.remove(k)
     return [found.get(j) for j in range(len(new))]
 
 

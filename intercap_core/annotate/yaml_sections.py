@@ -85,7 +85,7 @@ def _spans(text: str) -> dict[str, tuple[int, int]] | None:
     """First line and the one after the last of each section, without the comments that stand before
     the next one; None where sections do not begin lines of their own."""
     root = yaml.compose(text, Loader=yaml.SafeLoader)
-    if root is None:
+    if root is None or root.value == "":  # nothing, or nothing between the document's marks
         return {}
     if not isinstance(root, yaml.MappingNode) or root.flow_style:
         return None
@@ -117,6 +117,8 @@ def _changed(lines: list[str], section: str, value: Any, end: str) -> list[str]:
     assert isinstance(root, yaml.MappingNode)
     node = root.value[0][1]
     before: Any = next(iter(parse_yaml(text).values()))
+    if same(before, value):
+        return lines
     if not before or type(before) not in (list, dict) or type(before) is not type(value):
         return _in_place_of(lines, node, section, value, end)
     if node.flow_style and isinstance(value, dict):
@@ -131,6 +133,8 @@ def _changed(lines: list[str], section: str, value: Any, end: str) -> list[str]:
     if parts is None:
         raise NoLayout
     if isinstance(value, dict):
+        if [str(key.value) for key, _ in node.value] != [str(name) for name in before]:
+            raise NoLayout  # keys of another mapping are merged in
         known = [list(before).index(name) if name in before else None for name in value]
         old: list[Any] = [{name: one} for name, one in before.items()]
         new: list[Any] = [{name: one} for name, one in value.items()]
@@ -169,9 +173,7 @@ def _in_place_of(
         head = lines[0][: told[0]].rstrip()
         fresh[0] = _bare(fresh[0]) + lines[0][len(head) :]
     own = {n for n, column in told.items() if not lines[n][:column].strip()}
-    if set(told) - own - {0}:
-        raise NoLayout
-    kept = [lines[n] for n in sorted(own)]
+    kept = [line for n, line in enumerate(lines) if n in own or not line.strip()]
     if comment_texts("".join([*fresh[:1], *kept])) != comment_texts(text):
         raise NoLayout
     return [*fresh[:1], *kept, *fresh[1:]]
@@ -300,6 +302,8 @@ def _written(writer: Any, root: Any) -> str:
 
 def _flow(value: Any) -> str:
     """A value on one line."""
+    if type(value) is int:  # of which there may be thousands
+        return str(value)
     root = _commented([_node("", value)])
     root.fa.set_flow_style()
     return _written(_writer(""), root).strip()[1:-1]

@@ -1,6 +1,8 @@
 /* The annotation as it is edited: its sections, undo and redo; a copy of it is kept in this browser. */
 export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames"];
-const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
+const plain = (value) => JSON.stringify(value ?? null, (_, one) => // whatever the order of its keys
+  (one && typeof one === "object" && !Array.isArray(one) ? Object.fromEntries(Object.entries(one).sort()) : one));
+export const same = (a, b) => plain(a) === plain(b);
 /* An empty list says as much as no section, but of contact: there it says that nothing touches. */
 export const stated = (name, value) => (Array.isArray(value) && !value.length && name !== "contact" ? null : value ?? null);
 

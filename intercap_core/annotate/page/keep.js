@@ -1,7 +1,7 @@
 /* Saving what was edited, with the difference shown before; running what it touches; new beside old. */
 import { get, post } from "./api.js";
 import { ask, banner, button, diff, find, make, words } from "./dom.js";
-import { stated } from "./draft.js";
+import { same, stated } from "./draft.js";
 
 const CHECK_MS = 250;
 const LOOK_MS = 4000;
@@ -75,7 +75,14 @@ export class Keep {
     find("status").textContent = fault ? fault.words : count ? `not saved: ${Object.keys(app.draft.changes()).map(words).join(", ")}` : app.told.annotation.text ? "saved" : "no annotation yet";
   }
 
+  /* One save at a time, however often it is asked for. */
   async save() {
+    if (this.saving) return;
+    this.saving = true;
+    try { await this.#save(); } finally { this.saving = false; }
+  }
+
+  async #save() {
     const { app } = this, changes = app.draft.changes();
     if (!Object.keys(changes).length) { app.say("there is nothing to save"); return; }
     if (app.told.read_only) { app.say(app.told.read_only); return; }
@@ -116,7 +123,7 @@ export class Keep {
       return;
     }
     if (POSES.some((name) => name in mine)) for (const name of POSES) mine[name] = app.draft.get(name);
-    const both = Object.keys(mine).filter((name) => JSON.stringify(stated(name, theirs[name])) !== JSON.stringify(app.draft.saved[name] ?? null));
+    const both = Object.keys(mine).filter((name) => !same(stated(name, theirs[name]), app.draft.saved[name]));
     const answer = await ask("Somebody else changed this annotation meanwhile", [
       make("p", {}, "Their change, which is in the file:"), diff(told.difference || "(only the layout changed)"),
       make("p", {}, both.length ? `Both of you changed ${both.map(words).join(", ")}: yours would replace theirs there.` : "You changed other sections: both changes can stand.")],
@@ -129,7 +136,7 @@ export class Keep {
     app.draft.sections = { ...structuredClone(app.draft.saved), ...edited };
     app.draft.told();
     banner("changed", "");
-    await this.save();
+    await this.#save();
   }
 
   /* Has the file or the result changed behind this page? */
