@@ -411,6 +411,13 @@ def test_a_number_that_is_typed_counts_before_a_key_of_the_page(settings: Path) 
         keys.press("Delete")
         keys.press("Tab")  # no number: as it was
         assert _draft(page, "object_poses")[0]["translation"][0] == 0.25
+        page.page.mouse.move(*_middle_of_the_object(page))
+        page.page.mouse.wheel(0, 100)
+        page.wait("window.annotate.pose.late")
+        page.page.evaluate("window.annotate.show(1)")  # before the wheel's step was taken
+        page.page.wait_for_timeout(300)
+        assert [one["frame"] for one in _draft(page, "object_poses")] == [0]
+        assert page.page.evaluate("window.annotate.draft.done.at(-1).says").endswith("farther")
 
 
 def test_images_alone_are_shown_and_can_be_annotated(settings: Path) -> None:

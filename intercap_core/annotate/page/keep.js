@@ -57,11 +57,11 @@ export class Keep {
   }
 
   async check() {
-    const { app } = this;
-    try {
-      const found = await post(`${this.path}/check`, { changes: app.draft.changes() });
-      this.faults = found.faults;
-    } catch (error) { this.faults = [{ where: "", words: error.message }]; }
+    const { app } = this, asked = this.asked = {}; // an earlier answer may come later
+    let faults;
+    try { faults = (await post(`${this.path}/check`, { changes: app.draft.changes() })).faults; } catch (error) { faults = [{ where: "", words: error.message }]; }
+    if (asked !== this.asked) return;
+    this.faults = faults;
     this.state();
   }
 
@@ -79,6 +79,7 @@ export class Keep {
   async save() {
     if (this.saving) return;
     this.saving = true;
+    this.app.pose?.settle();
     try { await this.#save(); } finally { this.saving = false; }
   }
 

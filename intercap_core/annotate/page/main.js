@@ -241,12 +241,13 @@ class App {
 
   undo() {
     if (this.paint && this.mode === this.paint) { this.paint.undo(); return; }
+    this.pose?.settle();
     this.draft.undo();
     if (this.pose?.editing) this.pose.undone();
     this.panels();
   }
 
-  redo() { this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
+  redo() { this.pose?.settle(); this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
 
   saved(annotation, theirs = false) {
     this.told.annotation = annotation;

@@ -90,7 +90,10 @@ export class PoseEditor {
       middles.reduce((sum, m) => sum + m[i], 0) / Math.max(1, middles.length)]);
   }
 
-  leave() { this.editing = false; }
+  leave() {
+    this.settle();
+    this.editing = false;
+  }
 
   get hint() {
     return "Drag the object to move it, Shift+drag to turn it, Alt+drag to roll it, wheel for nearer and farther (Ctrl+wheel zooms). S fits it to the images, Esc ends.";
@@ -144,8 +147,16 @@ export class PoseEditor {
     this.pose = this.pose.map((row, i) => [row[0], row[1], row[2], row[3] + by[i]]);
     this.changed();
     clearTimeout(this.late);
-    this.late = setTimeout(() => this.put("object nearer or farther"), 250);
+    this.late = setTimeout(() => this.settle(), 250);
     return true;
+  }
+
+  /* Turns of the wheel are one step, once it rests or something else is done. */
+  settle() {
+    if (!this.late) return;
+    clearTimeout(this.late);
+    this.late = null;
+    this.put("object nearer or farther");
   }
 
   /* A drag on the object in the 3D viewer, which else turns the view. */
