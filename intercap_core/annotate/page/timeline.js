@@ -161,7 +161,7 @@ export class Timeline {
     const state = contact.stated ? !contact.stated.length ? "nothing touches, as annotated"
       : `${contact.stated.length} intervals stated, ${contact.stated.filter((i) => !contact.looked(i)).length} of them as found`
       : contact.probability ? "contact as found: an edit takes it into the annotation" : "no contact is found yet";
-    find("contact-bar").replaceChildren(make("span", { class: "dim" }, state), choose, ...(one ? [
+    find("contact-bar").replaceChildren(contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(one ? [
       make("b", {}, `${words(one.part)} ${one.start}–${one.end - 1}`),
       button("Confirm", () => contact.confirm(one), { title: "C" }),
       button("Starts here", () => contact.change(one, app.frame, one.end), { title: "[" }),
