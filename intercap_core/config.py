@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -32,7 +32,7 @@ from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stage_list import STAGES
 
 MAX_POSITION_M = 50.0  # a capture volume is some metres wide
-MIN_FLOOR_WIDTH_M = 0.01  # floor points this close to one line give no plane
+MIN_FLOOR_SPREAD_M = 0.02  # floor points this close to one line give no plane
 # Of a start that is read off a time code, or off the frame of a clap: of a frame of 1/25 s, which
 # is seen as a whole, an even error of 1/25/sqrt(12) = 12 ms, and as much of the clock that is read.
 START_SIGMA_S = 0.02
@@ -672,22 +672,29 @@ class SubjectPoint(Model):
     y: float
     """Pixels from its upper edge."""
 
+    def fault(self, sizes: Mapping[str, tuple[int, int]]) -> str | None:
+        """Say that no camera of the recording has the point; ``sizes`` are the cameras' widths and
+        heights, pixels."""
+        if self.camera not in sizes:
+            return _no_camera(self.camera, list(sizes))
+        width, height = sizes[self.camera]
+        if not (0 <= self.x < width and 0 <= self.y < height):
+            return (
+                f"is at x {self.x:g}, y {self.y:g}; camera {self.camera} has {width} x {height} "
+                "pixels"
+            )
+        return None
 
-def _width(points: tuple[Position, ...]) -> float:
-    """Largest distance of a point from the line through the first one and the one furthest off."""
-    first = points[0]
-    far = max(points, key=lambda point: math.dist(first, point))
-    length = math.dist(first, far)
-    if length == 0:
-        return 0.0
-    along = [(b - a) / length for a, b in zip(first, far, strict=True)]
 
-    def beside(point: Position) -> float:
-        offset = [b - a for a, b in zip(first, point, strict=True)]
-        shift = sum(a * b for a, b in zip(along, offset, strict=True))
-        return math.dist(offset, [shift * a for a in along])
+def _no_camera(name: str, names: Sequence[str]) -> str:
+    return f"names camera {name!r}; the recording has {', '.join(names)}"
 
-    return max(map(beside, points))
+
+def floor_spread(points: Sequence[Position] | np.ndarray) -> float:
+    """Root mean square distance of points, metres, from the line that fits them best."""
+    at = np.array(points, np.float64)
+    values = np.linalg.svd(at - at.mean(0), compute_uv=False)
+    return float(values[1] / np.sqrt(len(at)))
 
 
 class StatedStart(Model):
@@ -705,11 +712,24 @@ Start = Annotated[
 ]
 
 
+class Recorded(NamedTuple):
+    """What an annotation's entries are of: the number of ``frames``, each camera's image by name
+    as (width, height), and the name of the ``master``."""
+
+    frames: int
+    sizes: dict[str, tuple[int, int]]
+    master: str
+
+
+STATED_EMPTY = ("contact",)  # sections of an annotation in which an empty list states something
+
+
 class Annotation(Model):
     """annotations/<sequence>.yaml; every section is optional."""
 
     contact: tuple[ContactInterval, ...] | None = None
-    """Frames in which body parts touch the object; absent = find them."""
+    """Frames in which body parts touch the object; absent = find them, an empty list = nothing
+    touches in the whole sequence."""
     object_poses: tuple[ObjectPose, ...] = ()
     """Where the object is in some frames; its track agrees with them, and is carried from them
     where nothing is seen of it; empty = search."""
@@ -744,8 +764,11 @@ class Annotation(Model):
     def _floor_points(self) -> Annotation:
         if self.floor is not None and len(self.floor) < 3:
             raise ValueError(f"floor has {len(self.floor)} points, a plane needs 3 or more")
-        if self.floor is not None and _width(self.floor) < MIN_FLOOR_WIDTH_M:
-            raise ValueError("the floor points lie on one line; a plane needs one beside it")
+        if self.floor is not None and floor_spread(self.floor) < MIN_FLOOR_SPREAD_M:
+            raise ValueError(
+                f"the floor points lie on one line within {MIN_FLOOR_SPREAD_M * 1000:.0f} mm; a "
+                "plane needs one beside it"
+            )
         return self
 
     @model_validator(mode="after")
@@ -777,6 +800,11 @@ class Annotation(Model):
         return None
 
     @property
+    def names_cameras(self) -> bool:
+        """Whether an entry is of a camera by its name."""
+        return bool(self.subject or self.starts) or any(one.camera for one in self.left_right)
+
+    @property
     def stated_starts(self) -> dict[str, tuple[float, float]]:
         """Seconds and their standard deviation by camera; empty where no start is stated."""
         stated = {}
@@ -790,6 +818,9 @@ class Annotation(Model):
     def check_cameras(self, names: Sequence[str], master: str) -> str | None:
         """Say which entry is of none of the cameras ``names``, or that the ``master``'s start
         lacks."""
+        for index, point in enumerate(self.subject):
+            if point.camera not in names:
+                return f"subject[{index}] {_no_camera(point.camera, names)}"
         for index, sides in enumerate(self.left_right):
             if sides.camera is not None and sides.camera not in names:
                 return (
@@ -805,6 +836,17 @@ class Annotation(Model):
                 "they are counted from it)"
             )
         return None
+
+    def check_recording(self, recorded: Recorded) -> str | None:
+        """Say which entry is not of what was recorded, or None."""
+        problem = self.check_frames(recorded.frames)
+        if problem:
+            return problem
+        for index, point in enumerate(self.subject):
+            problem = point.fault(recorded.sizes)
+            if problem:
+                return f"subject[{index}] {problem}"
+        return self.check_cameras(list(recorded.sizes), recorded.master)
 
     def check_frames(self, count: int) -> str | None:
         """Say which entry lies past the recording's ``count`` frame sets, or None."""

@@ -12,7 +12,14 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
-from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
+from intercap_core.config import (
+    Annotation,
+    Config,
+    ObjectEntry,
+    Recorded,
+    SequenceEntry,
+    SubjectEntry,
+)
 from intercap_core.detections.converters.label_maps import read_label_map
 from intercap_core.errors import UserError
 from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
@@ -97,26 +104,26 @@ class Project:
             )
         if not look_at_frames:
             return annotation
-        with contextlib.suppress(artefacts.Unreadable):
-            with artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source:
-                count, names = len(source["times"]), source.text("camera_names")
-                master = str(source.attributes["master"])
-            problem = annotation.check_frames(count)
-            if problem:
-                raise UserError(f"{path}: {problem} (numbered from 0); correct the entry")
-            problem = annotation.check_cameras(names, master)
-            if problem:
-                raise UserError(f"{path}: {problem}; correct the entry")
+        recorded = self.recorded(sequence)
+        problem = annotation.check_recording(recorded) if recorded else None
+        if recorded and problem:
+            counted = " (numbered from 0)" if annotation.check_frames(recorded.frames) else ""
+            raise UserError(f"{path}: {problem}{counted}; correct the entry")
         return annotation
 
-    def annotation_sections(self, sequence: str) -> dict[str, Any]:
-        """The filled sections of the sequence's annotation file as written, unchecked.
-
-        Raises UserError where the file is not YAML.
-        """
-        path = self.annotation_path(sequence)
-        values = read_yaml(path) if path.exists() else {}
-        return {k: v for k, v in values.items() if v} if isinstance(values, dict) else {}
+    def recorded(self, sequence: str) -> Recorded | None:
+        """What the sequence's annotation may speak of; None before its frames have been read."""
+        with (
+            contextlib.suppress(artefacts.Unreadable),
+            artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source,
+        ):
+            sizes = [(int(width), int(height)) for width, height in source["colour_size"]]
+            return Recorded(
+                len(source["times"]),
+                dict(zip(source.text("camera_names"), sizes, strict=True)),
+                str(source.attributes["master"]),
+            )
+        return None
 
     def annotation_made(self, sequence: str) -> bool:
         """Whether the studio writes this sequence's annotation, beside the recordings."""

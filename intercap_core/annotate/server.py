@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import hashlib
 import json
 import shlex
 import threading
@@ -36,6 +37,7 @@ from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.images import Pictures
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sequences import SequenceList
+from intercap_core.commands.check import fault_of_cameras
 from intercap_core.config import Annotation, ObjectEntry, ObjectPose
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
@@ -93,12 +95,16 @@ class Annotator:
         if not opened.there("frames"):
             by_hand = shlex.join(["intercap", "run", str(self.settings), "--", "--until", "frames"])
             told = f"no images have been read of this recording yet: run it, or `{by_hand}`"
-            found: dict[str, Any] = {"sequence": name, "frames": 0, "notes": [told]}
+            found: dict[str, Any] = {
+                "sequence": name, "frames": 0, "notes": [told], "result": opened.stamp(),
+            }  # fmt: skip
         else:
             try:
                 found = result.describe(opened)
             except UserError as error:  # a run can make the images anew
-                found = {"sequence": name, "frames": 0, "notes": [str(error)]}
+                found = {
+                    "sequence": name, "frames": 0, "notes": [str(error)], "result": opened.stamp(),
+                }  # fmt: skip
         row = self.project.sequences[name]
         made = self.project.annotation_made(name)
         found |= {
@@ -108,8 +114,9 @@ class Annotator:
             "regions": list(CONTACT_REGIONS),
             "read_only": "the studio writes this annotation anew with the recording"
             if made
-            else "",
+            else document.locked(self.project.annotation_path(name)),
             "profile": str(self.runs.profile or ""),
+            "project": hashlib.sha256(str(self.settings.resolve()).encode()).hexdigest()[:16],
         }
         return found
 
@@ -137,20 +144,15 @@ class Annotator:
         """What is wrong with changed sections, what changes in the file, and what runs again."""
         now = document.read(self.project.annotation_path(name))
         changes = _changes(told)
-        sections = {k: v for k, v in (now.sections | changes).items() if v not in (None, [])}
-        faults = [] if not now.problem else [{"where": "file", "words": now.problem}]
-        faults += document.faults(sections)
+        faults, text = self._edited(name, now, changes)
         found: dict[str, Any] = {"faults": faults, "digest": now.digest, "difference": ""}
         if faults:
             return found
-        annotation = Annotation.model_validate(sections)
-        faults += self._faults(name, annotation)
-        if not faults:
-            text = document.patched(now, changes)
-            found["difference"] = document.difference(now.text, text, now.path.name)
-            if told.get("plan"):
-                edited = rerun.EditedProject.of(self.project, name, annotation)
-                found["touched"] = rerun.touched(edited, name)
+        found["difference"] = document.difference(now.text, text, now.path.name)
+        if told.get("plan"):
+            annotation = Annotation.model_validate(document.sections_with(now, changes))
+            edited = rerun.EditedProject.of(self.project, name, annotation)
+            found["touched"] = rerun.touched(edited, name)
         return found
 
     def save(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
@@ -163,12 +165,10 @@ class Annotator:
         if now.digest != told.get("digest"):
             base = str(told.get("text", ""))
             raise document.Changed(now, document.difference(base, now.text, path.name))
-        sections = {k: v for k, v in (now.sections | changes).items() if v not in (None, [])}
-        faults = document.faults(sections)
-        faults = faults or self._faults(name, Annotation.model_validate(sections))
+        faults, text = self._edited(name, now, changes)
         if faults:
             raise UserError("; ".join(f"{one['where']}: {one['words']}" for one in faults))
-        saved = document.save(now, document.patched(now, changes))
+        saved = document.save(now, text)
         if self.by:
             told = {"kind": "saved", "sections": sorted(changes)}
             with contextlib.suppress(OSError):  # the annotation is saved, whoever did it
@@ -267,17 +267,30 @@ class Annotator:
     def _answers(self, name: str) -> Path:
         return questions.answers_path(self.project.annotation_path(name))
 
+    def _edited(
+        self, name: str, now: document.Document, changes: dict[str, Any]
+    ) -> tuple[list[dict[str, str]], str]:
+        """What is wrong with the annotation when it is changed, and the file's text then."""
+        if now.problem:
+            return [{"where": "file", "words": now.problem}], now.text
+        sections = document.sections_with(now, changes)
+        faults = document.faults(sections)
+        faults = faults or self._faults(name, Annotation.model_validate(sections))
+        if faults:
+            return faults, now.text
+        text = document.patched(now, changes)
+        # an entry that stays as it is written may be wrong by its form alone: 12.0 is no frame
+        return document.faults(document.parsed(text)), text
+
     def _faults(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
         """What the recording says against an annotation."""
         told = [annotation.check_object(self.project.sequences[name].object)]
-        opened = self.opened(name)
-        if opened.there("frames"):
-            try:
-                with opened.images() as images:
-                    told.append(annotation.check_frames(images.num_sets))
-                    told.append(annotation.check_cameras(images.rig.names, images.master))
-            except UserError:  # of an older version: a run reads the frames anew
-                pass
+        recorded = self.project.recorded(name)
+        told.append(
+            annotation.check_recording(recorded)
+            if recorded
+            else fault_of_cameras(self.project, name, annotation)
+        )
         return [{"where": words.partition(".")[0].partition("[")[0].split(" ")[0], "words": words}
                 for words in told if words]  # fmt: skip
 

@@ -145,6 +145,8 @@ def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> 
         c = rig.names.index(camera)
         lens, pixel = rig[c].colour, np.array([x, y])
         depth = images.depth(frame, c) if rig[c].depth is not None else None
+    if not (0 <= x < lens.width and 0 <= y < lens.height):
+        raise UserError(f"x {x:g}, y {y:g} is outside of the image of camera {camera}")
     if not np.isfinite(rig[c].master_from_colour).all():
         raise UserError(f"camera {camera}: its pose is not known, so no point can be placed by it")
     if depth is not None:

@@ -74,7 +74,7 @@ def _name_list(project: Project, entry: ObjectEntry, path: Path) -> None:
     found = document.read(objects)
     told = dict(found.sections[entry.name])
     told["contact_vertices"] = os.path.relpath(path, objects.parent)
-    document.save(found, document.with_section(found.text, entry.name, told))
+    document.save(found, document.with_changes(found, {entry.name: told}))
 
 
 def _digest(path: Path) -> str:

@@ -48,7 +48,7 @@ def save_symmetry(
         )
     own = {k: v for k, v in dict(found.sections[entry.name]).items() if k != "symmetry"}
     own |= {"symmetry": symmetry} if symmetry else {}
-    document.save(found, document.with_section(found.text, entry.name, own))
+    document.save(found, document.with_changes(found, {entry.name: own}))
     return read_symmetry(project, entry)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
+from intercap_core.config import Annotation, DetectionsSettings, FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
@@ -113,11 +113,13 @@ def check_sequences(project: Project) -> Findings:
     faults += _annotations_without_sequence(project)
     for name, row in project.sequences.items():
         try:
-            project.annotation(name)
+            annotation = project.annotation(name)
+            problem = fault_of_cameras(project, name, annotation)
+            if problem:
+                path = project.annotation_path(name)
+                raise UserError(f"{path}: {problem}; correct the entry")
         except UserError as error:
             faults.append(Fault(name, str(error)))
-        else:
-            faults += _faults_of_starts(project, name)
         mesh = None if row.object is None else meshes[row.object]
         if mesh is not None:
             faults.append(Fault(name, mesh))
@@ -131,21 +133,20 @@ def check_sequences(project: Project) -> Findings:
     return found
 
 
-def _faults_of_starts(project: Project, name: str) -> list[Fault]:
-    """Whether the annotation states starts of cameras that are not there; what else is wrong with
-    the recordings is told elsewhere."""
+def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str | None:
+    """Say which entry of the annotation is of no camera of the recordings, where those can be
+    looked at and no frames have been read of them; what else is wrong with them is told elsewhere.
+    """
     from intercap_core.capture.layouts import open_layout
 
-    annotation, row = project.annotation(name), project.sequences[name]
-    if annotation.starts is None or project.recordings_made(name) is not None:
-        return []
+    row = project.sequences[name]
+    if not annotation.names_cameras or project.recordings_made(name) is not None:
+        return None
     try:
         extrinsics = open_layout(row).extrinsics
     except (UserError, OSError):
-        return []
-    problem = annotation.check_cameras(list(extrinsics.master_from_colour), extrinsics.master)
-    path = project.annotation_path(name)
-    return [Fault(name, f"{path}: {problem}; correct the entry")] if problem else []
+        return None
+    return annotation.check_cameras(list(extrinsics.master_from_colour), extrinsics.master)
 
 
 def notes_of_sequences(project: Project) -> list[Fault]:

@@ -44,11 +44,12 @@ def _named(
     min_confidence: float,
 ) -> Named:
     names = detections.camera_names
+    sizes = {
+        name: (int(w), int(h)) for name, (w, h) in zip(names, detections.image_sizes, strict=True)
+    }
     told = f"sequence {detections.sequence}: the annotation's {entry}"
-    if point.camera not in names:
-        raise UserError(
-            f"{told} names camera {point.camera!r}; the recording has {', '.join(names)}"
-        )
+    if fault := point.fault(sizes):
+        raise UserError(f"{told} {fault}")
     c = names.index(point.camera)
     where = f"camera {point.camera}, frame {point.frame}"
     shows = np.flatnonzero(image_of[:, c] == point.frame)
@@ -56,11 +57,6 @@ def _named(
         raise UserError(
             f"{told} names {where}, which has no image, or one that is not in step; name the "
             "person in another frame or camera"
-        )
-    width, height = (int(n) for n in detections.image_sizes[c])
-    if not (0 <= point.x < width and 0 <= point.y < height):
-        raise UserError(
-            f"{told} is at x {point.x:g}, y {point.y:g}; {where} has {width} x {height} pixels"
         )
     t, at = int(shows[0]), np.array([point.x, point.y])
     people = detections.people(t, c)[:, BODY_POINTS]

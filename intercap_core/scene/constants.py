@@ -178,7 +178,6 @@ FEET_TILT_DEG = 6.0  # twice what feet that have been apart tell a tilt to
 WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; who bends for long leans by less
 MIN_TRUNK_SETS = 5  # that show neck and hips
 MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
-MIN_ANNOTATED_SPREAD_M = 0.02  # annotated points this close to one line give no plane
 
 # --- decision: offsets and slips ------------------------------------------------------------------
 

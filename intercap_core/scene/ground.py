@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core.camera.rig import Rig, ring_centre
+from intercap_core.config import MIN_FLOOR_SPREAD_M, floor_spread
 from intercap_core.errors import UserError
 from intercap_core.scene.constants import (
     BELOW_FLOOR_COST,
@@ -20,7 +21,6 @@ from intercap_core.scene.constants import (
     FLOOR_REFINE_STEPS,
     LOWER_FLOOR_DEG,
     MAX_COVERED_SHARE,
-    MIN_ANNOTATED_SPREAD_M,
     MIN_FLOOR_AREA_M2,
 )
 from intercap_core.scene.up import Up, degrees_between
@@ -169,11 +169,11 @@ def annotated_ground(
     Raises UserError, to be prefixed with the sequence, where the points lie on one line.
     """
     point = floor.mean(0)
-    _, spread, axes = np.linalg.svd(floor - point, full_matrices=False)
-    if spread[1] / np.sqrt(len(floor)) < MIN_ANNOTATED_SPREAD_M:
+    axes = np.linalg.svd(floor - point, full_matrices=False)[2]
+    if floor_spread(floor) < MIN_FLOOR_SPREAD_M:
         raise UserError(
             f"annotation floor: its {len(floor)} points lie on one line within "
-            f"{MIN_ANNOTATED_SPREAD_M * 1000:.0f} mm; pick points that span the floor"
+            f"{MIN_FLOOR_SPREAD_M * 1000:.0f} mm; pick points that span the floor"
         )
     normal = axes[2] * np.sign(axes[2] @ up.direction)
     distance = (points - point) @ normal

@@ -474,8 +474,121 @@ def test_edits_of_a_tab_that_went_away_are_found_again(settings: Path) -> None:
         page.page.reload()
         page.wait(READY)
         assert _draft(page, "drop_frames") is None
+        page.page.keyboard.press("u")  # the older edits are not written over by new ones
+        page.page.evaluate("window.annotate.draft.set('subject', [{camera: 'k1', x: 9, y: 9}])")
         page.page.get_by_text("Take them up again").click()
-        assert _draft(page, "drop_frames") == [0]
+        assert _draft(page, "drop_frames") == [0] and _draft(page, "subject") is not None
+
+
+def test_edits_of_several_tabs_meet_what_was_saved_meanwhile(settings: Path) -> None:
+    path = annotation(settings)
+    path.write_text("# two people\ndrop_frames: [9]\n")
+    with served(settings) as server, _open(server) as page:
+        address = f"{server.address}/sequence/{NAME}#token={TOKEN}"
+        offered = page.page.locator('[data-banner="left"]')
+        others = [page.page.context.new_page() for _ in range(2)]
+        for other, edit in zip(others, ("drop_frames: [0, 9]", "contact: []"), strict=True):
+            other.goto(address)
+            Visit(other, page.fingers).wait(READY)
+            assert other.locator('[data-banner="left"]').count() == 0  # of tabs that live
+            name, value = edit.split(": ")
+            other.evaluate(f"window.annotate.draft.set('{name}', {value})")
+        for other in others:
+            other.close()
+        path.write_text("# two people\ndrop_frames: [8, 9]\n")
+        page.page.evaluate(
+            """() => { const old = { at: Date.now() - 31 * 24 * 3600e3, changes: {}, sections: {} };
+              localStorage.setItem("intercap-draft:other:s:tab", JSON.stringify(old));
+              localStorage.setItem(`intercap-draft:other:${window.annotate.told.sequence}:tab`,
+                JSON.stringify({ ...old, at: Date.now(), changes: { drop_frames: [5] } })); }"""
+        )
+        page.page.reload()
+        page.wait(READY)
+        assert "contact" in offered.inner_text() and "1 older" in offered.inner_text()
+        page.page.get_by_text("Take them up again").click()
+        page.wait("document.getElementById('dialog').open")
+        assert "both changes can stand" in page.page.locator("#dialog").inner_text()
+        page.page.locator('[data-answer="mine"]').click()
+        page.wait("document.getElementById('dialog-title').textContent.startsWith('Save')")
+        page.page.locator('[data-answer="save"]').click()
+        page.wait("document.getElementById('status').textContent === 'saved'")
+        assert path.read_text() == "# two people\ndrop_frames: [8, 9]\n\ncontact: []\n"
+        page.wait("document.querySelector('[data-banner=\"left\"]') !== null")
+        assert "drop frames" in offered.inner_text()
+        page.page.get_by_text("Take them up again").click()
+        page.wait("document.getElementById('dialog').open")
+        shown = page.page.locator("#dialog").inner_text()
+        assert "Both of you changed drop frames" in shown and "+drop_frames: [8, 9]" in shown
+        page.page.locator('[data-answer="theirs"]').click()
+        page.wait("document.getElementById('status').textContent === 'saved'")
+        assert _draft(page, "drop_frames") == [8, 9] and _draft(page, "contact") == []
+        assert page.page.evaluate("Object.keys(localStorage)") == [
+            f"intercap-draft:other:{NAME}:tab"
+        ]
+
+
+def test_that_nothing_touches_is_stated_and_taken_back(settings: Path) -> None:
+    path = annotation(settings)
+    with served(settings) as server, _open(server) as page:
+        bar, keys = page.page.locator("#contact-bar"), page.page.keyboard
+        page.page.locator(HAND).focus()
+        keys.press("Delete")  # the last interval: nothing touches any more
+        assert _draft(page, "contact") == [] and "nothing touches, as annotated" in bar.inner_text()
+        page.page.get_by_role("button", name="As found again").click()
+        assert _draft(page, "contact") is None and page.page.locator(HAND).count() == 1
+        keys.press("Control+z")
+        assert _draft(page, "contact") == []
+        keys.press("Control+s")
+        page.wait("document.getElementById('dialog').open")
+        page.wait("document.querySelector('[data-part=touches]').textContent.includes('joint')")
+        assert "+contact: []" in page.page.locator("#dialog").inner_text()
+        page.page.locator('[data-answer="save"]').click()
+        page.wait("document.getElementById('status').textContent === 'saved'")
+        assert path.read_text() == "contact: []\n"
+        page.page.reload()
+        page.wait(READY)
+        assert _draft(page, "contact") == [] and "nothing touches, as annotated" in bar.inner_text()
+        page.page.get_by_role("button", name="As found again").click()
+        _save(page)
+        page.wait("document.getElementById('status').textContent === 'no annotation yet'")
+        page.page.get_by_role("button", name="Nothing touches").click()
+        assert _draft(page, "contact") == [] and path.read_text().strip() == ""
+
+
+def test_a_number_that_is_typed_counts_before_a_key_of_the_page(settings: Path) -> None:
+    with served(settings) as server, _open(server) as page:
+        keys = page.page.keyboard
+        keys.press("o")
+        field = page.page.locator(".numbers input").first
+        field.focus()
+        keys.press("Control+a")
+        keys.type("0.125")
+        keys.press("Control+s")
+        page.wait("document.getElementById('dialog').open")
+        assert "0.125" in page.page.locator("#dialog").inner_text()
+        keys.press("Escape")
+        page.wait("!document.getElementById('dialog').open")
+        field.focus()
+        keys.press("Control+a")
+        keys.type("0.25")
+        keys.press("Control+z")  # what is typed is a step of its own
+        assert _draft(page, "object_poses")[0]["translation"][0] == 0.125
+        assert field.input_value() == "0.1250" and field.evaluate(
+            "(e) => e === document.activeElement"
+        )
+        keys.press("Control+Shift+z")
+        assert _draft(page, "object_poses")[0]["translation"][0] == 0.25
+        keys.press("Control+a")
+        keys.press("Delete")
+        keys.press("Tab")  # no number: as it was
+        assert _draft(page, "object_poses")[0]["translation"][0] == 0.25
+        page.page.mouse.move(*_middle_of_the_object(page))
+        page.page.mouse.wheel(0, 100)
+        page.wait("window.annotate.pose.late")
+        page.page.evaluate("window.annotate.show(1)")  # before the wheel's step was taken
+        page.page.wait_for_timeout(300)
+        assert [one["frame"] for one in _draft(page, "object_poses")] == [0]
+        assert page.page.evaluate("window.annotate.draft.done.at(-1).says").endswith("farther")
 
 
 def test_images_alone_are_shown_and_can_be_annotated(settings: Path) -> None:
@@ -520,6 +633,18 @@ def test_before_the_first_run_it_says_what_to_do(settings: Path) -> None:
         assert "intercap run" in page.page.locator("#banners").inner_text()
         page.page.locator("#tab-run").click()
         assert page.page.get_by_text("Run what is out of date").is_visible()
+        page.page.keyboard.press("x")
+        page.page.evaluate("window.annotate.keep.look()")
+        assert page.page.locator('[data-banner="result"]').count() == 0
+        annotation(settings).write_text("drop_frames: [\n")
+        page.page.evaluate("window.annotate.keep.look()")
+        page.page.get_by_text("Show", exact=True).click()
+        page.wait("document.getElementById('dialog').open")
+        shown = page.page.locator("#dialog").inner_text()
+        assert "broken" in shown and "line 2" in shown
+        assert page.page.locator("#dialog-buttons button").all_inner_texts() == ["Back"]
+        page.page.keyboard.press("Escape")
+        assert _draft(page, "drop_frames") == [0]
 
 
 def test_a_page_without_the_token_shows_nothing(settings: Path) -> None:

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import ValidationError
 
 from intercap_core.annotate import document
+from intercap_core.config import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "annotations.example.yaml"
@@ -200,3 +202,58 @@ def test_an_alias_of_what_is_taken_away_is_left_to_an_editor(path: Path) -> None
     with pytest.raises(UserError, match="change it in an editor"):
         _patched(path, text, floor=[[0, 0, 2], [1, 0, 2], [0, 1, 2]])
     assert path.read_text() == text
+
+
+def test_nothing_touches_is_another_statement_than_none(path: Path) -> None:
+    new = _patched(path, WRITTEN, contact=[])
+    assert Annotation.model_validate(yaml.safe_load(new)).contact == ()
+    assert "# looked at twice" in new and "# the end" in new
+    path.write_text(new)
+    assert document.read(path).sections == {"contact": [], "drop_frames": [3, 4]}
+    again = _patched(path, new, contact=None)
+    assert Annotation.model_validate(yaml.safe_load(again)).contact is None
+    assert _patched(path, "# mine\n", contact=[]) == "# mine\n\ncontact: []\n"
+
+
+def test_of_all_sections_contact_alone_says_something_when_it_is_empty(path: Path) -> None:
+    """Of the others an empty list is what the section is without, or no value at all."""
+    without = Annotation()
+    for name in Annotation.model_fields:
+        if name in STATED_EMPTY:
+            assert getattr(Annotation.model_validate({name: []}), name) is not None
+            continue
+        try:
+            told = Annotation.model_validate({name: []})
+        except ValidationError:
+            continue
+        assert told == without, name
+    assert STATED_EMPTY == ("contact",)
+    assert _patched(path, "drop_frames: [1]\nfloor: []\n", drop_frames=[]) == "floor: []\n"
+    assert document.faults(document.read(path).sections)  # as a run has it
+
+
+def test_lines_that_stay_keep_their_bytes_and_new_ones_end_as_most(path: Path) -> None:
+    mixed = (
+        "\ufeff# café\r\n\r\ncontact:\n- part: seat\r\n  start: 1\n  end: 4\r\n\r\n"
+        "drop_frames: [3]\r\nfloor: # of the hall\n- [0, 0, 1]\n- [1, 0, 1]\n- [0, 1, 1]"
+    ).encode()
+    path.write_bytes(mixed)
+    found = document.read(path)
+    contact = [{"part": "seat", "start": 1, "end": 5}, {"part": "any", "start": 7, "end": 8}]
+    floor = [*found.sections["floor"], [1, 1, 1]]
+    document.save(found, document.patched(found, {"contact": contact, "floor": floor}))
+    assert path.read_bytes() == mixed.replace(
+        b"  end: 4\r\n", b"  end: 5\r\n- {part: any, start: 7, end: 8}\r\n"
+    ).replace(b"- [0, 1, 1]", b"- [0, 1, 1]\r\n- [1, 1, 1]\r\n")
+
+
+def test_a_read_only_file_is_not_overwritten(path: Path) -> None:
+    path.write_text(WRITTEN)
+    path.chmod(0o444)
+    found = document.read(path)
+    with pytest.raises(UserError, match="read-only"):
+        document.save(found, "drop_frames: [2]\n")
+    assert path.read_text() == WRITTEN and document.locked(path)
+    path.chmod(0o644)
+    assert not document.locked(path) and not document.locked(path.with_name("none.yaml"))
+    document.save(found, "drop_frames: [2]\n")

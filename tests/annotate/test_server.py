@@ -18,6 +18,7 @@ import yaml
 
 from intercap_core.annotate import rerun
 from intercap_core.config import Annotation
+from intercap_core.errors import UserError
 from intercap_core.viewer.package import unpacked
 from tests.annotate.served import NAME, Served, annotation, artefact, copied, served, small_project
 
@@ -88,6 +89,69 @@ def test_an_edit_is_checked_as_it_is_typed(page: Served) -> None:
     assert not told["faults"] and "+  - {part: right_hand, start: 1, end: 4}" in told["difference"]
     _, told = page.post(f"{OF}/check", {"changes": {"contact": [{"part": "tail"}]}})
     assert told["faults"][0]["where"].startswith("contact.0")
+
+
+_PLACE = {"rotation_vector": [0, 0, 0], "translation": [0, 0, 2]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"contact": [{"part": "seat", "start": 1, "end": 9}]}, "contact[0].end is 9"),
+        ({"object_poses": [{"frame": 6, **_PLACE}]}, "object_poses[0].frame is 6"),
+        ({"subject": [{"camera": "k9", "x": 1, "y": 1}]}, "subject[0] names camera 'k9'"),
+        ({"subject": [{"camera": "k1", "x": 1e9, "y": 1}]}, "camera k1 has 480 x 270 pixels"),
+        ({"subject": [{"camera": "k1", "x": 1, "y": -1}]}, "subject[0] is at x 1, y -1"),
+        ({"subject": [{"camera": "k1", "frame": 6, "x": 1, "y": 1}]}, "subject[0].frame is 6"),
+        ({"left_right": [{"start": 0, "end": 2, "camera": "k9"}]}, "names camera 'k9'"),
+        ({"left_right": [{"start": 0, "end": 7}]}, "left_right[0].end is 7"),
+        ({"drop_frames": [0, 1, 2, 3, 4, 5]}, "drops all 6 frames"),
+        ({"starts": {"k2": 0, "k3": 1}}, "lacks k1, the master"),
+        ({"floor": [[0, 0, 1], [1, 0, 1], [1e9, 1, 1]]}, "millimetres"),
+        ({"floor": [[0, 0, 1], [1, 0, 1], [0.5, 0.02, 1]]}, "on one line within 20 mm"),
+    ],
+)
+def test_what_is_not_of_the_recording_is_said_as_a_run_says_it(
+    page: Served, settings: Path, changes: dict, said: str
+) -> None:
+    _, told = page.post(f"{OF}/check", {"changes": changes})
+    [fault] = told["faults"]
+    assert said in fault["words"]
+    path = annotation(settings)
+    path.write_text(yaml.safe_dump(changes))
+    with pytest.raises(UserError) as refused:
+        page.annotator.project.annotation(NAME)
+    assert fault["words"] in str(refused.value)
+    _, told = page.post(f"{OF}/check", {"changes": {}})  # of the file as it is, too
+    assert told["faults"] == [fault]
+
+
+def test_a_click_beside_the_image_places_no_point(page: Served) -> None:
+    for x, y in ((-1, 5), (5, 270.5), (1e8, 5)):
+        status, told = page.post(f"{OF}/point", {"camera": "k1", "frame": 0, "x": x, "y": y})
+        assert status == 422 and "outside of the image" in told["error"]
+
+
+def test_a_read_only_annotation_is_said_and_stays(page: Served, settings: Path) -> None:
+    path = annotation(settings)
+    path.write_text("drop_frames: [1]\n")
+    path.chmod(0o444)
+    told = page.json(OF)
+    assert "read-only" in told["read_only"]
+    digest = told["annotation"]["digest"]
+    status, told = page.post(f"{OF}/save", {"digest": digest, "changes": {"drop_frames": [2]}})
+    assert status == 422 and "read-only" in told["error"]
+    assert path.read_text() == "drop_frames: [1]\n"
+
+
+def test_a_number_of_another_form_is_said_before_it_fails_in_a_run(
+    page: Served, settings: Path
+) -> None:
+    """A page knows no 2.0 beside 2, a frame's number is a whole one."""
+    annotation(settings).write_text("contact:\n- {part: seat, start: 2.0, end: 4}\n")
+    contact = [{"part": "seat", "start": 2, "end": 4}, {"part": "any", "start": 0, "end": 1}]
+    _, told = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    assert told["faults"][0]["where"] == "contact.0.start"
 
 
 def test_a_save_writes_what_was_shown_and_refuses_what_it_did_not_see(

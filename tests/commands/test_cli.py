@@ -183,6 +183,11 @@ def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
             "starts: {k1: 0, k9: 0.5}",
             "sequence 'good': annotations/good.yaml: starts names camera 'k9', the cameras are k1;",
         ),
+        (
+            "annotations/good.yaml",
+            "subject: [{camera: k9, x: 1, y: 1}]",
+            "sequence 'good': annotations/good.yaml: subject[0] names camera 'k9'; the recording",
+        ),
         ("annotations/godo.yaml", "", "problem: annotations/godo.yaml: no sequence has this"),
         ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
     ],

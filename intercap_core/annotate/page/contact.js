@@ -80,7 +80,9 @@ export class Contact {
 
   remove(interval) {
     this.selected = null;
-    this.#put(this.#taken().filter((one) => id(one) !== id(interval)), "contact deleted");
+    const left = this.#taken().filter((one) => id(one) !== id(interval));
+    this.#put(left, "contact deleted");
+    if (!left.length) this.app.say("nothing touches any more, and that is annotated; \"As found again\" takes the statement away");
   }
 
   split(interval, frame) {
@@ -112,6 +114,18 @@ export class Contact {
       if (one.end > end) left.push({ ...one, start: end });
     }
     this.#put(left, "contact denied");
+  }
+
+  /* No part touches in the whole sequence; an empty list says so. */
+  nothing() {
+    this.selected = null;
+    this.app.draft.set("contact", [], "nothing touches");
+  }
+
+  /* The annotation says nothing of contact: it is found again. */
+  asFound() {
+    this.selected = null;
+    this.app.draft.set("contact", null, "contact as found again");
   }
 
   takeAll() { this.#put(this.#taken(), "found contact taken"); }

@@ -24,13 +24,14 @@ export function ask(title, body, choices) {
   const dialog = find("dialog");
   find("dialog-title").textContent = title;
   find("dialog-body").replaceChildren(...[body].flat());
+  dialog.onclose?.(); // another dialog was open: it is not answered
   return new Promise((resolve) => {
     let answer = "";
     const close = (value) => { answer = value; dialog.close(); };
     find("dialog-buttons").replaceChildren(...choices.map(([value, text, main]) =>
       button(text, () => close(value), { class: main ? "main" : "", data: { answer: value } })));
-    dialog.onclose = () => resolve(answer);
-    dialog.showModal();
+    dialog.onclose = () => { dialog.onclose = null; resolve(answer); };
+    if (!dialog.open) dialog.showModal();
     (dialog.querySelector("button.main") ?? dialog.querySelector("button"))?.focus();
   });
 }

@@ -1,13 +1,15 @@
-/* The annotation as it is edited: its sections, undo and redo, and a copy in this browser, so that a
- * tab that closes or a tunnel that breaks loses nothing. */
+/* The annotation as it is edited: its sections, undo and redo; a copy of it is kept in this browser. */
 export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames", "left_right"];
-const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
-const empty = (value) => value === null || value === undefined || (Array.isArray(value) && !value.length);
+const plain = (value) => JSON.stringify(value ?? null, (_, one) => // whatever the order of its keys
+  (one && typeof one === "object" && !Array.isArray(one) ? Object.fromEntries(Object.entries(one).sort()) : one));
+export const same = (a, b) => plain(a) === plain(b);
+/* An empty list says as much as no section, but of contact: there it says that nothing touches. */
+export const stated = (name, value) => (Array.isArray(value) && !value.length && name !== "contact" ? null : value ?? null);
 
 export class Draft extends EventTarget {
-  constructor(name, annotation) {
+  constructor(annotation, copies) {
     super();
-    this.key = `intercap-draft:${location.port}:${name}`;
+    this.copies = copies;
     this.undone = [];
     this.done = [];
     this.base(annotation);
@@ -20,7 +22,7 @@ export class Draft extends EventTarget {
     if (theirs) { this.done = []; this.undone = []; }
     this.file = annotation;
     this.saved = {};
-    for (const name of SECTIONS) this.saved[name] = annotation.sections[name] ?? null;
+    for (const name of SECTIONS) this.saved[name] = stated(name, annotation.sections[name]);
   }
 
   get(section) { return this.sections[section] ?? null; }
@@ -31,7 +33,7 @@ export class Draft extends EventTarget {
   /* The same of several sections at once. */
   put(values, says = "") {
     const next = {};
-    for (const [name, value] of Object.entries(values)) next[name] = empty(value) ? null : structuredClone(value);
+    for (const [name, value] of Object.entries(values)) next[name] = structuredClone(stated(name, value));
     if (Object.keys(next).every((name) => same(next[name], this.sections[name]))) return;
     this.done.push({ sections: this.sections, says });
     this.undone = [];
@@ -70,31 +72,36 @@ export class Draft extends EventTarget {
   }
 
   told() {
-    try {
-      if (this.dirty) {
-        const kept = { digest: this.file.digest, changes: this.changes(), at: Date.now() };
-        localStorage.setItem(this.key, JSON.stringify(kept));
-      } else localStorage.removeItem(this.key);
-    } catch { /* a browser that keeps nothing */ }
+    if (this.dirty) {
+      const { digest, text } = this.file;
+      this.copies.keep({ digest, text, sections: this.saved, changes: this.changes() });
+    } else this.copies.drop();
     this.dispatchEvent(new Event("change"));
   }
 
-  /* Edits that an earlier tab did not save, null = none. */
+  /* Edits that tabs which are gone did not save, the latest first. */
   left() {
-    try {
-      const kept = JSON.parse(localStorage.getItem(this.key) ?? "null");
-      if (!kept || typeof kept.changes !== "object") return null;
-      const open = Object.entries(kept.changes).filter(
-        ([name, value]) => SECTIONS.includes(name) && !same(value, this.saved[name]));
-      return open.length ? { ...kept, changes: Object.fromEntries(open) } : null;
-    } catch { return null; }
+    return this.copies.found.filter((kept) => {
+      const open = SECTIONS.some((name) => name in kept.changes && !same(kept.changes[name], this.saved[name]));
+      if (!open) this.copies.drop(kept.key);
+      return open;
+    });
   }
 
+  /* Go on with such edits, upon the file that they were made on. */
   takeLeft(kept) {
-    this.done.push({ sections: this.sections, says: "taken up again" });
-    this.sections = { ...this.sections, ...kept.changes };
+    if (kept.digest === this.file.digest) this.done.push({ sections: this.sections, says: "taken up again" });
+    else {
+      this.base({ ...this.file, digest: kept.digest, text: kept.text, sections: kept.sections }, true);
+      this.sections = structuredClone(this.saved);
+    }
+    this.sections = { ...this.sections, ...structuredClone(kept.changes) };
     this.told();
+    this.dropLeft(kept);
   }
 
-  dropLeft() { localStorage.removeItem(this.key); }
+  dropLeft(kept) {
+    this.copies.found = this.copies.found.filter((one) => one !== kept);
+    this.copies.drop(kept.key);
+  }
 }

@@ -1,6 +1,7 @@
 /* Saving what was edited, with the difference shown before; running what it touches; new beside old. */
 import { get, post } from "./api.js";
 import { ask, banner, button, diff, find, make, words } from "./dom.js";
+import { same, stated } from "./draft.js";
 
 const CHECK_MS = 250;
 const LOOK_MS = 4000;
@@ -23,12 +24,31 @@ export class Keep {
     window.addEventListener("beforeunload", (event) => { if (app.draft.dirty) event.preventDefault(); });
     this.state();
     setInterval(() => this.look(), LOOK_MS);
-    const left = app.draft.left();
-    if (left) {
-      banner("left", `Edits that were not saved are here, from ${new Date(left.at).toLocaleString()} (${Object.keys(left.changes).map(words).join(", ")}).`, [
-        ["Take them up again", () => app.draft.takeLeft(left)], ["Discard them", () => app.draft.dropLeft()]]);
-    }
+    this.check();
+    this.offer();
     this.progress();
+  }
+
+  /* Edits that were not saved, the latest first. Where the file is another one by now, they meet what
+   * was saved meanwhile like any edit. */
+  offer() {
+    const { draft } = this.app, [left, ...older] = draft.left();
+    if (!left) return;
+    const more = older.length ? ` ${older.length} older ${older.length > 1 ? "ones follow" : "one follows"}.` : "";
+    banner("left", `Edits that were not saved are here, from ${new Date(left.at).toLocaleString()} (${Object.keys(left.changes).map(words).join(", ")}).${more}`, [
+      ["Take them up again", () => this.takeUp(left)], ["Discard them", () => { draft.dropLeft(left); this.offer(); }]]);
+  }
+
+  async takeUp(left) {
+    const { app } = this, now = app.draft.file;
+    if (left.digest !== now.digest && app.draft.dirty) {
+      app.say("save or undo what you edited here first: these edits were made on an earlier file");
+      this.offer();
+      return;
+    }
+    app.draft.takeLeft(left);
+    if (left.digest !== now.digest) await this.conflict({ now, difference: lineDiff(left.text, now.text) });
+    this.offer();
   }
 
   checkSoon() {
@@ -38,12 +58,11 @@ export class Keep {
   }
 
   async check() {
-    const { app } = this;
-    if (!app.draft.dirty) { this.faults = []; this.state(); return; }
-    try {
-      const found = await post(`${this.path}/check`, { changes: app.draft.changes() });
-      this.faults = found.faults;
-    } catch (error) { this.faults = [{ where: "", words: error.message }]; }
+    const { app } = this, asked = this.asked = {}; // an earlier answer may come later
+    let faults;
+    try { faults = (await post(`${this.path}/check`, { changes: app.draft.changes() })).faults; } catch (error) { faults = [{ where: "", words: error.message }]; }
+    if (asked !== this.asked) return;
+    this.faults = faults;
     this.state();
   }
 
@@ -57,7 +76,15 @@ export class Keep {
     find("status").textContent = fault ? fault.words : count ? `not saved: ${Object.keys(app.draft.changes()).map(words).join(", ")}` : app.told.annotation.text ? "saved" : "no annotation yet";
   }
 
+  /* One save at a time, however often it is asked for. */
   async save() {
+    if (this.saving) return;
+    this.saving = true;
+    this.app.pose?.settle();
+    try { await this.#save(); } finally { this.saving = false; }
+  }
+
+  async #save() {
     const { app } = this, changes = app.draft.changes();
     if (!Object.keys(changes).length) { app.say("there is nothing to save"); return; }
     if (app.told.read_only) { app.say(app.told.read_only); return; }
@@ -92,8 +119,13 @@ export class Keep {
   /* Somebody else saved meanwhile: their change is shown, and nothing of either is lost. */
   async conflict(told) {
     const { app } = this, theirs = told.now.sections, mine = app.draft.changes();
+    if (told.now.problem) {
+      await ask("The annotation's file is broken by now", [make("p", { class: "fault" }, told.now.problem),
+        make("p", {}, "Nothing was saved, and what you see is as the file was before, with your edits. They stay here: save when the file is mended.")], [["", "Back", true]]);
+      return;
+    }
     if (POSES.some((name) => name in mine)) for (const name of POSES) mine[name] = app.draft.get(name);
-    const both = Object.keys(mine).filter((name) => JSON.stringify(theirs[name] ?? null) !== JSON.stringify(app.draft.saved[name] ?? null));
+    const both = Object.keys(mine).filter((name) => !same(stated(name, theirs[name]), app.draft.saved[name]));
     const answer = await ask("Somebody else changed this annotation meanwhile", [
       make("p", {}, "Their change, which is in the file:"), diff(told.difference || "(only the layout changed)"),
       make("p", {}, both.length ? `Both of you changed ${both.map(words).join(", ")}: yours would replace theirs there.` : "You changed other sections: both changes can stand.")],
@@ -106,13 +138,13 @@ export class Keep {
     app.draft.sections = { ...structuredClone(app.draft.saved), ...edited };
     app.draft.told();
     banner("changed", "");
-    await this.save();
+    await this.#save();
   }
 
   /* Has the file or the result changed behind this page? */
   async look() {
     const { app } = this;
-    if (document.hidden || !app.told.frames) return;
+    if (document.hidden) return;
     let now;
     try { now = await get(`${this.path}/state`); } catch (error) {
       banner("server", error.message);
@@ -132,7 +164,7 @@ export class Keep {
 
   async showChange() {
     const { app } = this, now = await get(`${this.path}/annotation`);
-    if (!app.draft.dirty) { app.saved(now, true); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
+    if (!app.draft.dirty && !now.problem) { app.saved(now, true); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
     await this.conflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
   }
 
@@ -215,6 +247,6 @@ export class Keep {
 }
 
 function lineDiff(before, now) {
-  const [a, b] = [before.split("\n"), now.split("\n")];
+  const [a, b] = [before.split(/\r?\n/), now.split(/\r?\n/)];
   return [...a.filter((line) => !b.includes(line)).map((line) => `-${line}`), ...b.filter((line) => !a.includes(line)).map((line) => `+${line}`)].join("\n");
 }

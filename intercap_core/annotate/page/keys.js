@@ -18,10 +18,16 @@ export function help() {
 export function pressed(app, event) {
   if (find("dialog").open) return;
   const control = event.ctrlKey || event.metaKey, typed = event.target.tagName, letter = event.key.toLowerCase();
-  if (control && letter === "s") { event.preventDefault(); app.keep.save(); return; }
+  if (control && /^[szy]$/.test(letter)) {
+    event.preventDefault();
+    typedFirst(event.target, () => {
+      if (letter === "s") app.keep.save();
+      else if (letter === "y" || event.shiftKey) app.redo();
+      else app.undo();
+    });
+    return;
+  }
   if (["INPUT", "SELECT", "TEXTAREA"].includes(typed) && event.target.type !== "checkbox" && event.target.type !== "range") return;
-  if (control && letter === "z") { event.preventDefault(); if (event.shiftKey) app.redo(); else app.undo(); return; }
-  if (control && letter === "y") { event.preventDefault(); app.redo(); return; }
   if (control || event.altKey || event.target.closest?.(".viewer")) return;
   const one = app.contact.selected && app.contact.under(app.frame);
   const far = event.shiftKey ? 10 : 1;
@@ -61,4 +67,12 @@ export function pressed(app, event) {
 function remove(app, contact) {
   if (app.sides.selected) app.sides.remove(app.sides.selected);
   else if (contact) app.contact.remove(contact);
+}
+
+/* What is being typed into a field counts before a key of the whole page does. */
+function typedFirst(field, act) {
+  const fields = () => [...find("panels").querySelectorAll("input")], at = fields().indexOf(field);
+  if (at >= 0) field.blur();
+  act();
+  if (at >= 0 && !find("dialog").open) fields()[at]?.focus();
 }

@@ -2,6 +2,7 @@
 import { get, packed, takeToken } from "./api.js";
 import { banner, button, find, make } from "./dom.js";
 import { Contact } from "./contact.js";
+import { Copies } from "./copies.js";
 import { Draft } from "./draft.js";
 import { apply, invert } from "./geometry.js";
 import { Keep } from "./keep.js";
@@ -22,7 +23,7 @@ import { Views } from "./views.js";
 
 const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45];
 class App {
-  constructor(told) {
+  constructor(told, copies) {
     this.told = told;
     this.frame = 0;
     this.direction = 1;
@@ -30,7 +31,7 @@ class App {
     this.layers = { body: true, object: true, contact: true, marks: true, sides: false, before: false };
     this.mode = null;
     this.steps = []; // milliseconds from a wish for a frame to all views drawn
-    this.draft = new Draft(told.sequence, told.annotation);
+    this.draft = new Draft(told.annotation, copies);
     this.pictures = new Pictures(told.sequence, told.stamp);
     this.contact = new Contact(this);
     try { this.overlay = new Overlay(); } catch (error) { banner("overlay", error.message); }
@@ -88,13 +89,18 @@ class App {
     let told;
     try {
       told = await get(`sequences/${this.told.sequence}`);
-      if (!told.frames) throw new Error(told.notes.join("; "));
+      if (!told.frames && this.told.frames) throw new Error(told.notes.join("; "));
     } catch (error) {
       banner("result", `${error.message} The page goes on with what it has; your edits are kept.`, again);
       return;
     }
     banner("result", "");
     const frame = this.frame;
+    if (!this.told.frames) { // views, time and all else come with the first frames
+      this.told.result = told.result;
+      if (told.frames) location.reload(); else facts(told);
+      return;
+    }
     for (const key of Object.keys(this.told)) delete this.told[key]; // of what is not there any more
     Object.assign(this.told, told);
     this.pictures = new Pictures(told.sequence, told.stamp);
@@ -242,12 +248,13 @@ class App {
 
   undo() {
     if (this.paint && this.mode === this.paint) { this.paint.undo(); return; }
+    this.pose?.settle();
     this.draft.undo();
     if (this.pose?.editing) this.pose.undone();
     this.panels();
   }
 
-  redo() { this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
+  redo() { this.pose?.settle(); this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
 
   saved(annotation, theirs = false) {
     this.told.annotation = annotation;
@@ -339,9 +346,9 @@ async function begin() {
     find("editor").hidden = false;
     facts(told);
     if (!told.frames) {
-      Object.assign(told, { cameras: [], places: [], images: [], times: [], fps: 1, result: "", stamp: "" });
+      Object.assign(told, { cameras: [], places: [], images: [], times: [], fps: 1, stamp: "" });
     }
-    window.annotate = new App(told);
+    window.annotate = new App(told, await Copies.open(told.project, told.sequence));
     await window.annotate.load();
   } catch (error) { stop(error.message); }
 }

@@ -90,7 +90,10 @@ export class PoseEditor {
       middles.reduce((sum, m) => sum + m[i], 0) / Math.max(1, middles.length)]);
   }
 
-  leave() { this.editing = false; }
+  leave() {
+    this.settle();
+    this.editing = false;
+  }
 
   get hint() {
     return "Drag the object to move it, Shift+drag to turn it, Alt+drag to roll it, wheel for nearer and farther (Ctrl+wheel zooms). S fits it to the images, Esc ends.";
@@ -144,8 +147,16 @@ export class PoseEditor {
     this.pose = this.pose.map((row, i) => [row[0], row[1], row[2], row[3] + by[i]]);
     this.changed();
     clearTimeout(this.late);
-    this.late = setTimeout(() => this.put("object nearer or farther"), 250);
+    this.late = setTimeout(() => this.settle(), 250);
     return true;
+  }
+
+  /* Turns of the wheel are one step, once it rests or something else is done. */
+  settle() {
+    if (!this.late) return;
+    clearTimeout(this.late);
+    this.late = null;
+    this.put("object nearer or farther");
   }
 
   /* A drag on the object in the 3D viewer, which else turns the view. */
@@ -211,11 +222,10 @@ export class PoseEditor {
         ...(stated.includes(app.frame) ? [button("Remove the pose", () => this.remove())] : []));
       return box;
     }
-    const vector = rotationVector(this.pose);
     const numbers = [
-      ...["x", "y", "z"].map((axis, i) => [`${axis}, m`, this.pose[i][3], (v) => { this.pose = this.pose.map((row, k) => (k === i ? [row[0], row[1], row[2], v] : row)); }, 0.005]),
-      ...["x", "y", "z"].map((axis, i) => [`turn ${axis}, rad`, vector[i], (v) => {
-        const next = [...vector]; next[i] = v;
+      ...["x", "y", "z"].map((axis, i) => [`${axis}, m`, () => this.pose[i][3], (v) => { this.pose = this.pose.map((row, k) => (k === i ? [row[0], row[1], row[2], v] : row)); }, 0.005]),
+      ...["x", "y", "z"].map((axis, i) => [`turn ${axis}, rad`, () => rotationVector(this.pose)[i], (v) => {
+        const next = [...rotationVector(this.pose)]; next[i] = v;
         this.pose = rigid(next, this.pose.map((row) => row[3]));
       }, 0.02]),
     ];
@@ -226,13 +236,17 @@ export class PoseEditor {
     box.replaceChildren(
       make("p", {}, `Object at frame ${app.frame}: master camera's frame, x right, y down, z forward.`),
       make("div", { class: "numbers" }, numbers.map(([name, value, set, step]) => make("label", {}, name,
-        make("input", { type: "number", step: String(step), value: value.toFixed(4), oninput: (event) => {
+        make("input", { type: "number", step: String(step), value: value().toFixed(4), oninput: (event) => {
           const number = event.target.valueAsNumber;
           event.target.setAttribute("aria-invalid", String(!Number.isFinite(number)));
           if (!Number.isFinite(number)) return;
           set(number);
           app.redraw();
-        }, onchange: () => this.put("object by numbers") })))),
+        }, onchange: (event) => {
+          if (Number.isFinite(event.target.valueAsNumber)) { this.put("object by numbers"); return; }
+          event.target.value = value().toFixed(4); // no number: as it was
+          event.target.removeAttribute("aria-invalid");
+        } })))),
       make("p", { class: "report", role: "status" }, this.report),
       button("Fit to the images", () => this.snap(), { class: "main", title: "S" }),
       button("As the result has it", () => { const found = this.found(app.frame); if (found) { this.pose = found; this.put("object as found"); this.changed(); } }),

@@ -211,17 +211,19 @@ export class Timeline {
       contact.add(choose.value, app.frame, Math.min(app.told.frames, app.frame + Math.ceil(app.told.fps / 2)));
     } }, new Option("add contact here…", ""), ...["any", ...contact.regions].map((part) => new Option(words(part), part)));
     choose.setAttribute("aria-label", "Add contact at this frame");
-    const state = contact.stated
-      ? `${contact.stated.length} intervals stated, ${contact.stated.filter((i) => !contact.looked(i)).length} of them as found`
+    const state = contact.stated ? !contact.stated.length ? "nothing touches, as annotated"
+      : `${contact.stated.length} intervals stated, ${contact.stated.filter((i) => !contact.looked(i)).length} of them as found`
       : contact.probability ? "contact as found: an edit takes it into the annotation" : "no contact is found yet";
-    find("contact-bar").replaceChildren(make("span", { class: "dim" }, state), choose, ...(one ? [
+    find("contact-bar").replaceChildren(contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(one ? [
       make("b", {}, `${words(one.part)} ${one.start}–${one.end - 1}`),
       button("Confirm", () => contact.confirm(one), { title: "C" }),
       button("Starts here", () => contact.change(one, app.frame, one.end), { title: "[" }),
       button("Ends here", () => contact.change(one, one.start, app.frame + 1), { title: "]" }),
       button("Split here", () => contact.split(one, app.frame), { title: "K" }),
       button("Delete", () => contact.remove(one), { title: "Delete" }),
-    ] : []), ...(!contact.stated && contact.probability ? [button("Take all as found", () => contact.takeAll())] : []));
+    ] : []), ...(!contact.stated && contact.probability ? [button("Take all as found", () => contact.takeAll())] : []),
+    ...(contact.stated?.length === 0 ? [] : [button("Nothing touches", () => contact.nothing(), { title: "No part touches the object in the whole sequence" })]),
+    ...(contact.stated ? [button("As found again", () => contact.asFound(), { title: "Take the annotation of contact away" })] : []));
   }
 
   cursor() {
