@@ -21,12 +21,14 @@ from intercap_core.object_track.constants import (
     APART_RAD,
     DOUBTFUL_PROBABILITY,
     ERROR_LASTING_S,
+    FREE_COST_S,
     GONE_PROBABILITY,
     LOST_PROBABILITY,
     MOTION_ROUNDS,
     NOTHING_LOG_RATIO,
     ROUNDS,
     SEEN_LOG_RATIO,
+    UNSEEN_S,
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode
 from intercap_core.object_track.fit import Fit
@@ -175,8 +177,12 @@ class Tracker:
         fits = self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
+        # where somebody gave poses, the usual motions did not explain what is recorded
+        free = np.where(self._near_given(), 0.0, FREE_COST_S)
         steps = [
-            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t])
+            step_costs(
+                self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
+            )
             for t, gap in enumerate(np.diff(self._times))
         ]
         self._emissions = [self._share * weight for weight in weights]
@@ -199,6 +205,14 @@ class Tracker:
                     if thing[other] != thing[k] and fit.log_ratio > SEEN_LOG_RATIO:
                         places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
         return decoded
+
+    def _near_given(self) -> np.ndarray:
+        """Steps (T - 1,) bool that begin or end in the time that an object is followed unseen from
+        a given pose."""
+        near = np.zeros(len(self._times), bool)
+        for t in self._prior.given:
+            near |= np.abs(self._times - self._times[t]) < UNSEEN_S
+        return near[1:] | near[:-1]
 
     # --- the outcome ---------------------------------------------------------------------------
 
