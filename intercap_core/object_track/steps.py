@@ -51,8 +51,8 @@ def step_costs(
     step before and by the step's own.
 
     The first mode is rest; in the second the object moves freely, of which any step is one, at
-    ``free_cost_s`` nats a second; then it moves with each of the H ``hands``, where the hand's motion is known and it is
-    near enough to hold the object.
+    ``free_cost_s`` nats a second; then it moves with each of the H ``hands``, where the hand's
+    motion is known and it is near enough to hold the object.
     """
     modes = FIRST_HAND + len(hands)
     found = np.zeros((modes, modes, len(before) + 1, len(after) + 1))

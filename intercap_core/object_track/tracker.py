@@ -26,9 +26,9 @@ from intercap_core.object_track.constants import (
     LOST_PROBABILITY,
     MOTION_ROUNDS,
     NOTHING_LOG_RATIO,
+    REACH_M,
     ROUNDS,
     SEEN_LOG_RATIO,
-    UNSEEN_S,
 )
 from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode
 from intercap_core.object_track.fit import Fit
@@ -178,7 +178,8 @@ class Tracker:
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
         # where somebody gave poses, the usual motions did not explain what is recorded
-        free = np.where(self._near_given(), 0.0, FREE_COST_S)
+        near = self._prior.near_given(self._times)
+        free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
         steps = [
             step_costs(
                 self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
@@ -198,6 +199,8 @@ class Tracker:
         decoded = decode(self._emissions, self._steps, absent)
         places = self._observer.places
         places.forget_clutter()
+        for t, one in self._prior.given.items():
+            self._tell_others(t, one, fits[t])
         for t, k in enumerate(decoded.path):
             if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
                 thing = things(fits[t])
@@ -206,13 +209,17 @@ class Tracker:
                         places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
         return decoded
 
-    def _near_given(self) -> np.ndarray:
-        """Steps (T - 1,) bool that begin or end in the time that an object is followed unseen from
-        a given pose."""
-        near = np.zeros(len(self._times), bool)
-        for t in self._prior.given:
-            near |= np.abs(self._times - self._times[t]) < UNSEEN_S
-        return near[1:] | near[:-1]
+    def _tell_others(self, t: int, given: GivenPose, fits: list[Fit]) -> None:
+        """Tell the places' prior what else the ``fits`` of frame t see than the object at the pose
+        that is given of it."""
+        centre = self._mesh.centre_at(given.pose)
+        centres = np.array([self._mesh.centre_at(fit.pose) for fit in fits]).reshape(-1, 3)
+        thing = things(fits)
+        own = [thing[k] for k, fit in enumerate(fits) if given.holds(self._mesh, fit.pose)]
+        far = np.linalg.norm(centres - centre, axis=1) > REACH_M + self._mesh.diameter
+        for k, fit in enumerate(fits):
+            if far[k] and thing[k] not in own and fit.log_ratio > SEEN_LOG_RATIO:
+                self._observer.places.seen_beside_given(centres[k])
 
     # --- the outcome ---------------------------------------------------------------------------
 

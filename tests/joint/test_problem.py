@@ -81,7 +81,7 @@ class _Scene:
         self.probability = np.zeros((len(state), len(CONTACT_REGIONS)))
         self.probability[:, list(touching)] = 1
         contact = Contact(self.geometry, 1.0)
-        contact.take_probability(self.probability)
+        contact.take_contact(self.probability, np.full(self.probability.shape, -1))
         every = np.ones(len(state), bool)
         terms = joint_terms(
             self.geometry,
