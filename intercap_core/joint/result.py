@@ -23,8 +23,9 @@ CARRIED = "object not seen, carried from annotated poses"
 @dataclass(frozen=True, eq=False)
 class JointResult:
     """The ``state``, ``probability`` (T, R) of contact and what is ``annotated`` (T, R) of it, 1
-    touching, the ``cameras`` with their ``time_offset`` (C,), seconds, the frames (T,) that are ``flagged``, and those among them in which the images
-    have ``contradicted`` the object's pose."""
+    touching, the ``cameras`` with their ``time_offset`` (C,), seconds, the frames (T,) that are
+    ``flagged``, and those among them in which the images have ``contradicted`` the object's pose.
+    """
 
     state: State
     probability: np.ndarray

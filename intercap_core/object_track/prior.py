@@ -30,8 +30,8 @@ class Prior:
         self.given: dict[int, GivenPose] = {}
 
     def near_given(self, times: np.ndarray) -> np.ndarray:
-        """Frames (T,) bool at ``times`` (T,), seconds, from a given pose on for as long as an object
-        is followed unseen, both ways."""
+        """Frames (T,) bool at ``times`` (T,), seconds, nearer to a given pose than the time that an
+        object is followed unseen."""
         near = np.zeros(len(times), bool)
         for t in self.given:
             near |= np.abs(times - times[t]) < UNSEEN_S
