@@ -214,7 +214,7 @@ class _Rounds:
     def minimise(self, max_steps: int) -> None:
         """One round: time offsets and images at the state, at most so many steps, contact anew."""
         if self._contact is not None:
-            self._contact.take_probability(self.estimate.probability)
+            self._contact.take_contact(self.estimate.probability, self.estimate.labels)
         self._body.refresh(self.state)
         offsets = self._body.estimate_offsets(self._prior).offset
         offset_change = self._body.take_offsets(offsets)

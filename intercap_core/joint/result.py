@@ -22,12 +22,14 @@ CARRIED = "object not seen, carried from annotated poses"
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """The ``state``, ``probability`` (T, R) of contact, the ``cameras`` with their ``time_offset``
-    (C,), seconds, the frames (T,) that are ``flagged``, and those among them in which the images
-    have ``contradicted`` the object's pose."""
+    """The ``state``, ``probability`` (T, R) of contact and what is ``annotated`` (T, R) of it, 1
+    touching, the ``cameras`` with their ``time_offset`` (C,), seconds, the frames (T,) that are
+    ``flagged``, and those among them in which the images have ``contradicted`` the object's pose.
+    """
 
     state: State
     probability: np.ndarray
+    annotated: np.ndarray
     cameras: Cameras
     time_offset: np.ndarray
     flagged: np.ndarray
@@ -49,6 +51,7 @@ class JointResult:
             return cls(
                 state,
                 joint["contact_probability"].astype(float),
+                joint["contact_annotated"],
                 Cameras(rig, joint["depth_bias"]),
                 joint["time_offset"],
                 joint["flagged"],

@@ -64,6 +64,7 @@ class Places:
         self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
         self._standing = [(s, self._standing_prior(s)) for s in standing]
         self._clutter: list[tuple[np.ndarray, dict[int, float]]] = []
+        self._others: list[np.ndarray] = []
 
     @classmethod
     def survey(
@@ -105,6 +106,8 @@ class Places:
         such place moves, and mostly somebody moves it. ``share`` is how many independent
         observations a frame is.
         """
+        if any(np.linalg.norm(other - place) < self._same for other in self._others):
+            return min(ratio, 0.0) - CLUTTER_LOG_RATIO
         ratio -= self._like_the_object(place)
         found = self._nearest(place)
         if found is None or found[0].share < SOMETIMES_PRESENT:
@@ -141,6 +144,12 @@ class Places:
             likeness = (place, {})
             self._clutter.append(likeness)
         likeness[1][t] = max(ratio, likeness[1].get(t, 0.0))
+
+    def seen_beside_given(self, place: np.ndarray) -> None:
+        """Record that something is seen at ``place`` (3,) in a frame in which somebody gave the
+        object's pose elsewhere: it is another thing, in all frames."""
+        if not any(np.linalg.norm(other - place) < self._same for other in self._others):
+            self._others.append(place)
 
     def forget_clutter(self) -> None:
         """Forget how much the things beside the object look like it, before it is told anew."""

@@ -8,6 +8,7 @@ from intercap_core.object_track.constants import (
     ANNOTATED_LOG_RATIO,
     ANNOTATION_LOG_RATIO,
     REACH_M,
+    UNSEEN_S,
     UPRIGHT_LOG_RATIO,
 )
 from intercap_core.object_track.fit import Fit
@@ -27,6 +28,14 @@ class Prior:
         self._observer = observer
         self._share = share
         self.given: dict[int, GivenPose] = {}
+
+    def near_given(self, times: np.ndarray) -> np.ndarray:
+        """Frames (T,) bool at ``times`` (T,), seconds, nearer to a given pose than the time that an
+        object is followed unseen."""
+        near = np.zeros(len(times), bool)
+        for t in self.given:
+            near |= np.abs(times - times[t]) < UNSEEN_S
+        return near
 
     def weigh(self, t: int, fits: list[Fit]) -> np.ndarray:
         """What speaks for hypotheses (K,) of frame t, against that none of them is true, nats.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +68,7 @@ class Proposals:
         self._step_s = step_s
         self._reach = max(1, round(LOOK_NEAR_S / step_s))
         self._searched: set[int] = set()
+        self._searched_near_given: set[int] = set()
         self._looked: set[int] = set()
 
     # --- where to start ------------------------------------------------------------------------
@@ -155,7 +157,8 @@ class Proposals:
         """Look for the object in the frames in doubt; whether something new was found.
 
         First with the rotations that the frames around lead to, outwards from where it is sure, and
-        with all once in each time that the object is seen; then, in some frames, with all.
+        with all once in each time that the object is seen, and near poses that somebody gave; then,
+        in some frames, with all.
         """
         fits = self._hypotheses.fits
         ratio, sure = np.zeros(len(fits)), np.zeros(len(fits))
@@ -171,6 +174,7 @@ class Proposals:
         for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
             if self._hypotheses.best(t) < poor and t not in self._looked:
                 new |= self._look_near(t, known)
+        new |= self._look_near_given(waiting, known)
         most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
         for t in self._unsearched(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
             self._searched.add(t)
@@ -193,6 +197,20 @@ class Proposals:
             t = max(waiting, key=self._observer.promise)
             self._searched.add(t)
             new = self._follow(t, self._observer.search(t))
+        return new
+
+    def _look_near_given(self, frames: list[int], known: dict[int, np.ndarray]) -> bool:
+        """Search those of the ``frames`` that are near given poses with all rotations, once, around
+        where the object is in the nearest of the frames ``known``; whether something new was found.
+        Somebody says that it is there: it is worth as many searches as frames."""
+        near = self._prior.near_given(self._times)
+        new = False
+        for t in frames:
+            if near[t] and t not in self._searched | self._searched_near_given:
+                self._searched_near_given.add(t)
+                poses = [known[u] for u in _beside(t, known)]
+                places = np.array([self._observer.mesh.centre_at(pose) for pose in poses])
+                new |= self._follow(t, self._observer.search(t, places=places if poses else None))
         return new
 
     def look_again(self, changed: set[int]) -> None:
@@ -318,3 +336,9 @@ class Proposals:
                 self._hypotheses.follow(t, fit)
                 new = True
         return new
+
+
+def _beside(t: int, known: Collection[int]) -> list[int]:
+    """The nearest of the ``known`` frames before and after frame t, where there are any."""
+    before, after = [u for u in known if u < t], [u for u in known if u > t]
+    return [*([max(before)] if before else []), *([min(after)] if after else [])]

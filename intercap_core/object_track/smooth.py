@@ -72,11 +72,13 @@ def smooth(
     node: np.ndarray,
     times: np.ndarray,
     centre: np.ndarray,
+    stated: FrameEvidence | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (T, 4, 4) and covariances (T, 6, 6) of all frames together, from ``start`` (T, 4, 4).
 
     ``node`` (T,) numbers the frames from 0, never falling, frames at rest alike; ``times`` (T,)
-    seconds; ``centre`` (3,) of the object, whose path is smooth.
+    seconds; ``centre`` (3,) of the object, whose path is smooth. What somebody ``stated`` counts
+    whole: it is no look at an object at rest, and no outlier.
     """
     count = int(node[-1]) + 1
     size = np.bincount(node)
@@ -88,6 +90,7 @@ def smooth(
     state[:, :3, 3] += state[:, :3, :3] @ centre
     state = _without_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
+    told = stated.about(centre) if stated is not None else None
     for _ in range(SMOOTH_STEPS):
         offset = step_between(evidence.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", offset - own, information, offset - own)
@@ -99,6 +102,11 @@ def smooth(
         force = evidence.gradient + np.einsum("tij,tj->ti", information, offset)
         np.add.at(gradient, node, weight[:, None] * force)
         gradient += offset[first] * UNKNOWN_SIGMA**-2
+        if told is not None:
+            offset = step_between(told.poses, state[node])
+            np.add.at(bands[0], node, told.information)
+            force = told.gradient + np.einsum("tij,tj->ti", told.information, offset)
+            np.add.at(gradient, node, force)
         _add_motion(state, node, times, bands, gradient)
         matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
         step = -cho_solve_banded((matrix, True), gradient.ravel(), check_finite=False).reshape(

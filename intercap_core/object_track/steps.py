@@ -44,21 +44,22 @@ def step_costs(
     after: np.ndarray,
     seconds: float,
     hands: Sequence[HandMotion | None],
+    free_cost_s: float = FREE_COST_S,
 ) -> np.ndarray:
     """Log-probabilities (M, M, K + 1, L + 1), M = 2 + H, of the steps from poses ``before`` (K, 4,
     4) to ``after`` (L, 4, 4), ``seconds`` later, and to and from none of them, by the mode of the
     step before and by the step's own.
 
-    The first mode is rest; in the second the object moves freely, of which any step is one, at some
-    cost; then it moves with each of the H ``hands``, where the hand's motion is known and it is
-    near enough to hold the object.
+    The first mode is rest; in the second the object moves freely, of which any step is one, at
+    ``free_cost_s`` nats a second; then it moves with each of the H ``hands``, where the hand's
+    motion is known and it is near enough to hold the object.
     """
     modes = FIRST_HAND + len(hands)
     found = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
     found[..., :-1, -1], found[..., -1, :-1] = -VANISH_COST, -APPEAR_COST
     if not (len(before) and len(after)):
         return found
-    own = mode_log_ratios(mesh, before, after, seconds, hands)
+    own = mode_log_ratios(mesh, before, after, seconds, hands, free_cost_s)
     changes = np.full((modes, modes), np.log(-np.expm1(-MODE_CHANGES_S * seconds)))
     np.fill_diagonal(changes, 0.0)
     # of the modes that are possible from a pose, one is true
@@ -74,13 +75,14 @@ def mode_log_ratios(
     after: np.ndarray,
     seconds: float,
     hands: Sequence[HandMotion | None],
+    free_cost_s: float = FREE_COST_S,
 ) -> np.ndarray:
     """Log-probabilities (M, K, L) of the same steps in each mode, of those between poses alone."""
     turn, shift = apart(mesh, before, after)
     moved = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift / (MOVING_M_S * seconds)) ** 2
     ways = [
         -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
-        -np.minimum(0.5 * moved, JUMP_COST) - FREE_COST_S * min(seconds, FREE_LASTING_S),
+        -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, FREE_LASTING_S),
         *(_held(mesh, before, after, seconds, hand) for hand in hands),
     ]
     return np.array(ways)

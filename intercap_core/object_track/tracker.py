@@ -21,10 +21,12 @@ from intercap_core.object_track.constants import (
     APART_RAD,
     DOUBTFUL_PROBABILITY,
     ERROR_LASTING_S,
+    FREE_COST_S,
     GONE_PROBABILITY,
     LOST_PROBABILITY,
     MOTION_ROUNDS,
     NOTHING_LOG_RATIO,
+    REACH_M,
     ROUNDS,
     SEEN_LOG_RATIO,
 )
@@ -175,8 +177,13 @@ class Tracker:
         fits = self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
+        # where somebody gave poses, the usual motions did not explain what is recorded
+        near = self._prior.near_given(self._times)
+        free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
         steps = [
-            step_costs(self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t])
+            step_costs(
+                self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
+            )
             for t, gap in enumerate(np.diff(self._times))
         ]
         self._emissions = [self._share * weight for weight in weights]
@@ -192,6 +199,8 @@ class Tracker:
         decoded = decode(self._emissions, self._steps, absent)
         places = self._observer.places
         places.forget_clutter()
+        for t, one in self._prior.given.items():
+            self._tell_others(t, one, fits[t])
         for t, k in enumerate(decoded.path):
             if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
                 thing = things(fits[t])
@@ -199,6 +208,18 @@ class Tracker:
                     if thing[other] != thing[k] and fit.log_ratio > SEEN_LOG_RATIO:
                         places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
         return decoded
+
+    def _tell_others(self, t: int, given: GivenPose, fits: list[Fit]) -> None:
+        """Tell the places' prior what else the ``fits`` of frame t see than the object at the pose
+        that is given of it."""
+        centre = self._mesh.centre_at(given.pose)
+        centres = np.array([self._mesh.centre_at(fit.pose) for fit in fits]).reshape(-1, 3)
+        thing = things(fits)
+        own = [thing[k] for k, fit in enumerate(fits) if given.holds(self._mesh, fit.pose)]
+        far = np.linalg.norm(centres - centre, axis=1) > REACH_M + self._mesh.diameter
+        for k, fit in enumerate(fits):
+            if far[k] and thing[k] not in own and fit.log_ratio > SEEN_LOG_RATIO:
+                self._observer.places.seen_beside_given(centres[k])
 
     # --- the outcome ---------------------------------------------------------------------------
 

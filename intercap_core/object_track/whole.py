@@ -203,10 +203,13 @@ class WholeTrack:
         hand = self._share * filled.hand
         information[unseen] = (hand + filled.images / noise)[unseen]
         gradient[unseen] = filled.pull[unseen] * (self._share - 1 / noise)
-        information += stated.information
-        gradient += stated.gradient(looked)
         combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
-        poses, covariance = smooth(combined, start, node, self._times, centre)
+        told = None
+        if stated.held:
+            told = self._without_symmetry(
+                FrameEvidence(looked, stated.information, stated.gradient(looked))
+            )
+        poses, covariance = smooth(combined, start, node, self._times, centre, told)
         return poses, covariance, segment
 
     def _worth_a_look(self, segment: np.ndarray) -> list[int]:

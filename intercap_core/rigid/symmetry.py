@@ -99,9 +99,9 @@ class SymmetryGroup:
         for discrete in self.discrete:
             rest = discrete[:3, :3].T @ element
             if self.axis is None:
-                if np.allclose(rest, np.eye(3), atol=1e-6):
+                if np.allclose(rest, np.eye(3), atol=SAME_TRANSFORM):
                     return pose @ discrete
-            elif np.allclose(rest @ self.axis, self.axis, atol=1e-6):
+            elif np.allclose(rest @ self.axis, self.axis, atol=SAME_TRANSFORM):
                 return pose @ discrete @ self._about_axis(rest)
         raise AssertionError("the nearest rotation is not in the group")
 

@@ -109,7 +109,7 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
 def _hold_fixed(assembly: Assembly, result: JointResult) -> None:
     """Cameras, time offsets and contact as the result has them."""
     if assembly.contact is not None:
-        assembly.contact.take_probability(result.probability)
+        assembly.contact.take_contact(result.probability, result.annotated)
     assembly.body.take_cameras(result.cameras, result.time_offset)
     assembly.object_.take_offsets(result.time_offset)
     if isinstance(assembly.object_, ObjectImagesData):

@@ -9,6 +9,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
 from intercap_core.contact.patches import contact_patches
 from intercap_core.energy import smoothness
+from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import minimise
@@ -80,15 +81,15 @@ class _Scene:
         self.geometry = Geometry(model, box, field, contact_patches(model), touched)
         self.probability = np.zeros((len(state), len(CONTACT_REGIONS)))
         self.probability[:, list(touching)] = 1
-        contact = Contact(self.geometry, 1.0)
-        contact.take_probability(self.probability)
+        self.contact = Contact(self.geometry, 1.0)
+        self.take(annotated=-1)
         every = np.ones(len(state), bool)
         terms = joint_terms(
             self.geometry,
             settings or JointSettings(),
             start or state,
             data=data,
-            contact=contact,
+            contact=self.contact,
             floor=floor,
             fps=15.0,
             trust=Trust(
@@ -100,6 +101,12 @@ class _Scene:
         self.problem = Problem(terms)
         self.problem.refresh(start or state)
         self.equations = self.problem.equations
+
+    def take(self, annotated: int) -> None:
+        """Let the contact term use the probability, ``annotated`` alike everywhere."""
+        self.contact.take_contact(
+            self.probability, np.full(self.probability.shape, annotated, np.int8)
+        )
 
     def distance(self, state: State) -> np.ndarray:
         """(T, N) of the skin's vertices to the box."""
@@ -113,6 +120,17 @@ def test_how_deep_an_object_is_in_the_body(model, box):
     chest = scene.geometry.at(state).joints[0][:, JOINT_INDEX["spine2"]]
     within = State(state.body, state.betas, state.expression, state.rotation, chest)
     assert (scene.geometry.at(within).object_depth(ThreadPool()) > 0.05).all()
+
+
+def test_an_annotated_contact_draws_more(model, box):
+    state = _state(model, 0.005)
+    scene = _Scene(model, box, state, touching=[LEFT_HAND])
+    detected = scene.equations(state).energy["contact"]
+    scene.take(annotated=0)
+    assert scene.equations(state).energy["contact"] == detected > 0
+    scene.take(annotated=1)
+    found = scene.equations(state).energy["contact"]
+    assert found == pytest.approx(ANNOTATED_CONTACT_WEIGHT * detected)
 
 
 def test_rows_of_several_threads_are_those_of_one(model, box):
@@ -193,6 +211,7 @@ def test_an_object_at_rest_moves_as_one(model, box):
     data = (_Hold(state, 0.02), ObjectData(tracked))
     problem = _Scene(model, box, state, data=data, still=True)
     problem.probability[FRAMES // 2 :, LEFT_HAND] = 1
+    problem.take(annotated=-1)
     found = minimise(problem.equations, state, max_steps=8).state
     assert np.linalg.norm(found.translation[0] - state.translation[0]) > 0.001
     assert np.linalg.norm(np.diff(found.translation, axis=0), axis=1).max() < 2e-4
@@ -384,6 +403,7 @@ def test_a_brief_contact_does_not_shake_a_steady_track(model, box):
     tracked = _tracked(state, 0.01, np.zeros(FRAMES, bool))
     problem = _Scene(model, box, state, data=(_Hold(state, 0.001), ObjectData(tracked)))
     problem.probability[2, LEFT_HAND] = 1
+    problem.take(annotated=-1)
     moved = minimise(problem.equations, state, max_steps=8).state.translation - state.translation
     assert np.abs(np.diff(moved, axis=0)).max() < 0.002
 

@@ -24,7 +24,12 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.decoder import NOT_SEEN, decode
 from intercap_core.object_track.motion import HandMotion
-from intercap_core.object_track.steps import excursions, step_costs, with_excursions
+from intercap_core.object_track.steps import (
+    excursions,
+    mode_log_ratios,
+    step_costs,
+    with_excursions,
+)
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.rigid.conftest import catalogue
 
@@ -256,3 +261,11 @@ def test_what_cannot_be_reached_between_sure_frames_costs_twice() -> None:
     ]
     far = [*centres[:4], clutter]  # sure frames that contradict each other say nothing
     assert not any(own.any() for own in excursions(far, np.zeros(5, int), sure, times))
+
+
+def test_free_motion_costs_what_is_asked(cup):
+    here, there = np.eye(4)[None], np.eye(4)[None].copy()
+    there[0, 0, 3] = 0.1
+    usual = mode_log_ratios(cup, here, there, 1 / 15, [])
+    free = mode_log_ratios(cup, here, there, 1 / 15, [], 0.0)
+    assert free[0] == usual[0] and free[1] - usual[1] == pytest.approx(FREE_COST_S / 15)

@@ -38,6 +38,18 @@ def test_what_the_person_is_at_or_what_left_is_the_object(bottle):
     assert places.prior(3, APART) > 0.5
 
 
+def test_what_is_seen_while_the_object_is_given_elsewhere_is_another(bottle):
+    places = Places(bottle, [], _joints(HANDLED, 20))
+    before = places.weigh(3, HANDLED, 20.0, 0.2)
+    assert before == 20.0
+    places.seen_beside_given(HANDLED + 0.01)
+    assert places.weigh(3, HANDLED, 20.0, 0.2) == -CLUTTER_LOG_RATIO
+    assert places.weigh(3, HANDLED, -4.0, 0.2) == -4.0 - CLUTTER_LOG_RATIO
+    assert places.weigh(3, HANDLED + np.array([0, 0.3, 0]), 20.0, 0.2) > 0
+    places.forget_clutter()
+    assert places.weigh(3, HANDLED, 20.0, 0.2) == -CLUTTER_LOG_RATIO
+
+
 def test_a_brief_visit_is_not_being_handled(bottle):
     joints = _joints(HANDLED, 40)
     joints[:2, :25] = APART

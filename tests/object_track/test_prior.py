@@ -84,3 +84,12 @@ def test_poses_that_keep_the_same_candidates_are_one_thing(mesh: ObjectMesh) -> 
     number = things(fits)
     assert number[0] == number[2] and len(set(number)) == 3
     assert things([]).shape == (0,)
+
+
+def test_frames_near_given_poses(mesh):
+    prior = prior_of(mesh)
+    times = np.arange(20) / 4
+    assert not prior.near_given(times).any()
+    prior.given[4] = prior.given[15] = GivenPose(4, np.eye(4), 0.01, 0.1)
+    near = [*range(1, 8), *range(12, 19)]
+    assert np.flatnonzero(prior.near_given(times)).tolist() == near

@@ -173,3 +173,26 @@ def test_a_rest_that_the_recording_cuts_is_found_from_three_frames_on(at_end: bo
         found.append(int((rests >= 0).sum()))
     assert (np.diff(found) >= 0).all(), "what rests longer is found as longer"
     assert found[-1] >= 10
+
+
+def test_a_stated_pose_holds_a_rest_that_hardly_shows() -> None:
+    """Of a rest of 30 frames one is stated, and what follows is seen half a metre away."""
+    true = np.tile(np.eye(4), (45, 1, 1))
+    true[36:, 0, 3] = 0.5
+    evidence = looks_at(true)
+    information = evidence.information.copy()
+    information[:36] = 0
+    gradient = np.where(information.any((1, 2))[:, None], evidence.gradient, 0.0)
+    stated = np.zeros((45, 6, 6))
+    stated[20] = np.diag(np.repeat([np.radians(5), 0.01], 3) ** -2.0)
+    node = np.concatenate([np.zeros(30, int), np.arange(1, 7), np.full(9, 7)])
+    start = true.copy()
+    start[30:36, 0, 3] = np.linspace(0.07, 0.43, 6)
+    seen = FrameEvidence(np.where((np.arange(45) < 36)[:, None, None], true, evidence.poses),
+                         information, gradient)  # fmt: skip
+    told = FrameEvidence(true, stated, np.zeros((45, 6)))
+    found, _ = smooth(seen, start, node, np.arange(45) / FPS, CENTRE, told)
+    assert shift(found, true)[:30].max() < 0.02
+    assert shift(found, true)[36:].max() < 0.02
+    without, _ = smooth(seen, start, node, np.arange(45) / FPS, CENTRE)
+    assert shift(without, true)[:30].max() > 0.1

@@ -104,6 +104,17 @@ def test_equivalent_poses_move_points_by_group_elements():
                 assert np.abs(group.discrete - element).max((1, 2)).min() < 1e-9
 
 
+def test_what_is_a_rotation_in_single_precision_alone_has_an_equivalent(group):
+    """A pose that a hand carried through many frames is a rotation to some 1e-6."""
+    rng = np.random.default_rng(3)
+    pose, reference = np.eye(4), np.eye(4)
+    pose[:3, :3], reference[:3, :3] = Rotation.random(2, rng=rng).as_matrix()
+    pose[:3, :3] += 5e-6 * rng.normal(size=(3, 3))
+    found = group.nearest_equivalent_pose(pose, reference)
+    rotation = group.nearest_equivalent(pose[:3, :3], reference[:3, :3])
+    np.testing.assert_allclose(found[:3, :3], rotation, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("symmetry", "words"),
     [

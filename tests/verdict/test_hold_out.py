@@ -113,7 +113,7 @@ def test_one_step_goes_where_many_do(capture: fitted.Capture, held: HeldOut) -> 
     """Against Gauss-Newton steps with correspondences taken anew, until they end."""
     with _opened(capture) as (inputs, settings, result):
         assembly = assemble(inputs, settings)
-        assembly.contact.take_probability(result.probability)
+        assembly.contact.take_contact(result.probability, result.annotated)
 
         def descended(used: np.ndarray) -> State:
             state = result.state

@@ -1,8 +1,9 @@
 """Contact: Q_t E_C of equation 6 (A.4), weighed by lambda_Q (setting ``contact_weight``).
 
 The residuals, and what differs from the paper, are in :mod:`intercap_core.energy.contact`. The
-paper's binary Q_t is the probability that each region touches, annotated or detected. The setting
-``contact_to`` says what skin is drawn to: any point of the object, or its annotated part.
+paper's binary Q_t is the probability that each region touches, annotated or detected; what somebody
+saw touching draws more. The setting ``contact_to`` says what skin is drawn to: any point of the
+object, or its annotated part.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.energy import contact
-from intercap_core.joint.constants import CONTACT_SIGMA
+from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT, CONTACT_SIGMA
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import State
@@ -26,17 +27,20 @@ class Contact(Term):
     def __init__(self, geometry: Geometry, weight: float) -> None:
         self._geometry, self._scale = geometry, weight / CONTACT_SIGMA**2
         self._probability: np.ndarray | None = None
+        self._draws: np.ndarray | None = None
         self._shares: contact.Shares | None = None
 
-    def take_probability(self, probability: np.ndarray) -> None:
-        """Use this probability (T, R) that each region touches from now on."""
+    def take_contact(self, probability: np.ndarray, annotated: np.ndarray) -> None:
+        """Use this probability (T, R) that each region touches from now on; ``annotated`` (T, R) is
+        1 where somebody states that it does."""
         self._probability = probability
+        self._draws = np.where(annotated == 1, ANNOTATED_CONTACT_WEIGHT, 1.0) * probability
 
     def holding(self) -> np.ndarray:
         """How surely each of the patches' vertices holds the object (T, M), times its share of its
         patch's area, as of the last :meth:`refresh`."""
         assert self._shares is not None, "refresh comes first"
-        assert self._probability is not None, "take_probability comes first"
+        assert self._probability is not None, "take_contact comes first"
         patches = self._geometry.patches
         gate = self._probability[:, patches.region_of_patch] * self._shares.gate
         return self._shares.area * gate[:, patches.patch]
@@ -50,7 +54,7 @@ class Contact(Term):
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add Q_t E_C at ``state`` with the vertices' shares of the last :meth:`refresh`."""
         assert self._shares is not None, "refresh comes first"
-        assert self._probability is not None, "take_probability comes first"
+        assert self._draws is not None, "take_contact comes first"
         patches, at_patch = self._geometry.patches, self._geometry.skin.patch
         posed = self._geometry.at(state)
         near = posed.touching
@@ -59,7 +63,7 @@ class Contact(Term):
             distance[:, at_patch],
             patches.patch,
             self._shares,
-            self._probability[:, patches.region_of_patch],
+            self._draws[:, patches.region_of_patch],
         )
         residual, weights = np.zeros_like(distance), np.zeros_like(distance)
         residual[:, at_patch], weights[:, at_patch] = touch, weight * self._scale
