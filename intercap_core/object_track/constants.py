@@ -400,6 +400,8 @@ GIVEN_SIGMAS = 3.0
 # see past it. One in which something else hides it says up to 6, and so much is chance. Chosen on
 # five objects of the studio at noise 2, two cameras.
 DENIED_LOG_RATIO = -25.0
+# Nats of one view, from which it shows the object: half of what all together need.
+VIEW_SHOWS_LOG_RATIO = SEEN_LOG_RATIO / 2
 # Standard deviation of its place, metres, up to which a pose is carried from given ones through
 # frames that show nothing: beyond, the joint fit bridges a lost object as well.
 CARRIED_M = 0.15

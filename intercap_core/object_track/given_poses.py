@@ -19,8 +19,10 @@ from intercap_core.object_track.constants import (
     GROWTH_LOST_RAD_S,
     SAME_POSE_DEG,
     SAME_POSE_M,
+    UNSEEN_S,
+    VIEW_SHOWS_LOG_RATIO,
 )
-from intercap_core.object_track.fit import MotionPrior
+from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.steps import apart
 from intercap_core.rigid.mesh import ObjectMesh
@@ -153,6 +155,21 @@ def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) 
                     break
                 found[t] = min(found[t], abs(times[t] - times[frame]))
     return found
+
+
+def at_edges(
+    fits: Sequence[Fit], unseen: np.ndarray, given: Sequence[int], times: np.ndarray
+) -> np.ndarray:
+    """Frames (T,) bool at ``times`` (T,), seconds, that a single view shows, near ``given`` ones and
+    beside ``unseen`` ones (T,).
+
+    What moves out of sight there does so fast, and how it moves until that view exposes is known
+    from one side alone: of a swung racquet, a decimetre in 19 ms, which no deviation states.
+    """
+    since = np.abs(times[:, None] - times[list(given)]).min(1, initial=np.inf)
+    beside = np.convolve(unseen, [1, 1, 1], "same") > 0
+    few = [sum(view.log_ratio > VIEW_SHOWS_LOG_RATIO for view in fit.views) < 2 for fit in fits]
+    return np.asarray((since > 0) & (since < UNSEEN_S) & beside & ~unseen & few)
 
 
 def against(

@@ -32,6 +32,7 @@ from intercap_core.object_track.given_poses import (
     TURNS_LESS,
     GivenEvidence,
     GivenPose,
+    at_edges,
     seconds_since,
 )
 from intercap_core.object_track.observer import Observer
@@ -62,7 +63,8 @@ class WholeTrack:
         contradict, or where those around for a moment are at like poses. A frame that smoothing
         moves far from its own fit becomes lost, unless they support the smoothed pose, and so does
         one whose final pose they contradict. Where they show nothing, from a given pose on, it is
-        carried from there, and in doubt in all frames but those that poses are given of.
+        carried from there, and in doubt in all frames but those that poses are given of; and so is
+        what comes into sight or leaves it there in a single view.
         """
         lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
@@ -83,6 +85,7 @@ class WholeTrack:
         doubtful[at] = False
         poses = np.array([fit.pose for fit in fits])
         lost &= contradicted | ~(in_hand | reached | self._nowhere(poses, lost))
+        doubtful |= at_edges(fits, lost | reached, at, self._times)
         return [
             replace(
                 frame,

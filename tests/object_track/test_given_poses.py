@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,10 +17,12 @@ from intercap_core.object_track.given_poses import (
     GivenEvidence,
     GivenPose,
     against,
+    at_edges,
     seconds_since,
 )
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.view import View, ViewGeometry
+from intercap_core.object_track.view_report import ViewReport
 from intercap_core.rigid.mesh import ObjectMesh
 from tests.helpers.object_capture import ObjectCapture
 from tests.rigid.conftest import catalogue
@@ -118,6 +122,21 @@ def test_a_carried_frame_is_in_doubt_before_it_is_lost(mesh, carried, sigma_m, l
     (found,) = flagged(mesh, [frame(at(), sigma_m, carried=carried)])
     assert (found.lost, found.ambiguous) == (lost, ambiguous)
     assert found.carried == (carried and not lost)
+
+
+def test_one_view_beside_what_is_unseen_is_in_doubt(mesh):
+    report = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
+    ratios = [(9, 9), (9, 0), (0, 0), (9, 9), (0, 9), (9, 0), (9, -2), (0, 0), (5, -1)]
+    fits = [
+        Fit(at(), np.eye(6), tuple(replace(report, log_ratio=float(one)) for one in both))
+        for both in ratios
+    ]
+    unseen = np.array([False, False, True, False, False, False, False, True, False])
+    near = at_edges(fits, unseen, [5], np.arange(9) / 10)
+    assert np.flatnonzero(near).tolist() == [1, 6, 8]
+    assert np.flatnonzero(at_edges(fits, unseen, [1, 6], np.arange(9) / 10)).tolist() == [8]
+    assert not at_edges(fits, unseen, [], np.arange(9) / 10).any()
+    assert np.flatnonzero(at_edges(fits, unseen, [5], np.arange(9.0))).tolist() == []
 
 
 def test_what_is_said_against_a_given_pose(mesh):
