@@ -160,8 +160,8 @@ def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) 
 def at_edges(
     fits: Sequence[Fit], unseen: np.ndarray, given: Sequence[int], times: np.ndarray
 ) -> np.ndarray:
-    """Frames (T,) bool at ``times`` (T,), seconds, that a single view shows, near ``given`` ones and
-    beside ``unseen`` ones (T,).
+    """Frames (T,) bool at ``times`` (T,), seconds, that a single view shows, near ``given`` frames
+    and beside ``unseen`` ones (T,).
 
     What moves out of sight there does so fast, and how it moves until that view exposes is known
     from one side alone: of a swung racquet, a decimetre in 19 ms, which no deviation states.

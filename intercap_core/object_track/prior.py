@@ -29,13 +29,15 @@ class Prior:
         self._share = share
         self.given: dict[int, GivenPose] = {}
 
-    def near_given(self, times: np.ndarray) -> np.ndarray:
+    def near_given(self, times: np.ndarray, hidden: np.ndarray) -> np.ndarray:
         """Frames (T,) bool at ``times`` (T,), seconds, nearer to a given pose than the time that an
-        object is followed unseen."""
-        near = np.zeros(len(times), bool)
+        object is followed unseen, where that pose is near to ``hidden`` frames (T,) as well."""
+        found = np.zeros(len(times), bool)
         for t in self.given:
-            near |= np.abs(times - times[t]) < UNSEEN_S
-        return near
+            near = np.abs(times - times[t]) < UNSEEN_S
+            if hidden[near].any():
+                found |= near
+        return found
 
     def weigh(self, t: int, fits: list[Fit]) -> np.ndarray:
         """What speaks for hypotheses (K,) of frame t, against that none of them is true, nats.

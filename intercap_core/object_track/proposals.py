@@ -174,7 +174,8 @@ class Proposals:
         for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
             if self._hypotheses.best(t) < poor and t not in self._looked:
                 new |= self._look_near(t, known)
-        new |= self._look_near_given(waiting, known)
+        near = self._prior.near_given(self._times, decoded.path == NOT_SEEN)
+        new |= self._look_near_given([t for t in waiting if near[t]], known)
         most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
         for t in self._unsearched(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
             self._searched.add(t)
@@ -200,13 +201,12 @@ class Proposals:
         return new
 
     def _look_near_given(self, frames: list[int], known: dict[int, np.ndarray]) -> bool:
-        """Search those of the ``frames`` that are near given poses with all rotations, once, around
-        where the object is in the nearest of the frames ``known``; whether something new was found.
+        """Search the ``frames``, which are near given poses, with all rotations, once, around where
+        the object is in the nearest of the frames ``known``; whether something new was found.
         Somebody says that it is there: it is worth as many searches as frames."""
-        near = self._prior.near_given(self._times)
         new = False
         for t in frames:
-            if near[t] and t not in self._searched | self._searched_near_given:
+            if t not in self._searched | self._searched_near_given:
                 self._searched_near_given.add(t)
                 poses = [known[u] for u in _beside(t, known)]
                 places = np.array([self._observer.mesh.centre_at(pose) for pose in poses])

@@ -177,18 +177,16 @@ class Tracker:
         fits = self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
-        # where somebody gave poses, the usual motions did not explain what is recorded
-        near = self._prior.near_given(self._times)
-        free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
-        steps = [
-            step_costs(
-                self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
-            )
-            for t, gap in enumerate(np.diff(self._times))
-        ]
+        steps = self._step_costs(poses, np.full(len(poses) - 1, FREE_COST_S))
         self._emissions = [self._share * weight for weight in weights]
         absent = self._share * ABSENT_LOG_RATIO
         decoded = decode(self._emissions, steps, absent)
+        # where somebody gave poses as it is out of sight, the usual motions explain nothing
+        near = self._prior.near_given(self._times, decoded.path == NOT_SEEN)
+        if near.any():
+            free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
+            steps = self._step_costs(poses, free)
+            decoded = decode(self._emissions, steps, absent)
         sure = np.array(
             [k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY
              for t, k in enumerate(decoded.path)]
@@ -208,6 +206,16 @@ class Tracker:
                     if thing[other] != thing[k] and fit.log_ratio > SEEN_LOG_RATIO:
                         places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
         return decoded
+
+    def _step_costs(self, poses: list[np.ndarray], free: np.ndarray) -> list[np.ndarray]:
+        """Of the steps [T - 1] between the hypotheses' poses [T] (K, 4, 4), where free motion costs
+        ``free`` (T - 1,) nats a second."""
+        return [
+            step_costs(
+                self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
+            )
+            for t, gap in enumerate(np.diff(self._times))
+        ]
 
     def _tell_others(self, t: int, given: GivenPose, fits: list[Fit]) -> None:
         """Tell the places' prior what else the ``fits`` of frame t see than the object at the pose

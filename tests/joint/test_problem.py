@@ -9,6 +9,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
 from intercap_core.contact.patches import contact_patches
 from intercap_core.energy import smoothness
+from intercap_core.energy.constants import CONTACT_TOLERANCE
 from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
@@ -104,9 +105,8 @@ class _Scene:
 
     def take(self, annotated: int) -> None:
         """Let the contact term use the probability, ``annotated`` alike everywhere."""
-        self.contact.take_contact(
-            self.probability, np.full(self.probability.shape, annotated, np.int8)
-        )
+        every = np.full(self.probability.shape, annotated, np.int8)
+        self.contact.take_contact(self.probability, every)
 
     def distance(self, state: State) -> np.ndarray:
         """(T, N) of the skin's vertices to the box."""
@@ -122,15 +122,18 @@ def test_how_deep_an_object_is_in_the_body(model, box):
     assert (scene.geometry.at(within).object_depth(ThreadPool()) > 0.05).all()
 
 
-def test_an_annotated_contact_draws_more(model, box):
-    state = _state(model, 0.005)
+@pytest.mark.parametrize(
+    ("gap", "times"), [(0.020, ANNOTATED_CONTACT_WEIGHT), (CONTACT_TOLERANCE - 0.0005, 1.0)]
+)
+def test_an_annotated_contact_draws_more_while_it_stands_apart(model, box, gap, times):
+    state = _state(model, gap)
     scene = _Scene(model, box, state, touching=[LEFT_HAND])
     detected = scene.equations(state).energy["contact"]
-    scene.take(annotated=0)
-    assert scene.equations(state).energy["contact"] == detected > 0
-    scene.take(annotated=1)
-    found = scene.equations(state).energy["contact"]
-    assert found == pytest.approx(ANNOTATED_CONTACT_WEIGHT * detected)
+    for annotated, factor in ((0, 1.0), (1, times)):
+        scene.take(annotated)
+        scene.problem.refresh(state)
+        found = scene.equations(state).energy["contact"]
+        assert found == pytest.approx(factor * detected) and found > 0
 
 
 def test_rows_of_several_threads_are_those_of_one(model, box):
@@ -212,6 +215,7 @@ def test_an_object_at_rest_moves_as_one(model, box):
     problem = _Scene(model, box, state, data=data, still=True)
     problem.probability[FRAMES // 2 :, LEFT_HAND] = 1
     problem.take(annotated=-1)
+    problem.problem.refresh(state)
     found = minimise(problem.equations, state, max_steps=8).state
     assert np.linalg.norm(found.translation[0] - state.translation[0]) > 0.001
     assert np.linalg.norm(np.diff(found.translation, axis=0), axis=1).max() < 2e-4
@@ -404,6 +408,7 @@ def test_a_brief_contact_does_not_shake_a_steady_track(model, box):
     problem = _Scene(model, box, state, data=(_Hold(state, 0.001), ObjectData(tracked)))
     problem.probability[2, LEFT_HAND] = 1
     problem.take(annotated=-1)
+    problem.problem.refresh(state)
     moved = minimise(problem.equations, state, max_steps=8).state.translation - state.translation
     assert np.abs(np.diff(moved, axis=0)).max() < 0.002
 

@@ -89,7 +89,10 @@ def test_poses_that_keep_the_same_candidates_are_one_thing(mesh: ObjectMesh) -> 
 def test_frames_near_given_poses(mesh):
     prior = prior_of(mesh)
     times = np.arange(20) / 4
-    assert not prior.near_given(times).any()
+    hidden = np.isin(np.arange(20), [2, 9])
+    assert not prior.near_given(times, hidden).any()
     prior.given[4] = prior.given[15] = GivenPose(4, np.eye(4), 0.01, 0.1)
+    assert np.flatnonzero(prior.near_given(times, hidden)).tolist() == [*range(1, 8)]
+    hidden[18] = True
     near = [*range(1, 8), *range(12, 19)]
-    assert np.flatnonzero(prior.near_given(times)).tolist() == near
+    assert np.flatnonzero(prior.near_given(times, hidden)).tolist() == near

@@ -2,8 +2,8 @@
 
 The residuals, and what differs from the paper, are in :mod:`intercap_core.energy.contact`. The
 paper's binary Q_t is the probability that each region touches, annotated or detected; what somebody
-saw touching draws more. The setting ``contact_to`` says what skin is drawn to: any point of the
-object, or its annotated part.
+saw touching draws more while it stands apart. The setting ``contact_to`` says what skin is drawn
+to: any point of the object, or its annotated part.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.energy import contact
+from intercap_core.energy.constants import CONTACT_TOLERANCE
 from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT, CONTACT_SIGMA
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
@@ -27,14 +28,14 @@ class Contact(Term):
     def __init__(self, geometry: Geometry, weight: float) -> None:
         self._geometry, self._scale = geometry, weight / CONTACT_SIGMA**2
         self._probability: np.ndarray | None = None
+        self._annotated: np.ndarray | None = None
         self._draws: np.ndarray | None = None
         self._shares: contact.Shares | None = None
 
     def take_contact(self, probability: np.ndarray, annotated: np.ndarray) -> None:
         """Use this probability (T, R) that each region touches from now on; ``annotated`` (T, R) is
         1 where somebody states that it does."""
-        self._probability = probability
-        self._draws = np.where(annotated == 1, ANNOTATED_CONTACT_WEIGHT, 1.0) * probability
+        self._probability, self._annotated = probability, annotated == 1
 
     def holding(self) -> np.ndarray:
         """How surely each of the patches' vertices holds the object (T, M), times its share of its
@@ -46,15 +47,23 @@ class Contact(Term):
         return self._shares.area * gate[:, patches.patch]
 
     def refresh(self, state: State) -> None:
-        """Take anew which vertices carry the contact."""
+        """Take anew which vertices carry the contact, and how much each region draws."""
+        assert self._probability is not None, "take_contact comes first"
+        assert self._annotated is not None, "take_contact comes first"
         patches = self._geometry.patches
         distance = self._geometry.at(state).touching.distance[:, self._geometry.skin.patch]
         self._shares = contact.shares(distance, patches.patch, patches.region_of_patch)
+        more = np.zeros_like(self._probability)
+        for region in np.flatnonzero(self._annotated.any(0)).tolist():
+            nearest = np.abs(distance[:, patches.region == region]).min(1)
+            apart = np.clip((nearest - CONTACT_TOLERANCE) / CONTACT_SIGMA, 0.0, 1.0)
+            more[:, region] = self._annotated[:, region] * apart
+        self._draws = (1.0 + (ANNOTATED_CONTACT_WEIGHT - 1.0) * more) * self._probability
 
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add Q_t E_C at ``state`` with the vertices' shares of the last :meth:`refresh`."""
         assert self._shares is not None, "refresh comes first"
-        assert self._draws is not None, "take_contact comes first"
+        assert self._draws is not None, "refresh comes first"
         patches, at_patch = self._geometry.patches, self._geometry.skin.patch
         posed = self._geometry.at(state)
         near = posed.touching
