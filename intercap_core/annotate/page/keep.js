@@ -21,7 +21,7 @@ export class Keep {
     find("undo").onclick = () => app.undo();
     find("redo").onclick = () => app.redo();
     find("save").onclick = () => this.save();
-    window.addEventListener("beforeunload", (event) => { if (app.draft.dirty) event.preventDefault(); });
+    window.addEventListener("beforeunload", (event) => { if (app.draft.dirty || app.paint?.changed) event.preventDefault(); });
     this.state();
     setInterval(() => this.look(), LOOK_MS);
     this.check();
@@ -134,10 +134,9 @@ export class Keep {
     const edited = structuredClone(mine);
     app.draft.base(told.now, true);
     app.told.annotation = told.now;
-    if (answer === "theirs") { app.draft.takeFile("theirs taken"); banner("changed", ""); return; }
-    app.draft.sections = { ...structuredClone(app.draft.saved), ...edited };
-    app.draft.told();
+    app.draft.over(edited);
     banner("changed", "");
+    if (answer === "theirs") { app.draft.takeFile("theirs taken"); return; }
     await this.#save();
   }
 
@@ -163,7 +162,9 @@ export class Keep {
   }
 
   async showChange() {
-    const { app } = this, now = await get(`${this.path}/annotation`);
+    const { app } = this;
+    let now;
+    try { now = await get(`${this.path}/annotation`); } catch (error) { app.say(error.message); this.known = null; return; }
     if (!app.draft.dirty && !now.problem) { app.saved(now, true); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
     await this.conflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
   }

@@ -204,7 +204,7 @@ export class Timeline {
   }
 
   #bar() {
-    const { app, contact } = this, one = contact.selected && contact.under(app.frame);
+    const { app, contact } = this, one = contact.chosen(app.frame);
     const choose = make("select", { id: "part", onchange: () => {
       if (!choose.value) return;
       this.extra.add(choose.value);
