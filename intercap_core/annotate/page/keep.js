@@ -112,8 +112,7 @@ export class Keep {
       else await ask("Not saved", make("p", {}, error.message), [["", "Back", true]]);
       return;
     }
-    await this.plan();
-    if (answer === "run") this.start();
+    if (answer === "run") this.start(); else this.plan(); // which takes seconds: the next save need not wait
   }
 
   /* Somebody else saved meanwhile: their change is shown, and nothing of either is lost. */

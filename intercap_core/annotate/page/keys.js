@@ -35,7 +35,7 @@ export function pressed(app, event) {
   if (control || event.altKey || (VIEWERS.test(event.key) && event.target.closest?.(".viewer"))) return;
   if (event.repeat && !AGAIN.test(event.key)) { event.preventDefault(); return; }
   const one = app.contact.chosen(app.frame);
-  const contact = (act) => (one ? act() : app.say("choose a bar of contact first: click it"));
+  const contact = (act) => (one ? act() : app.say("choose a bar of the timeline first: click it"));
   const far = event.shiftKey ? 10 : 1;
   const names = Object.keys(app.layers);
   const act = {
@@ -51,7 +51,7 @@ export function pressed(app, event) {
     e: () => app.sides.press(event.shiftKey ? null : app.views.chosen?.camera.name),
     x: () => app.dropped.toggle(app.frame),
     q: () => app.questions.next(),
-    b: () => app.layer("before", !app.layers.before),
+    b: () => (app.space.before ? app.layer("before", !app.layers.before) : app.keep.compare()),
     c: () => contact(() => app.contact.confirm(one)), k: () => contact(() => app.contact.split(one, app.frame)),
     "[": () => contact(() => app.contact.change(one, app.frame, one.end)), "]": () => contact(() => app.contact.change(one, one.start, app.frame + 1)),
     delete: () => remove(app, contact, one), backspace: () => remove(app, contact, one),

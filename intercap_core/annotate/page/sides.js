@@ -114,7 +114,7 @@ export class Sides {
   /* The first press begins at the frame that is shown, the second one ends with it. */
   press(camera) {
     const { app } = this, key = camera ?? "", begun = this.open.get(key);
-    if (!app.told.frames) return;
+    if (!app.told.frames) { app.say("no images are there yet"); return; }
     this.show();
     if (begun) {
       this.open.delete(key);

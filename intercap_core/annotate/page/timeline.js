@@ -183,9 +183,11 @@ export class Timeline {
     const end = event.target.dataset.end, from = this.#frameAt(event);
     let [start, stop] = [one.start, one.end];
     const move = (next) => {
-      const by = Math.round(this.#frameAt(next) - from);
-      start = end === "end" ? one.start : Math.min(Math.max(0, one.start + by), end ? one.end - 1 : app.told.frames - 1);
-      stop = end === "start" ? one.end : Math.max(Math.min(app.told.frames, one.end + by), end ? one.start + 1 : 1);
+      const lowest = end === "end" ? one.start + 1 - one.end : -one.start; // a whole bar keeps its length
+      const highest = end === "start" ? one.end - 1 - one.start : app.told.frames - one.end;
+      const by = Math.min(Math.max(Math.round(this.#frameAt(next) - from), lowest), highest);
+      start = one.start + (end === "end" ? 0 : by);
+      stop = one.end + (end === "start" ? 0 : by);
       this.#put(bar, start, stop);
       app.show(end === "end" ? stop - 1 : start);
     };

@@ -96,3 +96,7 @@ def test_a_step_back_leads_to_what_was_and_delete_takes_the_chosen_part(settings
         keys.press("Control+z")
         keys.press("Delete")
         assert draft_of(page, "contact") == [back]
+        box = page.page.locator('[data-part="back"] .bar').bounding_box()
+        assert box is not None  # a bar that is dragged past the first frame keeps its length
+        drag(page, (box["x"] + box["width"] / 2, box["y"] + 8), (-box["width"], 2))
+        assert draft_of(page, "contact") == [back | {"start": 0, "end": 7}]

@@ -159,3 +159,6 @@ def test_keys_work_wherever_the_focus_is(settings: Path) -> None:
         page.page.locator(".viewer").focus()
         keys.press("o")
         assert page.page.evaluate("document.body.dataset.mode") == "PoseEditor"
+        keys.press("b")
+        page.wait("document.getElementById('hint').textContent.startsWith('no run')")
+        assert not page.page.evaluate("window.annotate.layers.before")
