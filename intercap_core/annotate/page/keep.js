@@ -86,7 +86,7 @@ export class Keep {
 
   async #save() {
     const { app } = this, changes = app.draft.changes();
-    if (!Object.keys(changes).length) { app.say("there is nothing to save"); return; }
+    if (!Object.keys(changes).length) { app.say(app.paint?.changed ? "what is painted is saved by its own button, under Object" : "there is nothing to save"); return; }
     if (app.told.read_only) { app.say(app.told.read_only); return; }
     let found;
     try { found = await post(`${this.path}/check`, { changes }); } catch (error) { app.say(error.message); return; }
@@ -100,7 +100,9 @@ export class Keep {
     post(`${this.path}/check`, { changes, plan: true }).then(({ touched }) => {
       touches.textContent = touched?.length ? `A run then makes anew: ${touched.map((one) => words(one.stage)).join(", ")}.` : "Nothing has to be run again.";
     }, (error) => { touches.textContent = error.message; });
-    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference), touches],
+    const begun = [app.sides.open.size ? "left and right" : "", app.dropped.from === null ? "" : "frames to drop"].filter(Boolean);
+    const open = begun.length ? [make("p", { class: "fault" }, `Begun and not ended, so not in it: ${begun.join(", ")}.`)] : [];
+    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference), ...open, touches],
       [["save", "Save", true], ...(app.told.profile ? [] : [["run", "Save and run"]]), ["", "Cancel"]]);
     if (!answer) return;
     try {

@@ -1,6 +1,6 @@
 /* The page: one frame for all views, the viewer and the timeline; layers, modes, keys. */
 import { get, packed, takeToken } from "./api.js";
-import { banner, button, find, make } from "./dom.js";
+import { banner, button, find, make, refill } from "./dom.js";
 import { Contact } from "./contact.js";
 import { Copies } from "./copies.js";
 import { Draft } from "./draft.js";
@@ -273,7 +273,7 @@ class App {
   #bar() {
     const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", sides: "left/right", before: this.space.before ? "before" : null };
     const numbers = Object.keys(this.layers);
-    find("layers").replaceChildren(...Object.entries(names).filter(([, text]) => text).map(([name, text]) => make("label", { title: name === "before" ? "B" : String(numbers.indexOf(name) + 1) },
+    refill(find("layers"), ...Object.entries(names).filter(([, text]) => text).map(([name, text]) => make("label", { title: name === "before" ? "B" : String(numbers.indexOf(name) + 1) },
       make("input", { type: "checkbox", checked: this.layers[name], data: { layer: name }, onchange: (event) => this.layer(name, event.target.checked) }), ` ${text} `, name === "sides" ? legend() : null)));
   }
 
@@ -319,7 +319,7 @@ class App {
       sides: () => [sidesPanel(this)],
       run: () => [this.keep?.panel()],
     };
-    box.replaceChildren(...(parts[this.open]?.() ?? []).filter(Boolean));
+    refill(box, ...(parts[this.open]?.() ?? []).filter(Boolean));
   }
 }
 

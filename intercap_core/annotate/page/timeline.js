@@ -1,5 +1,5 @@
 /* One time for all: flags, doubts and dropped frames, and a row of contact for each body part. */
-import { button, find, make, words } from "./dom.js";
+import { button, find, make, refill, words } from "./dom.js";
 import { id } from "./contact.js";
 import { posedFrames } from "./pose.js";
 import { sidesRows } from "./sides_panel.js";
@@ -216,7 +216,7 @@ export class Timeline {
     const state = contact.stated ? !contact.stated.length ? "nothing touches, as annotated"
       : `${contact.stated.length} intervals stated, ${contact.stated.filter((i) => !contact.looked(i)).length} of them as found`
       : contact.probability ? "contact as found: an edit takes it into the annotation" : "no contact is found yet";
-    find("contact-bar").replaceChildren(contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(one ? [
+    refill(find("contact-bar"), contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(one ? [
       make("b", {}, `${words(one.part)} ${one.start}–${one.end - 1}`),
       button("Confirm", () => contact.confirm(one), { title: "C" }),
       button("Starts here", () => contact.change(one, app.frame, one.end), { title: "[" }),

@@ -147,6 +147,8 @@ def test_where_people_touch_is_painted_and_kept_with_the_object(settings: Path) 
         assert page.page.evaluate("window.annotate.paint.painted.size") > 0
         page.page.keyboard.press("Control+z")
         drag(page, middle, (-20, 10))
+        page.page.keyboard.press("Control+s")
+        assert "its own button" in page.page.locator("#hint").inner_text()
         painted = page.page.evaluate("[...window.annotate.paint.painted]")
         page.page.get_by_text("Save the surface").click()
         page.page.locator('[data-answer="save"]').click()

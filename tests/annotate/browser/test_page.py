@@ -156,6 +156,19 @@ def test_keys_work_wherever_the_focus_is(settings: Path) -> None:
         keys.press("Space")
         layer = page.page.evaluate("window.annotate.layers.body")
         assert not layer and not page.page.evaluate("window.annotate.playing")
+        page.page.locator("#tab-marks").click()
+        page.page.get_by_role("button", name="Drop frame 0").focus()
+        keys.press("Enter")
+        focus = "document.activeElement.textContent"
+        assert page.page.evaluate(focus) == "Keep frame 0"
+        page.page.locator('[data-camera="k1"] canvas').hover()
+        keys.press("e")
+        keys.press("Control+s")
+        page.wait("document.getElementById('dialog').open")
+        assert (
+            "not ended, so not in it: left and right" in page.page.locator("#dialog").inner_text()
+        )
+        keys.press("Escape")
         page.page.locator(".viewer").focus()
         keys.press("o")
         assert page.page.evaluate("document.body.dataset.mode") == "PoseEditor"
