@@ -25,7 +25,7 @@ TOGETHER = ("workflow", "slurm")
 # Folders and files that start processes, render whole captures or fit whole sequences;
 # `make test-fast` leaves them out, and what is marked `slow` elsewhere.
 SLOW = (
-    "annotate/test_browser.py",
+    "annotate/browser",
     "bench",
     "body/test_jacobian.py",
     "body_fit/test_recover.py",
@@ -66,7 +66,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Slow tests are marked, and what shares a long run comes first: a worker is busy with it."""
     places = {item: item.path.relative_to(PROJECT_ROOT / "tests") for item in items}
     for item, place in places.items():
-        if place.parts[0] in SLOW or place.as_posix() in SLOW:
+        if any(place.is_relative_to(one) for one in SLOW):
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: places[item].parts[0] not in TOGETHER)
 

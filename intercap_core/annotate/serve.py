@@ -34,7 +34,8 @@ def serve(
     try:
         import uvicorn
 
-        from intercap_core.annotate.server import Annotator, application
+        from intercap_core.annotate.annotator import Annotator
+        from intercap_core.annotate.server import application
     except ModuleNotFoundError as error:
         raise UserError(
             f"the page needs the package {error.name}: pip install 'intercap-core[annotate]'"

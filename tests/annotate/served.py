@@ -18,8 +18,9 @@ from typing import Any
 import h5py
 import uvicorn
 
+from intercap_core.annotate.annotator import Annotator
 from intercap_core.annotate.guard import TOKEN_HEADER
-from intercap_core.annotate.server import Annotator, application
+from intercap_core.annotate.server import application
 from intercap_core.person.sides import swapped
 from tests.helpers import fitted_capture as fitted
 

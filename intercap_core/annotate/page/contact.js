@@ -2,6 +2,7 @@
  * states contact, nothing touches outside of its intervals; so the first edit takes all that was
  * found into the draft. */
 import { bytes } from "./api.js";
+import { UNSEEN } from "./draft.js";
 
 const TOUCHING = 0.5;
 
@@ -11,7 +12,6 @@ export class Contact {
     const told = app.told.contact;
     this.regions = told?.regions ?? app.told.regions;
     this.probability = told ? bytes(told.probability) : null;
-    this.fromFound = new Set(); // intervals of the draft that nobody has looked at
     this.selected = null; // { part, start, end }
   }
 
@@ -43,97 +43,99 @@ export class Contact {
 
   intervals() { return this.stated ?? this.found(); }
 
-  /* The intervals to change: the draft's, or what was found, which becomes the draft. */
+  /* The intervals to change: the draft's, or what was found, which becomes the draft; and those of them
+   * that nobody has looked at. */
   #taken() {
-    if (this.stated) return structuredClone(this.stated);
-    const found = this.found();
-    for (const one of found) this.fromFound.add(id(one));
-    return found;
+    if (this.stated) return { all: structuredClone(this.stated), unseen: new Set(this.app.draft.get(UNSEEN) ?? []) };
+    const all = this.found();
+    return { all, unseen: new Set(all.map(id)) };
   }
 
-  looked(interval) { return this.stated !== null && !this.fromFound.has(id(interval)); }
+  looked(interval) { return this.stated !== null && !this.app.draft.get(UNSEEN)?.includes(id(interval)); }
 
-  #put(intervals, says) {
+  #put(intervals, unseen, says) {
     intervals.sort((a, b) => order(this.regions, a) - order(this.regions, b) || a.start - b.start);
-    this.app.draft.set("contact", intervals, says);
+    this.app.draft.put({ contact: intervals, [UNSEEN]: intervals.map(id).filter((one) => unseen.has(one)) }, says);
   }
 
   change(interval, start, end) {
-    const all = this.#taken(), k = all.findIndex((one) => id(one) === id(interval));
+    const { all, unseen } = this.#taken(), k = all.findIndex((one) => id(one) === id(interval));
     if (k < 0) return;
     const bound = (v) => Math.max(0, Math.min(this.app.told.frames, Math.round(v)));
     const next = { ...all[k], start: bound(start), end: bound(end) };
-    if (next.end <= next.start) return;
+    if (next.end <= next.start) { this.app.say("contact would end before it starts"); return; }
     all[k] = next;
-    this.fromFound.delete(id(interval));
+    unseen.delete(id(interval));
     this.selected = next;
-    this.#put(all, "contact moved");
+    this.#put(all, unseen, "contact moved");
   }
 
   confirm(interval) {
-    const all = this.#taken();
-    this.fromFound.delete(id(interval));
+    const { all, unseen } = this.#taken();
+    unseen.delete(id(interval));
     this.selected = interval;
-    if (this.stated) this.app.draft.told();
-    else this.#put(all, "contact confirmed");
+    this.#put(all, unseen, "contact confirmed");
   }
 
   remove(interval) {
     this.selected = null;
-    const left = this.#taken().filter((one) => id(one) !== id(interval));
-    this.#put(left, "contact deleted");
+    const { all, unseen } = this.#taken(), left = all.filter((one) => id(one) !== id(interval));
+    this.#put(left, unseen, "contact deleted");
     if (!left.length) this.app.say("nothing touches any more, and that is annotated; \"As found again\" takes the statement away");
   }
 
   split(interval, frame) {
-    if (frame <= interval.start || frame >= interval.end) return;
-    const rest = this.#taken().filter((one) => id(one) !== id(interval));
+    if (frame <= interval.start || frame >= interval.end) { this.app.say("go to a frame within the interval to split it there"); return; }
+    const { all, unseen } = this.#taken(), rest = all.filter((one) => id(one) !== id(interval));
     const parts = [{ ...interval, end: frame }, { ...interval, start: frame }];
-    if (this.fromFound.has(id(interval))) parts.forEach((one) => this.fromFound.add(id(one)));
+    if (unseen.has(id(interval))) parts.forEach((one) => unseen.add(id(one)));
     this.selected = parts[1];
-    this.#put([...rest, ...parts], "contact split");
+    this.#put([...rest, ...parts], unseen, "contact split");
   }
 
   add(part, start, end) {
-    const all = this.#taken().filter((one) => !(one.part === part && one.start < end && one.end > start));
-    const meets = this.intervals().filter((one) => one.part === part && one.start < end && one.end > start);
+    const { all, unseen } = this.#taken(), meets = all.filter((one) => one.part === part && one.start < end && one.end > start);
     const next = {
       part, start: Math.min(start, ...meets.map((one) => one.start)),
       end: Math.max(end, ...meets.map((one) => one.end)),
     };
     this.selected = next;
-    this.#put([...all, next], "contact added");
+    unseen.delete(id(next));
+    this.#put([...all.filter((one) => !meets.includes(one)), next], unseen, "contact added");
   }
 
   /* No contact of a part in these frames. */
   clear(part, start, end) {
-    const left = [];
-    for (const one of this.#taken()) {
+    const { all, unseen } = this.#taken(), left = [];
+    for (const one of all) {
       if (one.part !== part || one.end <= start || one.start >= end) { left.push(one); continue; }
       if (one.start < start) left.push({ ...one, end: start });
       if (one.end > end) left.push({ ...one, start: end });
     }
-    this.#put(left, "contact denied");
+    this.#put(left, unseen, "contact denied");
   }
 
   /* No part touches in the whole sequence; an empty list says so. */
   nothing() {
     this.selected = null;
-    this.app.draft.set("contact", [], "nothing touches");
+    this.#put([], new Set(), "nothing touches");
   }
 
   /* The annotation says nothing of contact: it is found again. */
   asFound() {
     this.selected = null;
-    this.app.draft.set("contact", null, "contact as found again");
+    this.app.draft.put({ contact: null, [UNSEEN]: null }, "contact as found again");
   }
 
-  takeAll() { this.#put(this.#taken(), "found contact taken"); }
+  takeAll() {
+    const { all, unseen } = this.#taken();
+    this.#put(all, unseen, "found contact taken");
+  }
 
-  under(frame) {
-    const chosen = this.selected;
-    if (chosen && this.intervals().some((one) => id(one) === id(chosen))) return chosen;
-    return this.intervals().find((one) => one.start <= frame && frame < one.end) ?? null;
+  /* The chosen interval; where a step back has changed it, that of the same part at the frame. */
+  chosen(frame) {
+    const of = this.selected && this.intervals().filter((one) => one.part === this.selected.part);
+    return of?.find((one) => id(one) === id(this.selected)) ?? of?.find((one) => one.start <= frame && frame < one.end) ?? null;
   }
 }
 

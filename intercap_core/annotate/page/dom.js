@@ -19,6 +19,19 @@ export const button = (text, click, properties = {}) =>
 
 export const words = (name) => name.replaceAll("_", " ");
 
+/* New children of a box. What was in focus by the keyboard stays so: the nearest that is called the same,
+ * else the box's first. */
+export function refill(box, ...children) {
+  const all = () => [...box.querySelectorAll("button, input, select, summary")];
+  const called = (one) => `${one.tagName} ${one.title || one.textContent}`;
+  const old = document.activeElement, at = old?.matches(":focus-visible") ? all().indexOf(old) : -1;
+  box.replaceChildren(...children);
+  if (at < 0) return;
+  const now = all(), alike = now.filter((one) => called(one) === called(old));
+  const [next] = alike.sort((a, b) => Math.abs(now.indexOf(a) - at) - Math.abs(now.indexOf(b) - at));
+  (next ?? now[0])?.focus({ preventScroll: true });
+}
+
 /* A dialog with buttons; resolves to the value of the one that was pressed, "" = it was closed. */
 export function ask(title, body, choices) {
   const dialog = find("dialog");

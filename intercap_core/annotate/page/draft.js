@@ -1,5 +1,7 @@
 /* The annotation as it is edited: its sections, undo and redo; a copy of it is kept in this browser. */
 export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames", "left_right"];
+/* Not of the file: intervals of contact, as they were found, that nobody has looked at. */
+export const UNSEEN = "unseen";
 const plain = (value) => JSON.stringify(value ?? null, (_, one) => // whatever the order of its keys
   (one && typeof one === "object" && !Array.isArray(one) ? Object.fromEntries(Object.entries(one).sort()) : one));
 export const same = (a, b) => plain(a) === plain(b);
@@ -64,6 +66,12 @@ export class Draft extends EventTarget {
 
   get dirty() { return Object.keys(this.changes()).length > 0; }
 
+  /* Edits upon what the file has by now. */
+  over(edits) {
+    this.sections = { ...structuredClone(this.saved), ...structuredClone(edits), [UNSEEN]: this.get(UNSEEN) };
+    this.told();
+  }
+
   /* The file's sections in place of the edits, as a step that can be undone. */
   takeFile(says) {
     this.done.push({ sections: this.sections, says });
@@ -74,7 +82,7 @@ export class Draft extends EventTarget {
   told() {
     if (this.dirty) {
       const { digest, text } = this.file;
-      this.copies.keep({ digest, text, sections: this.saved, changes: this.changes() });
+      this.copies.keep({ digest, text, sections: this.saved, changes: this.changes(), [UNSEEN]: this.get(UNSEEN) });
     } else this.copies.drop();
     this.dispatchEvent(new Event("change"));
   }
@@ -95,7 +103,7 @@ export class Draft extends EventTarget {
       this.base({ ...this.file, digest: kept.digest, text: kept.text, sections: kept.sections }, true);
       this.sections = structuredClone(this.saved);
     }
-    this.sections = { ...this.sections, ...structuredClone(kept.changes) };
+    this.sections = { ...this.sections, ...structuredClone({ ...kept.changes, [UNSEEN]: kept[UNSEEN] ?? null }) };
     this.told();
     this.dropLeft(kept);
   }

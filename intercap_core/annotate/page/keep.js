@@ -21,7 +21,7 @@ export class Keep {
     find("undo").onclick = () => app.undo();
     find("redo").onclick = () => app.redo();
     find("save").onclick = () => this.save();
-    window.addEventListener("beforeunload", (event) => { if (app.draft.dirty) event.preventDefault(); });
+    window.addEventListener("beforeunload", (event) => { if (app.draft.dirty || app.paint?.changed) event.preventDefault(); });
     this.state();
     setInterval(() => this.look(), LOOK_MS);
     this.check();
@@ -86,7 +86,7 @@ export class Keep {
 
   async #save() {
     const { app } = this, changes = app.draft.changes();
-    if (!Object.keys(changes).length) { app.say("there is nothing to save"); return; }
+    if (!Object.keys(changes).length) { app.say(app.paint?.changed ? "what is painted is saved by its own button, under Object" : "there is nothing to save"); return; }
     if (app.told.read_only) { app.say(app.told.read_only); return; }
     let found;
     try { found = await post(`${this.path}/check`, { changes }); } catch (error) { app.say(error.message); return; }
@@ -100,7 +100,9 @@ export class Keep {
     post(`${this.path}/check`, { changes, plan: true }).then(({ touched }) => {
       touches.textContent = touched?.length ? `A run then makes anew: ${touched.map((one) => words(one.stage)).join(", ")}.` : "Nothing has to be run again.";
     }, (error) => { touches.textContent = error.message; });
-    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference), touches],
+    const begun = [app.sides.open.size ? "left and right" : "", app.dropped.from === null ? "" : "frames to drop"].filter(Boolean);
+    const open = begun.length ? [make("p", { class: "fault" }, `Begun and not ended, so not in it: ${begun.join(", ")}.`)] : [];
+    const answer = await ask(`Save ${app.draft.file.path}`, [diff(found.difference), ...open, touches],
       [["save", "Save", true], ...(app.told.profile ? [] : [["run", "Save and run"]]), ["", "Cancel"]]);
     if (!answer) return;
     try {
@@ -112,8 +114,7 @@ export class Keep {
       else await ask("Not saved", make("p", {}, error.message), [["", "Back", true]]);
       return;
     }
-    await this.plan();
-    if (answer === "run") this.start();
+    if (answer === "run") this.start(); else this.plan(); // which takes seconds: the next save need not wait
   }
 
   /* Somebody else saved meanwhile: their change is shown, and nothing of either is lost. */
@@ -134,10 +135,9 @@ export class Keep {
     const edited = structuredClone(mine);
     app.draft.base(told.now, true);
     app.told.annotation = told.now;
-    if (answer === "theirs") { app.draft.takeFile("theirs taken"); banner("changed", ""); return; }
-    app.draft.sections = { ...structuredClone(app.draft.saved), ...edited };
-    app.draft.told();
+    app.draft.over(edited);
     banner("changed", "");
+    if (answer === "theirs") { app.draft.takeFile("theirs taken"); return; }
     await this.#save();
   }
 
@@ -163,7 +163,9 @@ export class Keep {
   }
 
   async showChange() {
-    const { app } = this, now = await get(`${this.path}/annotation`);
+    const { app } = this;
+    let now;
+    try { now = await get(`${this.path}/annotation`); } catch (error) { app.say(error.message); this.known = null; return; }
     if (!app.draft.dirty && !now.problem) { app.saved(now, true); app.draft.takeFile("theirs taken"); app.draft.done.pop(); app.draft.told(); return; }
     await this.conflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
   }

@@ -11,6 +11,10 @@ const KEYS = [
   ["Q", "next question; then 1, 2, 3 answer it"], ["Ctrl+Z", "undo; with Shift redo"], ["Ctrl+S", "save"], ["Esc", "end what is going on"],
 ];
 
+const VIEWERS = /^( |f|Arrow(Left|Right)|Home|End|[1-9])$/; // keys that the 3D viewer has itself
+const AGAIN = /^(Arrow(Left|Right)|[npNP])$/; // that go on as long as they are held
+const PRESSED = ["BUTTON", "INPUT", "SUMMARY"]; // by the space bar
+
 export function help() {
   ask("Keys", make("table", { class: "keys" }, KEYS.map(([key, says]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, says)))), [["", "Close", true]]);
 }
@@ -28,8 +32,10 @@ export function pressed(app, event) {
     return;
   }
   if (["INPUT", "SELECT", "TEXTAREA"].includes(typed) && event.target.type !== "checkbox" && event.target.type !== "range") return;
-  if (control || event.altKey || event.target.closest?.(".viewer")) return;
-  const one = app.contact.selected && app.contact.under(app.frame);
+  if (control || event.altKey || (VIEWERS.test(event.key) && event.target.closest?.(".viewer"))) return;
+  if (event.repeat && !AGAIN.test(event.key)) { event.preventDefault(); return; }
+  const one = app.contact.chosen(app.frame);
+  const contact = (act) => (one ? act() : app.say("choose a bar of the timeline first: click it"));
   const far = event.shiftKey ? 10 : 1;
   const names = Object.keys(app.layers);
   const act = {
@@ -45,10 +51,10 @@ export function pressed(app, event) {
     e: () => app.sides.press(event.shiftKey ? null : app.views.chosen?.camera.name),
     x: () => app.dropped.toggle(app.frame),
     q: () => app.questions.next(),
-    b: () => app.layer("before", !app.layers.before),
-    c: () => one && app.contact.confirm(one), k: () => one && app.contact.split(one, app.frame),
-    "[": () => one && app.contact.change(one, app.frame, one.end), "]": () => one && app.contact.change(one, one.start, app.frame + 1),
-    delete: () => remove(app, one), backspace: () => remove(app, one),
+    b: () => (app.space.before ? app.layer("before", !app.layers.before) : app.keep.compare()),
+    c: () => contact(() => app.contact.confirm(one)), k: () => contact(() => app.contact.split(one, app.frame)),
+    "[": () => contact(() => app.contact.change(one, app.frame, one.end)), "]": () => contact(() => app.contact.change(one, one.start, app.frame + 1)),
+    delete: () => remove(app, contact, one), backspace: () => remove(app, contact, one),
     escape: () => { app.setMode(null); app.questions.current = null; app.sides.cancel(); app.contact.selected = null; app.timeline.draw(); app.panels(); },
     "?": () => help(),
     " ": () => app.play(),
@@ -59,14 +65,14 @@ export function pressed(app, event) {
       const name = names[number - 1];
       if (name) app.layer(name, !app.layers[name]);
     }
-  } else if (act && !(event.key === " " && typed === "BUTTON")) act();
+  } else if (act && !(event.key === " " && PRESSED.includes(typed) && event.target.type !== "range")) act();
   else return;
   event.preventDefault();
 }
 
-function remove(app, contact) {
+function remove(app, contact, one) {
   if (app.sides.selected) app.sides.remove(app.sides.selected);
-  else if (contact) app.contact.remove(contact);
+  else contact(() => app.contact.remove(one));
 }
 
 /* What is being typed into a field counts before a key of the whole page does. */

@@ -1,6 +1,6 @@
 /* The page: one frame for all views, the viewer and the timeline; layers, modes, keys. */
 import { get, packed, takeToken } from "./api.js";
-import { banner, button, find, make } from "./dom.js";
+import { banner, button, find, make, refill } from "./dom.js";
 import { Contact } from "./contact.js";
 import { Copies } from "./copies.js";
 import { Draft } from "./draft.js";
@@ -64,7 +64,7 @@ class App {
       try {
         const object = await packed(`${of}/object?v=${this.told.result}`);
         this.pose = new PoseEditor(this, object);
-        this.paint = new Paint(this, object);
+        this.paint = new Paint(this, object, this.paint);
         this.overlay?.mesh("object", object.arrays.faces, OBJECT);
         this.overlay?.move("object", object.arrays.vertices);
       } catch (error) { banner("object", error.message); }
@@ -104,11 +104,11 @@ class App {
     for (const key of Object.keys(this.told)) delete this.told[key]; // of what is not there any more
     Object.assign(this.told, told);
     this.pictures = new Pictures(told.sequence, told.stamp);
-    this.contact = Object.assign(new Contact(this), { fromFound: this.contact.fromFound });
+    this.contact = new Contact(this);
     this.timeline.contact = this.contact;
     this.views.views.forEach((view, k) => (view.camera = told.cameras[k] ?? view.camera));
     this.setMode(null);
-    if (told.annotation.digest !== this.draft.file.digest && !this.draft.dirty) this.saved(told.annotation);
+    if (told.annotation.digest !== this.draft.file.digest && !this.draft.dirty && !told.annotation.problem) this.saved(told.annotation, true);
     facts(told);
     await this.load();
     await this.sides.again();
@@ -254,7 +254,13 @@ class App {
     this.panels();
   }
 
-  redo() { this.pose?.settle(); this.draft.redo(); if (this.pose?.editing) this.pose.undone(); this.panels(); }
+  redo() {
+    if (this.paint && this.mode === this.paint) { this.paint.redo(); return; }
+    this.pose?.settle();
+    this.draft.redo();
+    if (this.pose?.editing) this.pose.undone();
+    this.panels();
+  }
 
   saved(annotation, theirs = false) {
     this.told.annotation = annotation;
@@ -267,7 +273,7 @@ class App {
   #bar() {
     const names = { body: "body", object: this.told.object ? this.told.object.replaceAll("_", " ") : null, contact: "contact", marks: "marks", sides: "left/right", before: this.space.before ? "before" : null };
     const numbers = Object.keys(this.layers);
-    find("layers").replaceChildren(...Object.entries(names).filter(([, text]) => text).map(([name, text]) => make("label", { title: name === "before" ? "B" : String(numbers.indexOf(name) + 1) },
+    refill(find("layers"), ...Object.entries(names).filter(([, text]) => text).map(([name, text]) => make("label", { title: name === "before" ? "B" : String(numbers.indexOf(name) + 1) },
       make("input", { type: "checkbox", checked: this.layers[name], data: { layer: name }, onchange: (event) => this.layer(name, event.target.checked) }), ` ${text} `, name === "sides" ? legend() : null)));
   }
 
@@ -313,7 +319,7 @@ class App {
       sides: () => [sidesPanel(this)],
       run: () => [this.keep?.panel()],
     };
-    box.replaceChildren(...(parts[this.open]?.() ?? []).filter(Boolean));
+    refill(box, ...(parts[this.open]?.() ?? []).filter(Boolean));
   }
 }
 

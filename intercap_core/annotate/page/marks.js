@@ -126,12 +126,14 @@ export class FloorMarks {
 /* Frame sets that count as not recorded; all frames keep their numbers, so intervals stay where they
  * are in time. */
 export class DroppedFrames {
-  constructor(app) { this.app = app; this.from = null; }
+  constructor(app) { this.app = app; this.from = null; this.on = true; }
 
   has(frame) { return (this.app.draft.get("drop_frames") ?? []).includes(frame); }
 
-  toggle(first, last = first) {
-    const { app } = this, now = new Set(app.draft.get("drop_frames") ?? []), on = !now.has(first);
+  toggle(frame) { this.put(frame, frame, !this.has(frame)); }
+
+  put(first, last, on) {
+    const { app } = this, now = new Set(app.draft.get("drop_frames") ?? []);
     for (let t = first; t <= last; t += 1) { if (on) now.add(t); else now.delete(t); }
     app.draft.set("drop_frames", [...now].sort((a, b) => a - b), on ? "frames dropped" : "frames kept");
   }
@@ -143,11 +145,11 @@ export class DroppedFrames {
       make("p", { class: "dim" }, "A dropped frame keeps its number and counts as not recorded: contact and poses stay where they are in time."),
       button(this.has(app.frame) ? `Keep frame ${app.frame}` : `Drop frame ${app.frame}`, () => this.toggle(app.frame), { class: "main", title: "X" }),
       this.from === null
-        ? button("From this frame…", () => { this.from = app.frame; app.panels(); })
-        : button(`${this.from} to ${app.frame}`, () => {
+        ? button(`${this.has(app.frame) ? "Keep" : "Drop"} from this frame…`, () => { this.from = app.frame; this.on = !this.has(app.frame); app.panels(); })
+        : button(`${this.on ? "Drop" : "Keep"} ${this.from} to ${app.frame}`, () => {
           const [a, b] = [Math.min(this.from, app.frame), Math.max(this.from, app.frame)];
           this.from = null;
-          this.toggle(a, b);
+          this.put(a, b, this.on);
         }));
   }
 }

@@ -8,7 +8,8 @@ const BRUSH_PX = 14; // of the screen
 const BEHIND = 0.04; // of the object's size: what lies this much behind the nearest is not painted
 
 export class Paint {
-  constructor(app, object) {
+  /* `before`: the one until now, whose strokes go on where the mesh is the same. */
+  constructor(app, object, before = null) {
     this.app = app;
     const { vertices, faces } = object.arrays;
     this.vertices = vertices;
@@ -17,6 +18,14 @@ export class Paint {
     this.told = null;
     this.painted = new Set();
     this.strokes = [];
+    this.undone = [];
+    if (before?.changed) {
+      const { vertices: own } = before;
+      if (own.length === vertices.length && own.every((v, k) => v === vertices[k])) {
+        const { told, saved, painted, strokes, undone } = before;
+        Object.assign(this, { told, saved, painted, strokes, undone });
+      } else app.say("the object has another mesh by now: what was painted and not saved was of the old one, and is gone");
+    }
   }
 
   get hint() { return "Paint where people touch the object; Shift erases, the wheel zooms, Ctrl+Z undoes a stroke. Esc ends."; }
@@ -39,6 +48,7 @@ export class Paint {
     this.saved = new Set(told.vertices);
     this.painted = new Set(told.vertices);
     this.strokes = [];
+    this.undone = [];
   }
 
   /* Vertices that a view sees from ahead: { id, at: on its canvas, depth }. */
@@ -71,12 +81,19 @@ export class Paint {
       this.app.redraw();
     };
     dab(event);
-    return { move: dab, end: () => { this.strokes.push(before); this.app.panels(); } };
+    return { move: dab, end: () => { this.strokes.push(before); this.undone = []; this.app.panels(); } };
   }
 
-  undo() {
-    const before = this.strokes.pop();
-    if (before) this.painted = before;
+  undo() { this.#swap(this.strokes, this.undone); }
+
+  redo() { this.#swap(this.undone, this.strokes); }
+
+  #swap(from, to) {
+    const next = from.pop();
+    if (next) {
+      to.push(this.painted);
+      this.painted = next;
+    }
     this.app.redraw();
     this.app.panels();
   }

@@ -2,14 +2,18 @@
  * edits counts as given when the edit is saved: an edit that is lost or undone is asked again. */
 import { get, post } from "./api.js";
 import { button, make } from "./dom.js";
+import { UNSEEN, same } from "./draft.js";
 import { putPose } from "./pose.js";
+
+const POSES = ["object_poses", "object_pose"];
+const EDITED = { subject: ["subject"], sides: ["left_right"], lost: POSES, turn: POSES, contact: ["contact", UNSEEN] };
 
 export class Questions {
   constructor(app) {
     this.app = app;
     this.list = [];
     this.current = null;
-    this.pending = []; // answers that edit: { told, depth: steps of the draft with the edit }
+    this.pending = []; // answers that edit: { told, depth: steps of the draft with the edit, of: what it edits, was: before }
     app.draft.addEventListener("change", () => {
       const kept = this.pending.filter((one) => one.depth <= app.draft.done.length);
       if (kept.length === this.pending.length) return;
@@ -28,13 +32,17 @@ export class Questions {
 
   /* The draft was saved: what was answered by it is kept. */
   async saved() {
-    const given = this.pending;
+    const given = this.pending.filter(({ of, was }) => !same(this.#state(of), was)); // or nobody placed, turned or marked
+    const open = given.length < this.pending.length;
     this.pending = [];
+    if (open) await this.load();
     for (const { told } of given) {
       try { this.#take((await post(`sequences/${this.app.told.sequence}/answer`, told)).questions); } catch (error) { this.app.say(error.message); }
     }
     this.app.panels();
   }
+
+  #state(sections) { return sections.map((name) => this.app.draft.get(name)); }
 
   ask(question) {
     const { app } = this;
@@ -55,7 +63,8 @@ export class Questions {
     const opens = { mark: app.sides, place: pose, no: question.kind === "turn" ? pose : question.kind === "subject" ? app.subject : null }[answer];
     const told = { ...question, answer };
     // before the edit, so that the steps tell whether it is there
-    if (edits) this.pending.push({ told, depth: draft.done.length + (opens ? 1 : 0) });
+    const of = EDITED[question.kind], was = this.#state(of);
+    if (edits) this.pending.push({ told, of, was, depth: draft.done.length + (opens ? 1 : 0) });
     if (question.kind === "contact" && answer === "yes") contact.add(question.part, question.first, question.last + 1);
     if (question.kind === "contact" && answer === "no") contact.clear(question.part, question.first, question.last + 1);
     if (question.kind === "turn" && answer === "yes" && pose?.found(question.frame)) {
@@ -67,7 +76,9 @@ export class Questions {
       const set = app.setOf(app.told.cameras.findIndex((one) => one.name === camera), frame);
       draft.set("subject", [...(draft.get("subject") ?? []), { camera, frame: set, x, y }], "subject confirmed");
     }
-    if (edits) {
+    const nothing = edits && !opens && same(this.#state(of), was); // it is as answered already
+    if (nothing) this.pending = this.pending.filter((one) => one.told !== told);
+    if (edits && !nothing) {
       this.list = this.list.filter((one) => one.id !== question.id);
       this.pending.at(-1).depth = draft.done.length + (opens ? 1 : 0);
     } else {

@@ -3,6 +3,7 @@
 import { packed } from "./api.js";
 import { apply, project } from "./geometry.js";
 import { make } from "./dom.js";
+import { same } from "./draft.js";
 
 export const LEFT = "#56b4ff", RIGHT = "#ff8c1a"; // told apart in all common kinds of colour blindness
 const LETTERED = [2, 5]; // of a side's points: wrist and ankle
@@ -37,7 +38,7 @@ export class Sides {
   }
 
   /* Results are others by now. */
-  async again() { if (this.loading) { this.data = null; this.loading = null; await this.load(); } }
+  async again() { if (this.loading || this.app.layers.sides) { this.data = null; this.loading = null; await this.load(); } }
 
   // ---------------------------------------------------------------- what is stated, by image
   /* Images (C, sets) in which left and right are stated to be exchanged. */
@@ -58,9 +59,12 @@ export class Sides {
     return [...of(all, {}), ...own].sort((a, b) => a.start - b.start);
   }
 
-  entries() { return this.app.told.cameras.length ? this.#entries(this.#matrix()) : []; }
+  entries() { return this.app.told.cameras.length ? [...this.#entries(this.#matrix()), ...this.#others()] : []; }
 
-  #put(rows, says) { this.app.draft.set("left_right", this.#entries(rows), says); }
+  /* Of a camera that the recording has not, entries stay as they are until they are removed. */
+  #others() { return (this.app.draft.get("left_right") ?? []).filter((one) => one.camera && this.#index(one.camera) < 0); }
+
+  #put(rows, says, others = this.#others()) { this.app.draft.set("left_right", [...this.#entries(rows), ...others], says); }
 
   #index(camera) { return this.app.told.cameras.findIndex((one) => one.name === camera); }
 
@@ -88,6 +92,7 @@ export class Sides {
   /* An entry moved to other moments, or taken away. */
   move(one, start, end) {
     const rows = this.#matrix(), chosen = rows.filter((_, c) => !one.camera || c === this.#index(one.camera));
+    if (!chosen.length) { this.#put(rows, "left and right: frames removed", this.#others().filter((other) => !same(other, one))); return; }
     for (const row of chosen) row.fill(0, one.start, one.end);
     const c = Math.max(0, this.#index(one.camera));
     const next = { ...one, start: this.#set(c, start), end: this.#set(c, end - 1) + 1 };
@@ -109,7 +114,7 @@ export class Sides {
   /* The first press begins at the frame that is shown, the second one ends with it. */
   press(camera) {
     const { app } = this, key = camera ?? "", begun = this.open.get(key);
-    if (!app.told.frames) return;
+    if (!app.told.frames) { app.say("no images are there yet"); return; }
     this.show();
     if (begun) {
       this.open.delete(key);

@@ -1,5 +1,5 @@
 /* One time for all: flags, doubts and dropped frames, and a row of contact for each body part. */
-import { button, find, make, words } from "./dom.js";
+import { button, find, make, refill, words } from "./dom.js";
 import { id } from "./contact.js";
 import { posedFrames } from "./pose.js";
 import { sidesRows } from "./sides_panel.js";
@@ -183,9 +183,11 @@ export class Timeline {
     const end = event.target.dataset.end, from = this.#frameAt(event);
     let [start, stop] = [one.start, one.end];
     const move = (next) => {
-      const by = Math.round(this.#frameAt(next) - from);
-      start = end === "end" ? one.start : Math.min(Math.max(0, one.start + by), end ? one.end - 1 : app.told.frames - 1);
-      stop = end === "start" ? one.end : Math.max(Math.min(app.told.frames, one.end + by), end ? one.start + 1 : 1);
+      const lowest = end === "end" ? one.start + 1 - one.end : -one.start; // a whole bar keeps its length
+      const highest = end === "start" ? one.end - 1 - one.start : app.told.frames - one.end;
+      const by = Math.min(Math.max(Math.round(this.#frameAt(next) - from), lowest), highest);
+      start = one.start + (end === "end" ? 0 : by);
+      stop = one.end + (end === "start" ? 0 : by);
       this.#put(bar, start, stop);
       app.show(end === "end" ? stop - 1 : start);
     };
@@ -204,7 +206,7 @@ export class Timeline {
   }
 
   #bar() {
-    const { app, contact } = this, one = contact.selected && contact.under(app.frame);
+    const { app, contact } = this, one = contact.chosen(app.frame);
     const choose = make("select", { id: "part", onchange: () => {
       if (!choose.value) return;
       this.extra.add(choose.value);
@@ -214,7 +216,7 @@ export class Timeline {
     const state = contact.stated ? !contact.stated.length ? "nothing touches, as annotated"
       : `${contact.stated.length} intervals stated, ${contact.stated.filter((i) => !contact.looked(i)).length} of them as found`
       : contact.probability ? "contact as found: an edit takes it into the annotation" : "no contact is found yet";
-    find("contact-bar").replaceChildren(contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(one ? [
+    refill(find("contact-bar"), contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(one ? [
       make("b", {}, `${words(one.part)} ${one.start}–${one.end - 1}`),
       button("Confirm", () => contact.confirm(one), { title: "C" }),
       button("Starts here", () => contact.change(one, app.frame, one.end), { title: "[" }),

@@ -1,0 +1,27 @@
+"""A project that the tests of the page share, and a copy for each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import pytest
+
+from tests.annotate.served import artefact, copied, small_project
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    settings = small_project(tmp_path_factory.mktemp("browsed"), total=10)
+    with h5py.File(artefact(settings, "joint"), "r+") as file:
+        names = [name.decode() for name in file["region_names"][:]]
+        file["contact_probability"][...] = 0.02
+        file["contact_probability"][2:8, names.index("right_hand")] = 0.9
+        file["contact_probability"][4:8, names.index("seat")] = 0.45
+        file["contact_annotated"][...] = -1
+    return settings
+
+
+@pytest.fixture
+def settings(made: Path, tmp_path: Path) -> Path:
+    return copied(made, tmp_path / "project")
