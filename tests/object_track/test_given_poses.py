@@ -137,6 +137,10 @@ def test_one_view_beside_what_is_unseen_is_in_doubt(mesh):
     assert np.flatnonzero(at_edges(fits, unseen, [1, 6], np.arange(9) / 10)).tolist() == [8]
     assert not at_edges(fits, unseen, [], np.arange(9) / 10).any()
     assert np.flatnonzero(at_edges(fits, unseen, [5], np.arange(9.0))).tolist() == []
+    for count in (1, 2):
+        assert at_edges(fits[:count], unseen[:count], [0], np.arange(float(count))).shape == (
+            count,
+        )
 
 
 def test_what_is_said_against_a_given_pose(mesh):
