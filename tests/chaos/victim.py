@@ -42,6 +42,8 @@ class Victim:
                 env={**self.flow.environment, "COLUMNS": "400", **(environment or {})},
                 stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT,
                 start_new_session=True,
+                # tests that a shell runs in the background ignore Ctrl-C, and all that they start
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
             )  # fmt: skip
 
     def go_on(self) -> tuple[int, str]:
