@@ -134,6 +134,10 @@ def _run(
     watcher = Watcher(project, console)
     try:
         status = run_watched(command, watcher, console)
+        # a result that became the same as before hides from Snakemake what was damaged after it
+        if status == 0 and not arguments and not Plan(project).all_done():
+            watcher = Watcher(project, console)
+            status = run_watched(command, watcher, console)
     except ToldToEnd as end:
         _unlock(settings)
         words = f"{end}: {watcher.steps()} jobs were done, and are kept; the same command goes on"
