@@ -823,13 +823,10 @@ class Annotation(Model):
                 return f"subject[{index}] {_no_camera(point.camera, names)}"
         for index, sides in enumerate(self.left_right):
             if sides.camera is not None and sides.camera not in names:
-                return (
-                    f"left_right[{index}] names camera {sides.camera!r}, the cameras are "
-                    f"{', '.join(names)}"
-                )
+                return f"left_right[{index}] {_no_camera(sides.camera, names)}"
         for name in self.starts or ():
             if name not in names:
-                return f"starts names camera {name!r}, the cameras are {', '.join(names)}"
+                return f"starts {_no_camera(name, names)}"
         if self.starts and master not in self.starts:
             return (
                 f"starts lacks {master}, the master, beside which the others' are told (0 where "

@@ -373,7 +373,7 @@ def test_starts_of_cameras_that_are_not_there() -> None:
     assert stated.stated_starts == {"k1": (0.0, 0.02), "2": (-1.5, 0.1)}
     assert stated.check_cameras(["k1", "2"], "k1") is None
     said = str(stated.check_cameras(["k1", "k2", "k3"], "k1"))
-    assert said == "starts names camera '2', the cameras are k1, k2, k3"
+    assert said == "starts names camera '2'; the recording has k1, k2, k3"
     assert "lacks k3, the master" in str(stated.check_cameras(["k1", "2", "k3"], "k3"))
     assert Annotation().check_cameras(["k1"], "k1") is None and not Annotation().stated_starts
 

@@ -134,8 +134,9 @@ def _run(
     watcher = Watcher(project, console)
     try:
         status = run_watched(command, watcher, console)
-        # a result that became the same as before hides from Snakemake what was damaged after it
-        if status == 0 and not arguments and not Plan(project).all_done():
+        # below a job to run Snakemake looks at no marks (DAG.update_needrun): where the results
+        # between are as they were, what is out of date there is planned by another start alone
+        while status == 0 and not arguments and not watcher.idle and not Plan(project).all_done():
             watcher = Watcher(project, console)
             status = run_watched(command, watcher, console)
     except ToldToEnd as end:
@@ -328,6 +329,11 @@ class Watcher:
         said = self.transcript.read_text(encoding="utf-8", errors="replace")
         done, of = (STEPS.findall(said) or [("0", "?")])[-1]
         return f"{done} of {of}"
+
+    @property
+    def idle(self) -> bool:
+        """Whether Snakemake has said of no job that it is done."""
+        return self.steps().startswith("0 of ")
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:

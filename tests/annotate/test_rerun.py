@@ -60,6 +60,14 @@ def _ended(runs: rerun.Runs) -> None:
     _until(lambda: not runs.going_on)
 
 
+def _run(project: Project) -> rerun.Runs:
+    """One that has ended."""
+    runs = rerun.Runs()
+    runs.start(project, NAME)
+    _ended(runs)
+    return runs
+
+
 def test_a_run_asks_for_one_sequence_and_tells_how_far_it_is(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,10 +91,7 @@ def test_a_run_asks_for_one_sequence_and_tells_how_far_it_is(
 
 def test_a_run_that_fails_says_why(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
     _pretend(monkeypatch, "import sys; print('another run is going on'); sys.exit(1)")
-    runs = rerun.Runs()
-    runs.start(project, NAME)
-    _ended(runs)
-    told = runs.progress(project)
+    told = _run(project).progress(project)
     assert told["state"] == "failed" and "another run is going on" in told["words"]
 
 
@@ -161,9 +166,7 @@ def test_a_run_that_ended_on_a_terminal_counts_as_ended(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _pretend(monkeypatch, "import sys; sys.exit(1)")
-    runs = rerun.Runs()
-    runs.start(project, NAME)
-    _ended(runs)
+    _run(project)
     later = time.time() + 5
     for stage in SEQUENCE_STAGES:
         path = project.artefact(NAME, stage)
@@ -176,9 +179,7 @@ def test_the_result_before_is_kept_and_held_against_the_new_one(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _pretend(monkeypatch, "")
-    runs = rerun.Runs()
-    runs.start(project, NAME)
-    _ended(runs)
+    _run(project)
     joint = project.artefact(NAME, "joint")
     kept = before.before_paths(project, NAME)["joint"]
     assert os.path.samefile(joint, kept)  # without a copy

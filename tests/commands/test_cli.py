@@ -181,7 +181,7 @@ def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
         (
             "annotations/good.yaml",
             "starts: {k1: 0, k9: 0.5}",
-            "sequence 'good': annotations/good.yaml: starts names camera 'k9', the cameras are k1;",
+            "sequence 'good': annotations/good.yaml: starts names camera 'k9'; the recording has",
         ),
         (
             "annotations/good.yaml",

@@ -164,7 +164,7 @@ def test_a_wrong_table_stops_before_any_job(
         ("contact: [{part: seat, start: 4, end: 2}]\n", "contact.0: interval is reversed"),
         ("contact: [{part: seat, start: 4, end: 99}]\n", "contact[0].end is 99, the recording has"),
         ("floor: [[\n", "not valid YAML"),
-        ("starts: {k1: 0, k9: 0.4}\n", "starts names camera 'k9', the cameras are k1, k2, k3"),
+        ("starts: {k1: 0, k9: 0.4}\n", "starts names camera 'k9'; the recording has k1, k2, k3"),
         ("starts: {k2: 0, k3: 0.4}\n", "starts lacks k1, the master"),
     ],
 )

@@ -52,6 +52,20 @@ def test_killed_in_a_stage_and_with_damaged_results_it_goes_on(
     assert [name for name, same in identical(victim, peaceful).items() if not same] == []
 
 
+def test_damage_below_a_result_that_comes_to_the_same_is_mended_by_one_command(
+    victim: Victim, peaceful: Victim
+) -> None:
+    """Snakemake plans the first of these alone: between them all is as it was."""
+    for damaged in (
+        *(victim.flow.artefact(OTHER, stage) for stage in ("scene", "joint")),
+        victim.flow.results / "heatmaps.h5",
+    ):
+        damaged.write_bytes(damaged.read_bytes()[:-1000])
+    status, said = victim.go_on()
+    assert status == 0, said[-3000:]
+    assert [name for name, same in identical(victim, peaceful).items() if not same] == []
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_told_to_end_it_says_so_once_and_leaves_nothing(victim: Victim, number: int) -> None:
     victim.flow.artefact(ONE, "person").unlink()

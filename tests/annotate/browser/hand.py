@@ -56,3 +56,11 @@ def save(page: Visit, answer: str = "save") -> None:
     page.page.keyboard.press("Control+s")
     page.wait("document.getElementById('dialog').open")
     page.page.locator(f'[data-answer="{answer}"]').click()
+
+
+def keep_mine(page: Visit) -> None:
+    """In the dialog of a conflict, and save."""
+    page.page.locator('[data-answer="mine"]').click()
+    page.wait("document.getElementById('dialog-title').textContent.startsWith('Save')")
+    page.page.locator('[data-answer="save"]').click()
+    page.wait(SAVED)

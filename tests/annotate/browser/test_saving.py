@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.annotate.browser.hand import HAND, READY, SAVED, draft_of, open_page, save
+from tests.annotate.browser.hand import (
+    HAND,
+    READY,
+    SAVED,
+    draft_of,
+    keep_mine,
+    open_page,
+    save,
+)
 from tests.annotate.served import NAME, TOKEN, annotation, served
 from tests.helpers.browser import Visit, needs_chromium
 
@@ -21,10 +29,7 @@ def test_two_annotators_keep_both_changes(settings: Path) -> None:
         save(page)
         page.wait("document.getElementById('dialog-title').textContent.startsWith('Somebody')")
         assert "[8, 9]" in page.page.locator("#dialog").inner_text()
-        page.page.locator('[data-answer="mine"]').click()
-        page.wait("document.getElementById('dialog-title').textContent.startsWith('Save')")
-        page.page.locator('[data-answer="save"]').click()
-        page.wait(SAVED)
+        keep_mine(page)
     text = path.read_text()
     assert (
         "drop_frames: [8, 9]" in text and "right_hand" in text and text.startswith("# two people")
@@ -73,10 +78,7 @@ def test_edits_of_several_tabs_meet_what_was_saved_meanwhile(settings: Path) -> 
         page.page.get_by_text("Take them up again").click()
         page.wait("document.getElementById('dialog').open")
         assert "both changes can stand" in page.page.locator("#dialog").inner_text()
-        page.page.locator('[data-answer="mine"]').click()
-        page.wait("document.getElementById('dialog-title').textContent.startsWith('Save')")
-        page.page.locator('[data-answer="save"]').click()
-        page.wait(SAVED)
+        keep_mine(page)
         assert path.read_text() == "# two people\ndrop_frames: [8, 9]\n\ncontact: []\n"
         page.wait("document.querySelector('[data-banner=\"left\"]') !== null")
         assert "drop frames" in offered.inner_text()
