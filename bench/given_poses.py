@@ -1,6 +1,7 @@
 """What poses that somebody gives are worth: an object's track with none, one and more of them.
 
-    python -m bench.given_poses config/object/noise_2.yaml --sequences bottle_drink_s02
+    intercap run config/object/two_cameras_2.yaml -- --until object_track
+    python -m bench.given_poses
 
 tracks the object again from the stored artefacts, with poses from truth that are off by a
 centimetre and five degrees in frames in which the stored track is truly lost.
@@ -41,7 +42,7 @@ _COLUMNS = ("lost", "unseen", "mm", "p95", "deg", "there mm", "p95", "deg", "car
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "settings", type=Path, nargs="?", default=Path("config/object/noise_2.yaml")
+        "settings", type=Path, nargs="?", default=Path("config/object/two_cameras_2.yaml")
     )
     parser.add_argument("--sequences", nargs="*", help="those whose track is truly lost, else")
     parser.add_argument("--poses", type=int, nargs="*", default=[1, 2, 3])
@@ -74,7 +75,7 @@ def compare(
                 "said_lost_share": float(lost.mean()),
             }
             table.add_row(name, str(count), *(f"{value:.3g}" for value in own.values()))
-            add_figures(output, f"given_poses.{name}.{count}", own)
+            add_figures(output, f"given_poses.{project.config.dataset}.{name}.{count}", own)
     Console(width=140).print(table)
 
 
