@@ -28,7 +28,7 @@ from rich.table import Column, Table
 
 from bench.again import artefacts_of, check_run, compute_once
 from intercap_core.errors import UserError
-from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.project import Project, load_project
 
 SETTINGS = Path("config/evaluation/quick.yaml")
@@ -135,7 +135,7 @@ def _fit(project: Project, sequence: str, folder: Path) -> dict[str, Path]:
 
 
 def _figures(paths: Mapping[str, Mapping[str, Path]], *, sequential: bool) -> Figures:
-    from intercap_core.evaluation.sequences import areas
+    from intercap_core.commands.evaluate.sequences import areas
 
     found = areas([SequenceMetrics.read(by_stage["metrics"]) for by_stage in paths.values()])
     return {

@@ -13,13 +13,13 @@ import numpy as np
 from bench.ablation import EVERYTHING, WITHOUT_CONTACT, WITHOUT_SMOOTHNESS, WITHOUT_STICK
 from bench.figures import figure_class
 from intercap_core import artefacts
-from intercap_core.energy.stick import local_points
-from intercap_core.metrics.contact import CONTACT_M
-from intercap_core.metrics.proximity import PosedObject
-from intercap_core.metrics.tracks import read_body, read_object
-from intercap_core.metrics.truth import Truth
+from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core.evaluation.proximity import PosedObject
+from intercap_core.evaluation.tracks import read_body, read_object
+from intercap_core.evaluation.truth import Truth
+from intercap_core.joint.terms.stick_residual import local_points
+from intercap_core.output.site.closeups import SIDES, closeup, holds, read_handling
 from intercap_core.project import Project
-from intercap_core.report.closeups import SIDES, closeup, holds, read_handling
 from intercap_core.schemas import SCENE
 
 Paths = Mapping[str, Mapping[str, Mapping[str, Path]]]  # by variant, sequence and stage

@@ -28,15 +28,15 @@ from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.annotate.rerun import targets
 from intercap_core.commands.bench import put_figures
+from intercap_core.commands.evaluate.objects import measure
 from intercap_core.errors import UserError
-from intercap_core.evaluation.objects import measure
-from intercap_core.metrics import figures, hold_figures
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.metrics.flags import ranges
-from intercap_core.metrics.object_errors import ObjectErrors
-from intercap_core.metrics.times import match_times
+from intercap_core.evaluation import figures, hold_figures
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.flags import ranges
+from intercap_core.evaluation.object_errors import ObjectErrors
+from intercap_core.evaluation.times import match_times
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project, load_project
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import METRIC_REGIONS, SCENE, TRUTH
 
 OBJECT, CONTACT = "racquet_swing_s11", "bottle_drink_s02"

@@ -26,10 +26,10 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body_fit.observations import Observations, PersonCloud
-from intercap_core.camera import projection
-from intercap_core.metrics.proximity import Sight
-from intercap_core.rigid.surface_tree import SurfaceTree
-from intercap_core.solve.robust import geman_mcclure
+from intercap_core.evaluation.proximity import Sight
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.geometry.solve.robust import geman_mcclure
 
 HAND_COMPONENTS = 12
 KEYPOINT_SCALE_PX = 100.0

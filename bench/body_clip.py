@@ -22,8 +22,8 @@ from intercap_core.body_fit.observations import (
 )
 from intercap_core.config import BodyFitSettings
 from intercap_core.errors import UserError
-from intercap_core.metrics.body import vertex_error
-from intercap_core.metrics.truth import Truth
+from intercap_core.evaluation.body import vertex_error
+from intercap_core.evaluation.truth import Truth
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES
 

@@ -23,7 +23,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from intercap_core.capture.k4a import Recording
+from intercap_core.formats.recordings.k4a import Recording
 
 Blosc, Blosc2, Bitshuffle = hdf5plugin.Blosc, hdf5plugin.Blosc2, hdf5plugin.Bitshuffle
 CODECS: dict[str, Mapping[str, Any]] = {

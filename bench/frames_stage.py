@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
-from intercap_core.capture.frames import Frames
-from intercap_core.capture.k4a import Recording
 from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.formats.recordings.k4a import Recording
 from intercap_core.stages import frames as stage
 from intercap_core.studio.mkv import MkvWriter
 

@@ -22,15 +22,15 @@ from scipy.spatial.transform import Rotation
 
 from bench.command import add_figures
 from intercap_core import artefacts
+from intercap_core.commands.evaluate.objects import measure
 from intercap_core.config import ObjectPose
 from intercap_core.errors import UserError
-from intercap_core.evaluation.objects import measure
-from intercap_core.metrics import object_errors
-from intercap_core.metrics.object_errors import ObjectErrors
-from intercap_core.metrics.times import match_times
+from intercap_core.evaluation import object_errors
+from intercap_core.evaluation.object_errors import ObjectErrors
+from intercap_core.evaluation.times import match_times
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.pipeline import given
 from intercap_core.project import Project, load_project
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, SCENE, TRUTH
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import object_track

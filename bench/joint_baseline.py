@@ -34,9 +34,8 @@ from bench.object_baseline import Recipe as ObjectRecipe
 from bench.soft_rasteriser import OverdrawRasteriser, Pixels
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.kinematics import rotation_from_axis_angle
-from intercap_core.camera.transforms import rigid
-from intercap_core.energy.constants import PENETRATION_TOLERANCE
-from intercap_core.energy.proximity import proximity
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.solve.robust import geman_mcclure
 from intercap_core.joint.constants import (
     ACCELERATION_OUTLIER,
     BODY_ACCELERATION,
@@ -48,9 +47,10 @@ from intercap_core.joint.constants import (
     PENETRATION_SIGMA,
     VERTICES_PER_MEASUREMENT,
 )
+from intercap_core.joint.energy_constants import PENETRATION_TOLERANCE
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.proximity import proximity
 from intercap_core.joint.state import BODY, OBJECT_SHIFT, OBJECT_TURN, State
-from intercap_core.solve.robust import geman_mcclure
 
 STEPS = 700  # of L-BFGS: 100 and 600
 ROUND = 10  # steps between two looks at the clouds

@@ -13,30 +13,30 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model, load_pose_prior
+from intercap_core.body_fit.body_samples import choose_samples
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.body_fit.torch_terms import TorchTerms
-from intercap_core.capture.frames import Frames
 from intercap_core.config import JointSettings, ObjectTrackSettings
-from intercap_core.contact.detect import contact_probability
-from intercap_core.contact.motion import region_motion
-from intercap_core.contact.patches import contact_patches
-from intercap_core.detections.read import Detections
-from intercap_core.energy.body_samples import choose_samples
 from intercap_core.errors import UserError
+from intercap_core.evaluation import object_pose
+from intercap_core.evaluation.body import vertex_error
+from intercap_core.evaluation.truth import Truth
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.joint.contact.detect import contact_probability
+from intercap_core.joint.contact.motion import region_motion
+from intercap_core.joint.contact.patches import contact_patches
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.ground import Ground
-from intercap_core.metrics import object_pose
-from intercap_core.metrics.body import vertex_error
-from intercap_core.metrics.truth import Truth
 from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.view import View
 from intercap_core.project import Project
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
 from intercap_core.stages.object_track import ObjectRecording
 

@@ -20,13 +20,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bench.soft_rasteriser import OverdrawRasteriser, Pixels, Rasteriser, SoftRasteriser
-from intercap_core.camera.projection import project_with_jacobian
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera.projection import project_with_jacobian
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import render
+from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import View
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import render
-from intercap_core.rigid.shots import Rendering
 
 MARGIN_PX = 12  # of a tile around mask and prediction: how far a pose may stray
 COVERED = 0.5  # depth counts where the object is drawn at all

@@ -10,21 +10,21 @@ from functools import cached_property
 
 import numpy as np
 
-from intercap_core.camera.transforms import rigid
-from intercap_core.capture.frames import Frames
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
-from intercap_core.metrics import object_pose
-from intercap_core.metrics.truth import Truth
+from intercap_core.evaluation import object_pose
+from intercap_core.evaluation.truth import Truth
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.twist import moved
 from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View
 from intercap_core.project import Project
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import moved
 
 # Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
 ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)

@@ -10,9 +10,9 @@ import numpy as np
 from bench.figures import figure_class
 from bench.object_baseline import Recipe, fit_by_adam
 from bench.object_clip import ObjectClip
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.twist import moved
 from intercap_core.object_track.fit import fit_pose
-from intercap_core.rigid.twist import moved
 
 FRAMES = 10
 OFF_M, OFF_DEG = 0.03, 10.0

@@ -24,18 +24,18 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import rigid
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import CpuRenderer, Renderer, open_renderer
+from intercap_core.geometry.rigid.shots import Shot, Surface
+from intercap_core.geometry.rigid.twist import moved
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, reduced_lens
 from intercap_core.object_track.view import Candidate, View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import CpuRenderer, Renderer, open_renderer
-from intercap_core.rigid.shots import Shot, Surface
-from intercap_core.rigid.twist import moved
 
 VIEWS = (1, 2, 4, 6, 12, 16)
 FACES = (150, 600, 2400, 10_000)

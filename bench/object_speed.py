@@ -34,7 +34,7 @@ from bench.object_convergence import draw_convergence
 from bench.object_scaling import tracking_scaling
 from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
-from intercap_core.metrics.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
+from intercap_core.evaluation.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
 from intercap_core.object_track.constants import FIT_ROUNDS
 from intercap_core.object_track.fit import MotionPrior
 from intercap_core.object_track.given_poses import GivenPose

@@ -46,10 +46,10 @@ from rich.table import Column, Table
 from bench.again import artefacts_of, check_run, compute_once
 from bench.oracle_inputs import write_open_mesh, write_true_mesh, write_true_scene
 from intercap_core.commands.bench import put_figures
+from intercap_core.commands.evaluate.part import console_of, number
 from intercap_core.errors import UserError
-from intercap_core.evaluation.part import console_of, number
-from intercap_core.metrics import figures
-from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.evaluation import figures
+from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.project import Project, load_project
 
 SETTINGS = Path("config/evaluation/quick.yaml")

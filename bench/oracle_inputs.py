@@ -11,12 +11,12 @@ from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.rigid.contact_vertices import contact_list
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.joint.cameras import BIAS
-from intercap_core.rigid.contact_vertices import contact_list
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import SCENE, TRUTH
 
 REMOVED_SHARE = 0.1  # of the faces

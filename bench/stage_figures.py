@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.metrics import body, capture, contact, keypoints, object_errors
-from intercap_core.metrics import truth as truths
-from intercap_core.metrics.proximity import PosedObject
-from intercap_core.metrics.tracks import read_body, read_object
-from intercap_core.metrics.truth import Truth
+from intercap_core.evaluation import body, capture, contact, keypoints, object_errors
+from intercap_core.evaluation import truth as truths
+from intercap_core.evaluation.proximity import PosedObject
+from intercap_core.evaluation.tracks import read_body, read_object
+from intercap_core.evaluation.truth import Truth
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import METRIC_REGIONS, PERSON, SCENE
 
 Figures = dict[str, float]

@@ -33,9 +33,9 @@ COLUMNS = {
 
 def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
     """Errors of one recording's track, made in ``folder`` by the code that is imported."""
-    from intercap_core.metrics import object_errors
+    from intercap_core.evaluation import object_errors
+    from intercap_core.geometry.rigid.mesh import ObjectMesh
     from intercap_core.project import load_project
-    from intercap_core.rigid.mesh import ObjectMesh
     from intercap_core.stages import object_track
 
     project = load_project(settings)
@@ -56,7 +56,7 @@ def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
 
 def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]:
     """Figures by dataset, as ``intercap evaluate`` has them; see :func:`errors_of`."""
-    from intercap_core.metrics.object_errors import figures
+    from intercap_core.evaluation.object_errors import figures
     from intercap_core.project import load_project
 
     found = {}

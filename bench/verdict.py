@@ -3,7 +3,7 @@
     python -m bench.verdict METRICS [METRICS ...]
 
 METRICS are metrics.h5 of sequences with truth, best of many kinds of rigs and noise: stated errors
-can be trusted as far as those reach. Prints the factors for `intercap_core/verdict/constants.py`,
+can be trusted as far as those reach. Prints the factors for `intercap_core/evaluation/verdict/constants.py`,
 and how well errors are told of recordings of a kind (the folder above a sequence's) that was left
 out of the fit: the spread that is stated is of these.
 """
@@ -23,10 +23,10 @@ from scipy.optimize import least_squares
 from scipy.stats import spearmanr
 
 from intercap_core.errors import UserError
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.metrics.verdict_figures import WITHIN, stated_errors
-from intercap_core.verdict.constants import Factors
-from intercap_core.verdict.part import Part
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.verdict.constants import Factors
+from intercap_core.evaluation.verdict.part import Part
+from intercap_core.evaluation.verdict_figures import WITHIN, stated_errors
 
 SPREAD_SHARE = 0.8  # of the true errors that are within a part's spread
 # Of the jackknife's shift: what a single camera changes is an error, though the studio's stated

@@ -358,8 +358,8 @@ def release(
     """
     _prepare()
     from intercap_core.commands.release import check_release, write_release
+    from intercap_core.output.release.manifest import KINDS
     from intercap_core.project import load_project
-    from intercap_core.release.manifest import KINDS
 
     if check is not None:
         raise typer.Exit(0 if check_release(check) else 1)
@@ -430,8 +430,8 @@ def evaluate(
     Examples: intercap evaluate; intercap evaluate --only bodies --output body.json;
     intercap evaluate --only objects --seed 7 --output results/seed_7/evaluation.json
     """
-    from intercap_core.evaluation.evaluate import evaluate as run_evaluation
-    from intercap_core.evaluation.evaluate import evaluate_quick
+    from intercap_core.commands.evaluate.run import evaluate as run_evaluation
+    from intercap_core.commands.evaluate.run import evaluate_quick
 
     _check_output(output, replace_any=True)
     if quick and seed is not None:
@@ -552,7 +552,7 @@ def close_mesh(
 
     Example: intercap close-mesh scan.ply scan_closed.ply --widest-mm 30
     """
-    from intercap_core.rigid.closing import close_mesh as close
+    from intercap_core.geometry.rigid.closing import close_mesh as close
 
     widest = None if widest_mm is None else 1e-3 * widest_mm
     done = close(mesh, output, widest_m=widest, share=WIDEST_HOLE)

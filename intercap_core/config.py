@@ -600,7 +600,7 @@ class ObjectEntry(Model):
     """Watertight mesh in metres (.ply or .obj)."""
     contact_vertices: Path | None = None
     """Vertices that people are likely to touch: a JSON list (or one that also says on which mesh it
-    was chosen, see rigid/contact_vertices.py), or a pickle as InterCap released."""
+    was chosen, see geometry/rigid/contact_vertices.py), or a pickle as InterCap released."""
     symmetry: Symmetry = Symmetry()
     """Symmetry group."""
     labels: tuple[str, ...] = ()

@@ -26,11 +26,11 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
-from intercap_core.export.upright import z_up_frame
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.export.upright import z_up_frame
 from intercap_core.project import Project, load_project
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
 
 Z_UP, MASTER = "z-up", "master"  # frames beside those of the cameras, by name

@@ -20,8 +20,8 @@ from intercap_core.config import (
     SequenceEntry,
     SubjectEntry,
 )
-from intercap_core.detections.converters.label_maps import read_label_map
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.converters.label_maps import read_label_map
 from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
 from intercap_core.inputs.quotes import printable, quoted
 from intercap_core.inputs.yaml_files import read_yaml

@@ -22,7 +22,7 @@ from intercap_core.kernel_cache import (
 from intercap_core.pipeline.code_digest import ROOT, modules_reached
 
 FILES = {
-    "solve/__init__.py": "",
+    "geometry/solve/__init__.py": "",
     "solve/constants.py": "OFFSET = 10.0\n",
     "solve/inner.py": (
         "import numba\n\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + 1.0\n"

@@ -9,8 +9,8 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import read_parameters
-from intercap_core.camera.transforms import apply
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.posed import open_sequence
 from intercap_core.schemas import BODY_FIT, JOINT
 from tests.helpers import fitted_capture as fitted

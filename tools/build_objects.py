@@ -17,7 +17,7 @@ import trimesh
 from object_shapes import furniture, luggage, sports, vessels
 from object_shapes.parts import Built
 
-from intercap_core.rigid.contact_vertices import contact_list
+from intercap_core.geometry.rigid.contact_vertices import contact_list
 
 BUILDERS: dict[str, Callable[[], Built]] = {
     "01_suitcase": luggage.suitcase,

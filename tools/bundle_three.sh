@@ -5,7 +5,7 @@
 set -eu
 THREE=0.187.0
 ESBUILD=0.28.2
-target=$(cd "$(dirname "$0")/.." && pwd)/intercap_core/viewer/data
+target=$(cd "$(dirname "$0")/.." && pwd)/intercap_core/output/viewer/data
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 cd "$work"

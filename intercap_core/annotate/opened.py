@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.capture.frames import Frames
+from intercap_core.formats.recordings.frames import Frames
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES, SCENE
 from intercap_core.stage_list import SEQUENCE_STAGES

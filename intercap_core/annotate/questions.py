@@ -17,7 +17,7 @@ from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
 from intercap_core.errors import UserError
-from intercap_core.metrics.flags import ranges
+from intercap_core.evaluation.flags import ranges
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
 
 EVEN = (0.25, 0.75)  # probabilities of contact between which it is asked

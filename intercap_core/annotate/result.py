@@ -13,16 +13,16 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import rigid
 from intercap_core.errors import UserError
-from intercap_core.metrics.flags import ranges
+from intercap_core.evaluation.flags import ranges
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.viewer import page as page_of
+from intercap_core.output.viewer.content import gather
+from intercap_core.output.viewer.package import payload, unpacked
 from intercap_core.pipeline.record import read_record
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
-from intercap_core.viewer import page as page_of
-from intercap_core.viewer.content import gather
-from intercap_core.viewer.package import payload, unpacked
 
 DOUBTED = 1.5  # times the part's stated error: a frame that the verdict doubts
 _DRAWN = {

@@ -22,7 +22,7 @@ from intercap_core.annotate.annotator import Annotator, told_of
 from intercap_core.annotate.guard import App, Guard
 from intercap_core.annotate.opened import Opened
 from intercap_core.errors import UserError
-from intercap_core.viewer.package import DATA as VIEWER
+from intercap_core.output.viewer.package import DATA as VIEWER
 
 PAGE = Path(__file__).parent / "page"
 _KEEP = {

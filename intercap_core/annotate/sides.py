@@ -14,16 +14,16 @@ from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
-from intercap_core.metrics.exchanged import exchanged
-from intercap_core.metrics.flags import ranges
+from intercap_core.evaluation.exchanged import exchanged
+from intercap_core.evaluation.flags import ranges
+from intercap_core.formats.detections.read import Detections
+from intercap_core.output.viewer.package import payload
 from intercap_core.person.facing import against_build
 from intercap_core.person.sides import ARMS, LEGS, swapped
 from intercap_core.person.stated_sides import stated_images
 from intercap_core.schemas import BODY_FIT, JOINT, PERSON, SCENE
 from intercap_core.stages.person import subject_keypoints
-from intercap_core.viewer.package import payload
 
 POINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe")  # of each side
 BONES = ((0, 1), (1, 2), (3, 4), (4, 5), (5, 6))

@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
-from intercap_core.camera.clouds import master_points
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply, rigid
 from intercap_core.config import ObjectEntry, ObjectTrackSettings
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.camera.clouds import master_points
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import open_renderer
 from intercap_core.object_track.constants import (
     ASSESS_MIN_OVERLAP,
     SEEN_LOG_RATIO,
@@ -25,8 +27,6 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.fit import Fit, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.view import View
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import open_renderer
 from intercap_core.schemas import SCENE
 
 NEEDED = ("frames", "detections", "scene", "person")

@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 from intercap_core.annotate import document
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.contact_vertices import contact_list
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.mesh_files import load_mesh
 from intercap_core.project import Project, tidy
-from intercap_core.rigid.contact_vertices import contact_list
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.mesh_files import load_mesh
 
 _SAME = 1e-6  # of the object's size: a vertex of the file is this one of the mesh
 

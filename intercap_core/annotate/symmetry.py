@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from intercap_core.annotate import document
 from intercap_core.config import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project, tidy
-from intercap_core.rigid.symmetry import SymmetryGroup
 
 
 def read_symmetry(project: Project, entry: ObjectEntry) -> dict[str, Any]:

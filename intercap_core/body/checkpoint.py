@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.inputs.files import MAX_MODEL_BYTES, Unreadable, check_file
-from intercap_core.safe_pickle import PICKLE_ERRORS, check_program
+from intercap_core.inputs.safe_pickle import PICKLE_ERRORS, check_program
 
 # What makes tensors out of a file's storages; each only builds values
 _ALLOWED = {

@@ -30,27 +30,23 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import RestJoints, pose, rest_points
-from intercap_core.body_fit.constants import KEYPOINT_SCALE
-from intercap_core.body_fit.terms import Bodies, Columns, Observations, Targets, Views
-from intercap_core.energy import body_cloud_kernel, body_keypoints_kernel, body_self
-from intercap_core.energy.body_constants import (
-    SELF_REACH_M,
-    SELF_TOLERANCE_M,
-    SELF_WEIGHT,
-)
-from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.body_keypoints_kernel import Pieces
-from intercap_core.energy.body_priors_kernel import Priors, add_priors
-from intercap_core.energy.body_samples import Samples
-from intercap_core.energy.body_surface_kernel import (
+from intercap_core.body_fit import body_cloud_kernel, body_keypoints_kernel, body_self
+from intercap_core.body_fit.body_constants import SELF_REACH_M, SELF_TOLERANCE_M, SELF_WEIGHT
+from intercap_core.body_fit.body_keypoints import KeypointSet
+from intercap_core.body_fit.body_keypoints_kernel import Pieces
+from intercap_core.body_fit.body_priors_kernel import Priors, add_priors
+from intercap_core.body_fit.body_samples import Samples
+from intercap_core.body_fit.body_surface_kernel import (
     SelfPairs,
     add_plane_cost,
     add_self_cost,
     add_self_equations,
 )
-from intercap_core.energy.sightings_kernel import KeypointObservations
-from intercap_core.solve.levenberg_marquardt import NormalEquations
-from intercap_core.solve.thread_pool import ThreadPool
+from intercap_core.body_fit.constants import KEYPOINT_SCALE
+from intercap_core.body_fit.sightings_kernel import KeypointObservations
+from intercap_core.body_fit.terms import Bodies, Columns, Observations, Targets, Views
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 
 _SHAPE = TRANSL.stop
 

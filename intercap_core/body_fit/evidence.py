@@ -15,6 +15,12 @@ from torch import Tensor
 
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit import body_cloud, body_keypoints, body_samples, body_self
+from intercap_core.body_fit.body_cloud import CloudRows
+from intercap_core.body_fit.body_keypoints import KeypointSet
+from intercap_core.body_fit.body_samples import COVERINGS
+from intercap_core.body_fit.body_self import SelfContact
+from intercap_core.body_fit.body_surface import Surface
 from intercap_core.body_fit.constants import (
     CONFIDENCE_BINS,
     FEWEST_IN_BIN,
@@ -35,16 +41,10 @@ from intercap_core.body_fit.matching import Matcher, Skin
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.terms import Views
-from intercap_core.camera.rig import Rig
-from intercap_core.energy import body_cloud, body_keypoints, body_samples, body_self
-from intercap_core.energy.body_cloud import CloudRows
-from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.body_samples import COVERINGS
-from intercap_core.energy.body_self import SelfContact
-from intercap_core.energy.body_surface import Surface
-from intercap_core.solve.robust import SIGMA_PER_MAD
-from intercap_core.solve.thread_pool import ThreadPool
-from intercap_core.solve.velocity import limited_velocity
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
+from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.velocity import limited_velocity
 
 
 def measured_doubt(confidence: Tensor, error: Tensor) -> float:

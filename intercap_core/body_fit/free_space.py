@@ -6,7 +6,7 @@ person begins:
 
     e = -d - c,    d = the way along -n, in the image, to the first pixel not seen through,
 
-c the covering's thickness as in :mod:`intercap_core.energy.body_cloud`. The person's mask is not
+c the covering's thickness as in :mod:`intercap_core.body_fit.body_cloud`. The person's mask is not
 used, so one that is too small, or lacks a hand, adds no bias; an occluder is nearer than the
 vertex, and pixels without depth are unknown: neither has a residual.
 """
@@ -25,7 +25,7 @@ from intercap_core.body_fit.constants import (
     FREE_SPACE_REACH_M,
     FREE_SPACE_STEP_M,
 )
-from intercap_core.camera.rig import Camera
+from intercap_core.geometry.camera.rig import Camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from intercap_core.camera.projection_kernels import project_point
+from intercap_core.geometry.camera.projection_kernels import project_point
 
 
 @numba.njit(cache=True, nogil=True)

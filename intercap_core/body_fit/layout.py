@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.constants import (
     COVERING_PRIOR_PER_FRAME,
     OFFSET_PRIOR_PER_FRAME,
@@ -22,8 +23,7 @@ from intercap_core.body_fit.constants import (
 )
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.terms import Columns
-from intercap_core.energy.body_samples import COVERINGS
-from intercap_core.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 NUM_OFFSETS = 25  # OpenPose's body keypoints
 

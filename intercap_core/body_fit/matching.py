@@ -1,6 +1,6 @@
 """What one frame's depth and masks say of each sample of the skin, camera by camera: E_D.
 
-Points of the person meet the surface (:mod:`intercap_core.energy.body_cloud`), vertices that a
+Points of the person meet the surface (:mod:`intercap_core.body_fit.body_cloud`), vertices that a
 camera looks past stick out (:mod:`.free_space`), and rims of masks touch (:mod:`.outlines`).
 """
 
@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body_fit import body_cloud
+from intercap_core.body_fit.body_cloud import Matches
+from intercap_core.body_fit.body_samples import Samples
+from intercap_core.body_fit.body_surface import Surface
 from intercap_core.body_fit.constants import CLOUD_HUBER_M, FREE_SPACE_TRUST, OUTLINE_TRUST
 from intercap_core.body_fit.free_space import seen_through
 from intercap_core.body_fit.observations import PersonCloud
 from intercap_core.body_fit.outlines import RimSamples, touching
-from intercap_core.camera.rig import Rig
-from intercap_core.energy import body_cloud
-from intercap_core.energy.body_cloud import Matches
-from intercap_core.energy.body_samples import Samples
-from intercap_core.energy.body_surface import Surface
+from intercap_core.geometry.camera.rig import Rig
 
 
 class Skin(NamedTuple):

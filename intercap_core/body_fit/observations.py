@@ -24,15 +24,15 @@ from intercap_core.body_fit.constants import (
 )
 from intercap_core.body_fit.free_space import DepthWindow
 from intercap_core.body_fit.outlines import Outline, outline
-from intercap_core.camera.mask_pixels import mask_pixels, mask_window
-from intercap_core.camera.masks import Runs
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply
-from intercap_core.capture.frames import Frames
-from intercap_core.detections.read import FROM_DETECTOR
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import FROM_DETECTOR
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
+from intercap_core.geometry.camera.masks import Runs
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.schemas import PERSON, SCENE
-from intercap_core.solve.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True, eq=False)

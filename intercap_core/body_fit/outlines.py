@@ -7,7 +7,7 @@ the rim's tangent span touches the surface where the normals agree. There the di
 
 with the camera's centre o, the plane's outward normal N, the vertex v of the body whose normal and
 place in the image are nearest, and the covering's thickness c as in
-:mod:`intercap_core.energy.body_cloud`. A rim at the image's border is not the person's, nor one
+:mod:`intercap_core.body_fit.body_cloud`. A rim at the image's border is not the person's, nor one
 where another detected thing begins, which may be in front. Masks made from the images alone have
 the form that was expected, but for what moved before a known background.
 """
@@ -21,6 +21,9 @@ import cv2
 import numpy as np
 
 from intercap_core.body_fit import outlines_kernel
+from intercap_core.body_fit.body_constants import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M
+from intercap_core.body_fit.body_samples import Samples
+from intercap_core.body_fit.body_surface import Surface
 from intercap_core.body_fit.constants import (
     BESIDE_AT_720P,
     OUTLINE_BLUR_PX,
@@ -29,12 +32,9 @@ from intercap_core.body_fit.constants import (
     OUTLINE_POINTS,
     SHORTEST_OUTLINE_PX,
 )
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.mask_pixels_kernel import drawn
-from intercap_core.camera.masks import Runs
-from intercap_core.energy.body_constants import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M
-from intercap_core.energy.body_samples import Samples
-from intercap_core.energy.body_surface import Surface
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.mask_pixels_kernel import drawn
+from intercap_core.geometry.camera.masks import Runs
 
 _BORDER_PX = 2  # of the image
 

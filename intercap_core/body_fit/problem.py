@@ -13,16 +13,16 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.vposer import PoseGaussian
+from intercap_core.body_fit import body_self
+from intercap_core.body_fit.body_cloud import CloudRows
+from intercap_core.body_fit.body_keypoints import KeypointSet
+from intercap_core.body_fit.body_samples import COVERINGS, Samples
 from intercap_core.body_fit.compiled_terms import CompiledTerms
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.layout import Layout, Shared
 from intercap_core.body_fit.terms import Bodies, Observations, Targets, Terms, Views
 from intercap_core.body_fit.torch_terms import TorchTerms
-from intercap_core.energy import body_self
-from intercap_core.energy.body_cloud import CloudRows
-from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.body_samples import COVERINGS, Samples
-from intercap_core.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 
 def terms_on(device: torch.device, model: BodyModel, samples: Samples) -> Terms:
@@ -33,7 +33,7 @@ def terms_on(device: torch.device, model: BodyModel, samples: Samples) -> Terms:
 
 @dataclass
 class BodyProblem:
-    """E_B of T frames; see :class:`intercap_core.solve.levenberg_marquardt.Problem`.
+    """E_B of T frames; see :class:`intercap_core.geometry.solve.levenberg_marquardt.Problem`.
 
     keypoints: those that take part, the 25 of the body first. base (T,P): parameters that are not
     fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they

@@ -22,7 +22,7 @@ from intercap_core.body_fit.constants import (
     RECOVERED_COST_SLACK,
 )
 from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.solve.levenberg_marquardt import minimise
+from intercap_core.geometry.solve.levenberg_marquardt import minimise
 
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 

@@ -14,6 +14,7 @@ from intercap_core.body.keypoints import BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import VPoser
+from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.constants import (
     CLOUD_REACH_M,
     KEYPOINT_SCALE,
@@ -30,9 +31,8 @@ from intercap_core.body_fit.recover import recover
 from intercap_core.body_fit.start import between, place_trunk, turned_around
 from intercap_core.body_fit.terms import Targets, Terms
 from intercap_core.config import BodyFitSettings
-from intercap_core.energy.body_samples import COVERINGS
+from intercap_core.geometry.solve.levenberg_marquardt import Solution, minimise
 from intercap_core.progress import Progress
-from intercap_core.solve.levenberg_marquardt import Solution, minimise
 
 log = logging.getLogger(__name__)
 

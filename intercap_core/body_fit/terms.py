@@ -14,10 +14,10 @@ import numpy as np
 from torch import Tensor
 
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.energy.body_cloud import CloudRows
-from intercap_core.energy.body_keypoints import KeypointSet
-from intercap_core.energy.body_self import Pairs
-from intercap_core.solve.levenberg_marquardt import NormalEquations
+from intercap_core.body_fit.body_cloud import CloudRows
+from intercap_core.body_fit.body_keypoints import KeypointSet
+from intercap_core.body_fit.body_self import Pairs
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 
 @dataclass

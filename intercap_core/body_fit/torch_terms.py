@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit import body_cloud, body_keypoints, body_priors, body_self
+from intercap_core.body_fit.body_cloud import CloudRows
+from intercap_core.body_fit.body_keypoints import Keypoints, PointTerm
+from intercap_core.body_fit.body_samples import Samples
 from intercap_core.body_fit.constants import KEYPOINT_SCALE
 from intercap_core.body_fit.terms import Bodies, Columns, Observations
-from intercap_core.energy import body_cloud, body_keypoints, body_priors, body_self
-from intercap_core.energy.body_cloud import CloudRows
-from intercap_core.energy.body_keypoints import Keypoints, PointTerm
-from intercap_core.energy.body_samples import Samples
-from intercap_core.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 _CHUNK = 32  # frames whose dense rows are held at once
 
@@ -53,7 +53,7 @@ class KeypointTerm:
     projection of view v, J_i^v the detection, w its confidence, sigma its standard deviation (the
     paper's k is 1 / sigma^2), rho that of Geman and McClure. Triangulated keypoints, where there
     are any, count in the same way by their distance in metres. See
-    :mod:`intercap_core.energy.body_keypoints`.
+    :mod:`intercap_core.body_fit.body_keypoints`.
     """
 
     model: BodyModel
@@ -136,7 +136,7 @@ class CloudTerm:
 
     v_s is a sample of the skin, n_s the surface's normal there, target_s the mean place along it of
     the person's points that were matched to the sample, c_g the thickness of its covering. See
-    :mod:`intercap_core.energy.body_cloud`.
+    :mod:`intercap_core.body_fit.body_cloud`.
     """
 
     model: BodyModel
@@ -190,7 +190,7 @@ class SelfPenetrationTerm:
     """(5) E_P_self = weight sum over pairs of rho(d) / 2, d = max(0, -n . (p - q) - tolerance).
 
     p is a sample of one part of the body, q the point of another part that it is behind, n the
-    normal there. See :mod:`intercap_core.energy.body_self`.
+    normal there. See :mod:`intercap_core.body_fit.body_self`.
     """
 
     model: BodyModel
@@ -233,7 +233,7 @@ class PriorTerm:
     """E_theta_b + E_theta_h + E_theta_f + E_alpha + E_psi, and E_beta of a frame's own shape.
 
     The priors of equation 2, and joint limits beyond the paper: see
-    :mod:`intercap_core.energy.body_priors`. E_beta of a shared shape is in :mod:`.layout`.
+    :mod:`intercap_core.body_fit.body_priors`. E_beta of a shared shape is in :mod:`.layout`.
     """
 
     model: BodyModel

@@ -12,8 +12,8 @@ from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
 if TYPE_CHECKING:
-    from intercap_core.capture.source import Layout
     from intercap_core.commands.check_recordings import Looked
+    from intercap_core.formats.recordings.source import Layout
 
 LABELS_TOLD = 8  # labels that a note names
 
@@ -61,12 +61,12 @@ def check_detector(project: Project) -> list[Fault]:
     """
     settings = project.config.detections
     if settings.keypoint_model is not None:
-        from intercap_core.detections.models.onnx_pose import PoseModel
+        from intercap_core.formats.detections.models.onnx_pose import PoseModel
 
         PoseModel.load(settings)
     if settings.segmentation_model is None:
         return []
-    from intercap_core.detections.models.onnx_segmentation import Segmenter
+    from intercap_core.formats.detections.models.onnx_segmentation import Segmenter
 
     classes = Segmenter.load(settings).classes
     return [
@@ -137,7 +137,7 @@ def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str
     """Say which entry of the annotation is of no camera of the recordings, where those can be
     looked at and no frames have been read of them; what else is wrong with them is told elsewhere.
     """
-    from intercap_core.capture.layouts import open_layout
+    from intercap_core.formats.recordings.layouts import open_layout
 
     row = project.sequences[name]
     if not annotation.names_cameras or project.recordings_made(name) is not None:
@@ -165,9 +165,9 @@ def notes_of_sequences(project: Project) -> list[Fault]:
 
 
 def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
-    from intercap_core.capture.layouts import open_layout
-    from intercap_core.detections.candidate_files import has_candidates
-    from intercap_core.detections.keypoint_files import has_keypoints
+    from intercap_core.formats.detections.candidate_files import has_candidates
+    from intercap_core.formats.detections.keypoint_files import has_keypoints
+    from intercap_core.formats.recordings.layouts import open_layout
 
     try:
         layout = open_layout(row)
@@ -218,7 +218,7 @@ def _notes_of_keypoints(
     cameras: list[str],
 ) -> list[str]:
     """What a look at the first people of each camera shows: their form, place and confidence."""
-    from intercap_core.detections.keypoint_check import look_at_keypoints
+    from intercap_core.formats.detections.keypoint_check import look_at_keypoints
 
     notes: list[str] = []
     for name in cameras:
@@ -245,8 +245,8 @@ def _notes_of_candidates(
     cameras: list[str],
 ) -> list[str]:
     """What a look at the first results of each camera shows: their form, size and labels."""
-    from intercap_core.detections.candidate_check import look_at_candidates
-    from intercap_core.detections.converters.label_maps import class_names
+    from intercap_core.formats.detections.candidate_check import look_at_candidates
+    from intercap_core.formats.detections.converters.label_maps import class_names
 
     assert row.candidates is not None
     settings = project.config.detections
@@ -286,7 +286,7 @@ def _annotations_without_sequence(project: Project) -> list[Fault]:
 
 def _look_at_mesh(project: Project, name: str, found: Findings) -> str | None:
     """Why an object's mesh cannot be used; what is said of one that can is noted."""
-    from intercap_core.rigid import mesh
+    from intercap_core.geometry.rigid import mesh
 
     said = _Kept()
     mesh.log.addHandler(said)
@@ -356,8 +356,8 @@ def faults_of_truth(path: Path) -> list[str]:
 
 
 def _look_at_recordings(row: SequenceEntry, settings: FramesSettings) -> Looked:
-    from intercap_core.capture.layouts import open_layout
     from intercap_core.commands.check_recordings import Looked, look_at_recordings
+    from intercap_core.formats.recordings.layouts import open_layout
 
     try:
         layout = open_layout(row)

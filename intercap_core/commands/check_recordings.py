@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from intercap_core.capture.glance import Glance
-from intercap_core.capture.source import Layout
 from intercap_core.config import SequenceEntry
-from intercap_core.detections import candidate_files, keypoint_files
 from intercap_core.errors import UserError
+from intercap_core.formats.detections import candidate_files, keypoint_files
+from intercap_core.formats.recordings.glance import Glance
+from intercap_core.formats.recordings.source import Layout
 
 # Of what the others last, or of what a file or its rate states: below the first a recording is of
 # little use and a problem, below the second it is noted.

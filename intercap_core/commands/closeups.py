@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from intercap_core.errors import UserError
+from intercap_core.output.site.closeups import closeup, holds, read_handling
 from intercap_core.project import load_project
-from intercap_core.report.closeups import closeup, holds, read_handling
 from intercap_core.stage_list import SEQUENCE_STAGES
 
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from intercap_core.errors import UserError
-from intercap_core.metrics.compare import SAME, Comparison, compare
+from intercap_core.evaluation.compare import SAME, Comparison, compare
 
 ROWS = 40  # sequences printed; all are in the tables
 TABLES = ("compare_sequences.csv", "compare_frames.csv", "compare_figures.csv")

@@ -15,7 +15,6 @@ from pydantic import BaseModel
 
 from intercap_core import schemas
 from intercap_core.artefacts import Schema
-from intercap_core.commands import architecture
 from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
 
 ENTRIES: dict[str, tuple[type[BaseModel], str, str]] = {
@@ -49,7 +48,6 @@ def contents() -> dict[str, str]:
         "config/config.yaml": default_settings(),
         "config/README.md": settings_page(),
         "docs/artefacts.md": artefacts_page(),
-        "docs/architecture.md": architecture.page(),
     }
     for name, (model, _, _) in ENTRIES.items():
         text = json.dumps(model.model_json_schema(), indent=2) + "\n"

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from intercap_core import artefacts, schemas
 from intercap_core.errors import UserError
-from intercap_core.metrics.flags import ranges
+from intercap_core.evaluation.flags import ranges
 
 TEXTS_TOLD = 30  # lines of one dataset
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from intercap_core import schemas
 from intercap_core.errors import UserError
-from intercap_core.metrics.summary import SequenceSummary
+from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.output.release import manifest
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.project import Project, tidy
-from intercap_core.release import manifest
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from intercap_core.versions import versions
 

@@ -6,9 +6,9 @@ import webbrowser
 from pathlib import Path
 
 from intercap_core.errors import UserError
+from intercap_core.output.viewer import page
 from intercap_core.project import Project
 from intercap_core.stage_list import SEQUENCE_STAGES
-from intercap_core.viewer import page
 
 _NEEDED = ("frames", "scene", "body_fit")
 

@@ -1,208 +1,193 @@
-"""The field's part of `intercap evaluate` that ends with the metrics, of people alone with exports.
+"""Errors of the scene artefact of recordings as they are made outside a studio.
 
-No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam,
-somebody else in the room;
-what the verdict without truth tells of them.
+Cameras out of step, rooms whose measured surface is mostly floor, feet that leave the floor.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from rich.table import Table
 
 from intercap_core import artefacts
-from intercap_core.body.artefact import load_model
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.bench import judgement
-from intercap_core.evaluation.part import Figures, Measured, Part, console_of, keyed, number
-from intercap_core.metrics import figures, subject_right
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.metrics.verdict_figures import TRUE, stated_errors, verdict_figures
-from intercap_core.project import Project
-from intercap_core.schemas import FRAMES, JOINT, TRUTH
-from intercap_core.stages.export import MARKER
-from intercap_core.studio.subjects import Subject
+from intercap_core.evaluation.body import FOOT_JOINTS
+from intercap_core.evaluation.capture import MEDIAN_CHI_1
+from intercap_core.evaluation.extrinsics import CUBE_SIDE_M, displacement, rig_centre
+from intercap_core.evaluation.planted import Floor
+from intercap_core.evaluation.times import match_times
+from intercap_core.schemas import FRAMES, SCENE, TRUTH
 
-NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
-BUILDS, SHOES, PASSER_BY = "field_builds", "field_shoes", "field_passer_by"
-_BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
-_BONES = (
-    ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
-)  # fmt: skip
-_WIDTH = 122
+WORSE_M = 0.001  # by more than this a camera ends worse than it was given
 
 
 @dataclass(frozen=True, eq=False)
-class FieldSequence:
-    """What stage ``metrics`` has measured; the relative errors (B,) of the limbs' lengths, and the
-    error of the person's height, metres; of all images with a chosen person the share in which it
-    is the subject; whether there is an export of a body and of no object."""
+class FieldScene:
+    """Of one recording's cameras (N,) but the master, those that have images.
 
-    metrics: SequenceMetrics
-    bones: np.ndarray
-    height_m: float
-    subject_right: float
-    exported_alone: bool
+    ``apart_s`` true time by which a camera's images are older than its sets say; ``late_s`` the
+    error of the stated one, the median over images, ``sigma_s`` its stated deviation;
+    ``set_aside``: the scene says that it cannot tell. ``before`` and ``after`` of the extrinsics
+    and their ``stated`` deviation, metres, RMS displacement over a 2 m cube. ``floor_m`` by how
+    much the floor is off under the true feet, in the mean, and ``tilt_deg`` its tilt; NaN without
+    a floor.
+    """
 
-
-FieldSequences = Measured[FieldSequence]
-
-
-def measure(project: Project, sequence: str) -> FieldSequence:
-    """Errors of one recording after ``metrics``."""
-    row = project.sequences[sequence]
-    assert row.truth is not None
-    joint = project.artefact(sequence, "joint")
-    with artefacts.read(joint, JOINT) as fitted, artefacts.read(row.truth, TRUTH) as true:
-        gender = project.subjects[row.subject].gender
-        model = load_model(project.config.body_models, gender, fitted)
-        shape = torch.as_tensor(np.atleast_2d(fitted["betas"]), dtype=model.dtype)
-        rest = model.zeros(1)
-        rest.betas = shape
-        with torch.no_grad():
-            vertices = model.forward(rest).vertices[0].numpy()
-        own, known = (_lengths(a["joints"]) for a in (fitted, true))
-        person = Subject.load(str(true.attributes["subject"]))
-    height = float(np.ptp(vertices[:, 1])) - float(np.ptp(person.rest[:, 1]))
-    metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
-    chosen, scene = (project.artefact(sequence, stage) for stage in ("person", "scene"))
-    right = subject_right.measure(chosen, scene, row.truth)
-    alone = exported_alone(project.artefact(sequence, "export"))
-    return FieldSequence(metrics, own / known - 1, height, right, alone)
+    sequence: str
+    fps: float
+    apart_s: np.ndarray
+    late_s: np.ndarray
+    sigma_s: np.ndarray
+    set_aside: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    stated: np.ndarray
+    floor_m: float
+    tilt_deg: float
 
 
-def exported_alone(folder: Path) -> bool:
-    """Whether ``folder`` is a whole export that moves a body and knows of no object."""
-    if not (folder / MARKER).is_file():
-        return False
-    told = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    there = all((folder / name).is_file() for name in told["files"])
-    named = {Path(name).name for name in told["files"]}
-    return there and "body.npz" in named and "object.npz" not in named and not told["object"]
+def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
+    """Compare one scene with its truth; raises UserError where an artefact cannot be read."""
+    with (
+        artefacts.read(frames, FRAMES) as recorded,
+        artefacts.read(scene, SCENE) as found,
+        artefacts.read(truth, TRUTH) as true,
+    ):
+        fps, names = float(found.attributes["fps"]), found.text("camera_names")
+        at = match_times(truth, true["times"], found["times"], fps)
+        order = [true.text("camera_names").index(name) for name in names]
+        master = names.index(str(found.attributes["master"]))
+        index: np.ndarray = recorded["colour_index"]
+        available = index >= 0
+        late, true_late = (
+            np.where(available, slip / fps - offset, np.nan)
+            for slip, offset in (
+                (found["slip"], found["time_offset"]),
+                (true["slip"][at][:, order], true["time_offset"][order]),
+            )
+        )
+        apart = np.nanmedian(true_late, axis=0)
+        error = np.nanmedian(late - true_late, axis=0)
+        unseen = np.asarray((found["image_of"] < 0).all(axis=0))
+        poses = true["master_from_colour"][order]
+        before, after = (
+            displacement(found[key], poses, master)
+            for key in ("master_from_colour_start", "master_from_colour")
+        )
+        stated = stated_displacement(found["master_from_colour"], found["camera_covariance"])
+        feet = true["joints"][at][:, FOOT_JOINTS].reshape(-1, 3)
+        floor_m, tilt_deg = floor_error(
+            found["ground_point"],
+            found["ground_normal"],
+            Floor(true["ground_normal"], float(true.attributes["ground_offset"])),
+            feet,
+        )
+        counted = available.any(axis=0) & (np.arange(len(names)) != master)
+        return FieldScene(
+            str(found.attributes["sequence"]),
+            fps,
+            (apart - apart[master])[counted],
+            (error - error[master])[counted],
+            found["time_offset_sigma"][counted],
+            unseen[counted],
+            before[counted],
+            after[counted],
+            stated[counted],
+            floor_m,
+            tilt_deg,
+        )
 
 
-def last_stage(project: Project) -> str | None:
-    """People alone are taken to the export; what else there is ends with the metrics."""
-    return "export" if project.config.dataset == ALONE else None
+def floor_error(
+    point: np.ndarray, normal: np.ndarray, true: Floor, feet: np.ndarray
+) -> tuple[float, float]:
+    """How far a floor through ``point`` (3,) with ``normal`` (3,) is from the ``true`` one, in the
+    mean over the places of the true floor under ``feet`` (N, 3), metres, and the angle between
+    them, degrees. NaN without a floor."""
+    if not np.isfinite(normal).all():
+        return float("nan"), float("nan")
+    under = feet - true.height(feet)[:, None] * true.normal
+    angle = np.degrees(np.arccos(np.clip(normal @ true.normal, -1.0, 1.0)))
+    return float(np.abs((under - point) @ normal).mean()), float(angle)
 
 
-def seconds(project: Project, sequence: str) -> Figures:
-    """``verdict.seconds_per_frame`` of one recording, as `intercap bench` has it."""
-    with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
-        frames = len(recorded["times"])
-    return judgement(project.path, sequence, frames)
+def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """RMS displacement (C,) over the points of a 2 m cube at the rig's centre, metres, that the
+    covariance (C, 7, C, 7) of rotation about the camera's centre, translation and depth bias
+    states."""
+    arms = rig_centre(master_from_camera) - master_from_camera[:, :3, 3]
+    result = np.empty(len(arms))
+    for c, arm in enumerate(arms):
+        own = covariance[c, :6, c, :6]
+        across = np.cross(np.eye(3), arm)  # row i: the shift of the arm by a turn about axis i
+        by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
+        at_centre = np.trace(by_pose @ own @ by_pose.T)
+        turn = np.trace(own[:3, :3])
+        result[c] = np.sqrt(at_centre + CUBE_SIDE_M**2 / 12 * 2 * turn)
+    return result
 
 
-def _lengths(joints: np.ndarray) -> np.ndarray:
-    """Median lengths (B,) of the limbs' bones over time, of joints (T, 55, 3)."""
-    ends = [
-        [JOINT_INDEX[f"{side}_{name}"] for name in bone]
-        for side in ("left", "right")
-        for bone in _BONES
-    ]
-    a, b = np.array(ends).T
-    return np.median(np.linalg.norm(joints[:, a] - joints[:, b], axis=2), axis=0)
+def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Of recordings whose cameras started apart; milliseconds.
 
-
-def flat(evaluations: Sequence[FieldSequences]) -> Figures:
-    """Keys ``field.<measure>`` and ``verdict.<measure>``."""
-    every = [e.metrics for found in evaluations for e in found.errors]
-    found = keyed("verdict.", verdict_figures(every))
-    flags = figures.flag_figures([m for m in every if m.has_truth])
-    for key, name in (("flag_recall", "bad_recall"), ("flag_precision", "bad_precision")):
-        if key in flags:
-            found[f"field.{name}"] = flags[key]
-    for dataset, name in ((NO_DEPTH, "no_depth"), (BUILDS, "builds"), (SHOES, "shoes")):
-        some = [e for found in evaluations if found.dataset == dataset for e in found.errors]
-        found |= keyed(f"field.{name}_", _of_bodies(some)) if some else {}
-    if "field.builds_pve_mm" in found and "field.no_depth_pve_mm" in found:
-        found["field.builds_ratio"] = found["field.builds_pve_mm"] / found["field.no_depth_pve_mm"]
-    on_beam = [e.metrics for some in evaluations if some.dataset == BEAM for e in some.errors]
-    for stage in ("body_fit", "joint"):
-        suffix = "" if stage == "joint" else f"_{stage}"
-        for key in _BEAM_KEYS:
-            values = figures.pooled(on_beam, f"truth/{stage}/{key}")
-            if values is not None and np.isfinite(values).any():
-                unit = "mm_s" if key == "planted_speed" else "mm"
-                name = key.removeprefix("body_").removesuffix("_speed")
-                found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
-    several = [found for found in evaluations if found.dataset == PASSER_BY]
-    if several:
-        shares = [e.subject_right for some in several for e in some.errors]
-        shares += [0.0 for some in several for _ in some.missing]
-        found["field.subject_right_share"] = float(np.mean(shares))
-        if every := [e.metrics for some in several for e in some.errors]:
-            found["field.passer_by_pve_mm"] = figures.truth_figures(every, "joint")["body_pve_mm"]
-    alone = [found for found in evaluations if found.dataset == ALONE]
-    if alone:
-        whole = [_of_a_person_alone(e) for some in alone for e in some.errors]
-        count = len(whole) + sum(len(some.missing) for some in alone)
-        found["field.people_alone_share"] = sum(whole) / count
+    A camera is solved where its images show the right set: the error is below half a set's time.
+    One that is not, and that the scene does not set aside, is ``offset_wrong``.
+    """
+    if not scenes:
+        return {}
+    late, sigma, aside, step = (
+        np.concatenate([values(s) for s in scenes])
+        for values in (
+            lambda s: np.abs(s.late_s),
+            lambda s: s.sigma_s,
+            lambda s: s.set_aside,
+            lambda s: np.full(len(s.late_s), 1 / s.fps),
+        )
+    )
+    solved = ~aside & (late < step / 2)
+    found = {
+        "offset_solved_share": float(solved.mean()),
+        "offset_wrong": float((~solved & ~aside).sum()),
+        "offset_cameras": float(len(late)),
+    }
+    if solved.any():
+        found["offset_error_ms"] = 1e3 * float(late[solved].mean())
+        found["offset_error_worst_ms"] = 1e3 * float(late[solved].max())
+    known = solved & (sigma > 0)
+    if known.any():
+        found["offset_sigma_ms"] = 1e3 * float(np.median(sigma[known]))
+        found["offset_normalised"] = float(np.median(late[known] / sigma[known])) / MEDIAN_CHI_1
     return found
 
 
-def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
-    """Skin, lengths of limbs and heights of some recordings' bodies."""
-    bones = np.abs(np.stack([e.bones for e in some])).mean(axis=1)  # by person
-    return {
-        "pve_mm": figures.truth_figures([e.metrics for e in some], "joint")["body_pve_mm"],
-        "bone_percent": 100 * float(bones.mean()),
-        "bone_worst_percent": 100 * float(bones.max()),
-        "height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in some])),
+def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Of rooms whose measured surface is mostly floor; millimetres."""
+    if not scenes:
+        return {}
+    before, after, stated = (
+        np.concatenate([getattr(s, name) for s in scenes]) for name in ("before", "after", "stated")
+    )
+    known = stated > 0
+    found = {
+        "extrinsics_floor_heavy_given_mm": 1e3 * float(before.mean()),
+        "extrinsics_floor_heavy_mm": 1e3 * float(after.mean()),
+        "extrinsics_floor_heavy_worst_mm": 1e3 * float(after.max()),
+        "extrinsics_worse_cameras": float((after > before + WORSE_M).sum()),
     }
+    if known.any():
+        found["extrinsics_normalised"] = float(np.median(after[known] / stated[known]))
+    return found
 
 
-def _of_a_person_alone(sequence: FieldSequence) -> bool:
-    """Whether there are figures and an export of the body, and none of an object that is not
-    there."""
-    has = figures.truth_figures([sequence.metrics], "joint")
-    measured = "body_pve_mm" in has and not any(name.startswith("object") for name in has)
-    return measured and sequence.exported_alone
-
-
-def print_field(evaluations: Sequence[FieldSequences]) -> None:
-    """A row a recording: true and stated errors, limbs, height."""
-    console = console_of(_WIDTH)
-    heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
-             "bones %", "height mm", "subject %")  # fmt: skip
-    table = Table("recording", *heads, box=None, title="the field, after metrics")
-    for found in evaluations:
-        for e in found.errors:
-            cells = []
-            by_part = {error.part: error for error in stated_errors(e.metrics)}
-            for part in TRUE:  # a person alone has no object
-                error = by_part.get(part)
-                told = error and [number(error.true, 1), number(error.stated, 1) or "silent"]
-                cells += told or ["", ""]
-            table.add_row(
-                f"{found.dataset}: {e.metrics.name}",
-                *cells,
-                number(100 * float(e.metrics.values["flagged"].mean()), 0),
-                number(100 * float(np.abs(e.bones).mean()), 1),
-                number(1e3 * e.height_m, 0),
-                number(100 * e.subject_right, 0),
-            )
-        for name in found.missing:
-            table.add_row(f"{found.dataset}: {name}", "no metrics")
-    console.print(table)
-    for key, value in flat(evaluations).items():
-        console.print(f"{key}: {value:.3g}", highlight=False)
-
-
-PART = Part(
-    "field",
-    "metrics",
-    ("joint",),
-    "metrics.figures",
-    measure,
-    flat,
-    print_field,
-    last=last_stage,
-    timed=seconds,
-)
+def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Of people whose feet leave the floor: the floor under them, millimetres and degrees."""
+    if not scenes:
+        return {}
+    height = np.array([s.floor_m for s in scenes])
+    found = {"beam_floor_missing": float(np.isnan(height).sum())}
+    if np.isfinite(height).any():
+        found["beam_floor_mm"] = 1e3 * float(np.nanmean(height))
+        found["beam_floor_worst_mm"] = 1e3 * float(np.nanmax(height))
+        found["beam_tilt_deg"] = float(np.nanmean([s.tilt_deg for s in scenes]))
+    return found

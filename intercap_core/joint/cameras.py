@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.rig import Rig
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.constants import (
     CAMERA_REACH_M,
     MAX_CAMERA_SHIFT_M,

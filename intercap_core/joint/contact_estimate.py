@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ContactInterval, JointSettings
-from intercap_core.contact.annotated import Oddity, annotation_evidence, oddities
-from intercap_core.contact.detect import RegionMotion, contact_probability
-from intercap_core.contact.motion import region_motion
-from intercap_core.contact.support import held
-from intercap_core.energy import ground
+from intercap_core.joint.contact.annotated import Oddity, annotation_evidence, oddities
+from intercap_core.joint.contact.detect import RegionMotion, contact_probability
+from intercap_core.joint.contact.motion import region_motion
+from intercap_core.joint.contact.support import held
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.state import State
+from intercap_core.joint.terms import ground_residual as ground
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.schemas import CONTACT_REGIONS
 

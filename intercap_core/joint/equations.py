@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from intercap_core.geometry.solve.banded import BandedSystem
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.state import ALL
-from intercap_core.solve.banded import BandedSystem
-from intercap_core.solve.thread_pool import ThreadPool
 
 # Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in the F frames of a slice.
 Rows = Callable[[slice, np.ndarray], np.ndarray]

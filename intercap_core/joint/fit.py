@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ContactInterval, JointSettings
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.constants import (
     BODY_SHARE,
@@ -36,7 +37,6 @@ from intercap_core.joint.terms.no_object import NoObject
 from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
-from intercap_core.solve.thread_pool import ThreadPool
 
 log = logging.getLogger(__name__)
 

@@ -10,16 +10,16 @@ import torch
 from intercap_core.body.joints import NUM_JOINTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.contact.patches import Patches
-from intercap_core.energy import smoothness
-from intercap_core.energy.proximity import Proximity, Surface, proximity
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surface_samples import sample_surface
+from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.joint import smoothness as smoothness
 from intercap_core.joint.constants import DEPTH_POINTS, OBJECT_ARM
+from intercap_core.joint.contact.patches import Patches
+from intercap_core.joint.proximity import Proximity, Surface, proximity
 from intercap_core.joint.skin import Skin
 from intercap_core.joint.state import BODY, State
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.surface_samples import sample_surface
-from intercap_core.solve.thread_pool import ThreadPool
 
 _FRAMES_TOGETHER = 32  # frames whose derivatives are made at a time
 

@@ -16,8 +16,6 @@ from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.lemo import FEWEST_FRAMES, FRAMES_PER_SECOND, MotionEncoder
 from intercap_core.body.model import BodyModel
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.frames import Frames
 from intercap_core.config import (
     BodyFitSettings,
     BodyModels,
@@ -25,11 +23,16 @@ from intercap_core.config import (
     ObjectEntry,
     ObjectTrackSettings,
 )
-from intercap_core.contact.patches import contact_patches
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
 from intercap_core.joint.constants import MAX_RATE_ERROR
+from intercap_core.joint.contact.patches import contact_patches
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.sequential import SequentialFits
@@ -38,10 +41,7 @@ from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.learned_motion import LearnedMotion
 from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
-from intercap_core.rigid.distance import DistanceField, SurfacePart
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK, SCENE
-from intercap_core.solve.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import open_renderer
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import Cameras
 from intercap_core.joint.constants import VIEWS_KEPT_BYTES
 from intercap_core.object_track.constants import TRACKING_FACES
@@ -15,9 +18,6 @@ from intercap_core.object_track.free_turns import free_turns, without_turns
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.object_track.view_report import ViewReport
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import open_renderer
-from intercap_core.solve.thread_pool import ThreadPool
 
 
 class ObjectImages:

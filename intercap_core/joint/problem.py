@@ -7,7 +7,7 @@ The paper's E_P (equation 5) is part of E_B; body in object and object in body, 
 drift go beyond the paper. To read a term, open its file; to leave one out or add one, change
 :func:`joint_terms`. Every residual is divided by the standard deviation that its source leaves
 unexplained, so that a term's weight in the settings is 1 where it is as strong as its evidence. The
-table of all equations is in :mod:`intercap_core.energy`.
+table of all equations is in :mod:`intercap_core.joint.energy_table`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from intercap_core.config import JointSettings
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import State
@@ -30,7 +31,6 @@ from intercap_core.joint.terms.penetration import Penetration
 from intercap_core.joint.terms.plant import Plant
 from intercap_core.joint.terms.stick import Stick
 from intercap_core.joint.terms.term import Term
-from intercap_core.solve.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.camera.rig import Rig
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.cameras import Cameras
 from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State

@@ -9,7 +9,7 @@ from torch import Tensor
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
 from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.camera import projection
+from intercap_core.geometry.camera import projection
 from intercap_core.joint.constants import HALF_WEIGHT_POINTS
 from intercap_core.joint.time_offsets import Sightings
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core.body.model import BodyModel
-from intercap_core.contact.patches import Patches
-from intercap_core.energy.body_samples import choose_samples
+from intercap_core.body_fit.body_samples import choose_samples
+from intercap_core.joint.contact.patches import Patches
 
 
 @dataclass(frozen=True)

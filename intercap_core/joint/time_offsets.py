@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 from intercap_core.joint.constants import (
     INNOVATION_OUTLIER,
     LOOSE_OFFSET_SIGMA_S,
@@ -33,7 +34,6 @@ from intercap_core.joint.constants import (
     POINT_SIGMA_M,
     POINTS_PER_PART,
 )
-from intercap_core.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
 
 @dataclass(frozen=True, eq=False)

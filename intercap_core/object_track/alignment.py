@@ -10,7 +10,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.object_track import outlines
 from intercap_core.object_track.constants import (
     ALIGNED_POINTS,
@@ -29,9 +32,6 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.groups import Group, centre_of
 from intercap_core.object_track.view import View
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.solve.robust import geman_mcclure_weight
 
 
 def align(

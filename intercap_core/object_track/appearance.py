@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.light import linear
+from intercap_core.geometry.rigid.paint import Paint
 from intercap_core.object_track.constants import (
     COLOUR_COST_MAX,
     COLOUR_HALF_SAMPLES_PX,
@@ -31,8 +31,8 @@ from intercap_core.object_track.constants import (
     PAINT_EXPLAINS,
     SHADING_SIGMA,
 )
+from intercap_core.object_track.light import linear
 from intercap_core.object_track.surface_kernel import patches_of
-from intercap_core.rigid.paint import Paint
 
 LEVELS_USED = slice(10, 251)  # darker ones are noise, brighter ones saturated
 LIGHT = np.full(256, np.nan)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import (
     HELD_M,
     HELD_M_S,
@@ -19,8 +21,6 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.motion import hand_motions
 from intercap_core.object_track.steps import FIRST_HAND, mode_log_ratios
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import moved, step_between
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numba
 
+from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.constants import LIKELY_LABEL_BONUS, MIN_RENDERED_PX
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import Candidate, View
-from intercap_core.rigid.shots import Rendering
 
 
 def choose(

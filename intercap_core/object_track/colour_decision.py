@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.appearance import LIGHT, Appearance, Sighting
 from intercap_core.object_track.candidates import choose
 from intercap_core.object_track.constants import (
@@ -36,7 +37,6 @@ from intercap_core.object_track.fit import Fit, seen_by
 from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.surface_kernel import seen_patches
-from intercap_core.rigid.shots import Shot, Surface
 
 
 class ColourDecision:

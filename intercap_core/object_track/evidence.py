@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import Renderer, default_renderer
 from intercap_core.object_track.constants import (
     COMMON_ERROR_VARIANCE,
     CONTOUR_SCALES_PX,
@@ -19,8 +21,6 @@ from intercap_core.object_track.fit import view_fits
 from intercap_core.object_track.view import View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit
 from intercap_core.object_track.view_report import ViewReport
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import Renderer, default_renderer
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.twist import step_between, twists
 from intercap_core.object_track.bridges import Bridge, Gap
 from intercap_core.object_track.constants import (
     CARRIED_LOG_RATIO,
@@ -20,8 +22,6 @@ from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.motion import unwrapped
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.steps import apart
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import step_between, twists
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import Renderer, default_renderer
+from intercap_core.geometry.rigid.shots import Rendering, Surface
+from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import (
     CONTOUR_SCALES_PX,
     DEPTH_SCALES_M,
@@ -34,10 +38,6 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.view import View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
 from intercap_core.object_track.view_report import ViewReport, quick_report
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import Renderer, default_renderer
-from intercap_core.rigid.shots import Rendering, Surface
-from intercap_core.rigid.twist import moved, step_between
 
 
 @dataclass(frozen=True)

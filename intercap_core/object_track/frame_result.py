@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import CARRIED_M, UNSURE_M, UNSURE_RAD
 from intercap_core.object_track.fit import Fit
-from intercap_core.rigid.mesh import ObjectMesh
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 
 
 def free_turns(mesh: ObjectMesh, pose: np.ndarray) -> np.ndarray:

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.twist import step_between
 from intercap_core.object_track.constants import (
     COMMON_ERROR_VARIANCE,
     COMMON_TURN_VARIANCE,
@@ -25,8 +27,6 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.fit import Fit, MotionPrior
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.steps import apart
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import step_between
 
 # Of the evidence's turns, whose covariance is stated less by this factor: see whole.py.
 TURNS_LESS = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)

@@ -13,9 +13,10 @@ from itertools import combinations
 
 import numpy as np
 
-from intercap_core.camera.transforms import apply
-from intercap_core.camera.triangulation import midpoints
-from intercap_core.detections.instance import PERSON_LABEL
+from intercap_core.formats.detections.instance import PERSON_LABEL
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.camera.triangulation import midpoints
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     CLOUD_MAX_SPREAD,
     CLOUD_PERCENTILE,
@@ -35,7 +36,6 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.outlines import Outline
 from intercap_core.object_track.view import Candidate, View
-from intercap_core.rigid.mesh import ObjectMesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from intercap_core.geometry.rigid.twist import step_between, twists
 from intercap_core.object_track.constants import (
     BASIN,
     CONTRADICTED_LOG_RATIO,
@@ -27,7 +28,6 @@ from intercap_core.object_track.motion import about, expected, extrapolated, unw
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
 from intercap_core.object_track.search import same_pose
-from intercap_core.rigid.twist import step_between, twists
 
 
 class Hypotheses:

@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.constants import (
     BACKGROUND_M,
     CLUTTER_RANGE_M,
@@ -36,8 +38,6 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.likelihood_kernel import depth_log_ratio, outline_cost
 from intercap_core.object_track.reduced_mask import EMPTY
 from intercap_core.object_track.view import Candidate, View
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.shots import Rendering
 
 
 def log_ratio(

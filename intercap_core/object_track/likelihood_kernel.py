@@ -5,8 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from intercap_core.camera.projection_kernels import project_point
-from intercap_core.energy.object_silhouette_kernel import nearest, rim
+from intercap_core.geometry.camera.projection_kernels import project_point
+from intercap_core.object_track.object_silhouette_kernel import nearest, rim
 
 
 @numba.njit(cache=True, nogil=True)

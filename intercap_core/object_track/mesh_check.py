@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     CHECK_FRAMES,
     CHECK_GAIN,
@@ -17,7 +18,6 @@ from intercap_core.object_track.constants import (
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import changed_share
-from intercap_core.rigid.mesh import ObjectMesh
 
 
 def mesh_doubts(observer: Observer, frames: list[FrameResult]) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.constants import (
     GROWTH_LOST_M_S,
     GROWTH_LOST_RAD_S,
@@ -21,7 +22,6 @@ from intercap_core.object_track.constants import (
     STILL_RAD,
 )
 from intercap_core.object_track.fit import MotionPrior
-from intercap_core.rigid.symmetry import SymmetryGroup
 
 # Elbow, wrist, and the knuckles of the index and the little finger, right and left.
 _HANDS = [

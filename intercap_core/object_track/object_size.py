@@ -11,11 +11,11 @@ from collections import Counter
 
 import numpy as np
 
-from intercap_core.camera.masks import Runs
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply
-from intercap_core.capture.frames import Frames
-from intercap_core.detections.read import Detections
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.masks import Runs
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.object_track.constants import (
     LABELS_TOLD,
     SIZE_CHECK_MIN_MASKS,

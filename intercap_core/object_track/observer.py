@@ -10,6 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.render import Renderer, open_renderer
 from intercap_core.object_track.constants import (
     ASSESS_MIN_OVERLAP,
     LOOK_NEAR_M,
@@ -29,10 +33,6 @@ from intercap_core.object_track.search import rank_frames, search
 from intercap_core.object_track.view import View
 from intercap_core.object_track.view_cache import ViewCache
 from intercap_core.progress import Progress
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.paint import Paint
-from intercap_core.rigid.render import Renderer, open_renderer
 
 Pictures = Callable[[int], list[np.ndarray | None]]
 """Of frame t the views' images (h, w, 3) uint8 BGR, reduced; None where there is none."""

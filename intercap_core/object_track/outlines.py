@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.energy.object_silhouette import rim
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     OUTLINE_CUT_PX,
     OUTLINE_DIRECTIONS,
     OUTLINE_MIN_DEPTH_M,
 )
+from intercap_core.object_track.object_silhouette import rim
 from intercap_core.object_track.view import Candidate, View
-from intercap_core.rigid.mesh import ObjectMesh
 
 _ANGLES = 2 * np.pi * np.arange(OUTLINE_DIRECTIONS) / OUTLINE_DIRECTIONS
 _COMPASS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)

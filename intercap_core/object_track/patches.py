@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from intercap_core.camera.projection_kernels import project_point
-from intercap_core.energy.object_silhouette_kernel import rim
+from intercap_core.geometry.camera.projection_kernels import project_point
+from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.constants import OUTSIDE_MASK_WEIGHT, PATCH_MARGIN_M
+from intercap_core.object_track.object_silhouette_kernel import rim
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import View
-from intercap_core.rigid.shots import Rendering
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     ALWAYS_PRESENT,
     AT_HAND_M,
@@ -34,7 +35,6 @@ from intercap_core.object_track.constants import (
 )
 from intercap_core.object_track.groups import centre_of, find_groups
 from intercap_core.object_track.view import View
-from intercap_core.rigid.mesh import ObjectMesh
 
 _BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what the mouth does
 

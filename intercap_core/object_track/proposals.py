@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from intercap_core.geometry.rigid.pose import rotation_exp
+from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import (
     ANNOTATION_FRAMES,
     BASIN,
@@ -40,8 +42,6 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
 from intercap_core.object_track.search import same_pose
 from intercap_core.object_track.turns import near_turns
-from intercap_core.rigid.pose import rotation_exp
-from intercap_core.rigid.twist import moved, step_between
 
 log = logging.getLogger(__name__)
 

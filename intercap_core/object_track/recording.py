@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.frames import Frames
-from intercap_core.detections.read import Candidate, Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Candidate, Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.object_track.constants import (
     CANDIDATE_MAX_EXTENT,
     CANDIDATE_MIN_EXTENT,

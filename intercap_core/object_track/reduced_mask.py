@@ -12,7 +12,7 @@ from functools import cached_property
 import numba
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.intrinsics import Intrinsics
 
 
 @dataclass(frozen=True, eq=False)

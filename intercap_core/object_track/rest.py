@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.geometry.rigid.pose import rotation_exp
+from intercap_core.geometry.rigid.twist import step_between
 from intercap_core.object_track.constants import (
     BLIP_APART_SQUARED,
     BLIP_FRAMES,
@@ -28,8 +30,6 @@ from intercap_core.object_track.constants import (
     UNSEEN_MOVING_COST,
 )
 from intercap_core.object_track.smooth import FrameEvidence
-from intercap_core.rigid.pose import rotation_exp
-from intercap_core.rigid.twist import step_between
 
 
 def resting(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -12,7 +12,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.detections.instance import PERSON_LABEL
+from intercap_core.formats.detections.instance import PERSON_LABEL
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import Renderer
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.alignment import align
 from intercap_core.object_track.constants import (
     ASSESS_MIN_OVERLAP,
@@ -36,10 +40,6 @@ from intercap_core.object_track.fit import Fit, assess_all, fit_pose
 from intercap_core.object_track.groups import centre_of, find_groups
 from intercap_core.object_track.motion import about
 from intercap_core.object_track.view import View
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import Renderer
-from intercap_core.rigid.symmetry import SymmetryGroup
 
 
 def search(

@@ -14,6 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from intercap_core.geometry.rigid.pose import rotation_log
+from intercap_core.geometry.rigid.twist import moved, step_between
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.object_track.constants import (
     ACCELERATION_M_S2,
     ACCELERATION_RAD_S2,
@@ -29,9 +32,6 @@ from intercap_core.object_track.constants import (
     TYPICAL_SLACK,
     UNKNOWN_SIGMA,
 )
-from intercap_core.rigid.pose import rotation_log
-from intercap_core.rigid.twist import moved, step_between
-from intercap_core.solve.robust import geman_mcclure_weight
 
 BAND = 2  # nodes that an acceleration couples to the one before
 

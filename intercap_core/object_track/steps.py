@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import logsumexp
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     APPEAR_COST,
     EXCURSION_COST,
@@ -33,7 +34,6 @@ from intercap_core.object_track.constants import (
     VANISH_COST,
 )
 from intercap_core.object_track.motion import HandMotion
-from intercap_core.rigid.mesh import ObjectMesh
 
 FIRST_HAND = 2  # the modes before: rest, free
 

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.twist import step_between
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import (
     ABSENT_LOG_RATIO,
@@ -43,9 +46,6 @@ from intercap_core.object_track.proposals import NotFound, Proposals
 from intercap_core.object_track.steps import excursions, step_costs, with_excursions
 from intercap_core.object_track.view import View
 from intercap_core.object_track.whole import WholeTrack
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.paint import Paint
-from intercap_core.rigid.twist import step_between
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.object_track.constants import (
     NEAR_TURN_CHANGED_SHARE,
     NEAR_TURN_DISTINCT_DEG,
@@ -23,9 +26,6 @@ from intercap_core.object_track.constants import (
     NEAR_TURN_STEPS,
 )
 from intercap_core.object_track.search import own_axes
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.solve.robust import geman_mcclure_weight
 
 
 def near_turns(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:

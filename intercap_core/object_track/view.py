@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
 from intercap_core.object_track.blobs import without_person
 from intercap_core.object_track.constants import (
     MAX_REDUCTION,

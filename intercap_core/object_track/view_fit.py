@@ -10,14 +10,16 @@ for each of n depth pixels and of m contour pixels (of the mask's contour or of 
 whichever has more), with ``trust`` of a mask from CONTOUR_TRUST_MIN to 1 by its overlap with the
 render (CONTOUR_TRUST_OVERLAP, CONTOUR_TRUST_RANGE). All are in
 :mod:`intercap_core.object_track.constants`; the residuals are in
-:mod:`intercap_core.energy.object_depth` and :mod:`intercap_core.energy.object_silhouette`.
+:mod:`intercap_core.object_track.object_depth` and :mod:`intercap_core.object_track.object_silhouette`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.energy import object_depth_kernel, object_silhouette_kernel
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.shots import Rendering, Shot
+from intercap_core.object_track import object_depth_kernel, object_silhouette_kernel
 from intercap_core.object_track.candidates import choose, mask_overlap, visible_pixels
 from intercap_core.object_track.constants import (
     CONTOUR_SAMPLES,
@@ -39,8 +41,6 @@ from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
 from intercap_core.object_track.view import Candidate, View
 from intercap_core.object_track.view_report import ViewReport, depth_agreement, unhidden
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.shots import Rendering, Shot
 
 NormalEquations = tuple[np.ndarray, np.ndarray]
 """J'WJ (6, 6) and J'Wr (6,), in units of one standard deviation."""

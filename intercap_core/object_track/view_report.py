@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.energy import object_depth_kernel
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.shots import Rendering
+from intercap_core.object_track import object_depth_kernel
 from intercap_core.object_track.candidates import choose, mask_overlap, visible_pixels
 from intercap_core.object_track.constants import AGREEMENT_SCALE_M, FREE_SPACE_M, MIN_RENDERED_PX
 from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.view import View
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.shots import Rendering
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from intercap_core.geometry.rigid.twist import twists
 from intercap_core.object_track.constants import (
     BASIN,
     BRIDGED_S,
@@ -39,7 +40,6 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
 from intercap_core.object_track.steps import apart
-from intercap_core.rigid.twist import twists
 
 
 class WholeTrack:

@@ -13,8 +13,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.triangulation import midpoints, rays_of
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import midpoints, rays_of
 from intercap_core.person.constants import (
     EXCHANGED_VIEW_COST,
     MAX_AGREEING_VIEWS,

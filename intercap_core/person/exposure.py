@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.solve.velocity import limited_velocity
 from intercap_core.person.constants import MAX_IMAGE_SPEED_RAD_S
-from intercap_core.solve.velocity import limited_velocity
 
 
 def at_set_times(

@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.geometry.solve.viterbi import cheapest_sequence
 from intercap_core.person.constants import (
     CHANGE_COST,
     CROSSED_HANDS_RATIO,
@@ -28,7 +29,6 @@ from intercap_core.person.constants import (
     TWIST_COST,
 )
 from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, PARTNER, exchange_points
-from intercap_core.solve.viterbi import cheapest_sequence
 
 _AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 _LIMBS = (ARMS, LEGS, HEAD)

@@ -12,8 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.triangulation import midpoints, pixel_scale, reproject, view_pairs
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import (
+    midpoints,
+    pixel_scale,
+    reproject,
+    view_pairs,
+)
 from intercap_core.person.constants import (
     LIFTED_SUPPORT,
     MIN_COMMON_POINTS,

@@ -16,11 +16,11 @@ from scipy.spatial import cKDTree
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
-from intercap_core.camera.clouds import depth_points
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply
-from intercap_core.camera.triangulation import Triangulation
-from intercap_core.capture.frames import Frames
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.clouds import depth_points
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.constants import (
     AT_BACKGROUND_MM,
     BODY_DEPTH_M,

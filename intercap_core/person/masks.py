@@ -6,10 +6,10 @@ import numpy as np
 from pycocotools import mask as coco_mask
 
 from intercap_core.body.keypoints import SKELETON, keypoint_pairs
-from intercap_core.camera.masks import Runs
-from intercap_core.detections.instance import PERSON_LABEL
-from intercap_core.detections.read import Candidate
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.instance import PERSON_LABEL
+from intercap_core.formats.detections.read import Candidate
+from intercap_core.geometry.camera.masks import Runs
 from intercap_core.person.constants import (
     BOX_MARGIN,
     LABEL_BONUS,

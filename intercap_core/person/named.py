@@ -8,8 +8,8 @@ import numpy as np
 
 from intercap_core.body.keypoints import SKELETON, keypoint_pairs
 from intercap_core.config import SubjectPoint
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
 from intercap_core.person.constants import NAMED_REACH
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import Named

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.camera.triangulation import Triangulation
 from intercap_core.config import ExchangedSides
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.sides import LIMBS, exchange_points, swapped
 
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig, ring_centre
-from intercap_core.camera.triangulation import pixel_scale, reproject
-from intercap_core.detections.read import PeopleOfImages
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.geometry.camera.rig import Rig, ring_centre
+from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
 from intercap_core.person.constants import (
     CENTRE_RANGE_M,
     HANDLING_WEIGHT,

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.triangulation import (
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import (
     Triangulation,
     pixel_scale,
     reproject,
     triangulate,
 )
+from intercap_core.geometry.solve.viterbi import cheapest_sequence
 from intercap_core.person.agreement import agree
 from intercap_core.person.constants import (
     EXCHANGE_ROUNDS,
@@ -31,7 +32,6 @@ from intercap_core.person.constants import (
 )
 from intercap_core.person.facing import mirrored
 from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
-from intercap_core.solve.viterbi import cheapest_sequence
 
 
 def triangulate_people(

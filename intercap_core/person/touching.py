@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.keypoints import BODY, LEFT_HAND, RIGHT_HAND
-from intercap_core.detections.instance import PERSON_LABEL
-from intercap_core.detections.read import Detections
+from intercap_core.formats.detections.instance import PERSON_LABEL
+from intercap_core.formats.detections.read import Detections
 from intercap_core.person.constants import TOUCH_REACH
 from intercap_core.person.subject import Touches
 

@@ -9,15 +9,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from intercap_core.capture.behave import intrinsics_of
-from intercap_core.capture.layouts import input_files
 from intercap_core.config import Annotation, BodyModels, Config, SequenceEntry
-from intercap_core.imports.file_names import intercap_file
+from intercap_core.formats.recordings.behave import intrinsics_of
+from intercap_core.formats.recordings.layouts import input_files
+from intercap_core.formats.released.file_names import intercap_file
+from intercap_core.output.site.settings import changed
 from intercap_core.pipeline.code_cache import stage_code
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.record import Record, libraries, plain, processor
 from intercap_core.project import Project
-from intercap_core.report.settings import changed
 
 # Columns of a sequence's row that a stage may read; reading another one is an error.
 COLUMNS: dict[str, tuple[str, ...]] = {

@@ -208,7 +208,7 @@ def run_dataset(project: Project) -> Path:
     Sequences that the project excludes because they failed are named in it, and those whose
     summary is missing or broken. Raises UserError where none is left.
     """
-    from intercap_core.report.settings import changed
+    from intercap_core.output.site.settings import changed
     from intercap_core.stages import dataset
 
     folder = project.results

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.capture.frames import Frames
+from intercap_core.formats.recordings.frames import Frames
 from intercap_core.scene.constants import (
     BACKGROUND_AGREE_MM,
     BACKGROUND_AGREE_PER_DEPTH,

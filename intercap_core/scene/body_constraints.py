@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.camera import projection
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import invert
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.scene.constants import (
     KEYPOINT_ERROR_TIME_S,
@@ -24,7 +25,6 @@ from intercap_core.scene.constants import (
     ROBUST_SIGMA,
 )
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.solve.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True, eq=False)

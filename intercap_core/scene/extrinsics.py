@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.body_constraints import BodyConstraint, BodyViews, body_views
 from intercap_core.scene.camera_verdicts import CameraVerdict, Judge
 from intercap_core.scene.constants import (

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.scene.constants import (
     FLOOR_COSINE,
     FLOOR_EFFECTIVE_POINTS,
@@ -21,7 +22,6 @@ from intercap_core.scene.constants import (
 )
 from intercap_core.scene.ground import Ground
 from intercap_core.scene.surface import Surface
-from intercap_core.solve.robust import geman_mcclure_weight
 
 
 class FloorConstraint:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig, ring_centre
 from intercap_core.config import MIN_FLOOR_SPREAD_M, floor_spread
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.scene.constants import (
     BELOW_FLOOR_COST,
     BELOW_FLOOR_M,

@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
-from intercap_core.camera import projection
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply
-from intercap_core.camera.triangulation import pixel_scale, triangulate
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
 from intercap_core.scene.constants import (
     MIN_CONFIDENCE,
     MOTION_ROUNDS,

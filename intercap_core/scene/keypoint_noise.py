@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.geometry.solve.gaps import filled_linearly
 from intercap_core.scene.constants import (
     CONSTANT_VARIANCE,
     ERROR_LENGTHS_S,
     FAST_SHARES,
     MIN_VALID_SHARE,
 )
-from intercap_core.solve.gaps import filled_linearly
 
 
 @dataclass(frozen=True)

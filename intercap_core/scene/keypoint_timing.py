@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.synchronise import images_of_moments
+from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.constants import (
     CONSTANT_VARIANCE,
     KEYPOINT_OFFSET_KNOWN_S,

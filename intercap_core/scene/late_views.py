@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.triangulation import pixel_scale, reproject
-from intercap_core.detections.read import PeopleOfImages
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
 from intercap_core.person.constants import MIN_COMMON_POINTS
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import BODY_POINTS, swapped

@@ -15,8 +15,8 @@ from itertools import combinations
 
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.scene.background import Background
 from intercap_core.scene.body_constraints import BodyConstraint, body_views
 from intercap_core.scene.constants import (

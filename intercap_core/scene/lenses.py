@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera import projection
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.constants import (
     LENS_FIT_RANGE,
     MIN_LENS_GAIN,

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.synchronise import images_of_moments
-from intercap_core.detections.read import PeopleOfImages
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.keypoint_timing import Offsets, keypoint_offsets
 from intercap_core.scene.slips import Slips, find_slips
 from intercap_core.scene.start_times import InStep, Starts, find_starts

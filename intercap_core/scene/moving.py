@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.frames import Frames
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.background import Background
 from intercap_core.scene.constants import (
     BEFORE_BACKGROUND_MM,

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.synchronise import usual_steps
-from intercap_core.detections.read import PeopleOfImages
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.formats.recordings.synchronise import usual_steps
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.person.constants import MAX_IMAGE_SPEED_RAD_S, MAX_LINK_GAP_S
 from intercap_core.scene.constants import LINK_SLACK_RAD, MAX_PEOPLE, MIN_CONFIDENCE, SLOWER_SETS
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from intercap_core.body.keypoints import LIMB_BONES, keypoint_pairs, of_side
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.constants import LIMB_REACH_M, PERSON_MASK_REDUCTION, TRUNK_REACH_M
 
 _BONES = (*TRUNK_REACH_M, *of_side("right", LIMB_BONES), *of_side("left", LIMB_BONES))

@@ -17,8 +17,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply, invert
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.scene.balance import balanced
 from intercap_core.scene.constants import (
     GATES_M,
@@ -39,7 +40,6 @@ from intercap_core.scene.constants import (
     SURFACE_SIGMA_FLOOR_M,
 )
 from intercap_core.scene.surface import Surface
-from intercap_core.solve.robust import SIGMA_PER_MAD
 
 ROTATION, TRANSLATION, BIAS, OFFSET = slice(0, 3), slice(3, 6), 6, 7
 FREEDOMS = 8  # of a camera

@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.synchronise import usual_steps
+from intercap_core.formats.recordings.synchronise import usual_steps
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.constants import (
     CLEAR_SLIP_GAIN,
     MANY_VIEWS,

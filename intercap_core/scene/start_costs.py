@@ -11,9 +11,9 @@ from itertools import combinations
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import invert
-from intercap_core.camera.triangulation import pixel_scale
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.triangulation import pixel_scale
 from intercap_core.scene.constants import EPIPOLAR_PX_AT_1080P
 
 _NO_MOTION_RAD = 1e-6

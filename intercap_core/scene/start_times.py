@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.camera.rig import Rig
-from intercap_core.detections.read import PeopleOfImages
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.constants import (
     CLEAR_SIGMAS,
     FEWEST_BLOCKS,

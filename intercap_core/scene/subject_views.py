@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.camera.rig import Rig
-from intercap_core.detections.read import PeopleOfImages
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.middles import fill_middles
 from intercap_core.person.sides import BODY_POINTS

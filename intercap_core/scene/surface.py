@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Rig
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.background import Background
 from intercap_core.scene.constants import (
     BACKGROUND_CELL_M,

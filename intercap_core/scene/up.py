@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.constants import (
     CAMERA_UP_CONE_DEG,
     GRAVITY_CONE_DEG,

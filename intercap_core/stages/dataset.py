@@ -17,16 +17,16 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyModels, CardSettings, ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.metrics import figures
-from intercap_core.metrics.contact import CONTACT_M
-from intercap_core.metrics.heatmaps import Heatmaps, collect
-from intercap_core.metrics.summary import BodyFile, SequenceSummary
-from intercap_core.release.card import facts, markdown, split_table
-from intercap_core.release.croissant import croissant
-from intercap_core.report import overview, tables
-from intercap_core.report.heat_pictures import body_surfaces, highest, object_pictures
-from intercap_core.report.overview import DatasetContent, Heat
-from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.evaluation import figures
+from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core.evaluation.heatmaps import Heatmaps, collect
+from intercap_core.evaluation.summary import BodyFile, SequenceSummary
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.release.card import facts, markdown, split_table
+from intercap_core.output.release.croissant import croissant
+from intercap_core.output.site import overview, tables
+from intercap_core.output.site.heat_pictures import body_surfaces, highest, object_pictures
+from intercap_core.output.site.overview import DatasetContent, Heat
 from intercap_core.schemas import HEATMAPS
 
 log = logging.getLogger(__name__)

@@ -12,15 +12,15 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.config import DetectionsSettings, SequenceEntry, digest
-from intercap_core.detections import candidate_files, keypoint_files
-from intercap_core.detections.candidate_files import Candidates
-from intercap_core.detections.converters.data_sets import BehaveFiles
-from intercap_core.detections.converters.label_maps import class_names
-from intercap_core.detections.image_numbers import CameraImages, camera_images
-from intercap_core.detections.instance import Instance, boxes_of
-from intercap_core.detections.keypoint_files import People
-from intercap_core.detections.keypoint_values import NOBODY, Values
 from intercap_core.errors import UserError
+from intercap_core.formats.detections import candidate_files, keypoint_files
+from intercap_core.formats.detections.candidate_files import Candidates
+from intercap_core.formats.detections.converters.data_sets import BehaveFiles
+from intercap_core.formats.detections.converters.label_maps import class_names
+from intercap_core.formats.detections.image_numbers import CameraImages, camera_images
+from intercap_core.formats.detections.instance import Instance, boxes_of
+from intercap_core.formats.detections.keypoint_files import People
+from intercap_core.formats.detections.keypoint_values import NOBODY, Values
 from intercap_core.progress import Progress
 from intercap_core.schemas import DETECTIONS, FRAMES
 
@@ -198,7 +198,7 @@ def _segment(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find instances in the images of which no file says anything."""
-    from intercap_core.detections.models.onnx_segmentation import Segmenter
+    from intercap_core.formats.detections.models.onnx_segmentation import Segmenter
 
     wanted = _unknown(images, [d.candidates_found for d in found])
     if not wanted:
@@ -223,7 +223,7 @@ def _find_people(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find keypoints in the images of which no file says anything."""
-    from intercap_core.detections.models.onnx_pose import PoseModel
+    from intercap_core.formats.detections.models.onnx_pose import PoseModel
 
     wanted = _unknown(images, [d.keypoints_found for d in found])
     if not wanted:
@@ -256,7 +256,7 @@ def _pictures(
     frames: Path, wanted: list[Image], damaged: list[int]
 ) -> Iterator[tuple[Image, np.ndarray]]:
     """The wanted images (H, W, 3); ``damaged`` counts for each camera those that do not decode."""
-    from intercap_core.capture.frames import Frames
+    from intercap_core.formats.recordings.frames import Frames
 
     with Frames.open(frames) as recording:
         for t, c in wanted:

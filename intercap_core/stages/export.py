@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply
-from intercap_core.capture.frames import Frames
 from intercap_core.config import BodyModels, ExportSettings, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
-from intercap_core.export import amass, body_files, bop, coco, contact, glb, intercap, meshes
-from intercap_core.export.about import About, BodyFile
-from intercap_core.export.body_files import Written
-from intercap_core.export.coordinates import Coordinates
-from intercap_core.export.deviations import Deviations
-from intercap_core.export.motion import Motion, read_motion
-from intercap_core.export.readme import needs_object, readme
-from intercap_core.export.silhouettes import Exposures, body_vertices, object_poses
-from intercap_core.export.touching import TouchingSurfaces
-from intercap_core.export.upright import z_up_frame
-from intercap_core.export.verdict import Verdict
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.export import amass, body_files, bop, coco, contact, glb, intercap, meshes
+from intercap_core.output.export.about import About, BodyFile
+from intercap_core.output.export.body_files import Written
+from intercap_core.output.export.coordinates import Coordinates
+from intercap_core.output.export.deviations import Deviations
+from intercap_core.output.export.motion import Motion, read_motion
+from intercap_core.output.export.readme import needs_object, readme
+from intercap_core.output.export.silhouettes import Exposures, body_vertices, object_poses
+from intercap_core.output.export.touching import TouchingSurfaces
+from intercap_core.output.export.upright import z_up_frame
+from intercap_core.output.export.verdict import Verdict
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, replaced
 

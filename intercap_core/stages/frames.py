@@ -13,22 +13,22 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.extrinsics_files import Extrinsics
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.capture.clocks import WRONG, best_epoch, drift_us, epochs
-from intercap_core.capture.extract import View, extract
-from intercap_core.capture.layouts import open_layout
-from intercap_core.capture.sound_delays import sound_starts
-from intercap_core.capture.synchronise import (
+from intercap_core.config import FramesSettings, SequenceEntry, digest
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import Extrinsics
+from intercap_core.formats.recordings.clocks import WRONG, best_epoch, drift_us, epochs
+from intercap_core.formats.recordings.extract import View, extract
+from intercap_core.formats.recordings.layouts import open_layout
+from intercap_core.formats.recordings.sound_delays import sound_starts
+from intercap_core.formats.recordings.synchronise import (
     SetTable,
     distance_to,
     nearest_images,
     synchronise,
 )
-from intercap_core.capture.timestamps import rate_of
-from intercap_core.config import FramesSettings, SequenceEntry, digest
-from intercap_core.errors import UserError
+from intercap_core.formats.recordings.timestamps import rate_of
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import FRAMES
 
 MIN_DRIFT_US = 1000.0  # less than the exposure of one image

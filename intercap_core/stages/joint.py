@@ -26,11 +26,11 @@ from intercap_core.config import (
     SubjectEntry,
     digest,
 )
-from intercap_core.imports.joint import import_joint
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.constants import FEW_HAND_VIEWS
 from intercap_core.joint.fit import JointFit, fit
 from intercap_core.joint.inputs import open_inputs
+from intercap_core.joint.released.artefact import import_joint
 from intercap_core.joint.state import State
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON
 

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.frames import Frames
 from intercap_core.config import (
     BodyFitSettings,
     BodyModels,
@@ -21,17 +19,20 @@ from intercap_core.config import (
     SubjectEntry,
     digest,
 )
+from intercap_core.evaluation import body, motion, object_pose
+from intercap_core.evaluation import truth as truths
+from intercap_core.evaluation.exchanged import exchanged
+from intercap_core.evaluation.extrinsics import displacement
+from intercap_core.evaluation.flags import merge_reasons
+from intercap_core.evaluation.measurement import Handled, Measurement, Values
+from intercap_core.evaluation.segmented import read_clouds
+from intercap_core.evaluation.stage_errors import StageErrors
+from intercap_core.evaluation.tracks import BodyTrack, read_body, read_object
+from intercap_core.evaluation.verdict.judge import Verdict
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.joint.result import CARRIED
-from intercap_core.metrics import body, motion, object_pose
-from intercap_core.metrics import truth as truths
-from intercap_core.metrics.exchanged import exchanged
-from intercap_core.metrics.extrinsics import displacement
-from intercap_core.metrics.flags import merge_reasons
-from intercap_core.metrics.measurement import Handled, Measurement, Values
-from intercap_core.metrics.segmented import read_clouds
-from intercap_core.metrics.stage_errors import StageErrors
-from intercap_core.metrics.tracks import BodyTrack, read_body, read_object
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import (
     BODY_FIT,
     JOINT,
@@ -40,7 +41,6 @@ from intercap_core.schemas import (
     PERSON,
     SCENE,
 )
-from intercap_core.verdict.judge import Verdict
 
 log = logging.getLogger(__name__)
 

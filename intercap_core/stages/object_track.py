@@ -10,11 +10,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
-from intercap_core.camera.transforms import rigid
-from intercap_core.capture.frames import Frames
 from intercap_core.config import ObjectEntry, ObjectPose, ObjectTrackSettings, digest
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.paint import Paint
 from intercap_core.object_track.absent import NOT_NAMED, SOURCE, absent_track
 from intercap_core.object_track.constants import NOTHING_LOG_RATIO, TOLD_SHARE, TRACKING_FACES
 from intercap_core.object_track.given_poses import GivenPose
@@ -22,8 +24,6 @@ from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.object_track.tracker import Track, Tracker
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.paint import Paint
 from intercap_core.schemas import OBJECT_TRACK
 
 log = logging.getLogger(__name__)

@@ -12,8 +12,6 @@ import numpy as np
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, read_parameters
-from intercap_core.camera.rig import Rig
-from intercap_core.capture.frames import Frames
 from intercap_core.config import (
     BodyModels,
     ContactInterval,
@@ -22,20 +20,22 @@ from intercap_core.config import (
     SequenceEntry,
     SubjectEntry,
 )
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
-from intercap_core.metrics.extrinsics import displacement
-from intercap_core.metrics.figures import SequenceMetrics
-from intercap_core.report.body import read_fit
-from intercap_core.report.capture import read_capture
-from intercap_core.report.closeups import CloseUp, closeup, holds, read_handling
-from intercap_core.report.overlays import Fit, Overlay, choose_cameras, choose_frames, overlays
-from intercap_core.report.sequence_page import SequenceContent, ViewerParts, page
-from intercap_core.report.track import TrackFacts, read_track
-from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.evaluation.extrinsics import displacement
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.site.body import read_fit
+from intercap_core.output.site.capture import read_capture
+from intercap_core.output.site.closeups import CloseUp, closeup, holds, read_handling
+from intercap_core.output.site.overlays import Fit, Overlay, choose_cameras, choose_frames, overlays
+from intercap_core.output.site.sequence_page import SequenceContent, ViewerParts, page
+from intercap_core.output.site.track import TrackFacts, read_track
+from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
 from intercap_core.stages.folders import check_replaceable, replaced
-from intercap_core.viewer import page as viewer
 
 log = logging.getLogger(__name__)
 

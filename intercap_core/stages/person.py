@@ -9,30 +9,30 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.triangulation import Triangulation, reproject, spread
-from intercap_core.capture.frames import Frames
 from intercap_core.config import ExchangedSides, ObjectEntry, PersonSettings, SubjectPoint, digest
-from intercap_core.detections.read import (
+from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import (
     FROM_DETECTOR,
     FROM_IMAGES,
     NOBODY_LOOKED,
     Detections,
 )
-from intercap_core.errors import UserError
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import Triangulation, reproject, spread
 from intercap_core.person.exposure import at_set_times
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.lifting import Lifter
 from intercap_core.person.masks import choose_mask, others_beside
 from intercap_core.person.middles import fill_middles
 from intercap_core.person.named import named_people
+from intercap_core.person.segmentation.image_segments import ImageCandidate, ViewSegments
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.stated_sides import exchanged_back, hold_sides, stated_images
 from intercap_core.person.subject import Subject, find_subject
 from intercap_core.person.swaps import steady_sides, triangulate_people
 from intercap_core.person.touching import touches_of
 from intercap_core.schemas import PERSON, SCENE
-from intercap_core.segmentation.image_segments import ImageCandidate, ViewSegments
 
 
 def run(
@@ -184,7 +184,7 @@ def _from_images(
         wanted = wanted & ~found.candidates_found
     if settings.segmentation == "detector" or not wanted.any():
         return {}
-    from intercap_core.segmentation.image_segmentation import segment_images
+    from intercap_core.person.segmentation.image_segmentation import segment_images
 
     joints = points.points.reshape(*wanted.shape[:1], NUM_KEYPOINTS, 3)
     sigma = spread(points, rig).reshape(joints.shape[:2])

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.rig import Rig, ring_centre
-from intercap_core.camera.transforms import apply
-from intercap_core.capture.frames import Frames
 from intercap_core.config import SceneSettings, digest
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig, ring_centre
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background, background_of
 from intercap_core.scene.camera_verdicts import direction_in_words, weakest_motion
 from intercap_core.scene.constants import BACKGROUND_CELL_M, WEAK_CAMERA_M

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from intercap_core.config import SequenceEntry
-from intercap_core.metrics import summary
+from intercap_core.evaluation import summary
 
 
 def run(

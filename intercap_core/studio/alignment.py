@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from intercap_core.camera.rig import Camera
+from intercap_core.geometry.camera.rig import Camera
 
 # Corners of one surface differ by less than this share of their depth: two pixels of the wide
 # binned image (0.23 degrees apart) on a surface that is 85 degrees off the ray.

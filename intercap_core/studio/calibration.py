@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import (
+from intercap_core.formats.calibration.k4a import (
     ACCELEROMETER,
     COLOUR_LOCATION,
     COLOUR_MODES,
@@ -18,7 +17,8 @@ from intercap_core.camera.k4a_calibration import (
     LENS_MODEL,
     Mode,
 )
-from intercap_core.camera.rig import Camera
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
 
 # The accelerometer's axes in the depth camera's, as in real devices but without their 6 degrees
 # of tilt: its x is the camera's -z, its y the camera's -x, its z the camera's y (down).

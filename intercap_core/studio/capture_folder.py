@@ -11,9 +11,9 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera, Rig
 from intercap_core.config import StudioCapture, StudioFault
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.studio.alignment import Aligner
 
 SOUND_RATE = 16_000  # samples a second

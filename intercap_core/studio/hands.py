@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.skeleton import Skeleton, turn, unit
 from intercap_core.studio.subjects import Subject
 

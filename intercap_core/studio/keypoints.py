@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.keypoints import BODY, CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
-from intercap_core.camera.rig import Camera
+from intercap_core.geometry.camera.rig import Camera
 from intercap_core.studio.noise import NoiseSource
 
 BODY_BIAS_M = (0.010, 0.020)  # fixed, of each body joint

@@ -16,7 +16,7 @@ from typing import IO, Literal
 
 import numpy as np
 
-from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
+from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
 
 KINECT_RATES = (5, 15, 30)  # frames a second
 TIMECODE_SCALE_NS = 1000  # block times are microseconds

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.config import ObjectEntry
-from intercap_core.rigid.mesh_files import load_mesh
+from intercap_core.geometry.rigid.mesh_files import load_mesh
 
 SCALE_ERROR = 0.005  # of the true size, up or down
 # RMS of the smooth displacement along the normal, in parts of the object's radius (root mean square

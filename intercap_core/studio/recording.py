@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import invert
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
 from intercap_core.studio.capture_folder import CaptureFolder, Device, Shot
 from intercap_core.studio.failures import CLOCK_FALLS_BACK_SETS

@@ -15,9 +15,9 @@ import numba
 import numpy as np
 import open3d as o3d
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.rigid.render import render_scene
-from intercap_core.rigid.shots import Drawable
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.rigid.render import render_scene
+from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 

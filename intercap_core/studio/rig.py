@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES, Mode
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import invert, rigid
+from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES, Mode
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.skeleton import turn, unit
 
 RADIUS_M, RADIUS_SPREAD_M = 2.55, 0.2

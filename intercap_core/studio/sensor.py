@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.studio.noise import NoiseSource, gaussian
 from intercap_core.studio.render import Cast, View
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from intercap_core.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.capture_folder import SOUND_RATE as RATE
 from intercap_core.studio.stage import Stage
 

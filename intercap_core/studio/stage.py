@@ -9,10 +9,10 @@ import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
-from intercap_core.rigid.normals import vertex_normals
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.rigid.normals import vertex_normals
 from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.interactions.base import TrueObject

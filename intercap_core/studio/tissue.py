@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.distance import DistanceField
 
 GAP_M = 0.0003  # skin that was pressed stays this far outside, so that float32 keeps it outside
 NEAR_M = 0.01

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.camera.clouds import master_points
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.capture.intercap import ReleaseLayout
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.recordings.intercap import ReleaseLayout
+from intercap_core.geometry.camera.clouds import master_points
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply, invert
 
 IMAGES = 7  # of each camera, spread over the recording: their median is the static background
 STEP = 4  # of the pixels that are compared, in rows and columns

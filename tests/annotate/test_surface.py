@@ -10,8 +10,8 @@ import pytest
 
 from intercap_core.annotate import document, surface, symmetry
 from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project, load_project
-from intercap_core.rigid.mesh import ObjectMesh
 from tests.helpers.fitted_capture import object_entry
 
 

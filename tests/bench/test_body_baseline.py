@@ -13,12 +13,12 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.observations import Observations, PersonCloud
-from intercap_core.camera import projection
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import BodyFitSettings
-from intercap_core.metrics.proximity import Sight
-from intercap_core.rigid.surface_tree import SurfaceTree
+from intercap_core.evaluation.proximity import Sight
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from tests.helpers.bodies import open_body
 from tests.helpers.synthetic_capture import ring
 

@@ -88,7 +88,7 @@ def test_what_derives_from_it_follows(package: Path, name: str, expected: str) -
 
 def test_a_constant_that_is_imported_already_is_refused() -> None:
     from bench.changed_constant import import_changed
-    from intercap_core.metrics import contact
+    from intercap_core.evaluation import contact
 
     assert contact.CONTACT_M == 0.0045
     with pytest.raises(UserError, match="fresh process"):

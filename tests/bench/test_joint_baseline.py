@@ -28,8 +28,12 @@ from bench.joint_baseline import (
 from bench.joint_clip import JointClip
 from bench.object_baseline import Crops, Recipe
 from bench.object_baseline import Energy as ObjectEnergy
-from intercap_core.contact.patches import contact_patches
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+from intercap_core.geometry.rigid.twist import moved
 from intercap_core.joint.constants import CONTACT_SIGMA
+from intercap_core.joint.contact.patches import contact_patches
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import BODY, OBJECT, State
@@ -38,10 +42,6 @@ from intercap_core.joint.terms.motion import BodyMotion, ObjectMotion
 from intercap_core.joint.terms.penetration import Penetration
 from intercap_core.joint.terms.term import Term
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.symmetry import SymmetryGroup
-from intercap_core.rigid.twist import moved
 from intercap_core.schemas import CONTACT_REGIONS
 from tests.helpers.bodies import open_body
 from tests.helpers.object_capture import ObjectCapture

@@ -16,10 +16,10 @@ from bench.object_baseline import (
     fit_by_adam,
     rotation_matrix,
 )
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+from intercap_core.geometry.rigid.twist import moved
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.symmetry import SymmetryGroup
-from intercap_core.rigid.twist import moved
 from tests.helpers.object_capture import ObjectCapture
 
 START = np.concatenate([np.radians(10) * np.array([0.6, -0.64, 0.48]), [0.02, -0.017, 0.015]])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bench import object_scaling
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import CpuRenderer
-from tests.rigid.conftest import catalogue
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import CpuRenderer
+from tests.geometry.rigid.conftest import catalogue
 
 
 @pytest.fixture(scope="module")

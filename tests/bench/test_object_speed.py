@@ -17,10 +17,10 @@ from bench.object_speed import (
     whole_track,
 )
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 FRAMES = 3
 

@@ -31,12 +31,12 @@ from bench.oracle_inputs import (
     write_true_scene,
 )
 from intercap_core import artefacts
-from intercap_core.camera.transforms import rigid
 from intercap_core.errors import UserError
+from intercap_core.evaluation.extrinsics import displacement
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.joint.cameras import BIAS
 from intercap_core.joint.inputs import read_cameras
-from intercap_core.metrics.extrinsics import displacement
-from intercap_core.rigid.mesh import ObjectMesh
 from intercap_core.schemas import SCENE
 from tests.helpers import fitted_capture as fitted
 

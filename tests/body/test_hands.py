@@ -13,7 +13,7 @@ import torch
 from intercap_core.body import priors
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.distance import DistanceField
 
 from .conftest import open_arrays
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from intercap_core.body_fit.free_space import DepthWindow, seen_through
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply, rigid
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply, rigid
 
 LENS = Intrinsics(320, 288, 252.0, 252.0, 159.5, 143.5)
 CAMERA = Camera("k1", LENS, LENS, np.eye(4), np.eye(4))

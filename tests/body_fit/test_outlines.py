@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from intercap_core.body_fit.outlines import Outline, RimSamples, outline, touching
-from intercap_core.camera import masks
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera import masks
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import rigid
 
 LENS = Intrinsics(640, 480, 500.0, 505.0, 318.0, 243.0, (0.08, -0.03, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 CENTRE, RADIUS = np.array([0.15, -0.1, 2.0]), 0.25

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.capture.layouts import open_layout
 from intercap_core.commands.check_recordings import Looked, look_at_recordings
 from intercap_core.config import SequenceEntry
+from intercap_core.formats.recordings.layouts import open_layout
 from tests.helpers.kinect_files import entry_of, record
 from tests.helpers.plain_capture import CAMERAS, plain_entry, write_rig
 

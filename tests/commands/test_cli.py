@@ -20,9 +20,6 @@ import yaml
 from rich.console import Console
 
 from intercap_core import artefacts
-from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera
 from intercap_core.commands.check import (
     check_detector,
     faults_of_sequences,
@@ -30,6 +27,9 @@ from intercap_core.commands.check import (
 )
 from intercap_core.commands.run import Watcher
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
 from intercap_core.pipeline.step import check_device
 from intercap_core.project import load_project
 from intercap_core.schemas import DETECTIONS

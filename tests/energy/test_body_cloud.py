@@ -9,9 +9,9 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
-from intercap_core.energy import body_cloud as term
-from intercap_core.energy.body_samples import COVERINGS, Samples, choose_samples
-from intercap_core.energy.body_surface import Surface
+from intercap_core.body_fit import body_cloud as term
+from intercap_core.body_fit.body_samples import COVERINGS, Samples, choose_samples
+from intercap_core.body_fit.body_surface import Surface
 from tests.helpers.bodies import open_body, random_normal
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.model import BodyModel
-from intercap_core.energy import body_keypoints as term
+from intercap_core.body_fit import body_keypoints as term
 from tests.helpers.bodies import random_normal
 
 K = 135

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from intercap_core.body.model import BodyModel
-from intercap_core.energy import body_priors
+from intercap_core.body_fit import body_priors
 
 
 @pytest.mark.parametrize("shape", [True, False])

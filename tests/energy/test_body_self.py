@@ -11,14 +11,14 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.body_fit import body_self as term
+from intercap_core.body_fit.body_constants import SELF_TOLERANCE_M
+from intercap_core.body_fit.body_keypoints import keypoint_set
+from intercap_core.body_fit.body_samples import COVERINGS, choose_samples
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import columns_of
 from intercap_core.body_fit.terms import Targets
-from intercap_core.energy import body_self as term
-from intercap_core.energy.body_constants import SELF_TOLERANCE_M
-from intercap_core.energy.body_keypoints import keypoint_set
-from intercap_core.energy.body_samples import COVERINGS, choose_samples
-from intercap_core.solve.levenberg_marquardt import minimise
+from intercap_core.geometry.solve.levenberg_marquardt import minimise
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import pytest
 
-import intercap_core.energy
+import intercap_core.joint.energy_table
 import intercap_core.joint.terms
 from intercap_core.config import Config
 
-PACKAGE = Path(intercap_core.energy.__file__).resolve().parents[1]
+PACKAGE = Path(intercap_core.joint.energy_table.__file__).resolve().parents[1]
 PAGE = PACKAGE.parent / "docs" / "equations.md"
 
 
@@ -30,7 +30,7 @@ def _rows(text: str) -> list[Row]:
     return [Row(*row) for row in cells if len(row) == 5][2:]
 
 
-ROWS = _rows(intercap_core.energy.__doc__ or "")
+ROWS = _rows(intercap_core.joint.energy_table.__doc__ or "")
 
 
 def _tree(file: str) -> ast.Module:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from intercap_core.energy import object_in_body
-from intercap_core.energy.constants import DEEPEST_IN_BODY, WATCHED_OUTSIDE
+from intercap_core.joint.energy_constants import DEEPEST_IN_BODY, WATCHED_OUTSIDE
+from intercap_core.joint.terms import object_in_body_residual as object_in_body
 
 RADIUS = 0.1
 

@@ -5,18 +5,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera import projection
-from intercap_core.camera.projection_kernels import project_point, project_point_with_jacobian
-from intercap_core.energy import (
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.projection_kernels import (
+    project_point,
+    project_point_with_jacobian,
+)
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import render
+from intercap_core.object_track import (
     object_depth,
     object_depth_kernel,
     object_silhouette,
     object_silhouette_kernel,
 )
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import render
-from tests.rigid.conftest import catalogue
-from tests.rigid.test_render import LENS, PINHOLE
+from tests.geometry.rigid.conftest import catalogue
+from tests.geometry.rigid.test_render import LENS, PINHOLE
 
 RNG = np.random.default_rng(5)
 MASTER = np.eye(4)

@@ -5,10 +5,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from intercap_core.energy import contact, ground, penetration, smoothness
-from intercap_core.energy.constants import PENETRATION_TOLERANCE
-from intercap_core.energy.proximity import along_by_object, proximity
-from intercap_core.rigid.distance import DistanceField, SurfacePart
+from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
+from intercap_core.joint import smoothness as smoothness
+from intercap_core.joint.energy_constants import PENETRATION_TOLERANCE
+from intercap_core.joint.proximity import along_by_object, proximity
+from intercap_core.joint.terms import contact_residual as contact
+from intercap_core.joint.terms import ground_residual as ground
+from intercap_core.joint.terms import penetration_residual as penetration
 
 RNG = np.random.default_rng(3)
 

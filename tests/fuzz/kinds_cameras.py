@@ -8,17 +8,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from intercap_core.camera.calibration_files import read_calibration
-from intercap_core.camera.extrinsics_files import Extrinsics, read_extrinsics, write_rig_file
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import colour_from_accelerometer
-from intercap_core.camera.k4a_calibration import read_calibration as read_kinect
-from intercap_core.camera.other_calibration import Recorded
-from intercap_core.camera.transforms import is_rigid
-from intercap_core.capture import behave, intercap
+from intercap_core.formats.calibration.extrinsics import Extrinsics, read_extrinsics, write_rig_file
+from intercap_core.formats.calibration.files import read_calibration
+from intercap_core.formats.calibration.k4a import colour_from_accelerometer
+from intercap_core.formats.calibration.k4a import read_calibration as read_kinect
+from intercap_core.formats.calibration.other import Recorded
+from intercap_core.formats.recordings import behave, intercap
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import is_rigid
 from intercap_core.studio.calibration import write_calibration
-from tests.camera.test_calibration_files import FORMS, RECORDED, VIEWS
 from tests.fuzz.kind import ImplausibleError, Kind, finite, within
+from tests.geometry.camera.test_calibration_files import FORMS, RECORDED, VIEWS
 from tests.helpers.kinect_files import MODES, make_camera, pose_of
 from tests.helpers.release_folders import behave_lens
 

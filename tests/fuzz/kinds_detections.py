@@ -10,18 +10,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from intercap_core.camera import masks
 from intercap_core.config import DetectionsSettings
-from intercap_core.detections import candidate_files, keypoint_files
-from intercap_core.detections.candidate_check import look_at_candidates
-from intercap_core.detections.class_names import COCO_NAMES
-from intercap_core.detections.converters.label_maps import read_label_map
-from intercap_core.detections.image_numbers import CameraImages
-from intercap_core.detections.instance import Instance
-from intercap_core.detections.keypoint_check import look_at_keypoints
-from intercap_core.detections.keypoint_layouts import WHOLE_BODY
-from intercap_core.detections.models.onnx_pose import PoseModel
-from intercap_core.detections.models.onnx_segmentation import Segmenter
+from intercap_core.formats.detections import candidate_files, keypoint_files
+from intercap_core.formats.detections.candidate_check import look_at_candidates
+from intercap_core.formats.detections.class_names import COCO_NAMES
+from intercap_core.formats.detections.converters.label_maps import read_label_map
+from intercap_core.formats.detections.image_numbers import CameraImages
+from intercap_core.formats.detections.instance import Instance
+from intercap_core.formats.detections.keypoint_check import look_at_keypoints
+from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
+from intercap_core.formats.detections.models.onnx_pose import PoseModel
+from intercap_core.formats.detections.models.onnx_segmentation import Segmenter
+from intercap_core.geometry.camera import masks
 from tests.fuzz.kind import ImplausibleError, Kind, finite, within
 from tests.helpers import tiny_onnx, tiny_pose
 

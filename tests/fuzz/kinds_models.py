@@ -17,16 +17,16 @@ from intercap_core.body.loading import OPEN_BODY, load_body_file
 from intercap_core.body.maps import load_maps, maps_path
 from intercap_core.body.vposer import VPoser
 from intercap_core.config import ObjectEntry
-from intercap_core.imports.behave_files import (
+from intercap_core.formats.released.behave_files import (
     object_poses_at_30_fps,
     person_poses_at_30_fps,
     read_object_pose,
     read_person_pose,
 )
-from intercap_core.imports.release_intercap import read_results
-from intercap_core.rigid.contact_vertices import contact_list, read_contact_vertices
-from intercap_core.rigid.mesh import ObjectMesh, colours_of
-from intercap_core.rigid.mesh_files import load_mesh
+from intercap_core.geometry.rigid.contact_vertices import contact_list, read_contact_vertices
+from intercap_core.geometry.rigid.mesh import ObjectMesh, colours_of
+from intercap_core.geometry.rigid.mesh_files import load_mesh
+from intercap_core.joint.released.intercap import read_results
 from tests.fuzz.kind import ImplausibleError, Kind, finite, within
 from tests.helpers.behave_results import write_30_fps
 from tests.helpers.lemo_release import random_state, write_release

@@ -10,14 +10,14 @@ import av
 import cv2
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera
-from intercap_core.capture.encoded import encoded_size
-from intercap_core.capture.image_files import DamagedImage, read_colour, read_depth
-from intercap_core.capture.k4a_layout import KinectRecording
-from intercap_core.capture.source import CameraRecording
-from intercap_core.capture.timestamps import read_timestamps, shots_of
-from intercap_core.capture.video import VideoRecording
+from intercap_core.formats.recordings.encoded import encoded_size
+from intercap_core.formats.recordings.image_files import DamagedImage, read_colour, read_depth
+from intercap_core.formats.recordings.k4a_layout import KinectRecording
+from intercap_core.formats.recordings.source import CameraRecording
+from intercap_core.formats.recordings.timestamps import read_timestamps, shots_of
+from intercap_core.formats.recordings.video import VideoRecording
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
 from tests.fuzz.kind import ImplausibleError, Kind, finite, within
 from tests.fuzz.kinds_cameras import check_lens, check_pose
 from tests.helpers.kinect_files import pose_of, record

@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
-from intercap_core.camera.clouds import HIDDEN_BEHIND_M
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera.clouds import HIDDEN_BEHIND_M
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply
 
 SAMPLES_PER_PIXEL = 2.0  # along each axis of the colour image, so that a surface has no holes
 

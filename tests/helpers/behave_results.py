@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from intercap_core.rigid.mesh import read_mesh
+from intercap_core.geometry.rigid.mesh import read_mesh
 
 
 def write_person(frame: Path, vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> Path:

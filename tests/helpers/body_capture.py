@@ -9,11 +9,11 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.artefacts import pack_ragged
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.masks import encode
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply, invert, rigid
-from intercap_core.rigid.render import render
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.masks import encode
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.rigid.render import render
 from intercap_core.schemas import FRAMES, PERSON, SCENE
 from tests.helpers.synthetic_capture import put_frame_sets, ring_of
 

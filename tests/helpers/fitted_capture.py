@@ -22,10 +22,7 @@ from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.camera import masks
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply, rigid
+from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.config import (
     BodyFitSettings,
     BodyModels,
@@ -34,11 +31,14 @@ from intercap_core.config import (
     ObjectTrackSettings,
     SubjectEntry,
 )
-from intercap_core.energy.body_samples import COVERINGS
+from intercap_core.geometry.camera import masks
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply, rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import render_scene
+from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.object_track.absent import SOURCE, absent_track
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import render_scene
-from intercap_core.rigid.shots import Drawable, Rendering
 from intercap_core.schemas import (
     BODY_FIT,
     CONTACT_REGIONS,

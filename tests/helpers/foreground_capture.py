@@ -12,9 +12,9 @@ import trimesh
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.capture.synchronise import images_of_moments
+from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.scene.background import background_of
 from intercap_core.schemas import SCENE
 from tests.helpers.synthetic_capture import (
@@ -144,7 +144,7 @@ class Carrying:
         return frames, self._write_scene(frames, folder / "scene.h5", floor)
 
     def _write_scene(self, frames: Path, path: Path, floor: bool) -> Path:
-        from intercap_core.capture.frames import Frames
+        from intercap_core.formats.recordings.frames import Frames
 
         with Frames.open(frames) as images:
             found = [background_of(images, c, self.joints) for c in range(self.views)]

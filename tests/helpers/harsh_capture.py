@@ -15,13 +15,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.masks import encode
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import invert, rigid
+from intercap_core.geometry.camera.masks import encode
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import render_scene
+from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import render_scene
-from intercap_core.rigid.shots import Drawable, Rendering
 from tests.helpers.object_capture import FPS
 from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH, looking_at
 

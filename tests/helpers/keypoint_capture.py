@@ -12,9 +12,9 @@ import numpy as np
 import open3d as o3d
 import yaml
 
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.subject import find_subject
 from intercap_core.scene.constants import MIN_CONFIDENCE

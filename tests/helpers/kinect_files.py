@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.extrinsics_files import Extrinsics, write_rig_file
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import COLOUR_MODES, DEPTH_MODES
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import rigid
 from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
 from intercap_core.studio.calibration import write_calibration

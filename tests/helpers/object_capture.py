@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.artefacts import pack_ragged
-from intercap_core.camera.masks import encode
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import invert, rigid
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import render_scene
-from intercap_core.rigid.shots import Drawable
+from intercap_core.geometry.camera.masks import encode
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import render_scene
+from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.schemas import DETECTIONS, FRAMES, PERSON, SCENE
 from tests.helpers.synthetic_capture import (
     COLOUR,

@@ -11,7 +11,7 @@ import functools
 import numpy as np
 import open3d as o3d
 
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.subjects import Subject
 
 VERTICES = 6890

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
-from intercap_core.detections.read import Detections
+from intercap_core.formats.detections.read import Detections
 from intercap_core.stages import detections, frames
 
 CAMERAS = ("left", "right")

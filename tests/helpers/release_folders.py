@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import invert
-from intercap_core.capture.frames import Frames
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import invert
 from tests.helpers.aligned_depth import depth_on_colour
 
 Colour = Callable[[int, int], bytes | None]  # of set t and camera c

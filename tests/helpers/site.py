@@ -14,7 +14,7 @@ from intercap_core.config import (
     PageSettings,
     SequenceEntry,
 )
-from intercap_core.metrics.figures import SequenceMetrics
+from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import dataset, metrics, page, summary

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.rig import Camera, Rig
-from intercap_core.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.schemas import FRAMES
 
 COLOUR = Intrinsics(

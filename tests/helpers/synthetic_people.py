@@ -8,9 +8,9 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.camera.triangulation import reproject
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.camera.triangulation import reproject
 from intercap_core.schemas import DETECTIONS
 
 _HEIGHTS = {

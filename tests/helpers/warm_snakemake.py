@@ -20,7 +20,7 @@ PRELOADED = (
     "snakemake.executors.touch",
     "pandas",
     "intercap_core.pipeline.code_digest",
-    "intercap_core.capture.layouts",
+    "intercap_core.formats.recordings.layouts",
     "intercap_core.project",
 )
 

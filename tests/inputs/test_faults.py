@@ -13,14 +13,14 @@ import onnx
 import pytest
 import torch
 
-from intercap_core.camera import masks
-from intercap_core.capture.encoded import encoded_size
-from intercap_core.capture.k4a import Recording
 from intercap_core.commands.check import faults_of_truth
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.rigid.mesh import colours_of
-from intercap_core.rigid.mesh_files import load_mesh
+from intercap_core.formats.recordings.encoded import encoded_size
+from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.geometry.camera import masks
+from intercap_core.geometry.rigid.mesh import colours_of
+from intercap_core.geometry.rigid.mesh_files import load_mesh
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
 from tests.fuzz.kinds import KINDS

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from intercap_core import safe_pickle
 from intercap_core.errors import UserError
+from intercap_core.inputs import safe_pickle
 from intercap_core.inputs.arrays import read_arrays
 from intercap_core.inputs.files import Unreadable, check_file, path_fault, read_bytes, read_text
 from intercap_core.inputs.json_files import parse_json, read_json, read_toml

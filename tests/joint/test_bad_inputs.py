@@ -22,7 +22,7 @@ from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyModels, JointSettings, ObjectEntry, ObjectTrackSettings
 from intercap_core.errors import UserError
-from intercap_core.rigid.contact_vertices import contact_list
+from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, OBJECT_TRACK
 from intercap_core.stages import joint
 from tests.helpers.lemo_release import write_release

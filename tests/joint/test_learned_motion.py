@@ -13,8 +13,11 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body import lemo
 from intercap_core.body.lemo import MotionEncoder
 from intercap_core.body.model import BodyModel
-from intercap_core.contact.patches import contact_patches
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.joint.constants import BODY_ACCELERATION, PROBE_STEPS
+from intercap_core.joint.contact.patches import contact_patches
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import minimise
@@ -23,9 +26,6 @@ from intercap_core.joint.state import ALL, BODY, BODY_SHIFT, State
 from intercap_core.joint.terms.learned_motion import LearnedMotion
 from intercap_core.joint.terms.motion import BodyMotion
 from intercap_core.joint.terms.term import Term
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.symmetry import SymmetryGroup
 from tests.helpers.lemo_release import random_state, write_release
 
 FRAMES = 11

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.contact.patches import contact_patches
+from intercap_core.joint.contact.patches import contact_patches
 from intercap_core.joint.contact_estimate import ContactEstimate
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry

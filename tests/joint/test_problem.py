@@ -7,10 +7,14 @@ import trimesh
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
-from intercap_core.contact.patches import contact_patches
-from intercap_core.energy import smoothness
-from intercap_core.energy.constants import CONTACT_TOLERANCE
+from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.joint import smoothness as smoothness
 from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT
+from intercap_core.joint.contact.patches import contact_patches
+from intercap_core.joint.energy_constants import CONTACT_TOLERANCE
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import minimise
@@ -20,11 +24,7 @@ from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData, TrackedPoses
 from intercap_core.joint.terms.term import Term
-from intercap_core.rigid.distance import DistanceField, SurfacePart
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import CONTACT_REGIONS
-from intercap_core.solve.thread_pool import ThreadPool
 
 FRAMES = 5
 LEFT_HAND = CONTACT_REGIONS.index("left_hand")

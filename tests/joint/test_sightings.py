@@ -10,10 +10,10 @@ import torch
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
-from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.joint.sightings import cloud_sightings, keypoint_sightings
 from intercap_core.joint.time_offsets import OffsetPrior, estimate_offsets
 from tests.helpers.bodies import open_body

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.contact.standing import sole_parts, standing_probability
-from intercap_core.energy import stick
 from intercap_core.joint.constants import STICK_VERTICES
+from intercap_core.joint.contact.standing import sole_parts, standing_probability
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.minimise import minimise
 from intercap_core.joint.state import State
+from intercap_core.joint.terms import stick_residual as stick
 from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.stick import _representatives

@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.render import CpuRenderer
+from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import PATCHES_ACROSS
 from intercap_core.object_track.decoder import Decoded, decode, given, mixed
@@ -16,12 +20,8 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.prior import Prior
 from intercap_core.object_track.surface_kernel import patches_of
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.paint import Paint
-from intercap_core.rigid.render import CpuRenderer
-from intercap_core.rigid.shots import Shot, Surface
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 FRAMES, OPEN = 12, 6
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # a toolbox looks alike from behind

@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.bridges import Bridge, Gap, straight
 from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.frame_result import FrameResult
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.object_track.whole import WholeTrack
-from intercap_core.rigid.mesh import ObjectMesh
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import FPS, ObjectCapture
-from tests.rigid.conftest import catalogue
 
 FRAMES = 9
 WRIST, INDEX, PINKY = (KEYPOINT_NAMES.index(f"right_{n}") for n in ("wrist", "index1", "pinky1"))

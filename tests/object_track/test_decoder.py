@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     ABSENT_LOG_RATIO,
     ERROR_LASTING_S,
@@ -30,8 +31,7 @@ from intercap_core.object_track.steps import (
     step_costs,
     with_excursions,
 )
-from intercap_core.rigid.mesh import ObjectMesh
-from tests.rigid.conftest import catalogue
+from tests.geometry.rigid.conftest import catalogue
 
 NO_HAND = [None, None]
 

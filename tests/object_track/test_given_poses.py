@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import GROWTH_LOST_M_S, UNSURE_M
 from intercap_core.object_track.fit import Fit
 from intercap_core.object_track.frame_result import FrameResult, flagged
@@ -23,9 +24,8 @@ from intercap_core.object_track.given_poses import (
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.object_track.view_report import ViewReport
-from intercap_core.rigid.mesh import ObjectMesh
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 FIVE = float(np.radians(5))
 LABELS = ("suitcase",)

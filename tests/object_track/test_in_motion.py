@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import MAX_HYPOTHESES
 from intercap_core.object_track.decoder import Decoded
 from intercap_core.object_track.fit import Fit, seen_by
@@ -21,10 +23,8 @@ from intercap_core.object_track.prior import Prior
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View, ViewGeometry
 from intercap_core.object_track.whole import WholeTrack
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.twist import moved, step_between
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import FPS, ObjectCapture
-from tests.rigid.conftest import catalogue
 
 FRAMES = 6
 OFFSETS = np.array([0.0, 0.03, 0.02, -0.02])  # of the exposures, seconds

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import LABEL_LOG_RATIO, LOG_MISSED
 from intercap_core.object_track.fit import Fit, assess_all
 from intercap_core.object_track.likelihood_kernel import outline_cost
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 NONE = np.zeros((0, 0), bool)
 

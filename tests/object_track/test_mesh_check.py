@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.mesh_check import scaled
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.symmetry import SymmetryGroup
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 FRAMES = 4
 

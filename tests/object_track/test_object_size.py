@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from intercap_core.capture.frames import Frames
 from intercap_core.config import DetectionsSettings, SequenceEntry
-from intercap_core.detections.read import Detections
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
 from intercap_core.object_track.object_size import label_doubt, size_doubt
 from intercap_core.stages import detections
 from tests.helpers.synthetic_capture import ring, write_frames

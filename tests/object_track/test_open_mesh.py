@@ -6,11 +6,11 @@ import numpy as np
 import trimesh
 
 from intercap_core.config import ObjectEntry
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.fit import fit_pose
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.mesh import ObjectMesh
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 
 def open_below(mesh: ObjectMesh, path) -> ObjectMesh:

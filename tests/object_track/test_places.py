@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import CLUTTER_LOG_RATIO
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.places import Places, Standing
 from intercap_core.object_track.tracker import Tracker
-from intercap_core.rigid.mesh import ObjectMesh
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.harsh_capture import FPS, HarshCapture
-from tests.rigid.conftest import catalogue
 
 HANDLED, APART = np.array([0.0, 0.0, 2.0]), np.array([1.2, 0.0, 2.5])
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.constants import (
     ANNOTATED_LOG_RATIO,
     ANNOTATION_LOG_RATIO,
@@ -19,8 +20,7 @@ from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.places import Places, Standing
 from intercap_core.object_track.prior import Prior, things
 from intercap_core.object_track.view_report import ViewReport
-from intercap_core.rigid.mesh import ObjectMesh
-from tests.rigid.conftest import catalogue
+from tests.geometry.rigid.conftest import catalogue
 
 SHARE = 0.25
 HANDLED, TWIN, AWAY = (np.array(p) for p in ([0.0, 0, 2], [1.2, 0, 2.5], [-1.5, 0, 2]))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from intercap_core.geometry.rigid.twist import moved
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
-from intercap_core.rigid.twist import moved
 
 SIGMA = np.repeat([np.radians(1.0), 0.003], 3)
 CENTRE = np.array([0.02, -0.01, 0.05])

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.masks import encode
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import rigid
-from intercap_core.energy import object_depth, object_silhouette
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.masks import encode
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.object_track import object_depth, object_silhouette
 from intercap_core.object_track.reduced_mask import decode, reduced_lens
 from intercap_core.object_track.view import ViewGeometry, distances
 from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH

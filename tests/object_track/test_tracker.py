@@ -7,20 +7,20 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.config import ObjectPose, ObjectTrackSettings
 from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import CpuRenderer
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.fit import MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.search import rank_frames, rotation_grid, search
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.render import CpuRenderer
-from intercap_core.rigid.symmetry import SymmetryGroup
 from intercap_core.schemas import OBJECT_TRACK
 from intercap_core.stages import object_track
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 SETTINGS = ObjectTrackSettings()
 LABELS = ("suitcase",)
@@ -106,7 +106,7 @@ def test_fit_is_the_same_whatever_the_threads_do(mesh, capture, views):
 
 def test_fit_drawn_by_warp_is_the_same(mesh, capture, views):
     pytest.importorskip("warp", reason="warp is not installed (pip install 'intercap-core[gpu]')")
-    from intercap_core.rigid.render_warp import WarpRenderer
+    from intercap_core.geometry.rigid.render_warp import WarpRenderer
 
     start = _disturbed(capture.poses[0], 0.03, 10, 6)
     one, two = (

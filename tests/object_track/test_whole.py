@@ -8,15 +8,15 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings, Symmetry
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.turns import near_turns
 from intercap_core.object_track.view import View, ViewGeometry
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.mesh import ObjectMesh
-from intercap_core.rigid.symmetry import SymmetryGroup
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
-from tests.rigid.conftest import catalogue
 
 
 def mesh_of(shape: trimesh.Trimesh, symmetry: SymmetryGroup | None = None) -> ObjectMesh:

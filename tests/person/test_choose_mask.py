@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera import masks
-from intercap_core.detections.read import Candidate
+from intercap_core.formats.detections.read import Candidate
+from intercap_core.geometry.camera import masks
 from intercap_core.person.masks import others_beside
 
 HEIGHT, WIDTH = 120, 160

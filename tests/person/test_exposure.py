@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.transforms import apply, invert
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.exposure import at_set_times
 from intercap_core.person.swaps import triangulate_people
 from tests.helpers.synthetic_capture import ring

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.camera.transforms import apply, invert
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.agreement import agree
 from intercap_core.person.facing import mirrored
 from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swapped

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.person.lifting import Relief
 from tests.helpers.synthetic_capture import ring
 

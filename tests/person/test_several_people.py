@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.camera.masks import encode
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.camera.triangulation import reproject
 from intercap_core.config import SubjectPoint
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.camera.masks import encode
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.camera.triangulation import reproject
 from intercap_core.person.groups import Group
 from intercap_core.person.named import named_people
 from intercap_core.person.subject import Subject, find_subject

@@ -7,10 +7,10 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.camera.triangulation import Triangulation
 from intercap_core.config import ExchangedSides, PersonSettings
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.sides import LEGS, exchange_points, swapped
 from intercap_core.person.stated_sides import exchanged_back, hold_sides, stated_images
 from intercap_core.schemas import PERSON

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.camera.rig import ring_centre
-from intercap_core.camera.transforms import apply
-from intercap_core.detections.read import Detections
+from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.camera.rig import ring_centre
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.person.sides import swapped
 from intercap_core.person.subject import find_subject
 from tests.helpers.synthetic_capture import ring

@@ -14,16 +14,16 @@ import pytest
 
 from intercap_core.commands.check import faults_of_sequences
 from intercap_core.commands.closeups import draw_closeups
+from intercap_core.commands.evaluate import field
+from intercap_core.commands.evaluate.part import Measured
 from intercap_core.commands.inspect import print_summary
 from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError
-from intercap_core.evaluation import field
-from intercap_core.evaluation.part import Measured
+from intercap_core.output.release.manifest import KINDS
 from intercap_core.pipeline.outcome import line, notes
 from intercap_core.pipeline.step import run_dataset, run_step, run_studio
 from intercap_core.posed import open_sequence
 from intercap_core.project import Project, load_project
-from intercap_core.release.manifest import KINDS
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 NAME = "alone"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.scene.camera_verdicts import (
     CameraVerdict,
     Evidence,

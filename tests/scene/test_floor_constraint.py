@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import apply
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration

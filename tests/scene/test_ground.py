@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import apply, invert
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.scene.constants import FOOT_HEIGHT_M
 from intercap_core.scene.feet import ground_of_feet
 from intercap_core.scene.ground import (

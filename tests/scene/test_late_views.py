@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.camera.transforms import apply, invert
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY
 from intercap_core.scene.late_views import with_late_views
 from tests.helpers.synthetic_capture import ring

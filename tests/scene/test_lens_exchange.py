@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from intercap_core.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.scene.background import steady_background
 from intercap_core.scene.lens_exchange import exchange_lenses, exchanged
 from intercap_core.scene.subject_views import triangulated

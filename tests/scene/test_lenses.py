@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from intercap_core.camera.rig import Rig
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.lenses import lens_gains, swapped_lenses
 from tests.helpers.synthetic_capture import perturbed, ring
 from tests.helpers.synthetic_people import seen_by, walking

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.camera.transforms import apply
-from intercap_core.capture.frames import Frames
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import background_of
 from intercap_core.scene.moving import moving_surfaces
 from intercap_core.scene.registration import MOVING, Estimate, Layer, Registration

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.camera.triangulation import triangulate
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.camera.triangulation import triangulate
 from intercap_core.scene.body_constraints import BodyConstraint, BodyViews, body_views
 from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
 from intercap_core.scene.subject_views import SubjectViews

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.camera.triangulation import reproject
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.camera.triangulation import reproject
 from intercap_core.scene.constants import WINDOW_SETS
 from intercap_core.scene.keypoint_timing import keypoint_offsets
 from intercap_core.scene.slips import find_slips, interval_gains, longest_slip

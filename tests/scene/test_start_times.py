@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.camera.triangulation import reproject
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.camera.triangulation import reproject
 from intercap_core.person.sides import swapped
 from intercap_core.scene.moments import find_moments
 from intercap_core.scene.people_in_view import middles

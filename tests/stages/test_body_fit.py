@@ -17,19 +17,19 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit import body_cloud, body_keypoints, body_samples
+from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.compiled_terms import CompiledTerms
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, columns_of
 from intercap_core.body_fit.terms import Views
 from intercap_core.body_fit.torch_terms import TorchTerms
-from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
-from intercap_core.energy import body_cloud, body_keypoints, body_samples
-from intercap_core.energy.body_samples import COVERINGS
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve.levenberg_marquardt import minimise
 from intercap_core.schemas import BODY_FIT, BODY_PARTS, PERSON
-from intercap_core.solve.levenberg_marquardt import minimise
 from intercap_core.stages import body_fit
 from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import Inputs, master_from_room, ring, write_capture

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.camera import masks
 from intercap_core.config import DetectionsSettings, SequenceEntry
-from intercap_core.detections import coco
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections import coco
+from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.camera import masks
 from intercap_core.stages import detections
 from tests.helpers.synthetic_capture import ring, write_frames
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.camera.extrinsics_files import Extrinsics, read_extrinsics, write_rig_file
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import rigid
-from intercap_core.capture.frames import Frames
 from intercap_core.config import FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import Extrinsics, read_extrinsics, write_rig_file
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
 from tests.helpers.kinect_files import (

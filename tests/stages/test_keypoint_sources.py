@@ -19,11 +19,11 @@ tiny_pose = pytest.importorskip("tiny_pose", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
-from intercap_core.camera import masks  # noqa: E402
 from intercap_core.config import (  # noqa: E402
     SequenceEntry,
 )
 from intercap_core.errors import UserError  # noqa: E402
+from intercap_core.geometry.camera import masks  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402
 
 SIZE, COUNT = (640, 360), 3
@@ -113,7 +113,8 @@ def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
 def test_without_a_model_nothing_is_loaded():
     words = (
         "import sys, intercap_core.stages.detections; "
-        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.models.onnx_pose' "
+        "sys.exit('onnxruntime' in sys.modules or "
+        "'intercap_core.formats.detections.models.onnx_pose' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.camera import masks
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.capture.synchronise import images_of_moments
 from intercap_core.config import PersonSettings
 from intercap_core.errors import UserError
+from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.geometry.camera import masks
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.sides import LEGS, swapped
 from intercap_core.person.swaps import steady_sides
 from intercap_core.schemas import PERSON, SCENE

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
 from intercap_core.stages import detections, frames
 from tests.helpers.plain_capture import detect, plain_entry, write_rig
 

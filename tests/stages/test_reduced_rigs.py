@@ -9,7 +9,6 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
-from intercap_core.camera.rig import Rig
 from intercap_core.config import (
     BodyFitSettings,
     BodyModels,
@@ -22,7 +21,8 @@ from intercap_core.config import (
     SubjectEntry,
 )
 from intercap_core.errors import UserError
-from intercap_core.rigid.mesh import ObjectMesh
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import (
@@ -35,12 +35,12 @@ from intercap_core.stages import (
     person,
     summary,
 )
+from tests.geometry.rigid.conftest import catalogue
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.body_capture import ring, write_capture
 from tests.helpers.object_capture import ObjectCapture
 from tests.helpers.reduced_capture import Reduction
 from tests.helpers.site import merge, row
-from tests.rigid.conftest import catalogue
 from tests.stages.test_body_fit import motion
 
 SUBJECT = SubjectEntry(subject="s01", gender="neutral")

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.camera.rig import Rig
 from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
-from intercap_core.detections.read import Detections
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.stages import detections
 from intercap_core.stages import frames as frames_stage
 from tests.helpers.release_folders import write_behave, write_intercap

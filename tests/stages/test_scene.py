@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.camera.rig import Rig
-from intercap_core.camera.transforms import apply, invert
 from intercap_core.config import SceneSettings
 from intercap_core.errors import UserError
-from intercap_core.export.upright import z_up_frame
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.output.export.upright import z_up_frame
 from intercap_core.scene import camera_verdicts
 from intercap_core.schemas import SCENE
 from intercap_core.stages import scene

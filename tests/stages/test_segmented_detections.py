@@ -16,10 +16,10 @@ pytest.importorskip("onnxruntime")
 tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
-from intercap_core.camera import masks  # noqa: E402
 from intercap_core.config import (  # noqa: E402
     SequenceEntry,
 )
+from intercap_core.geometry.camera import masks  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402
 
 WIDTH, HEIGHT, COUNT = 160, 96, 5
@@ -85,7 +85,8 @@ def test_without_a_model_nothing_is_loaded(capture):
     detect(capture, "detections.h5")
     words = (
         "import sys, intercap_core.stages.detections; "
-        "sys.exit('onnxruntime' in sys.modules or 'intercap_core.detections.models.onnx_model' "
+        "sys.exit('onnxruntime' in sys.modules or "
+        "'intercap_core.formats.detections.models.onnx_model' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

@@ -11,8 +11,8 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.schedule import Fitter
-from intercap_core.camera.transforms import apply
 from intercap_core.config import BodyFitSettings
+from intercap_core.geometry.camera.transforms import apply
 from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import FPS, master_from_room, ring
 

@@ -16,14 +16,14 @@ from pycocotools import mask as coco
 
 from intercap_core import artefacts
 from intercap_core.body.keypoints import BODY
-from intercap_core.camera.clouds import master_points
-from intercap_core.camera.extrinsics_files import read_extrinsics
-from intercap_core.camera.k4a_calibration import read_calibration
-from intercap_core.camera.rig import Camera
-from intercap_core.capture.k4a import Recording
 from intercap_core.config import Annotation, ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.formats.calibration.extrinsics import read_extrinsics
+from intercap_core.formats.calibration.k4a import read_calibration
+from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.geometry.camera.clouds import master_points
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import MARK, make_capture
 from intercap_core.studio.noise import NoiseSource

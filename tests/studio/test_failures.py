@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.camera.k4a_calibration import DEPTH_MODES
-from intercap_core.capture.k4a import Recording
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.k4a import DEPTH_MODES
+from intercap_core.formats.recordings.k4a import Recording
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.failures import Failures, check_faults

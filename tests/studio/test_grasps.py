@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.interactions.grasps import DIRECTIONS, Hollow
 from intercap_core.studio.interactions.handling import RIGHT, Handling
 from intercap_core.studio.stage import Stage

@@ -10,8 +10,8 @@ import pytest
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
-from intercap_core.rigid.distance import DistanceField
-from intercap_core.rigid.surface_samples import sample_surface
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.studio.hands import OPEN, Hand, shape
 from intercap_core.studio.skeleton import REACH_FREE, Skeleton, turn

@@ -10,10 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import apply, invert
-from intercap_core.capture.layouts import open_layout
-from intercap_core.capture.source import Image
 from intercap_core.config import (
     LayoutName,
     ObjectEntry,
@@ -22,6 +18,10 @@ from intercap_core.config import (
     StudioSettings,
 )
 from intercap_core.errors import UserError
+from intercap_core.formats.recordings.layouts import open_layout
+from intercap_core.formats.recordings.source import Image
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.studio.alignment import Aligner
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.capture_folder import Device, Shot

@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.camera.intrinsics import Intrinsics
-from intercap_core.camera.k4a_calibration import (
+from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
     colour_from_accelerometer,
     read_calibration,
 )
-from intercap_core.camera.rig import Camera
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
 

@@ -11,8 +11,8 @@ import open3d as o3d
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.camera.transforms import invert
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.keypoints import Detector

@@ -7,7 +7,7 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from intercap_core.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.studio.render import (
     BODY,
     CAMERA_GAMMA,

@@ -10,8 +10,8 @@ import pytest
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
-from intercap_core.metrics.planted import support
-from intercap_core.metrics.truth import Truth
+from intercap_core.evaluation.planted import support
+from intercap_core.evaluation.truth import Truth
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.shoes import FEET, LEATHER_M, SOLE_M, in_heavy_shoes, shoe_area
 from intercap_core.studio.stage import Stage, check_capture

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from intercap_core.camera.rig import Rig
 from intercap_core.cli import app
 from intercap_core.commands.check import faults_of_sequences
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.project import load_project
 from intercap_core.stages import frames as frames_stage
 from intercap_core.tables.calibration_choice import choose_calibration

@@ -43,7 +43,7 @@ export const post = async (path, told) =>
 
 export const blob = async (path, signal) => (await request(path, { signal })).blob();
 
-/* Header and arrays as intercap_core/viewer/package.py packs them, and the text for the viewer. */
+/* Header and arrays as intercap_core/output/viewer/package.py packs them, and the text for the viewer. */
 export async function packed(path) {
   const data = await blob(path);
   const whole = await new Response(data.stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();

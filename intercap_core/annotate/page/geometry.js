@@ -1,4 +1,4 @@
-/* Rigid motions as 3x4 rows, rotation vectors, and the lens of intercap_core/camera/projection.py. */
+/* Rigid motions as 3x4 rows, rotation vectors, and the lens of intercap_core/geometry/camera/projection.py. */
 export const IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]];
 
 export const compose = (a, b) => a.map((row) => [0, 1, 2, 3].map((k) =>

@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from intercap_core.body_fit import body_cloud, body_keypoints
 from intercap_core.body_fit.constants import KEYPOINT_SCALE
 from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.camera import projection
-from intercap_core.energy import body_cloud, body_keypoints
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, Sights
 from intercap_core.joint.state import BODY
-from intercap_core.solve.robust import geman_mcclure_weight
 
 _CHUNK = 32  # frames whose derivatives are held at once
 

@@ -1,6 +1,6 @@
 """Contact: Q_t E_C of equation 6 (A.4), weighed by lambda_Q (setting ``contact_weight``).
 
-The residuals, and what differs from the paper, are in :mod:`intercap_core.energy.contact`. The
+The residuals, and what differs from the paper, are in :mod:`intercap_core.joint.terms.contact_residual`. The
 paper's binary Q_t is the probability that each region touches, annotated or detected; what somebody
 saw touching draws more while it stands apart. The setting ``contact_to`` says what skin is drawn
 to: any point of the object, or its annotated part.
@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.energy import contact
-from intercap_core.energy.constants import CONTACT_TOLERANCE
 from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT, CONTACT_SIGMA
+from intercap_core.joint.energy_constants import CONTACT_TOLERANCE
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import State
+from intercap_core.joint.terms import contact_residual as contact
 from intercap_core.joint.terms.coupled import add_distances
 from intercap_core.joint.terms.term import Term
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.energy import stick
-from intercap_core.energy.proximity import Proximity, along_by_object
-from intercap_core.energy.smoothness import RATE
 from intercap_core.joint.equations import NormalEquations, Rows
 from intercap_core.joint.geometry import PosedGeometry
+from intercap_core.joint.proximity import Proximity, along_by_object
+from intercap_core.joint.smoothness import RATE
 from intercap_core.joint.state import ALL
+from intercap_core.joint.terms import stick_residual as stick
 
 
 def add_distances(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from intercap_core.energy import smoothness
+from intercap_core.joint import smoothness as smoothness
 from intercap_core.joint.constants import (
     BODY_DRIFT,
     DRIFT_POINTS_PER_MEASUREMENT,

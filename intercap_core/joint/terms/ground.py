@@ -1,6 +1,6 @@
 """Ground support: E_G (body, A.5) and E_G' (object, A.6) of equation 6.
 
-Weighed by lambda_G (setting ``ground_weight``); residuals in :mod:`intercap_core.energy.ground`.
+Weighed by lambda_G (setting ``ground_weight``); residuals in :mod:`intercap_core.joint.terms.ground_residual`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.energy import ground
-from intercap_core.energy.proximity import along_by_object
 from intercap_core.joint.constants import (
     GROUND_SIGMA,
     MIN_STANDING_VERTICES,
@@ -18,7 +16,9 @@ from intercap_core.joint.constants import (
 )
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.proximity import along_by_object
 from intercap_core.joint.state import BODY, OBJECT, State
+from intercap_core.joint.terms import ground_residual as ground
 from intercap_core.joint.terms.term import Term
 
 

@@ -27,10 +27,10 @@ from torch import Tensor
 from intercap_core.body import lemo
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.lemo import MotionEncoder
-from intercap_core.energy.smoothness import ACCELERATION
 from intercap_core.joint.constants import BODY_ACCELERATION, PROBE_STEPS, SPECTRAL_ITERATIONS
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.smoothness import ACCELERATION
 from intercap_core.joint.state import BODY, State
 from intercap_core.joint.terms.term import Term
 

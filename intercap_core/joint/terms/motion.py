@@ -1,7 +1,7 @@
 """Smooth motion: E_S (body, A.1) and E_A (object, A.3) of equation 6.
 
 Weighed by lambda_S and lambda_A (settings ``body_smoothness`` and ``object_smoothness``); what
-differs from the paper is in :mod:`intercap_core.energy.smoothness`. Recordings of fewer than three
+differs from the paper is in :mod:`intercap_core.joint.smoothness`. Recordings of fewer than three
 frames have no acceleration.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
-from intercap_core.energy import smoothness
+from intercap_core.joint import smoothness as smoothness
 from intercap_core.joint.constants import (
     ACCELERATION_OUTLIER,
     BODY_ACCELERATION,

@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.twist import moved, twists
 from intercap_core.joint.constants import (
     AMBIGUOUS_SHIFT,
     AMBIGUOUS_TURN,
@@ -31,7 +32,6 @@ from intercap_core.joint.constants import (
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.state import OBJECT, State
 from intercap_core.joint.terms.term import Term
-from intercap_core.rigid.twist import moved, twists
 
 # Standard deviations (6,) of turn and shift, rad and metres.
 _FLOOR = np.repeat([TRACK_FLOOR_TURN, TRACK_FLOOR_SHIFT], 3)

@@ -20,7 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.twist import step_between, twists
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, Cameras, Sights
 from intercap_core.joint.constants import IMAGES_OUTLIER
 from intercap_core.joint.equations import NormalEquations
@@ -31,8 +33,6 @@ from intercap_core.joint.terms.term import Term
 from intercap_core.object_track.constants import CONTRADICTED_LOG_RATIO, UNKNOWN_SIGMA
 from intercap_core.object_track.evidence import PoseEvidence, views_noise
 from intercap_core.object_track.view_report import ViewReport
-from intercap_core.rigid.twist import step_between, twists
-from intercap_core.solve.robust import geman_mcclure_weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Object in body (beyond the paper): the other side of :mod:`.penetration`, of the same weight.
 
-Residuals in :mod:`intercap_core.energy.object_in_body`. Of hands alone: what they hold is thin
+Residuals in :mod:`intercap_core.joint.terms.object_in_body_residual`. Of hands alone: what they hold is thin
 enough to lie between their vertices. Who sits is in the seat by what clothes and flesh yield, over
 an area on which the vertices of :mod:`.penetration` are dense, and would be lifted off it. Left out
 where the skin's own vertex is inside the object, which that term pushes out: a depth counts once.
@@ -12,9 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.energy import object_in_body, penetration
-from intercap_core.energy.constants import PENETRATION_TOLERANCE
-from intercap_core.energy.proximity import along_by_object
+from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.joint.constants import (
     MAX_OBJECT_POINTS,
     NEAR_SKIN,
@@ -22,11 +20,14 @@ from intercap_core.joint.constants import (
     OBJECT_SPACING,
     PENETRATION_SIGMA,
 )
+from intercap_core.joint.energy_constants import PENETRATION_TOLERANCE
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.proximity import along_by_object
 from intercap_core.joint.state import ALL, State
+from intercap_core.joint.terms import object_in_body_residual as object_in_body
+from intercap_core.joint.terms import penetration_residual as penetration
 from intercap_core.joint.terms.term import Term
-from intercap_core.rigid.surface_samples import sample_surface
 
 # Joints that carry the hands' skin.
 _HANDS = [

@@ -1,17 +1,17 @@
 """Body in object: named in the text of equation 6 ("as done in PROX"), without a symbol there.
 
 Beyond the paper's formulas: its E_P is equation 5, the self-penetration. Weighed by the setting
-``penetration_weight``; residuals in :mod:`intercap_core.energy.penetration`. E_P_self itself is
+``penetration_weight``; residuals in :mod:`intercap_core.joint.terms.penetration_residual`. E_P_self itself is
 part of the body's data.
 """
 
 from __future__ import annotations
 
-from intercap_core.energy import penetration
 from intercap_core.joint.constants import PENETRATION_SIGMA, VERTICES_PER_MEASUREMENT
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import State
+from intercap_core.joint.terms import penetration_residual as penetration
 from intercap_core.joint.terms.coupled import add_distances
 from intercap_core.joint.terms.term import Term
 

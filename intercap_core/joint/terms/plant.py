@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.contact.standing import sole_parts, standing_probability
 from intercap_core.joint.constants import PLANT_OUTLIER, PLANT_WALK, SOLE_VERTICES
+from intercap_core.joint.contact.standing import sole_parts, standing_probability
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import BODY, State

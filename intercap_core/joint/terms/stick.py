@@ -2,7 +2,7 @@
 
     E = sum over steps t, vertices i of Q_i a_i rho(|q_i(t+1) - q_i(t)|^2) / 2 sigma^2
 
-q is the vertex in the object's frame (:mod:`intercap_core.energy.stick`), Q the probability that
+q is the vertex in the object's frame (:mod:`intercap_core.joint.terms.stick_residual`), Q the probability that
 its region touches in both frames and its patch takes part, a its share of its patch's area. sigma
 is that of a random walk: real grips creep. Robust, so that what truly slides, turns in the fingers
 or is taken anew does so; and left out where a vertex has come far over the object at the start of
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.energy import stick
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.constants import (
     GLIDE_M,
     GLIDE_S,
@@ -26,11 +26,11 @@ from intercap_core.joint.constants import (
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import ALL, State
+from intercap_core.joint.terms import stick_residual as stick
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.coupled import add_steps
 from intercap_core.joint.terms.term import Term
 from intercap_core.schemas import CONTACT_REGIONS
-from intercap_core.solve.robust import geman_mcclure_weight
 
 # Hands grip and soles stand; what sits or leans glides as it settles.
 _GRIPPING = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith(("_hand", "_foot"))]

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from intercap_core.camera.transforms import invert
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.controls import Wander
 from intercap_core.studio.motion import Puppet
 

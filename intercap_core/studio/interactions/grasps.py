@@ -12,8 +12,8 @@ from itertools import product
 
 import numpy as np
 
-from intercap_core.camera.transforms import invert
-from intercap_core.rigid.distance import DistanceField
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.hands import THUMB, Hand, HandShape, shape
 from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.motion import Puppet

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import Footwork, Pose, Step, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
 from intercap_core.studio.interactions.base import SCRIPT_S, Box, Interaction, Performance, upright

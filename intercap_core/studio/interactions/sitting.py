@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import (
     SOLE_FRONT_M,
     Footwork,

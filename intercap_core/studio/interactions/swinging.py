@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from intercap_core.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import Pose, Step, plateau, ramp
 from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, wrapped

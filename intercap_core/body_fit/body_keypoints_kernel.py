@@ -1,0 +1,289 @@
+"""E_J (equation 3) of :mod:`.body_keypoints`, compiled: one pass over each body's keypoints.
+
+A keypoint is a sum of pieces, each of which follows one bone alone, so that its derivatives touch
+the columns of few joints; keypoints on the same chain of joints, a limb, share one dense block.
+Equal to the torch term to rounding, pose blend shapes included: see :mod:`.correctives_kernel`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from torch import Tensor
+
+from intercap_core.body.correctives_kernel import add_to_row
+from intercap_core.body.joints import PARENTS
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
+from intercap_core.body.skeleton_kernel import columns_of_limb, rest_points
+from intercap_core.body_fit.body_keypoints import KeypointSet
+from intercap_core.body_fit.sightings_kernel import evaluate_keypoint
+
+_SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
+_PARENTS = np.array(PARENTS)
+
+
+class Pieces(NamedTuple):
+    """What K keypoints are made of: E pieces, keypoint k of those from starts[k] to starts[k+1].
+
+    A piece lies at R x + share t, with R and t of its bone and x, at rest, from template (E,3) and
+    directions (E,3,S). carrier (K,): the piece on the bone that carries the keypoint's offset.
+    limb_starts (L+1,) and order (K,): the keypoints of each limb; moved_by (L,55) bool: the joints
+    that turn a limb. posedirs (E,3,486), or (E,3,0) where there are no pose blend shapes.
+    """
+
+    starts: np.ndarray
+    bone: np.ndarray
+    share: np.ndarray
+    template: np.ndarray
+    directions: np.ndarray
+    carrier: np.ndarray
+    limb_starts: np.ndarray
+    order: np.ndarray
+    moved_by: np.ndarray
+    posedirs: np.ndarray
+
+    @classmethod
+    def of(cls, model: BodyModel, chosen: KeypointSet) -> Pieces:
+        """The pieces of a set of keypoints."""
+        rest = model.linearise(model.zeros(), vertex_ids=chosen.vertices, joints=True)
+        points = rest.selection
+        weights = points.weights.double().numpy()
+        dtype = points.template.numpy().dtype
+        matrix = chosen.matrix.double().numpy()
+        made_of, bone = np.nonzero((matrix != 0) @ (weights != 0))
+        share = matrix[made_of] * weights[:, bone].T  # (E,N), of each point in each piece
+        carrier = np.flatnonzero(bone == chosen.carrier.numpy()[made_of])
+        starts = np.searchsorted(made_of, np.arange(len(matrix) + 1))
+
+        def mixed(values: Tensor) -> np.ndarray:
+            return np.tensordot(share, values.double().numpy(), 1).astype(dtype)
+
+        posedirs = points.directions[..., :0] if points.posedirs is None else points.posedirs
+        return cls(
+            starts, bone, share.sum(1).astype(dtype), mixed(points.template),
+            mixed(points.directions), carrier, chosen.limbs.starts, chosen.limbs.order,
+            chosen.limbs.moved_by, mixed(posedirs),
+        )  # fmt: skip
+
+    def at_rest(self, shape: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """Pieces (B,E,3) of bodies of shape (B,S), with the keypoints' offsets (K,3)."""
+        rest = rest_points(self.template, self.directions, shape)
+        rest[:, self.carrier] += offsets
+        return rest
+
+
+@numba.njit(cache=True, nogil=True)
+def _piece(skeleton, pieces, rest, b, e):
+    """Where piece e (3,) of body b is, times its share, metres."""
+    m, w = pieces.bone[e], pieces.share[e]
+    x, y, z = rest[b, e, 0], rest[b, e, 1], rest[b, e, 2]
+    turn, offset = skeleton.rotations, skeleton.offsets
+    p0 = turn[b, m, 0, 0] * x + turn[b, m, 0, 1] * y + turn[b, m, 0, 2] * z + w * offset[b, m, 0]
+    p1 = turn[b, m, 1, 0] * x + turn[b, m, 1, 1] * y + turn[b, m, 1, 2] * z + w * offset[b, m, 1]
+    p2 = turn[b, m, 2, 0] * x + turn[b, m, 2, 1] * y + turn[b, m, 2, 2] * z + w * offset[b, m, 2]
+    return p0, p1, p2
+
+
+@numba.njit(cache=True, nogil=True)
+def _point(skeleton, pieces, rest, b, k):
+    """Keypoint k (3,) of body b, metres."""
+    p0, p1, p2 = 0.0, 0.0, 0.0
+    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+        q0, q1, q2 = _piece(skeleton, pieces, rest, b, e)
+        p0, p1, p2 = p0 + q0, p1 + q1, p2 + q2
+    return p0, p1, p2
+
+
+@numba.njit(cache=True, nogil=True)
+def add_cost(skeleton, pieces, rest, observed, frames, cost):
+    """Add E_J to cost (B,) of the frames (B,), whose pieces at rest are (B,E,3)."""
+    gradient, matrix = np.empty(3), np.empty((3, 3))
+    for b in range(len(frames)):
+        total = 0.0
+        for k in range(len(pieces.carrier)):
+            p = _point(skeleton, pieces, rest, b, k)
+            total += evaluate_keypoint(observed, frames[b], k, p, False, gradient, matrix)
+        cost[b] += total
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
+    """Write the derivatives (3,m) of keypoint k by the columns that ``local`` (P,) places, those of
+    the shape from ``shape`` on. ``moved`` (3,S) is scratch."""
+    rows[:] = 0
+    moved[:] = 0
+    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+        m, w = pieces.bone[e], pieces.share[e]
+        q0, q1, q2 = _piece(skeleton, pieces, rest, b, e)
+        up = m
+        while up >= 0:
+            a0 = q0 - w * skeleton.joints[b, up, 0]
+            a1 = q1 - w * skeleton.joints[b, up, 1]
+            a2 = q2 - w * skeleton.joints[b, up, 2]
+            for d in range(3):
+                place = local[3 * up + d]
+                if place >= 0:  # a turn f of the joint moves the piece by f x a
+                    f0 = skeleton.frames[b, up, 0, d]
+                    f1 = skeleton.frames[b, up, 1, d]
+                    f2 = skeleton.frames[b, up, 2, d]
+                    rows[0, place] += f1 * a2 - f2 * a1
+                    rows[1, place] += f2 * a0 - f0 * a2
+                    rows[2, place] += f0 * a1 - f1 * a0
+            up = _PARENTS[up]
+        for d in range(3):
+            if local[_TRANSL + d] >= 0:
+                rows[d, local[_TRANSL + d]] += w
+        if len(shape):
+            for i in range(3):
+                r0 = skeleton.rotations[b, m, i, 0]
+                r1 = skeleton.rotations[b, m, i, 1]
+                r2 = skeleton.rotations[b, m, i, 2]
+                for s in range(moved.shape[1]):
+                    moved[i, s] += (
+                        r0 * pieces.directions[e, 0, s]
+                        + r1 * pieces.directions[e, 1, s]
+                        + r2 * pieces.directions[e, 2, s]
+                        + w * skeleton.moved[b, m, i, s]
+                    )
+    for s in shape:
+        for i in range(3):
+            rows[i, local[_SHAPE + s]] = moved[i, s]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_correctives(
+    skeleton, pieces, b, k, by_keypoint, rest_gradient, rows, local, joints, by_pose
+):
+    """Add the gradient by the pieces of keypoint k at rest, and to its rows (3,m) what ``joints``
+    change by pose blend shapes; by_keypoint (3,): the cost's gradient by the keypoint."""
+    for e in range(pieces.starts[k], pieces.starts[k + 1]):
+        turn = skeleton.rotations[b, pieces.bone[e]]
+        for i in range(3):
+            for d in range(3):
+                rest_gradient[b, e, d] += turn[i, d] * by_keypoint[i]
+            add_to_row(rows[i], local, joints, turn[i], pieces.posedirs[e], by_pose)
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _weigh(matrix, rows, weighted):
+    """weighted = matrix rows, (3,m)."""
+    for i in range(3):
+        m0, m1, m2 = matrix[i, 0], matrix[i, 1], matrix[i, 2]
+        for q in range(rows.shape[1]):
+            weighted[i, q] = m0 * rows[0, q] + m1 * rows[1, q] + m2 * rows[2, q]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _add_product(rows, weighted, block):
+    """Add the lower triangle of rows^T weighted, (m,m), to block; rows and weighted (3,m)."""
+    for p in range(block.shape[0]):
+        a0, a1, a2 = rows[0, p], rows[1, p], rows[2, p]
+        for q in range(p + 1):
+            block[p, q] += a0 * weighted[0, q] + a1 * weighted[1, q] + a2 * weighted[2, q]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_offset(turn, by_keypoint, matrix, weighted, to, first, gradient, hessian):
+    """Add the part of a keypoint's offset, whose three columns start at ``first``; turn (3,3) of
+    the bone that carries it."""
+    for d in range(3):
+        r0, r1, r2 = turn[0, d], turn[1, d], turn[2, d]
+        gradient[first + d] += r0 * by_keypoint[0] + r1 * by_keypoint[1] + r2 * by_keypoint[2]
+        for e in range(3):
+            for i in range(3):
+                hessian[first + d, first + e] += turn[i, e] * (
+                    r0 * matrix[0, i] + r1 * matrix[1, i] + r2 * matrix[2, i]
+                )
+        for q in range(weighted.shape[1]):
+            part = r0 * weighted[0, q] + r1 * weighted[1, q] + r2 * weighted[2, q]
+            hessian[to[q], first + d] += part
+            hessian[first + d, to[q]] += part
+
+
+@numba.njit(cache=True, nogil=True)
+def add_equations(
+    skeleton,
+    pieces,
+    rest,
+    observed,
+    frames,
+    place,
+    first_offset,
+    offsets,
+    cost,
+    gradient,
+    hessian,
+    rest_gradient,
+    by_pose,
+):
+    """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
+    (B,E,3).
+
+    ``place`` (P,) says where a parameter's column is, -1 = fixed; the offsets of the first
+    ``offsets`` keypoints, three columns each, start at ``first_offset``. cost (B,), gradient (B,n),
+    hessian (B,n,n). rest_gradient (B,E,3): that of the pieces at rest, filled in, and by_pose
+    (B,54,3,9): see :mod:`.correctives_kernel`; of no body without pose blend shapes.
+    """
+    dtype = hessian.dtype
+    shape = np.flatnonzero(place[_SHAPE:] >= 0)
+    moved = np.empty((3, len(place) - _SHAPE), dtype)
+    by_keypoint, matrix = np.empty(3), np.empty((3, 3))
+    narrow = np.empty((3, 3), dtype)
+    limbs = len(pieces.limb_starts) - 1
+    all_local = np.empty((limbs, len(place)), np.int64)
+    all_to, width = np.empty((limbs, len(place)), np.int64), np.empty(limbs, np.int64)
+    for limb in range(limbs):
+        moved_by = pieces.moved_by[limb]
+        width[limb] = columns_of_limb(moved_by, place, all_local[limb], all_to[limb])
+    for b in range(len(frames)):
+        for limb in range(limbs):
+            m, local, to = width[limb], all_local[limb], all_to[limb]
+            rows, weighted = np.empty((3, m), dtype), np.empty((3, m), dtype)
+            block = np.zeros((m, m), dtype)
+            of_limb = np.flatnonzero(pieces.moved_by[limb, 1:]) + 1
+            for at in range(pieces.limb_starts[limb], pieces.limb_starts[limb + 1]):
+                k = pieces.order[at]
+                p = _point(skeleton, pieces, rest, b, k)
+                cost[b] += evaluate_keypoint(observed, frames[b], k, p, True, by_keypoint, matrix)
+                if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
+                    continue
+                _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)
+                for q in range(m):
+                    gradient[b, to[q]] += (
+                        rows[0, q] * by_keypoint[0]
+                        + rows[1, q] * by_keypoint[1]
+                        + rows[2, q] * by_keypoint[2]
+                    )
+                if len(rest_gradient):
+                    _add_correctives(
+                        skeleton,
+                        pieces,
+                        b,
+                        k,
+                        by_keypoint,
+                        rest_gradient,
+                        rows,
+                        local,
+                        of_limb,
+                        by_pose[b],
+                    )  # fmt: skip
+                for i in range(3):
+                    for o in range(3):
+                        narrow[i, o] = matrix[i, o]
+                _weigh(narrow, rows, weighted)
+                _add_product(rows, weighted, block)
+                if k < offsets:
+                    turn = skeleton.rotations[b, pieces.bone[pieces.carrier[k]]]
+                    first = first_offset + 3 * k
+                    _add_offset(
+                        turn, by_keypoint, matrix, weighted, to, first, gradient[b], hessian[b]
+                    )
+            for p in range(m):
+                for q in range(p):
+                    block[q, p] = block[p, q]
+            for p in range(m):
+                for q in range(m):
+                    hessian[b, to[p], to[q]] += block[p, q]

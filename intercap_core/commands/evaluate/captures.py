@@ -1,0 +1,99 @@
+"""The capture's part of `intercap evaluate`: recordings taken to the scene and held to truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from rich.table import Table
+
+from intercap_core.commands.evaluate.part import (
+    SPREAD,
+    Figures,
+    Measured,
+    Part,
+    console_of,
+    keyed,
+    number,
+    spread,
+)
+from intercap_core.evaluation import capture
+from intercap_core.evaluation.capture import CaptureErrors
+from intercap_core.project import Project
+
+Captures = Measured[CaptureErrors]
+_WIDTH = 112
+
+
+def measure(project: Project, sequence: str) -> CaptureErrors:
+    """Errors of one capture after ``scene``."""
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
+    return capture.measure(frames, scene, truth)
+
+
+def flat(evaluations: Sequence[Captures]) -> Figures:
+    """Keys ``<dataset>.<measure>``."""
+    found: Figures = {}
+    for captured in evaluations:
+        figures = capture.figures(captured.errors) | spread(capture.figures, captured.errors)
+        found |= keyed(f"{captured.dataset}.", figures)
+    return found
+
+
+def print_captures(evaluations: Sequence[Captures]) -> None:
+    """One table with a row for each capture, one of the figures with a column for each project."""
+    console = console_of(_WIDTH)
+    heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
+             "deg")  # fmt: skip
+    table = Table("capture", *heads, box=None, title="captures against truth, after scene")
+    for found in evaluations:
+        for e in found.errors:
+            table.add_row(
+                e.sequence,
+                e.room,
+                _mean_mm(e.before),
+                _mean_mm(e.after),
+                f"{1e3 * e.after.max():.1f}" if len(e.after) else "",
+                _mean_mm(np.abs(e.offset), 2),
+                f"{e.slips.found} of {e.slips.found + e.slips.missed}",
+                str(e.slips.false),
+                number(1e3 * e.ground_m, 2),
+                number(e.ground_deg, 3),
+            )
+        for name in found.missing:
+            table.add_row(name, "no scene")
+    console.print(table)
+    columns = [
+        capture.figures(found.errors) | spread(capture.figures, found.errors)
+        for found in evaluations
+    ]
+    names = [name for column in columns for name in column if not name.endswith(SPREAD)]
+    table = Table("measure", *(found.dataset for found in evaluations), box=None)
+    table.title = "all captures, after scene (+- standard error over captures)"
+    for name in dict.fromkeys(names):
+        table.add_row(name, *(_with_spread(column, name) for column in columns))
+    console.print(table)
+
+
+def _with_spread(figures: Figures, name: str) -> str:
+    value, error = (figures.get(key, math.nan) for key in (name, f"{name}{SPREAD}"))
+    return number(value, 3) + (f" +- {error:.3f}" if math.isfinite(error) else "")
+
+
+def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
+    return number(1e3 * float(values.mean()), digits) if len(values) else ""
+
+
+PART = Part(
+    "captures",
+    "scene",
+    ("frames",),
+    "metrics.capture",
+    measure,
+    flat,
+    print_captures,
+    kept=CaptureErrors,
+)

@@ -1,0 +1,208 @@
+"""The field's part of `intercap evaluate` that ends with the metrics, of people alone with exports.
+
+No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam,
+somebody else in the room;
+what the verdict without truth tells of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from intercap_core import artefacts
+from intercap_core.body.artefact import load_model
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.bench import judgement
+from intercap_core.commands.evaluate.part import Figures, Measured, Part, console_of, keyed, number
+from intercap_core.evaluation import figures, subject_right
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.verdict_figures import TRUE, stated_errors, verdict_figures
+from intercap_core.project import Project
+from intercap_core.schemas import FRAMES, JOINT, TRUTH
+from intercap_core.stages.export import MARKER
+from intercap_core.studio.subjects import Subject
+
+NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
+BUILDS, SHOES, PASSER_BY = "field_builds", "field_shoes", "field_passer_by"
+_BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
+_BONES = (
+    ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
+)  # fmt: skip
+_WIDTH = 122
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSequence:
+    """What stage ``metrics`` has measured; the relative errors (B,) of the limbs' lengths, and the
+    error of the person's height, metres; of all images with a chosen person the share in which it
+    is the subject; whether there is an export of a body and of no object."""
+
+    metrics: SequenceMetrics
+    bones: np.ndarray
+    height_m: float
+    subject_right: float
+    exported_alone: bool
+
+
+FieldSequences = Measured[FieldSequence]
+
+
+def measure(project: Project, sequence: str) -> FieldSequence:
+    """Errors of one recording after ``metrics``."""
+    row = project.sequences[sequence]
+    assert row.truth is not None
+    joint = project.artefact(sequence, "joint")
+    with artefacts.read(joint, JOINT) as fitted, artefacts.read(row.truth, TRUTH) as true:
+        gender = project.subjects[row.subject].gender
+        model = load_model(project.config.body_models, gender, fitted)
+        shape = torch.as_tensor(np.atleast_2d(fitted["betas"]), dtype=model.dtype)
+        rest = model.zeros(1)
+        rest.betas = shape
+        with torch.no_grad():
+            vertices = model.forward(rest).vertices[0].numpy()
+        own, known = (_lengths(a["joints"]) for a in (fitted, true))
+        person = Subject.load(str(true.attributes["subject"]))
+    height = float(np.ptp(vertices[:, 1])) - float(np.ptp(person.rest[:, 1]))
+    metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
+    chosen, scene = (project.artefact(sequence, stage) for stage in ("person", "scene"))
+    right = subject_right.measure(chosen, scene, row.truth)
+    alone = exported_alone(project.artefact(sequence, "export"))
+    return FieldSequence(metrics, own / known - 1, height, right, alone)
+
+
+def exported_alone(folder: Path) -> bool:
+    """Whether ``folder`` is a whole export that moves a body and knows of no object."""
+    if not (folder / MARKER).is_file():
+        return False
+    told = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+    there = all((folder / name).is_file() for name in told["files"])
+    named = {Path(name).name for name in told["files"]}
+    return there and "body.npz" in named and "object.npz" not in named and not told["object"]
+
+
+def last_stage(project: Project) -> str | None:
+    """People alone are taken to the export; what else there is ends with the metrics."""
+    return "export" if project.config.dataset == ALONE else None
+
+
+def seconds(project: Project, sequence: str) -> Figures:
+    """``verdict.seconds_per_frame`` of one recording, as `intercap bench` has it."""
+    with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
+        frames = len(recorded["times"])
+    return judgement(project.path, sequence, frames)
+
+
+def _lengths(joints: np.ndarray) -> np.ndarray:
+    """Median lengths (B,) of the limbs' bones over time, of joints (T, 55, 3)."""
+    ends = [
+        [JOINT_INDEX[f"{side}_{name}"] for name in bone]
+        for side in ("left", "right")
+        for bone in _BONES
+    ]
+    a, b = np.array(ends).T
+    return np.median(np.linalg.norm(joints[:, a] - joints[:, b], axis=2), axis=0)
+
+
+def flat(evaluations: Sequence[FieldSequences]) -> Figures:
+    """Keys ``field.<measure>`` and ``verdict.<measure>``."""
+    every = [e.metrics for found in evaluations for e in found.errors]
+    found = keyed("verdict.", verdict_figures(every))
+    flags = figures.flag_figures([m for m in every if m.has_truth])
+    for key, name in (("flag_recall", "bad_recall"), ("flag_precision", "bad_precision")):
+        if key in flags:
+            found[f"field.{name}"] = flags[key]
+    for dataset, name in ((NO_DEPTH, "no_depth"), (BUILDS, "builds"), (SHOES, "shoes")):
+        some = [e for found in evaluations if found.dataset == dataset for e in found.errors]
+        found |= keyed(f"field.{name}_", _of_bodies(some)) if some else {}
+    if "field.builds_pve_mm" in found and "field.no_depth_pve_mm" in found:
+        found["field.builds_ratio"] = found["field.builds_pve_mm"] / found["field.no_depth_pve_mm"]
+    on_beam = [e.metrics for some in evaluations if some.dataset == BEAM for e in some.errors]
+    for stage in ("body_fit", "joint"):
+        suffix = "" if stage == "joint" else f"_{stage}"
+        for key in _BEAM_KEYS:
+            values = figures.pooled(on_beam, f"truth/{stage}/{key}")
+            if values is not None and np.isfinite(values).any():
+                unit = "mm_s" if key == "planted_speed" else "mm"
+                name = key.removeprefix("body_").removesuffix("_speed")
+                found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
+    several = [found for found in evaluations if found.dataset == PASSER_BY]
+    if several:
+        shares = [e.subject_right for some in several for e in some.errors]
+        shares += [0.0 for some in several for _ in some.missing]
+        found["field.subject_right_share"] = float(np.mean(shares))
+        if every := [e.metrics for some in several for e in some.errors]:
+            found["field.passer_by_pve_mm"] = figures.truth_figures(every, "joint")["body_pve_mm"]
+    alone = [found for found in evaluations if found.dataset == ALONE]
+    if alone:
+        whole = [_of_a_person_alone(e) for some in alone for e in some.errors]
+        count = len(whole) + sum(len(some.missing) for some in alone)
+        found["field.people_alone_share"] = sum(whole) / count
+    return found
+
+
+def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
+    """Skin, lengths of limbs and heights of some recordings' bodies."""
+    bones = np.abs(np.stack([e.bones for e in some])).mean(axis=1)  # by person
+    return {
+        "pve_mm": figures.truth_figures([e.metrics for e in some], "joint")["body_pve_mm"],
+        "bone_percent": 100 * float(bones.mean()),
+        "bone_worst_percent": 100 * float(bones.max()),
+        "height_mm": 1e3 * float(np.mean([abs(e.height_m) for e in some])),
+    }
+
+
+def _of_a_person_alone(sequence: FieldSequence) -> bool:
+    """Whether there are figures and an export of the body, and none of an object that is not
+    there."""
+    has = figures.truth_figures([sequence.metrics], "joint")
+    measured = "body_pve_mm" in has and not any(name.startswith("object") for name in has)
+    return measured and sequence.exported_alone
+
+
+def print_field(evaluations: Sequence[FieldSequences]) -> None:
+    """A row a recording: true and stated errors, limbs, height."""
+    console = console_of(_WIDTH)
+    heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
+             "bones %", "height mm", "subject %")  # fmt: skip
+    table = Table("recording", *heads, box=None, title="the field, after metrics")
+    for found in evaluations:
+        for e in found.errors:
+            cells = []
+            by_part = {error.part: error for error in stated_errors(e.metrics)}
+            for part in TRUE:  # a person alone has no object
+                error = by_part.get(part)
+                told = error and [number(error.true, 1), number(error.stated, 1) or "silent"]
+                cells += told or ["", ""]
+            table.add_row(
+                f"{found.dataset}: {e.metrics.name}",
+                *cells,
+                number(100 * float(e.metrics.values["flagged"].mean()), 0),
+                number(100 * float(np.abs(e.bones).mean()), 1),
+                number(1e3 * e.height_m, 0),
+                number(100 * e.subject_right, 0),
+            )
+        for name in found.missing:
+            table.add_row(f"{found.dataset}: {name}", "no metrics")
+    console.print(table)
+    for key, value in flat(evaluations).items():
+        console.print(f"{key}: {value:.3g}", highlight=False)
+
+
+PART = Part(
+    "field",
+    "metrics",
+    ("joint",),
+    "metrics.figures",
+    measure,
+    flat,
+    print_field,
+    last=last_stage,
+    timed=seconds,
+)

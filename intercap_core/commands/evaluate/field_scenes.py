@@ -1,0 +1,91 @@
+"""The field's part of `intercap evaluate` that ends with the scene.
+
+Cameras that started apart or have unequal rates, rooms whose measured surface is mostly floor, a
+person on a beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from rich.table import Table
+
+from intercap_core.commands.evaluate.part import Figures, Measured, Part, console_of, keyed, number
+from intercap_core.evaluation import field
+from intercap_core.evaluation.field import FieldScene
+from intercap_core.project import Project
+
+FieldScenes = Measured[FieldScene]
+# What datasets of each cause begin with
+STARTS, RATES, FLOOR, BEAM = "field_starts", "field_rates", "field_floor", "field_beam"
+_WIDTH = 128
+
+
+def measure(project: Project, sequence: str) -> FieldScene:
+    """Errors of one recording after ``scene``."""
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
+    return field.measure(frames, scene, truth)
+
+
+def flat(evaluations: Sequence[FieldScenes]) -> Figures:
+    """Keys ``field.<measure>``; those of starts also by dataset, of unequal rates apart."""
+    found = keyed("field.", field.floor_figures(_of(evaluations, FLOOR)))
+    found |= keyed("field.", field.start_figures(_of(evaluations, STARTS)))
+    found |= keyed("field.rates_", field.start_figures(_of(evaluations, RATES)))
+    found |= keyed("field.", field.beam_figures(_of(evaluations, BEAM)))
+    for measured in evaluations:
+        if measured.dataset.startswith(STARTS):
+            rate = measured.dataset.removeprefix(STARTS)
+            figures = field.start_figures(measured.errors)
+            found |= {f"field.{key}{rate}": value for key, value in figures.items()}
+    return found
+
+
+def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
+    return [e for found in evaluations if found.dataset.startswith(cause) for e in found.errors]
+
+
+def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
+    """A row a recording."""
+    console = console_of(_WIDTH)
+    heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse",
+             "floor mm", "deg")  # fmt: skip
+    table = Table("recording", *heads, box=None, title="the field, after scene")
+    for found in evaluations:
+        for e in found.errors:
+            table.add_row(
+                f"{found.dataset}: {e.sequence}",
+                _list(e.apart_s, 2),
+                _list(1e3 * e.late_s, 1),
+                _list(1e3 * e.sigma_s, 1),
+                str(int(e.set_aside.sum())),
+                number(1e3 * float(e.before.mean()), 1),
+                number(1e3 * float(e.after.mean()), 1),
+                number(1e3 * float(np.median(e.stated)), 1),
+                str(int((e.after > e.before + field.WORSE_M).sum())),
+                number(1e3 * e.floor_m, 1) or "-",
+                number(e.tilt_deg, 2) or "-",
+            )
+        for name in found.missing:
+            table.add_row(f"{found.dataset}: {name}", "no scene")
+    console.print(table)
+    for key, value in flat(evaluations).items():
+        console.print(f"{key}: {value:.3g}", highlight=False)
+
+
+def _list(values: np.ndarray, digits: int) -> str:
+    return " ".join(number(float(value), digits) or "-" for value in values)
+
+
+PART = Part(
+    "field_scenes",
+    "scene",
+    ("frames",),
+    "metrics.field",
+    measure,
+    flat,
+    print_scenes,
+)

@@ -1,0 +1,105 @@
+"""`intercap evaluate`: virtual recordings against truth, as tables and as flat JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from intercap_core.commands.evaluate import (
+    bodies,
+    budget,
+    captures,
+    field,
+    field_scenes,
+    objects,
+    sequences,
+)
+from intercap_core.commands.evaluate.part import Figures, Part, require_truth
+from intercap_core.commands.evaluate.reference import REFERENCE, compare
+from intercap_core.commands.evaluate.seeds import drawn_anew
+from intercap_core.commands.evaluate.workflows import bring_up_to_date
+from intercap_core.project import load_project
+
+PARTS: dict[str, Part[Any]] = {
+    part.name: part
+    for part in (
+        sequences.PART,
+        captures.PART,
+        objects.PART,
+        bodies.PART,
+        field_scenes.PART,
+        field.PART,
+    )
+}
+QUICK_SETTINGS = Path("config/evaluation/quick.yaml")
+QUICK_PARTS = ("sequences", "objects")
+
+
+def evaluate(
+    settings: Mapping[str, Sequence[Path]],
+    output: Path,
+    *,
+    cores: int = 0,
+    reference: Path | None = None,
+    seed: int | None = None,
+) -> int:
+    """Bring the evaluation's recordings up to date, print the tables and write ``output``.
+
+    ``settings``: for each part of ``PARTS`` the settings files of its recordings: ``sequences`` are
+    taken to the metrics, ``captures`` to the scene alone, ``objects`` to the object's track,
+    ``bodies`` to the body's fit, ``field_scenes`` and ``field``, recordings as outside a studio, to
+    the scene and to the metrics (people alone to the exports). ``output`` is flat JSON with keys
+    ``area.measure`` and, where a figure has one, ``area.measure_spread``: areas of annotated
+    recordings end in ``_annotated``, those of ``captures`` have their dataset's name, that of
+    ``objects`` is ``object``, that of ``bodies`` is ``body``, those of both parts of the field are
+    ``field`` and ``verdict``; ``time`` holds minutes. The figures are compared with those of
+    ``reference`` where one is given.
+    ``seed`` draws all recordings anew (:mod:`.seeds`). Returns 1 where a stage failed; recordings
+    that failed are left out of the figures and named. Raises UserError where a project's settings
+    are wrong, or none of its sequences has a result.
+    """
+    begin = time.monotonic()
+    if seed is not None:
+        settings = drawn_anew(settings, seed)
+    projects = {
+        name: [load_project(path) for path in paths] for name, paths in settings.items() if paths
+    }  # faults are told before any work
+    wanted = {name: PARTS[name].targets(some) for name, some in projects.items()}
+    for some in projects.values():
+        for project in some:
+            require_truth(project)
+    frames = budget.frames_of([project for some in projects.values() for project in some])
+    status = bring_up_to_date(wanted, frames, cores=cores)
+    workers = cores or len(os.sched_getaffinity(0))
+    found: Figures = {}
+    for name, some in projects.items():
+        part = PARTS[name]
+        measured = part.measure_all(some, workers=workers)
+        part.print_tables(measured)
+        found |= part.flat(measured) | part.time_one(some)
+    minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
+    passed = (time.monotonic() - begin) / 60
+    budget.print_minutes(list(projects), minutes, passed)
+    found |= {f"time.{key}": value for key, value in {**minutes, "minutes": passed}.items()}
+    flat = {key: _rounded(value) for key, value in found.items() if math.isfinite(value)}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    if reference is not None:
+        compare(flat, reference)
+    print(output)
+    return status
+
+
+def evaluate_quick(output: Path, *, cores: int = 0) -> int:
+    """The fixed small set, beside the figures recorded last; see :func:`evaluate`."""
+    settings = {part: [QUICK_SETTINGS] for part in QUICK_PARTS}
+    return evaluate(settings, output, cores=cores, reference=REFERENCE)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")

@@ -1,0 +1,214 @@
+"""The part of `intercap evaluate` that is taken to the end: every stage held to truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from intercap_core.commands.evaluate.part import (
+    SPREAD,
+    Figures,
+    Measured,
+    Part,
+    keyed,
+    number,
+    spread,
+)
+from intercap_core.evaluation import figures, hold_figures
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.verdict_figures import verdict_figures
+from intercap_core.project import Project
+from intercap_core.stage_list import ESTIMATES
+
+PLAIN, ANNOTATED = "no annotations", "annotated"
+# Figures of the sequential fits that stand beside the joint stage's, and their names there.
+SEQUENTIAL = {
+    "body_pve_mm": "body_pve_sequential_mm",
+    "hand_grasp_mpjpe_mm": "hand_grasp_sequential_mm",
+    "fingertip_touching_mm": "fingertip_touching_sequential_mm",
+    "slip_mm_s": "slip_sequential_mm_s",
+    "planted_mm_s": "planted_sequential_mm_s",
+    "floor_mm": "floor_sequential_mm",
+    "foot_swing_mm": "foot_swing_sequential_mm",
+    "acceleration_feet_mm": "acceleration_feet_sequential_mm",
+}
+# Other names under which the joint stage's goals are stated.
+ALSO = {
+    "object_translation_median_mm": ("joint", "object_translation_mm"),
+    "contact_vertex_f1": ("joint", "contact_f1"),
+    "penetration_mean_mm": ("penetration", "mean_mm"),
+}
+# Of each object, after which stage and how it is called there, beside the joint stage.
+BY_OBJECT = {
+    "body mm": ("body_fit", "body_pve_mm"),
+    "grasp mm": ("body_fit", "hand_grasp_mpjpe_mm"),
+    "tips mm": ("body_fit", "fingertip_touching_mm"),
+    "slip mm/s": ("body_fit", "slip_mm_s"),
+    "planted mm/s": ("body_fit", "planted_mm_s"),
+    "object mm": ("object_track", "object_translation_mm"),
+    "p95": ("object_track", "object_translation_p95_mm"),
+    "turn deg": ("object_track", "object_rotation_deg"),
+    "p95 ": ("object_track", "object_rotation_p95_deg"),
+    "contact F1": ("body_fit", "contact_f1"),
+}
+BY_OBJECT_WIDTH = 190  # columns of its table, also where a file takes it
+Areas = dict[str, Figures]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSequence:
+    """The metrics of one sequence, and whether it is annotated."""
+
+    metrics: SequenceMetrics
+    annotated: bool
+
+
+Sequences = Measured[MeasuredSequence]
+
+
+def measure(project: Project, sequence: str) -> MeasuredSequence:
+    """What stage ``metrics`` has measured."""
+    made = project.annotation_made(sequence) or project.annotation_path(sequence).exists()
+    return MeasuredSequence(SequenceMetrics.read(project.artefact(sequence, "metrics")), made)
+
+
+def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]:
+    """The sequences apart by whether they are annotated; empty groups are left out."""
+    every = [e for found in evaluations for e in found.errors]
+    apart = {
+        name: [e.metrics for e in every if e.annotated == annotated]
+        for name, annotated in ((PLAIN, False), (ANNOTATED, True))
+    }
+    return {name: sequences for name, sequences in apart.items() if sequences}
+
+
+def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
+    """Every figure of a group of sequences by area: the stages, and what is not one stage's."""
+    known = [s for s in sequences if s.has_truth]
+    found = {
+        stage: figures.truth_figures(sequences, stage) | hold_figures.hold_figures(known, stage)
+        for stage in ESTIMATES
+    }
+    for stage in ESTIMATES:
+        sweep = figures.contact_sweep(sequences, stage)
+        found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
+    found["joint"] |= hold_figures.stated_contact_figures(known) | _beside_sequential(known, found)
+    penetration = figures.penetration_figures(sequences)
+    for name, (area, measure) in ALSO.items():
+        figure = {**found, "penetration": penetration}[area].get(measure)
+        if figure is not None:
+            found["joint"][name] = figure
+    return {
+        **found,
+        "penetration": penetration,
+        "vertex_to_cloud": figures.cloud_figures(sequences),
+        "vertex_to_cloud_floor": figures.floor_figures(sequences),
+        "extrinsics": figures.extrinsics_figures(sequences),
+        "flags": figures.flag_figures(sequences),
+        "verdict": verdict_figures(known),
+    }
+
+
+def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
+    """What the joint stage is held to: the sequential fits' figures, and objects that got worse."""
+    first = found["body_fit"]
+    beside = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
+    if any(s.object_ for s in sequences):
+        worse = hold_figures.worse_objects(sequences)
+        beside |= {"object_worse_count": float(len(worse))}
+    cameras = figures.extrinsics_figures(sequences)
+    if "joint_mean_mm" in cameras:
+        beside["extrinsics_mm"] = cameras["joint_mean_mm"]
+        beside["extrinsics_scene_mm"] = cameras["after_mean_mm"]
+    for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
+        slips = hold_figures.slip_by_object(sequences, stage)
+        beside |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
+    for name, some in _by_object(sequences).items():
+        turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")
+        if turn is not None:
+            beside[f"{name}.object_rotation_p95_deg"] = turn
+    depths = [figures.penetration_figures(some) for some in _by_object(sequences).values()]
+    deepest = [found["mean_mm"] for found in depths if np.isfinite(found.get("mean_mm", np.nan))]
+    if deepest:
+        beside["penetration_worst_object_mm"] = max(deepest)
+    return beside
+
+
+def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceMetrics]]:
+    names = sorted({s.object_ for s in sequences if s.object_})
+    return {name: [s for s in sequences if s.object_ == name] for name in names}
+
+
+def with_spread(sequences: Sequence[SequenceMetrics]) -> Areas:
+    """The same, and to each figure its standard error over the sequences."""
+    return {
+        area: found | spread(lambda some, area=area: areas(some)[area], sequences)  # type: ignore[misc]
+        for area, found in areas(sequences).items()
+    }
+
+
+def flat(evaluations: Sequence[Sequences]) -> Figures:
+    """Keys ``joint.body_pve_mm``; areas of annotated sequences end in ``_annotated``."""
+    found: Figures = {}
+    for group, sequences in groups(evaluations).items():
+        for area, measures in with_spread(sequences).items():
+            found |= keyed(f"{area}{'' if group == PLAIN else '_annotated'}.", measures)
+    if "joint_annotated.contact_detected_f1" in found:
+        found["joint.contact_detected_annotated_f1"] = found["joint_annotated.contact_detected_f1"]
+    return found
+
+
+def print_sequences(evaluations: Sequence[Sequences]) -> None:
+    """One table for the three stages side by side, one for the rest; a column for each group."""
+    console = Console()
+    found = {name: with_spread(some) for name, some in groups(evaluations).items()}
+    counts = {name: len(some) for name, some in groups(evaluations).items()}
+    for group, tables in found.items():
+        table = Table("measure", *ESTIMATES, box=None)
+        table.title = f"against truth, {group} ({counts[group]} sequences, +- standard error)"
+        for measure in _names([tables[stage] for stage in ESTIMATES]):
+            table.add_row(measure, *(_cell(tables[stage], measure) for stage in ESTIMATES))
+        console.print(table)
+    table = Table("after joint", *found, box=None, title="all frames (+- standard error)")
+    for area in next(iter(found.values()), {}):
+        if area in ESTIMATES:
+            continue
+        columns = [tables[area] for tables in found.values()]
+        for name in _names(columns):
+            table.add_row(f"{area}.{name}", *(_cell(column, name) for column in columns))
+    console.print(table)
+    for group, some in groups(evaluations).items():
+        table = Table("object", *BY_OBJECT, "stated F1", "penetration mm", box=None)
+        table.title = f"sequential fits > joint, {group}"
+        for name, of_object in _by_object(some).items():
+            table.add_row(name, *_row(areas(of_object)))
+        Console(width=max(console.width, BY_OBJECT_WIDTH)).print(table)
+    for name in (name for measured in evaluations for name in measured.missing):
+        console.print(f"{name}: no metrics", highlight=False, markup=False)
+
+
+def _row(found: Areas) -> list[str]:
+    joint = found["joint"]
+    cells = [
+        f"{number(found[stage].get(measure), 2)} > {number(joint.get(measure), 2)}"
+        for stage, measure in BY_OBJECT.values()
+    ]
+    stated = number(joint.get("contact_detected_f1"), 2)
+    return [*cells, stated, number(joint.get("penetration_mean_mm"), 1)]
+
+
+def _names(columns: Sequence[Figures]) -> list[str]:
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [name for name in names if not name.endswith(SPREAD)]
+
+
+def _cell(column: Figures, name: str) -> str:
+    error = number(column.get(name + SPREAD), 3)
+    return number(column.get(name), 3) + (f" +- {error}" if error else "")
+
+
+PART = Part("sequences", "metrics", (), "metrics.figures", measure, flat, print_sequences)

@@ -1,0 +1,257 @@
+"""Errors of the scene artefact against truth: poses, time, slips, floor, depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.evaluation.extrinsics import displacement, rig_centre
+from intercap_core.evaluation.times import match_times
+from intercap_core.schemas import FRAMES, SCENE, TRUTH
+
+CAPTURE_RADIUS_M = 1.5  # around the rig's centre, on the floor
+_RINGS, _SPOKES = 40, 90  # of the places on the floor where heights are compared
+MEDIAN_CHI_1 = 0.6745  # median of |x| where x is normal with deviation 1
+_WORSE_M = 1e-6  # rounding is no change for the worse
+
+
+@dataclass(frozen=True)
+class Slip:
+    """Images ``first`` to ``last`` (sets) of a camera that all show ``frames`` sets before."""
+
+    camera: int
+    first: int
+    last: int
+    frames: int
+
+
+@dataclass(frozen=True)
+class SlipCounts:
+    """True slips that were detected or missed, and false detections, by event.
+
+    ``images_wrong`` of all ``images`` are given a slip that is not the true one.
+    """
+
+    found: int
+    missed: int
+    false: int
+    images_wrong: int
+    images: int
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureErrors:
+    """One capture's errors, metres, seconds, degrees; NaN = unknown or not estimated.
+
+    ``before`` and ``after`` (C-1,) of the extrinsics, ``offset`` (C-1,), master left out;
+    ``offset_normalised`` (C-1,) over the stated deviation; ``depth_bias`` (C,). Cameras without an
+    image, or without depth, are left out.
+    """
+
+    sequence: str
+    room: str
+    before: np.ndarray
+    after: np.ndarray
+    offset: np.ndarray
+    offset_normalised: np.ndarray
+    slips: SlipCounts
+    ground_m: float
+    ground_deg: float
+    depth_bias: np.ndarray
+
+
+def offset_errors(offset: np.ndarray, true_offset: np.ndarray, master: int) -> np.ndarray:
+    """Errors (C-1,) of time offsets (C,) relative to the master's, the master left out, seconds."""
+    error = (offset - offset[master]) - (true_offset - true_offset[master])
+    return np.delete(error, master)
+
+
+def slip_events(slip: np.ndarray, available: np.ndarray) -> list[Slip]:
+    """Runs of equal slips, not zero, over each camera's images; both (T, C).
+
+    Sets without an image of the camera neither belong to a run nor end it.
+    """
+    events = []
+    for camera in range(slip.shape[1]):
+        images = np.flatnonzero(available[:, camera])
+        values = slip[images, camera]
+        starts = np.flatnonzero(np.diff(values, prepend=values[:1] + 1))
+        ends = np.append(starts, len(values))[1:]
+        for start, end in zip(starts, ends, strict=True):
+            if values[start]:
+                first, last = int(images[start]), int(images[end - 1])
+                events.append(Slip(camera, first, last, int(values[start])))
+    return events
+
+
+def compare_slips(slip: np.ndarray, true_slip: np.ndarray, available: np.ndarray) -> SlipCounts:
+    """Compare slips (T, C) by event, on the sets in which the camera has an image (T, C).
+
+    A true event is found where a detected one of the same camera and the same number of frames
+    overlaps it; a detected event that overlaps no such true one is a false detection.
+    """
+    true, found = slip_events(true_slip, available), slip_events(slip, available)
+    answered = sum(any(_meet(t, f) for f in found) for t in true)
+    return SlipCounts(
+        found=answered,
+        missed=len(true) - answered,
+        false=sum(not any(_meet(t, f) for t in true) for f in found),
+        images_wrong=int((slip != true_slip)[available].sum()),
+        images=int(available.sum()),
+    )
+
+
+def ground_error(
+    point: np.ndarray,
+    normal: np.ndarray,
+    true_normal: np.ndarray,
+    true_offset: float,
+    centre: np.ndarray,
+) -> tuple[float, float]:
+    """Mean height error over the capture area, metres, and the angle between normals, degrees.
+
+    The found floor goes through ``point`` (3,) with ``normal`` (3,), the true one is
+    ``true_normal`` . x + ``true_offset`` = 0, both normals unit and up. The capture area is the
+    disc of ``CAPTURE_RADIUS_M`` on the true floor around the foot of ``centre`` (3,). NaN without
+    a floor.
+    """
+    if not np.isfinite([*point, *normal]).all():
+        return float("nan"), float("nan")
+    foot = centre - (true_normal @ centre + true_offset) * true_normal
+    across = np.cross(true_normal, np.eye(3)[np.argmin(np.abs(true_normal))])
+    across /= np.linalg.norm(across)
+    along = np.cross(true_normal, across)
+    # Rings of equal area, so that all places count the same
+    radius = CAPTURE_RADIUS_M * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
+    angle = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
+    u, v = (np.outer(radius, f(angle)).ravel()[:, None] for f in (np.cos, np.sin))
+    places = foot + u * across + v * along
+    height = (point - places) @ normal / (true_normal @ normal)
+    sine, cosine = np.linalg.norm(np.cross(normal, true_normal)), normal @ true_normal
+    return float(np.abs(height).mean()), float(np.degrees(np.arctan2(sine, cosine)))
+
+
+def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
+    """Compare one capture's scene with its truth.
+
+    Raises UserError where an artefact is missing or broken, or the truth is of another recording.
+    """
+    with (
+        artefacts.read(frames, FRAMES) as recorded,
+        artefacts.read(scene, SCENE) as found,
+        artefacts.read(truth, TRUTH) as true,
+    ):
+        names, true_names = found.text("camera_names"), true.text("camera_names")
+        at = match_times(truth, true["times"], found["times"], float(found.attributes["fps"]))
+        strangers = sorted(set(names) - set(true_names))
+        if strangers:
+            raise UserError(
+                f"{truth}: knows no camera {strangers[0]!r}, which {scene} has; it is the truth of "
+                "another recording"
+            )
+        order = [true_names.index(name) for name in names]
+        available = recorded["colour_index"] >= 0
+        seen = available.any(0)
+        measured = (recorded["depth_index"] >= 0).any(0)
+        master = names.index(str(found.attributes["master"]))
+        others = np.delete(seen, master)
+        true_poses = true["master_from_colour"][order]
+        true_offset = true["time_offset"][order]
+        offset = offset_errors(found["time_offset"], true_offset, master)[others]
+        sigma = np.delete(found["time_offset_sigma"], master)[others]
+        before, after = (
+            np.delete(displacement(found[key], true_poses, master), master)[others]
+            for key in ("master_from_colour_start", "master_from_colour")
+        )
+        height, angle = ground_error(
+            found["ground_point"],
+            found["ground_normal"],
+            true["ground_normal"],
+            float(true.attributes["ground_offset"]),
+            rig_centre(true_poses),
+        )
+        return CaptureErrors(
+            sequence=str(found.attributes["sequence"]),
+            room=str(true.attributes.get("room", "")),
+            before=before,
+            after=after,
+            offset=offset,
+            offset_normalised=offset / np.where(sigma > 0, sigma, np.nan),
+            slips=compare_slips(found["slip"], true["slip"][at][:, order], available),
+            ground_m=height,
+            ground_deg=angle,
+            depth_bias=(found["depth_bias"] - _true_bias(true)[order])[measured],
+        )
+
+
+def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
+    """What is reported of several captures, in millimetres, milliseconds and degrees.
+
+    Extrinsics of rooms with furniture, and apart those of bare floors (``floor_only``); shares of
+    captures that got better or worse are over both, by the mean over a capture's cameras.
+    """
+    if not captures:
+        return {}
+    found: dict[str, float] = {"captures": float(len(captures))}
+    for name, bare in (("extrinsics", False), ("extrinsics_floor_only", True)):
+        group = [c for c in captures if (c.room == "bare") == bare]
+        before = 1e3 * _joined([c.before for c in group])
+        after = 1e3 * _joined([c.after for c in group])
+        if len(after):
+            found[f"{name}_before_mm"] = float(before.mean())
+            found[f"{name}_after_mm" if not bare else f"{name}_mm"] = float(after.mean())
+            found[f"{name}_worst_capture_mm"] = max(
+                1e3 * float(c.after.mean()) for c in group if len(c.after)
+            )
+            found[f"{name}_worst_camera_mm"] = float(after.max())
+    several = [c for c in captures if len(c.after)]
+    if several:
+        change = np.array([c.after.mean() - c.before.mean() for c in several])
+        found["extrinsics_improved_share"] = float((change < -_WORSE_M).mean())
+        found["extrinsics_worse_share"] = float((change > _WORSE_M).mean())
+    offset = _joined([c.offset for c in captures])
+    if len(offset):
+        found["offset_error_ms"] = 1e3 * float(np.abs(offset).mean())
+        found["offset_error_worst_ms"] = 1e3 * float(np.abs(offset).max())
+    normalised = _joined([c.offset_normalised for c in captures])
+    if np.isfinite(normalised).any():
+        ratio = float(np.nanmedian(np.abs(normalised))) / MEDIAN_CHI_1
+        found["offset_normalised_median"] = ratio
+    if len(offset):
+        found["offset_estimated_share"] = float(np.isfinite(normalised).mean())
+    found["slips_true"] = float(sum(c.slips.found + c.slips.missed for c in captures))
+    found["slips_missed"] = float(sum(c.slips.missed for c in captures))
+    found["slips_false"] = float(sum(c.slips.false for c in captures))
+    images = sum(c.slips.images for c in captures)
+    if images:
+        found["slips_images_wrong_share"] = sum(c.slips.images_wrong for c in captures) / images
+    height = np.array([c.ground_m for c in captures])
+    found["ground_missing_share"] = float(np.isnan(height).mean())
+    if np.isfinite(height).any():
+        found["ground_error_mm"] = 1e3 * float(np.nanmean(height))
+        found["ground_error_worst_mm"] = 1e3 * float(np.nanmax(height))
+        found["ground_error_deg"] = float(np.nanmean([c.ground_deg for c in captures]))
+    bias = _joined([c.depth_bias for c in captures])
+    if np.isfinite(bias).any():
+        found["depth_bias_error_mm"] = 1e3 * float(np.nanmean(np.abs(bias)))
+    return found
+
+
+def _true_bias(truth: artefacts.Artefact) -> np.ndarray:
+    """(C,), NaN where the truth does not state it."""
+    if "depth_bias" in truth:
+        return truth["depth_bias"]
+    return np.full(len(truth["time_offset"]), np.nan)
+
+
+def _meet(a: Slip, b: Slip) -> bool:
+    return a.camera == b.camera and a.frames == b.frames and a.first <= b.last and b.first <= a.last
+
+
+def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *parts])

@@ -1,0 +1,206 @@
+"""Two versions of a dataset side by side: what changed, by sequence and frame."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
+from intercap_core.errors import UserError
+from intercap_core.evaluation.body import BODY_JOINTS, FINGER_JOINTS
+from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.evaluation.verdict_figures import stated_errors
+from intercap_core.schemas import JOINT
+
+TOUCHING = 0.5  # a stated probability of contact from which a region counts as touching
+MOVED_MM = 1.0  # a frame has changed where body or object moved by this much
+TURNED_DEG = 0.5  # or the object turned by this much
+NAME, FRAME = "sequence", "frame"
+SAME, CHANGED, ADDED, REMOVED, UNLIKE = "same", "changed", "added", "removed", "not comparable"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """``sequences`` has a row for each that either version has, the most changed first; ``frames``
+    a row for each changed frame; ``figures`` of both datasets whole, "figure", "old" and "new", as
+    summary.json has them, empty where either has none. Millimetres and degrees."""
+
+    sequences: pd.DataFrame
+    frames: pd.DataFrame
+    figures: pd.DataFrame
+
+
+def compare(old: Path, new: Path) -> Comparison:
+    """Compare two results folders, sequence by sequence.
+
+    A sequence is one with a joint artefact. Raises UserError where a folder has none.
+    """
+    before, after = (_sequences(folder) for folder in (old, new))
+    rows: list[dict[str, object]] = []
+    frames = []
+    for name in sorted({*before, *after}):
+        if name not in before or name not in after:
+            rows.append({NAME: name, "state": ADDED if name not in before else REMOVED})
+            continue
+        try:
+            row, changed = _compare_one(name, before[name], after[name])
+        except UserError as error:
+            row, changed = {"state": UNLIKE, "note": str(error)}, pd.DataFrame()
+        rows.append({NAME: name, **row})
+        frames.append(changed)
+    columns = [
+        NAME, "state", "frames", "changed_frames", "body_mm", "body_max_mm", "hands_mm",
+        "object_mm", "object_max_mm", "object_deg", "contact_frames_before",
+        "contact_frames_after", "contact_changed_frames", "flagged_before", "flagged_after",
+        *(f"stated_{part}_mm_{when}" for part in ("body", "hands", "object")
+          for when in ("before", "after")),
+        "note",
+    ]  # fmt: skip
+    table = pd.DataFrame(rows, columns=columns)
+    numbers = table.columns.drop([NAME, "state", "note"])
+    table[numbers] = table[numbers].astype(float)
+    table["note"] = table["note"].fillna("")
+    worst = table[["body_max_mm", "object_max_mm"]].max(axis=1)
+    share = table["changed_frames"] / table["frames"]
+    order = pd.DataFrame({"told": table["state"].isin([ADDED, REMOVED, UNLIKE]), "share": share,
+                          "worst": worst}).fillna(-1)  # fmt: skip
+    table = table.loc[order.sort_values(["told", "share", "worst"], ascending=False).index]
+    found = [one for one in frames if len(one)]
+    return Comparison(
+        table.reset_index(drop=True),
+        pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=[NAME, FRAME]),
+        _figures(old, new),
+    )
+
+
+def _figures(old: Path, new: Path) -> pd.DataFrame:
+    """Figures that both summaries have, by name."""
+    both = []
+    for folder in (old, new):
+        try:
+            told = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return pd.DataFrame(columns=["figure", "old", "new"])
+        both.append(dict(_numbers(told)))
+    before, after = both
+    rows = [(name, before[name], after[name]) for name in before if name in after]
+    return pd.DataFrame(rows, columns=["figure", "old", "new"])
+
+
+def _numbers(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, float]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{above}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{above}{name}", float(value)
+
+
+def _sequences(folder: Path) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise UserError(f"{folder}: there is no such folder; name a results folder")
+    found = {path.parent.name: path.parent for path in sorted(folder.glob("*/joint.h5"))}
+    if not found:
+        raise UserError(
+            f"{folder}: holds no sequence with a joint.h5; name a results folder, "
+            "results/<dataset>, of a project that was run"
+        )
+    return found
+
+
+def _compare_one(name: str, old: Path, new: Path) -> tuple[dict[str, object], pd.DataFrame]:
+    with (
+        artefacts.read(old / "joint.h5", JOINT) as before,
+        artefacts.read(new / "joint.h5", JOINT) as after,
+    ):
+        table = _frames(name, before, after)
+        changed = (
+            (table["body_mm"] > MOVED_MM)
+            | (table["hands_mm"] > MOVED_MM)
+            | (table["object_mm"] > MOVED_MM)
+            | (table["object_deg"] > TURNED_DEG)
+            | (table["touches"] != "")
+            | (table["touches_no_more"] != "")
+            | (table["flag_before"] != table["flag_after"])
+        )
+        touching = [np.any(_touching(one), axis=1) for one in (before, after)]
+    contact = (table["touches"] != "") | (table["touches_no_more"] != "")
+    row: dict[str, object] = {
+        "state": CHANGED if changed.any() else SAME,
+        "frames": len(table),
+        "changed_frames": int(changed.sum()),
+        "body_mm": table["body_mm"].mean(),
+        "body_max_mm": table["body_mm"].max(),
+        "hands_mm": table["hands_mm"].mean(),
+        "object_mm": table["object_mm"].mean(),
+        "object_max_mm": table["object_mm"].max(),
+        "object_deg": table["object_deg"].mean(),
+        "contact_frames_before": int(touching[0].sum()),
+        "contact_frames_after": int(touching[1].sum()),
+        "contact_changed_frames": int(contact.sum()),
+        "note": "",
+    }
+    for when, folder in (("before", old), ("after", new)):
+        row |= _measured(folder, when)
+    return row, table[changed].copy()
+
+
+def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
+    joints, joints_after = before["joints"], after["joints"]
+    if joints.shape != joints_after.shape:
+        raise UserError(
+            f"sequence {name}: {len(joints)} frames before and {len(joints_after)} after; frames "
+            "cannot be set against each other"
+        )
+    apart = 1e3 * np.linalg.norm(joints_after - joints, axis=2)
+    fingers = np.hstack([apart[:, hand] for hand in FINGER_JOINTS])
+    turned = np.full(len(joints), np.nan)
+    known = np.isfinite(before["rotation"]).all((1, 2)) & np.isfinite(after["rotation"]).all((1, 2))
+    if known.any():
+        turn = after["rotation"][known] @ before["rotation"][known].swapaxes(1, 2)
+        turned[known] = np.degrees(Rotation.from_matrix(turn).magnitude())
+    regions = np.array(before.text("region_names"))
+    old, new = _touching(before), _touching(after)
+    if "made_by" in before.attributes or "made_by" in after.attributes:
+        new = old  # of another program's results contact is not stated, which is no change
+    return pd.DataFrame(
+        {
+            NAME: name,
+            FRAME: np.arange(len(joints)),
+            "body_mm": apart[:, BODY_JOINTS].mean(1),
+            "hands_mm": fingers.mean(1),
+            "object_mm": 1e3 * np.linalg.norm(after["translation"] - before["translation"], axis=1),
+            "object_deg": turned,
+            "touches": _named(regions, new & ~old),
+            "touches_no_more": _named(regions, old & ~new),
+            "flag_before": before.text("flag_reason"),
+            "flag_after": after.text("flag_reason"),
+        }
+    )
+
+
+def _touching(joint: Artefact) -> np.ndarray:
+    return np.nan_to_num(joint["contact_probability"]) >= TOUCHING
+
+
+def _named(regions: np.ndarray, which: np.ndarray) -> Sequence[str]:
+    return [";".join(regions[row]) for row in which]
+
+
+def _measured(folder: Path, when: str) -> dict[str, object]:
+    """Flagged frames and stated errors, where there is a summary that can be read."""
+    try:
+        found = SequenceSummary.read(folder / "summary.h5").metrics
+    except UserError:
+        return {}
+    row: dict[str, object] = {f"flagged_{when}": int(found.values["flagged"].sum())}
+    for error in stated_errors(found):
+        row[f"stated_{error.part}_mm_{when}"] = error.stated
+    return row

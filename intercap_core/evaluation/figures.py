@@ -1,0 +1,300 @@
+"""From the metrics of sequences to the figures that are reported, in millimetres and degrees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
+from intercap_core.evaluation import contact, object_errors, penetration
+from intercap_core.evaluation.object_errors import ObjectErrors
+from intercap_core.schemas import METRICS, PER_VERTEX_METRICS
+from intercap_core.stage_list import ESTIMATES
+
+SUMMARY_TRUTH = (
+    "body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "object_translation_mm",
+    "object_rotation_deg", "contact_region_f1", "contact_f1", "contact_recall",
+    "acceleration_error",
+)  # fmt: skip
+SUMMARY_PENETRATION = (
+    "mean_mm", "median_mm", "p98_mm", "share_le_5mm", "share_le_7mm", "share_le_20mm",
+)  # fmt: skip
+BAD_BODY_M = 0.040  # a body frame beyond this PVE should have been flagged
+_PER_VERTEX = PER_VERTEX_METRICS | {"object_sample_points", "object_sample_contact"}
+
+Figures = dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceMetrics:
+    """One sequence's metrics artefact without its distances by vertex; ``made_by`` names another
+    program that made what is measured, "" = this one."""
+
+    name: str
+    subject: str
+    object_: str
+    fps: float
+    has_truth: bool
+    values: dict[str, np.ndarray] = field(repr=False)
+    made_by: str = ""
+
+    @classmethod
+    def read(cls, path: Path) -> SequenceMetrics:
+        """Raises UserError as :func:`artefacts.read` does."""
+        with artefacts.read(path, METRICS) as artefact:
+            return cls.of(artefact)
+
+    @classmethod
+    def of(cls, artefact: Artefact) -> SequenceMetrics:
+        """From an open metrics artefact, or the summary of one."""
+        told = artefact.attributes
+        values = {
+            key: artefact[key]
+            for key in artefact.keys()  # noqa: SIM118 (not a dict)
+            if key in METRICS.fields and key not in _PER_VERTEX
+        }
+        return cls(
+            str(told["sequence"]), str(told["subject"]), str(told["object"]),
+            float(told["fps"]), bool(told["has_truth"]), values,
+            str(told.get("made_by", "")),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.values["flagged"])
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there are figures of an object: not of a person alone, nor where none was
+        found."""
+        return "contact_frame" in self.values
+
+
+def pooled(sequences: Sequence[SequenceMetrics], key: str) -> np.ndarray | None:
+    """The frames of all sequences that have dataset ``key``, end to end; None if none has."""
+    found = [s.values[key] for s in sequences if key in s.values]
+    return np.concatenate(found) if found else None
+
+
+def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """Over contact frames: each frame's mean depth, as the paper's figure."""
+    depth, touching = pooled(sequences, "penetration_mean"), pooled(sequences, "contact_frame")
+    if depth is None or touching is None:
+        return {}
+    return penetration.summarise(depth, touching)
+
+
+def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """Means over all frames with a cloud."""
+    keys = {
+        "body_mm": "body_to_cloud",
+        "object_mm": "object_to_cloud",
+        "body_visible_mm": "body_visible_to_cloud",
+        "object_visible_mm": "object_visible_to_cloud",
+    }
+    return {name: 1e3 * _over(sequences, key, np.nanmean) for name, key in keys.items()}
+
+
+def floor_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """What :func:`cloud_figures` gives with the true poses put in; empty without truth."""
+    keys = {
+        "body_mm": "truth/body_floor",
+        "object_mm": "truth/object_floor",
+        "body_visible_mm": "truth/body_visible_floor",
+        "object_visible_mm": "truth/object_visible_floor",
+    }
+    found = {name: 1e3 * _over(sequences, key, np.nanmean) for name, key in keys.items()}
+    return {name: value for name, value in found.items() if np.isfinite(value)}
+
+
+def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
+    """Errors after ``stage`` over all frames of the sequences with truth.
+
+    What the stage does not estimate is left out. Object errors are medians (and p95) over frames
+    that two or more views truly see. Accelerations are millimetres a frame^2 at 30 fps;
+    ``acceleration_error`` is the body's, the object's where the stage has no body.
+    """
+    known = [s for s in sequences if s.has_truth]
+
+    def over(key: str, how: Callable[[np.ndarray], Any] = np.nanmean, scale: float = 1e3) -> float:
+        return scale * _over(known, f"truth/{stage}/{key}", how)
+
+    figures: Figures = {
+        "body_pve_mm": over("body_pve"),
+        "body_mpjpe_mm": over("body_mpjpe"),
+        "hand_mpjpe_mm": over("hand_mpjpe"),
+        "hand_mpjpe_wrist_mm": over("hand_mpjpe_wrist"),
+        "hand_grasp_mpjpe_mm": _hand_in_grasp(known, stage),
+        **object_figures(known, stage),
+        **_contact_figures(known, stage),
+        "acceleration_body_mm": over("acceleration_body"),
+        "acceleration_hands_mm": over("acceleration_hands"),
+        "acceleration_object_mm": over("acceleration_object"),
+        "joint_normalised_median": over("joint_normalised", np.nanmedian, 1.0),
+    }
+    body = figures["acceleration_body_mm"]
+    figures["acceleration_error"] = body if np.isfinite(body) else figures["acceleration_object_mm"]
+    return {key: value for key, value in figures.items() if np.isfinite(value)}
+
+
+def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """Recall and precision of the flags on frames that are truly bad after ``joint``."""
+    flagged, bad = [], []
+    for s in sequences:
+        if not s.has_truth:
+            continue
+        wrong = np.zeros(len(s), bool)
+        if "truth/joint/object_translation" in s.values:
+            wrong = _object_errors(s, "joint").lost
+        if "truth/joint/body_pve" in s.values:
+            wrong = wrong | (s.values["truth/joint/body_pve"] > BAD_BODY_M)
+        flagged.append(s.values["flagged"])
+        bad.append(wrong)
+    if not bad:
+        return {}
+    found, true = np.concatenate(flagged), np.concatenate(bad)
+    return {
+        "bad_frames": float(true.mean()),
+        "flag_recall": contact.recall(found, true),
+        "flag_precision": contact.precision(found, true),
+    }
+
+
+def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """True displacement of the cameras that have images, mean and worst: as given, after the scene,
+    after the joint fit.
+
+    The master is left out: poses are relative to it.
+    """
+    figures: Figures = {}
+    for when in ("before", "after", "joint"):
+        found = [
+            s.values[f"truth/extrinsics_{when}"]
+            for s in sequences
+            if f"truth/extrinsics_{when}" in s.values
+        ]
+        if found:
+            moved = 1e3 * np.concatenate([v[np.isfinite(v)] for v in found]).astype(np.float64)
+            if len(moved) == 0:
+                continue
+            figures[f"{when}_mean_mm"] = float(moved.mean())
+            figures[f"{when}_worst_mm"] = float(moved.max())
+    return figures
+
+
+def contact_sweep(sequences: Sequence[SequenceMetrics], stage: str) -> dict[float, float]:
+    """Vertex F1 by threshold in millimetres."""
+    counts = pooled(sequences, f"truth/{stage}/vertex_contact_counts")
+    if counts is None:
+        return {}
+    limits = next(s.values["truth/sweep"] for s in sequences if "truth/sweep" in s.values)
+    return {
+        round(1e3 * float(limit), 3): contact.f1(counts[:, i].sum(0))
+        for i, limit in enumerate(limits)
+    }
+
+
+def _over(
+    sequences: Sequence[SequenceMetrics],
+    key: str,
+    how: Callable[[np.ndarray], Any],
+) -> float:
+    values = pooled(sequences, key)
+    if values is None or not np.isfinite(values).any():
+        return float("nan")
+    return float(how(values.astype(np.float64)))
+
+
+def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
+    """Hand error over the frames in which that hand truly touches the object."""
+    handling = [s for s in sequences if "truth/contact_region" in s.values]
+    errors = pooled(handling, f"truth/{stage}/hand_mpjpe")
+    touching = pooled(handling, "truth/contact_region")
+    if errors is None or touching is None:
+        return float("nan")
+    held = errors[touching[:, :2]]  # METRIC_REGIONS starts with the left and the right hand
+    return 1e3 * float(held.mean()) if len(held) else float("nan")
+
+
+def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:
+    key = f"truth/{stage}/object_"
+    of, true = s.values, "truth/object_"
+    return ObjectErrors(
+        sequence=s.name,
+        object_=s.object_,
+        fps=s.fps,
+        translation=of[key + "translation"],
+        rotation=of[key + "rotation"],
+        turn=of[key + "turn"],
+        centre=of[key + "centre"],
+        true_centre=of[true + "centre"],
+        views=of[true + "views"],
+        moves=of[true + "moving"],
+        flagged=of[key + "flagged"],
+        normalised=of.get(key + "normalised"),
+    )
+
+
+def object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
+    """The figures of :func:`object_errors.figures` by the names of this module's tables."""
+    have = [s for s in sequences if f"truth/{stage}/object_translation" in s.values]
+    found = object_errors.figures([_object_errors(s, stage) for s in have])
+    names = {
+        "translation_median_mm": "object_translation_mm",
+        "translation_p95_mm": "object_translation_p95_mm",
+        "rotation_median_deg": "object_rotation_deg",
+        "rotation_p95_deg": "object_rotation_p95_deg",
+        "normalised_median": "object_normalised_median",
+    }
+    return {names.get(key, key): value for key, value in found.items()}
+
+
+def _contact_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
+    key = f"truth/{stage}/"
+    have = [s for s in sequences if f"{key}region_contact" in s.values]
+    if not have:
+        return {}
+    found, true = pooled(have, f"{key}region_contact"), pooled(have, "truth/contact_region")
+    counts = pooled(have, f"{key}vertex_contact_counts")
+    touching, truly = pooled(have, f"{key}contact_frame"), pooled(have, "truth/contact_frame")
+    assert found is not None and true is not None and counts is not None
+    assert touching is not None and truly is not None
+    at = list(contact.SWEEP_M).index(contact.CONTACT_M)
+    return {
+        "contact_region_f1": contact.f1(contact.confusion(found.ravel(), true.ravel())),
+        "contact_f1": contact.f1(counts[:, at].sum(0)),
+        "contact_recall": contact.recall(touching, truly),
+    }
+
+
+def summary(dataset: str, sequences: Sequence[SequenceMetrics]) -> dict[str, Any]:
+    """The content of summary.json; a figure that cannot be known is None."""
+    truth = {}
+    if any(s.has_truth for s in sequences):
+        for stage in ESTIMATES:
+            figures = truth_figures(sequences, stage)
+            truth[stage] = {k: figures[k] for k in SUMMARY_TRUTH if k in figures}
+    depth = penetration_figures(sequences)
+    return _rounded(
+        {
+            "dataset": dataset,
+            "sequences": len(sequences),
+            "frames": sum(len(s) for s in sequences),
+            "truth": truth,
+            "penetration": {k: depth.get(k, float("nan")) for k in SUMMARY_PENETRATION},
+            "vertex_to_cloud": cloud_figures(sequences),
+        }
+    )
+
+
+def _rounded(value: Any) -> Any:
+    """Six significant digits; NaN is null in JSON."""
+    if isinstance(value, dict):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    return value

@@ -1,0 +1,136 @@
+"""What is held, what stands, and contact as it is stated: figures of sequences with truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from intercap_core.evaluation import motion
+from intercap_core.evaluation.detected import Reliability, detected_figures, reliability
+from intercap_core.evaluation.figures import Figures, SequenceMetrics, object_figures, pooled
+from intercap_core.schemas import METRIC_REGIONS
+
+# An object is worse than before beyond this share and these amounts, millimetres and degrees.
+WORSE_SHARE, WORSE_MM, WORSE_DEG = 0.05, 0.2, 0.1
+
+
+def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
+    """After ``stage``, which has a body: how what truly touches slips, how what truly stands moves.
+
+    ``slip_mm_s`` is the mean over objects of the means over their frames. Joints' errors are RMS,
+    the part that is constant over a sequence apart from the part that varies. What no sequence has
+    is left out.
+    """
+    key = f"truth/{stage}/"
+    have = [s for s in sequences if f"{key}fingertips" in s.values]
+    if not have:
+        return {}
+    figures: Figures = _joint_figures(have, key)
+    handling = [s for s in have if "truth/contact_region" in s.values]
+    tips, touching = pooled(handling, f"{key}fingertips"), pooled(handling, "truth/contact_region")
+    if tips is not None and touching is not None:
+        # METRIC_REGIONS starts with the left and the right hand
+        figures["fingertip_touching_mm"] = 1e3 * _mean(tips[touching[:, :2]])
+    figures["acceleration_feet_mm"] = 1e3 * _mean(pooled(have, f"{key}acceleration_feet"))
+    slips = slip_by_object(have, stage)
+    figures["slip_mm_s"] = _mean(np.array(list(slips.values())))
+    figures["planted_mm_s"] = 1e3 * _mean(pooled(have, f"{key}planted_speed"))
+    figures["floor_mm"] = 1e3 * _mean(pooled(have, f"{key}planted_height"))
+    figures["foot_swing_mm"] = 1e3 * _mean(pooled(have, f"{key}foot_swing"))
+    lags = [lag for s in have if "truth/standing" in s.values for lag in _lift_lags(s, stage)]
+    figures["foot_lift_frames"] = _mean(np.abs(lags)) if lags else np.nan
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def slip_by_object(sequences: Sequence[SequenceMetrics], stage: str) -> dict[str, float]:
+    """Mean slip of each object that is truly touched, mm/s."""
+    found = {}
+    for name in sorted({s.object_ for s in sequences}):
+        slip = pooled([s for s in sequences if s.object_ == name], f"truth/{stage}/slip")
+        if slip is not None and np.isfinite(slip).any():
+            found[name] = 1e3 * float(np.nanmean(slip))
+    return found
+
+
+def stated_contact_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """How well the joint stage's own contact agrees with the true one."""
+    found = _stated_and_true(sequences)
+    if found is None:
+        return {}
+    figures = detected_figures(*found, METRIC_REGIONS)
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def contact_reliability(sequences: Sequence[SequenceMetrics]) -> Reliability | None:
+    """How often what is stated as contact with some probability is contact; None without truth."""
+    found = _stated_and_true(sequences)
+    return None if found is None else reliability(*found[:2])
+
+
+def _stated_and_true(
+    sequences: Sequence[SequenceMetrics],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Stated probability, true contact and true distance (N, 12) over all sequences' frames."""
+    stated = [s for s in sequences if "contact_probability" in s.values]
+    have = [s for s in stated if "truth/region_distance" in s.values]
+    probability, true = pooled(have, "contact_probability"), pooled(have, "truth/contact_region")
+    distance = pooled(have, "truth/region_distance")
+    if probability is None or true is None or distance is None:
+        return None
+    return probability[:, : len(METRIC_REGIONS)], true, distance  # the others have no true contact
+
+
+def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
+    """Objects whose median or p95 of place or turn is worse after ``joint`` than as tracked."""
+    limits = {
+        "object_translation_mm": WORSE_MM,
+        "object_translation_p95_mm": WORSE_MM,
+        "object_rotation_deg": WORSE_DEG,
+        "object_rotation_p95_deg": WORSE_DEG,
+    }
+    found = []
+    for name in sorted({s.object_ for s in sequences if s.has_truth}):
+        some = [s for s in sequences if s.has_truth and s.object_ == name]
+        before, after = (object_figures(some, stage) for stage in ("object_track", "joint"))
+        if any(
+            after[key] - before[key] > max(WORSE_SHARE * before[key], limit)
+            for key, limit in limits.items()
+            if key in before and key in after
+        ):
+            found.append(name)
+    return found
+
+
+def _joint_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
+    """RMS errors of body joints, of their mean over each sequence and of what varies about it."""
+    constant, varying, frames = 0.0, 0.0, 0
+    for s in sequences:
+        offset = s.values[f"{key}joint_offset"].astype(np.float64)
+        mean = offset.mean(0)
+        constant += len(offset) * float((mean**2).sum(-1).mean())
+        varying += float(((offset - mean) ** 2).sum(-1).mean(-1).sum())
+        frames += len(offset)
+    return {
+        "joints_constant_mm": 1e3 * float(np.sqrt(constant / frames)),
+        "joints_varying_mm": 1e3 * float(np.sqrt(varying / frames)),
+    }
+
+
+def _lift_lags(s: SequenceMetrics, stage: str) -> list[float]:
+    """Frames by which each foot leaves late each time that it truly stops to stand."""
+    fitted, true = s.values[f"truth/{stage}/foot_centre"], s.values["truth/foot_centre"]
+    standing = s.values["truth/standing"]
+    return [
+        lag
+        for foot in range(2)
+        for lag in motion.motion_onset_lags(
+            fitted[:, foot], true[:, foot], ~standing[:, foot], s.fps
+        )
+    ]
+
+
+def _mean(values: np.ndarray | None) -> float:
+    if values is None or not np.isfinite(values).any():
+        return float("nan")
+    return float(np.nanmean(values.astype(np.float64)))

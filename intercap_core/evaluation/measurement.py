@@ -1,0 +1,246 @@
+"""Every distance of one fitted body and object, frame by frame."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+from intercap_core.evaluation import contact, penetration
+from intercap_core.evaluation.clouds import Cloud, vertex_to_cloud, visible_to_cloud
+from intercap_core.evaluation.proximity import PosedBody, PosedObject, Sight, face_normals
+from intercap_core.evaluation.segmented import SegmentedClouds
+from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
+from intercap_core.evaluation.truth import Truth
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surface_samples import sample_surface
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.progress import Progress
+from intercap_core.schemas import CONTACT_REGIONS
+
+log = logging.getLogger(__name__)
+
+BODY_SAMPLES = 4000  # points of the body compared with the cloud, area-sampled
+VISIBILITY_SAMPLES = 2000  # the same of the object
+SAMPLE_SPACING_M = 0.006  # of the object's contact points, so that a fingertip's touch shows
+MAX_OBJECT_SAMPLES = 20000
+CLOUD_POINTS = 3000  # points of the person that are compared with the body's surface
+
+Values = dict[str, Any]
+
+
+class Handled:
+    """The object's ``mesh`` and ``track`` with the points of it that are compared."""
+
+    def __init__(self, mesh: ObjectMesh, track: ObjectTrack) -> None:
+        self.mesh, self.track = mesh, track
+        self.surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+        area = np.linalg.norm(
+            np.cross(
+                mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]],
+                mesh.vertices[mesh.faces[:, 2]] - mesh.vertices[mesh.faces[:, 0]],
+            ),
+            axis=1,
+        ).sum()
+        count = int(np.clip(area / 2 / SAMPLE_SPACING_M**2, 500, MAX_OBJECT_SAMPLES))
+        self.points = sample_surface(mesh.vertices, mesh.faces, count).of(mesh.vertices, mesh.faces)
+        self.samples = sample_surface(mesh.vertices, mesh.faces, VISIBILITY_SAMPLES)
+        self.sample_points = self.samples.of(mesh.vertices, mesh.faces)
+        self.sample_normals = mesh.face_normals[self.samples.faces]
+
+    def posed(self, t: int, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the object where they are in frame ``t``."""
+        return points @ self.track.rotation[t].T + self.track.translation[t]
+
+
+class Measurement:
+    """Distances of one body and, where there is one, the object that it handles, frame by frame.
+
+    Without ``handled`` there is nothing about an object and no contact in the values.
+    """
+
+    def __init__(
+        self,
+        handled: Handled | None,
+        body_track: BodyTrack,
+        clouds: SegmentedClouds,
+        rig: Rig,
+        threshold_m: float,
+    ) -> None:
+        self.handled = handled
+        self.body = body_track
+        self.clouds = clouds
+        self.rig = rig
+        self.threshold = threshold_m
+        self.faces = body_track.model.faces.numpy()
+        template = body_track.model.template.numpy().astype(np.float64)
+        self.tree = SurfaceTree(template, self.faces)
+        self.body_samples = sample_surface(template, self.faces, BODY_SAMPLES)
+
+    def over_frames(self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None) -> Values:
+        """Values by dataset of the metrics artefact.
+
+        With truth also ``true_distance`` (T, V), the true body's distances to the true object.
+        """
+        rows: list[Values] = []
+        handled = self.handled
+        counts = np.zeros(len(handled.points) if handled else 0, np.int32)
+        true_points = seen = true_surface = None
+        if truth is not None and truth.has_object:
+            if handled is not None:
+                true_points, seen = truth.object_samples_visible(handled.samples, handled.mesh)
+            true_surface = PosedObject(truth.object_vertices, truth.object_faces)
+        progress = Progress(log, "measured", len(self.body.joints))
+        for t, vertices in enumerate(self.body.vertices()):
+            vertices = vertices.astype(np.float64)
+            row: Values = {"ground_penetration": penetration.ground_penetration(vertices, *floor)}
+            surface = PosedBody(vertices, self.faces, self.tree)
+            if handled is not None:
+                between, touched = self._between(handled, t, vertices, surface, floor)
+                row |= between
+                counts += touched
+            seen_body = seen_object = None
+            if truth is not None and truth.visible is not None:
+                share = self.body_samples.of(truth.visible[t].astype(np.float32), self.faces)
+                seen_body, seen_object = share > 0.5, None if seen is None else seen[t]
+            cloud_row, clouds = self._to_clouds(t, vertices, surface, seen_body, seen_object)
+            row |= cloud_row
+            if truth is not None:
+                row |= self._true_body(t, truth, clouds[0], seen_body)
+            if truth is not None and true_surface is not None:
+                row |= self._true_object(
+                    t, truth, true_surface, true_points, clouds[1], seen_object
+                )
+            rows.append(row)
+            progress.step()
+        values = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+        if handled is None:
+            return values
+        touching = contact.vertex_contact(values["body_to_object"], self.threshold)
+        return values | {
+            "object_sample_points": handled.points,
+            "object_sample_contact": counts,
+            "contact_frame": touching.any(1),
+            "region_names": CONTACT_REGIONS,
+            "region_contact": contact.region_contact(
+                touching, self.body.model.regions, CONTACT_REGIONS
+            ),
+        }
+
+    def _between(
+        self,
+        handled: Handled,
+        t: int,
+        vertices: np.ndarray,
+        surface: PosedBody,
+        floor: tuple[np.ndarray, np.ndarray],
+    ) -> tuple[Values, np.ndarray]:
+        """Distances between body and object in frame ``t``, and the object's points (N,) that the
+        body touches."""
+        object_vertices = handled.posed(t, handled.mesh.vertices)
+        points = handled.posed(t, handled.points)
+        to_body = surface.signed_distance(object_vertices)
+        # of a point outside nothing but its contact is told
+        point_distance = surface.signed_distance(points, reach=1.01 * self.threshold)
+        track = handled.track
+        to_object = handled.surface.signed_distance(
+            vertices, track.rotation[t], track.translation[t]
+        )
+        depth = penetration.depths(to_object)
+        return {
+            "body_to_object": to_object,
+            "object_to_body": to_body,
+            "penetration_mean": depth.mean,
+            "penetration_median": depth.median,
+            "penetration_max": depth.max,
+            "penetration_object": penetration.depths(point_distance).mean,
+            "ground_penetration": np.fmax(
+                penetration.ground_penetration(vertices, *floor),
+                penetration.ground_penetration(object_vertices, *floor),
+            ),
+        }, contact.vertex_contact(point_distance, self.threshold)
+
+    def _to_clouds(
+        self,
+        t: int,
+        vertices: np.ndarray,
+        surface: PosedBody,
+        seen_body: np.ndarray | None,
+        seen_object: np.ndarray | None,
+    ) -> tuple[Values, tuple[Cloud, Cloud]]:
+        """Distances to frame ``t``'s clouds; the samples that cameras see are found where not
+        given."""
+        handled = self.handled
+        near = [vertices[::10]]
+        if handled is not None:
+            object_vertices = handled.posed(t, handled.mesh.vertices)
+            near.append(object_vertices)
+        person, object_ = (Cloud(points) for points in self.clouds.at(t, np.concatenate(near)))
+        body_points = self.body_samples.of(vertices, self.faces)
+        sight = None
+        if seen_body is None or (handled is not None and seen_object is None):
+            occluders = [surface.surface]
+            if handled is not None:
+                track = handled.track
+                occluders.append(handled.surface.placed(track.rotation[t], track.translation[t]))
+            sight = Sight(occluders)
+        if seen_body is None:
+            assert sight is not None
+            normals = face_normals(vertices, self.faces)[self.body_samples.faces]
+            seen_body = sight.seen(body_points, normals, self.rig.cameras)
+        step = max(1, len(person.points) // CLOUD_POINTS)
+        chosen = person.points[::step].astype(np.float64)
+        back = surface.distance(chosen)
+        row: Values = {
+            "body_to_cloud": vertex_to_cloud(vertices, person),
+            "body_visible_to_cloud": visible_to_cloud(body_points, seen_body, person),
+            "cloud_to_body": float(back.mean()) if len(back) else np.nan,
+        }
+        if handled is not None:
+            object_points = handled.posed(t, handled.sample_points)
+            if seen_object is None:
+                assert sight is not None
+                normals = handled.sample_normals @ handled.track.rotation[t].T
+                seen_object = sight.seen(object_points, normals, self.rig.cameras)
+            row["object_to_cloud"] = vertex_to_cloud(object_vertices, object_)
+            row["object_visible_to_cloud"] = visible_to_cloud(object_points, seen_object, object_)
+        return row, (person, object_)
+
+    def _true_body(
+        self, t: int, truth: Truth, person: Cloud, seen_body: np.ndarray | None
+    ) -> Values:
+        """The same measures with the true body put in."""
+        if truth.vertices is None:
+            return {}
+        vertices = truth.vertices[t].astype(np.float64)
+        row: Values = {"truth/body_floor": vertex_to_cloud(vertices, person)}
+        if seen_body is not None:
+            points = self.body_samples.of(vertices, self.faces)
+            row["truth/body_visible_floor"] = visible_to_cloud(points, seen_body, person)
+        return row
+
+    def _true_object(
+        self,
+        t: int,
+        truth: Truth,
+        surface: PosedObject,
+        sample_points: np.ndarray | None,
+        object_: Cloud,
+        seen_object: np.ndarray | None,
+    ) -> Values:
+        """The same measures with the true object put in, and true contact."""
+        rotation, translation = truth.rotation[t], truth.translation[t]
+        object_vertices = truth.object_vertices @ rotation.T + translation
+        row: Values = {"truth/object_floor": vertex_to_cloud(object_vertices, object_)}
+        if seen_object is not None and sample_points is not None:
+            points = sample_points @ rotation.T + translation
+            row["truth/object_visible_floor"] = visible_to_cloud(points, seen_object, object_)
+        if truth.vertices is not None:
+            vertices = truth.vertices[t].astype(np.float64)
+            distance = surface.signed_distance(vertices, rotation, translation)
+            row["true_distance"] = distance.astype(np.float32)
+            row["truth/penetration_mean"] = penetration.depths(distance).mean
+            row["truth/contact_frame"] = contact.vertex_contact(distance, self.threshold).any()
+        return row

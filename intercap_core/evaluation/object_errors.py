@@ -1,0 +1,260 @@
+"""Errors of one tracked object over a recording, and the figures of many such recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core import artefacts
+from intercap_core.evaluation import motion, object_pose
+from intercap_core.evaluation.times import match_times
+from intercap_core.evaluation.tracks import read_object
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.schemas import OBJECT_TRACK, SCENE, TRUTH
+
+SURFACE_POINTS = 500  # vertices at most that ADD-S and MSSD are taken over
+ADD_S_SHARE = 0.1  # of the diameter: the usual bound of ADD-S
+# Bounds of MSSD over the diameter whose recalls are averaged (BOP challenge 2019)
+MSSD_SHARES = np.arange(1, 11) * 0.05
+VIEW_BINS = ((0, 1), (2, 2), (3, 3), (4, 4), (5, 5), (6, 99))
+
+Figures = dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectErrors:
+    """T frames of one object, metres and degrees; what is not known is NaN.
+
+    ``translation`` and ``rotation`` (T,) errors; ``turn`` (T,) degrees turned since the frame
+    before beyond what is true; ``centre``, ``true_centre`` (T, 3); ``views`` (T,) that truly see
+    the object; ``moves`` (T,) it truly moves; ``flagged`` (T,) the stage does not trust it.
+    ``add_s`` and ``mssd`` (T,) over the diameter; ``normalised`` and ``normalised_turn`` (T,)
+    errors over the stated deviation, None where none is stated.
+    """
+
+    sequence: str
+    object_: str
+    fps: float
+    translation: np.ndarray
+    rotation: np.ndarray
+    turn: np.ndarray
+    centre: np.ndarray
+    true_centre: np.ndarray
+    views: np.ndarray
+    moves: np.ndarray
+    flagged: np.ndarray
+    add_s: np.ndarray | None = None
+    mssd: np.ndarray | None = None
+    normalised: np.ndarray | None = None
+    normalised_turn: np.ndarray | None = None
+
+    @property
+    def lost(self) -> np.ndarray:
+        """Frames (T,) in which the pose is truly lost."""
+        return object_pose.lost(self.translation, self.rotation)
+
+
+def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> ObjectErrors:
+    """Compare the artefact of stage ``object_track`` with the truth of its recording.
+
+    Of an object that was found in no frame the errors are infinite. Raises UserError where an
+    artefact is broken, or the truth is of another recording.
+    """
+    track = read_object(object_track, "object_track")
+    with artefacts.read(object_track, OBJECT_TRACK) as found:
+        sequence = str(found.attributes["sequence"])
+    with artefacts.read(scene, SCENE) as found, artefacts.read(truth, TRUTH) as true:
+        fps = float(found.attributes["fps"])
+        at = match_times(truth, true["times"], found["times"], fps)
+        rotation, translation = true["rotation"][at], true["translation"][at]
+        views = true["object_views"][at]
+    centre, true_centre = (
+        object_pose.posed_point(r, t, mesh.centre_of_mass)
+        for r, t in ((track.rotation, track.translation), (rotation, translation))
+    )
+    moves = motion.moving(rotation, true_centre, fps)
+    if not track.known:
+        beyond, unknown = np.full(len(at), np.inf), np.full(len(at), np.nan)
+        return ObjectErrors(
+            sequence=sequence,
+            object_=mesh.name,
+            fps=fps,
+            translation=beyond,
+            rotation=beyond,
+            turn=unknown,
+            centre=centre,
+            true_centre=true_centre,
+            views=views,
+            moves=moves,
+            flagged=track.flagged,
+            add_s=beyond,
+            mssd=beyond,
+        )
+    points = mesh.vertices[:: -(-len(mesh.vertices) // SURFACE_POINTS)]
+    poses = (track.rotation, track.translation, rotation, translation)
+    normalised = normalised_turn = None
+    if track.covariance is not None:
+        normalised = object_pose.normalised_translation_error(
+            track.translation, translation, track.covariance
+        )
+        normalised_turn = object_pose.normalised_rotation_error(
+            track.rotation, rotation, track.covariance, mesh.symmetry
+        )
+    return ObjectErrors(
+        sequence=sequence,
+        object_=mesh.name,
+        fps=fps,
+        translation=object_pose.centre_error(centre, true_centre),
+        rotation=object_pose.rotation_error_deg(track.rotation, rotation, mesh.symmetry),
+        turn=np.append(np.nan, motion.turns(track.rotation, rotation, mesh.symmetry)),
+        centre=centre,
+        true_centre=true_centre,
+        views=views,
+        moves=moves,
+        flagged=track.flagged,
+        add_s=add_s(points, *poses) / mesh.diameter,
+        mssd=mssd(points, *poses, mesh) / mesh.diameter,
+        normalised=normalised,
+        normalised_turn=normalised_turn,
+    )
+
+
+def add_s(
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    true_rotation: np.ndarray,
+    true_translation: np.ndarray,
+) -> np.ndarray:
+    """ADD-S (T,): mean distance of the true surface points from the nearest of the found ones.
+
+    ``points`` (N, 3) of the object under poses (T, 3, 3), (T, 3). Hinterstoisser et al., ACCV 2012.
+    """
+    found = points @ np.swapaxes(rotation, 1, 2) + translation[:, None]
+    true = points @ np.swapaxes(true_rotation, 1, 2) + true_translation[:, None]
+    return np.array([cKDTree(f).query(t)[0].mean() for f, t in zip(found, true, strict=True)])
+
+
+def mssd(
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    true_rotation: np.ndarray,
+    true_translation: np.ndarray,
+    mesh: ObjectMesh,
+) -> np.ndarray:
+    """MSSD (T,): the largest distance of corresponding points, the least over the symmetry group.
+
+    Hodan et al., BOP challenge 2020. Of a sphere it is the distance of its centres.
+    """
+    if mesh.symmetry.sphere:
+        return np.linalg.norm(translation - true_translation, axis=1)
+    found = points @ np.swapaxes(rotation, 1, 2) + translation[:, None]
+    best = np.full(len(found), np.inf)
+    for element in mesh.symmetry.elements():
+        moved = points @ element[:3, :3].T + element[:3, 3]
+        true = moved @ np.swapaxes(true_rotation, 1, 2) + true_translation[:, None]
+        best = np.minimum(best, np.linalg.norm(found - true, axis=2).max(1))
+    return best
+
+
+def figures(recordings: Sequence[ObjectErrors]) -> Figures:
+    """What is reported of several recordings, millimetres and degrees.
+
+    Errors are over frames that two or more views truly see; lost frames over all frames;
+    ``recovered_share`` of the times that the track was lost and the recording went on.
+    """
+    if not recordings:
+        return {}
+    seen = np.concatenate([r.views >= 2 for r in recordings])
+    lost = np.concatenate([r.lost for r in recordings])
+    flagged = np.concatenate([r.flagged for r in recordings])
+    found: Figures = {
+        "lost_share": float(lost.mean()),
+        "lost_unnoticed_share": float((lost & ~flagged).mean()),
+        "flagged_share": float(flagged.mean()),
+    }
+    if flagged.any():
+        found["flag_precision"] = float((lost & flagged).sum() / flagged.sum())
+    for key, unit, scale, errors in (
+        ("translation", "mm", 1e3, [r.translation for r in recordings]),
+        ("rotation", "deg", 1.0, [r.rotation for r in recordings]),
+    ):
+        values = scale * np.concatenate(errors)[seen]
+        if len(values):
+            found[f"{key}_median_{unit}"] = float(np.median(values))
+            with np.errstate(invalid="ignore"):  # infinite errors of what was found nowhere
+                found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
+    add, worst = _pooled([r.add_s for r in recordings]), _pooled([r.mssd for r in recordings])
+    if len(add):
+        found["add_s_recall"] = float((add < ADD_S_SHARE).mean())
+        found["mssd_recall"] = float((worst[:, None] < MSSD_SHARES).mean())
+    for name, errors_ in (
+        ("normalised_median", [r.normalised for r in recordings]),
+        ("normalised_turn_median", [r.normalised_turn for r in recordings]),
+    ):
+        ratios = _pooled(errors_)
+        if np.isfinite(ratios).any():
+            found[name] = float(np.nanmedian(ratios))
+    first = [object_pose.first_seen_found(r.translation, r.rotation, r.views) for r in recordings]
+    counted = [f for f in first if f is not None]
+    if counted:
+        found["first_frame_success"] = float(np.mean(counted))
+    ended = [end for r in recordings for end in _lost_runs_end(r.lost)]
+    if ended:
+        found["recovered_share"] = float(np.mean(ended))
+    return found | _jitter_and_lag(recordings)
+
+
+def by_views(recordings: Sequence[ObjectErrors]) -> dict[str, Figures]:
+    """The main figures by how many views truly see the object: "0-1", "2", ... "6+"."""
+    views, lost = (np.concatenate([getattr(r, k) for r in recordings]) for k in ("views", "lost"))
+    shift, turn = (
+        np.concatenate([getattr(r, k) for r in recordings]) for k in ("translation", "rotation")
+    )
+    found = {}
+    for low, high in VIEW_BINS:
+        here = (views >= low) & (views <= high)
+        if here.any():
+            name = str(low) if low == high else f"{low}+" if high > 90 else f"{low}-{high}"
+            found[name] = {
+                "frames": float(here.sum()),
+                "translation_median_mm": 1e3 * float(np.median(shift[here])),
+                "rotation_median_deg": float(np.median(turn[here])),
+                "lost_share": float(lost[here].mean()),
+            }
+    return found
+
+
+def _pooled(parts: Sequence[np.ndarray | None]) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *(part for part in parts if part is not None)])
+
+
+def _lost_runs_end(lost: np.ndarray) -> list[bool]:
+    """For each run of lost frames (T,) that the recording goes on after: True, else False."""
+    padded = np.concatenate([[False], lost, [False]]).astype(np.int8)
+    ends = np.flatnonzero(np.diff(padded) < 0)
+    return [bool(end < len(lost)) for end in ends]
+
+
+def _jitter_and_lag(recordings: Sequence[ObjectErrors]) -> Figures:
+    """Jitter over all frames of rest, and by how much the track errs at the start of motion."""
+    found: Figures = {}
+    steps, turns, lags = [np.zeros(0)], [np.zeros(0)], []
+    for r in recordings:
+        resting = motion.resting_steps(r.moves)
+        steps.append(motion.steps(r.centre, r.true_centre)[resting])
+        turns.append(r.turn[1:][resting])
+        lags += motion.motion_onset_lags(r.centre, r.true_centre, r.moves, r.fps)
+    for unit, values, scale in (("mm", steps, 1e3), ("deg", turns, 1.0)):
+        pooled = np.concatenate(values).astype(np.float64)
+        if len(pooled):
+            found[f"rest_jitter_{unit}"] = scale * float(np.sqrt((pooled**2).mean()))
+    if lags:
+        found["motion_onset_frames"] = float(np.abs(lags).mean())
+        found["motion_onset_late_frames"] = float(np.mean(lags))
+    return found

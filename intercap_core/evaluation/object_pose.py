@@ -1,0 +1,107 @@
+"""Errors of an object's pose against the true one: arrays in, numbers out."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi
+
+from intercap_core.evaluation.body import MEDIAN_CHI_3
+from intercap_core.geometry.rigid.pose import rotation_log
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+
+LOST_TRANSLATION_M = 0.050
+LOST_ROTATION_DEG = 20.0
+FOUND_TRANSLATION_M = 0.020
+FOUND_ROTATION_DEG = 10.0
+UNKNOWN_TURN_DEG = 30.0  # a deviation beyond this states that a turn is not known
+
+
+def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """A point (3,) of the object under poses (..., 3, 3), (..., 3): (..., 3)."""
+    return rotation @ point + translation
+
+
+def centre_error(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
+    """Distance (...) of the object's centre of mass (..., 3) from where it truly is, metres.
+
+    Symmetries leave the centre of mass in place, so no element of the group makes it smaller.
+    """
+    return np.linalg.norm(centre - true_centre, axis=-1)
+
+
+def rotation_error_deg(
+    rotation: np.ndarray,
+    true_rotation: np.ndarray,
+    symmetry: SymmetryGroup,
+) -> np.ndarray:
+    """Geodesic angle (...), the smallest over the symmetry group, degrees."""
+    return symmetry.rotation_error_deg(rotation, true_rotation)
+
+
+def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
+    """Which poses are truly lost (...): off by more than 50 mm or 20 degrees, infinite where the
+    object is there and was not found."""
+    return (translation_error_m > LOST_TRANSLATION_M) | (rotation_error_degrees > LOST_ROTATION_DEG)
+
+
+def first_seen_found(
+    translation_error_m: np.ndarray,
+    rotation_error_degrees: np.ndarray,
+    views: np.ndarray,
+) -> bool | None:
+    """Whether the first frame that truly has a view is within 20 mm and 10 degrees.
+
+    All (T,); None where no frame has a view.
+    """
+    seen = np.flatnonzero(views > 0)
+    if len(seen) == 0:
+        return None
+    first = seen[0]
+    return bool(
+        translation_error_m[first] < FOUND_TRANSLATION_M
+        and rotation_error_degrees[first] < FOUND_ROTATION_DEG
+    )
+
+
+def normalised_translation_error(
+    translation: np.ndarray,
+    true_translation: np.ndarray,
+    covariance: np.ndarray,
+) -> np.ndarray:
+    """Mahalanobis length (T,) of the translation's error over its median: 1 if calibrated.
+
+    ``covariance`` (T, 6, 6) of (rotation vector, translation); NaN where it says nothing.
+    """
+    block = covariance[:, 3:, 3:]
+    error = translation - true_translation
+    length = np.full(len(error), np.nan)
+    known = np.isfinite(block).all((1, 2))
+    known[known] = np.linalg.eigvalsh(block[known])[:, 0] > 0
+    solved = np.linalg.solve(block[known], error[known][..., None])[..., 0]
+    length[known] = np.sqrt(np.einsum("ti,ti->t", error[known], solved))
+    return length / MEDIAN_CHI_3
+
+
+def normalised_rotation_error(
+    rotation: np.ndarray,
+    true_rotation: np.ndarray,
+    covariance: np.ndarray,
+    symmetry: SymmetryGroup,
+) -> np.ndarray:
+    """As :func:`normalised_translation_error` of the turn (T,) between poses (T, 3, 3).
+
+    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` say nothing and are left out; NaN
+    where all are.
+    """
+    truly = symmetry.nearest_equivalent(true_rotation, rotation)
+    error = rotation_log(rotation @ np.swapaxes(truly, 1, 2))
+    result = np.full(len(error), np.nan)
+    for t, block in enumerate(covariance[:, :3, :3]):
+        if not np.isfinite(block).all():
+            continue
+        variance, axes = np.linalg.eigh(block)
+        known = (variance > 0) & (variance < np.radians(UNKNOWN_TURN_DEG) ** 2)
+        if known.any():
+            length = np.sqrt(((error[t] @ axes[:, known]) ** 2 / variance[known]).sum())
+            result[t] = length / chi(int(known.sum())).median()
+    return result

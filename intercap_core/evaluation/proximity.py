@@ -1,0 +1,131 @@
+"""Signed distances between a posed body and a posed object, and their visibility to the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
+
+REACH_M = 0.10  # distances are capped here: no reported figure needs larger ones
+DEEPEST_M = 0.25  # and depths of what is inside here
+_LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own triangle
+
+
+class PosedObject:
+    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once.
+
+    ``watertight``: rays tell what is inside; else the mesh winds around it.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
+        self._tree, self._vertices = SurfaceTree(vertices, faces), vertices
+        field = None
+        if not (watertight and self._tree.closed):
+            field = DistanceField(vertices, faces, watertight=watertight)
+        self._solid = _Solid(self._tree.shaped(vertices), field)
+
+    def placed(self, rotation: np.ndarray, translation: np.ndarray) -> ShapedSurface:
+        """The surface under master_from_object."""
+        return self._tree.shaped(self._vertices @ rotation.T + translation)
+
+    def signed_distance(
+        self,
+        points: np.ndarray,
+        rotation: np.ndarray,
+        translation: np.ndarray,
+        *,
+        reach: float = REACH_M,
+    ) -> np.ndarray:
+        """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
+
+        Negative inside; at most ``reach``, at least -``DEEPEST_M``.
+        """
+        return self._solid.signed_distance((points - translation) @ rotation, reach)
+
+
+class PosedBody:
+    """A body in one pose, vertices (V, 3), with the ``tree`` of its faces (F, 3).
+
+    ``surface``: its tree, posed.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
+        self.surface = tree.shaped(vertices)
+        self._solid = _Solid(self.surface, None if tree.closed else DistanceField(vertices, faces))
+
+    def signed_distance(self, points: np.ndarray, *, reach: float = REACH_M) -> np.ndarray:
+        """Signed distance (N,) of points (N, 3), as of :class:`PosedObject`."""
+        return self._solid.signed_distance(points, reach)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (N,) of points (N, 3) on either side, at most ``DEEPEST_M``."""
+        return self.surface.distance(points, DEEPEST_M)
+
+
+class _Solid:
+    """How far from a ``surface``, and what is inside: by the ``field`` where that is not closed."""
+
+    def __init__(self, surface: ShapedSurface, field: DistanceField | None = None) -> None:
+        self._surface, self._field = surface, field
+
+    def signed_distance(self, points: np.ndarray, reach: float) -> np.ndarray:
+        if self._field is None:
+            return self._surface.signed_distance(points, reach, DEEPEST_M)
+        low, high = self._field.box + np.array([[-reach], [reach]])
+        found = np.full(len(points), reach)
+        near = np.flatnonzero(((points > low) & (points < high)).all(1))
+        found[near] = self._surface.distance(points[near], reach)
+        inside = near[self._field.inside(points[near])]
+        deep = inside[found[inside] >= reach]
+        found[deep] = self._surface.distance(points[deep], DEEPEST_M)
+        found[inside] *= -1
+        return found
+
+
+class Sight:
+    """Visibility to the rig's cameras, in one frame, of surfaces that occlude each other."""
+
+    def __init__(self, surfaces: Sequence[ShapedSurface]) -> None:
+        self._surfaces = surfaces
+
+    def seen(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        cameras: Sequence[Camera],
+    ) -> np.ndarray:
+        """Whether some depth camera (colour where it has none) sees each surface point (N,).
+
+        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the surfaces.
+        """
+        seen = np.zeros(len(points), bool)
+        for camera in cameras:
+            lens, camera_from_master = (
+                (camera.depth, camera.depth_from_master)
+                if camera.depth
+                else (camera.colour, camera.colour_from_master)
+            )
+            eye = -camera_from_master[:3, :3].T @ camera_from_master[:3, 3]
+            facing = ((eye - points) * normals).sum(1) > 0
+            ids = np.flatnonzero(facing & ~seen)
+            ids = ids[lens.sees(apply(camera_from_master, points[ids]))]
+            if len(ids) == 0:
+                continue
+            start = points[ids] + _LIFT_M * normals[ids]
+            hidden = np.zeros(len(ids), bool)
+            for surface in self._surfaces:
+                surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)
+            seen[ids[~hidden]] = True
+        return seen
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Outward unit normals (F, 3)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

@@ -1,0 +1,177 @@
+"""Depth points of one frame that the segmentation gives to the person or the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.evaluation import segmented_kernel
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
+from intercap_core.geometry.camera.masks import Runs
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.schemas import OBJECT_TRACK, PERSON
+
+# Only depth pixels within this distance of the projected meshes are used: larger errors of a fit
+# need no exact figure.
+MARGIN_M = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMasks:
+    """Masks of one colour image: the person's and that of the object's kept candidate."""
+
+    person: Runs | None
+    object_: Runs | None
+
+
+def segmented_points(
+    depth: np.ndarray,
+    camera: Camera,
+    masks: ViewMasks,
+    near: np.ndarray,
+    bias_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the person and of the object (N, 3) float32, master frame, metres.
+
+    ``depth`` (H, W) uint16 mm; ``near`` (M, 3) points of the meshes, master frame, around which
+    depth pixels are looked at; ``bias_m`` is subtracted from the depth. A point belongs to the
+    mask that covers the colour pixel showing it.
+    """
+    found = [np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)]
+    space = _Space.around(camera, near)
+    for place, runs in enumerate((masks.person, masks.object_)):
+        window = None if runs is None or space is None else mask_window(depth, camera, runs)
+        if window is not None:
+            assert runs is not None and space is not None
+            found[place] = space.points(
+                depth, camera, mask_pixels(depth, camera, runs, window), bias_m
+            )
+    return found[0], found[1]
+
+
+@dataclass(frozen=True)
+class _Space:
+    """A box of a depth image from ``low`` to before ``high`` (column, row), and a range of depths,
+    millimetres."""
+
+    low: tuple[int, int]
+    high: tuple[int, int]
+    nearest: float
+    farthest: float
+
+    @classmethod
+    def around(cls, camera: Camera, near: np.ndarray) -> _Space | None:
+        """That of points (M, 3), master frame, with ``MARGIN_M``; None where the camera sees none
+        of them."""
+        lens = camera.depth
+        if lens is None:
+            return None
+        least, most = segmented_kernel.extent(
+            np.asarray(near, np.float64), camera.depth_from_master, tuple(lens.parameters.tolist())
+        )
+        if not np.isfinite(least[2]):
+            return None
+        margin = lens.fx * MARGIN_M / max(float(least[2]), MARGIN_M)
+        low, high = np.floor(least[:2] - margin), np.ceil(most[:2] + margin) + 1
+        return cls(
+            (int(low[0]), int(low[1])),
+            (int(high[0]), int(high[1])),
+            1e3 * max(float(least[2]) - MARGIN_M, 0.0),
+            1e3 * (float(most[2]) + MARGIN_M),
+        )
+
+    def points(
+        self, depth: np.ndarray, camera: Camera, index: np.ndarray, bias_m: float
+    ) -> np.ndarray:
+        """Points (N, 3) float32, master frame, of those flat pixels (M,) of the image (H, W) mm
+        that are in it."""
+        assert camera.depth is not None
+        return segmented_kernel.placed(
+            depth,
+            index,
+            camera.depth.rays,
+            self.low,
+            self.high,
+            self.nearest,
+            self.farthest,
+            camera.master_from_depth.astype(np.float32),
+            np.float32(bias_m),
+        )
+
+
+def read_person_masks(person: Path) -> list[list[bytes]]:
+    """Masks (T, C) of the person artefact, COCO RLE, empty = none."""
+    with artefacts.read(person, PERSON) as people:
+        masks = artefacts.unpack_ragged(people["mask_offsets"], people["mask_rle"])
+        sets, cameras = people["person"].shape
+    return [masks[t * cameras : (t + 1) * cameras] for t in range(sets)]
+
+
+class SegmentedClouds:
+    """Person's and object's points of every frame, over all views.
+
+    ``frames`` are read by the moment that their images show (:meth:`Frames.showing`);
+    ``person_masks`` (T, C) of COCO RLE bytes, empty = none; ``candidate_masks`` the same of the
+    candidate that the object's track kept, None where it does not matter; ``depth_bias`` (C,) of
+    the scene.
+    """
+
+    def __init__(
+        self,
+        frames: Frames,
+        rig: Rig,
+        person_masks: list[list[bytes]],
+        candidate_masks: list[list[bytes]] | None,
+        depth_bias: np.ndarray,
+    ) -> None:
+        self._frames = frames
+        self._rig = rig
+        self._masks = (person_masks, candidate_masks)
+        self._bias = depth_bias
+
+    def at(self, t: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points of person and object (N, 3) of frame ``t``, near the meshes' points (M, 3)."""
+        person, object_ = [], []
+        for c, camera in enumerate(self._rig):
+            depth = self._frames.depth(t, c)
+            if depth is None:
+                continue
+            colour = camera.colour
+            runs = [
+                Runs(masks[t][c], colour.height, colour.width) if masks and masks[t][c] else None
+                for masks in self._masks
+            ]
+            bias = float(self._bias[c])
+            found = segmented_points(depth, camera, ViewMasks(*runs), near, bias)
+            person.append(found[0])
+            object_.append(found[1])
+        if not person:
+            return np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+        return np.concatenate(person), np.concatenate(object_)
+
+
+def read_clouds(
+    images: Frames,
+    rig: Rig,
+    depth_bias: np.ndarray,
+    image_of: np.ndarray,
+    detections: Path,
+    person: Path,
+    object_track: Path,
+) -> SegmentedClouds:
+    """Those of a sequence, from the artefacts of its detections, person and object track;
+    ``images`` and ``image_of`` (T, C) by the moment that they show."""
+    found = Detections.load(detections).showing(image_of).with_candidates_of(person)
+    with artefacts.read(object_track, OBJECT_TRACK) as track:
+        kept = track["candidate"]
+    total, cameras = kept.shape
+    candidates = [
+        [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
+        for t in range(total)
+    ]
+    return SegmentedClouds(images, rig, read_person_masks(person), candidates, depth_bias)

@@ -1,0 +1,220 @@
+"""Errors of each stage's body and object against the truth, by dataset of the metrics artefact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.evaluation import body, contact, motion, object_pose
+from intercap_core.evaluation import truth as truths
+from intercap_core.evaluation.measurement import Values
+from intercap_core.evaluation.planted import foot_errors, support
+from intercap_core.evaluation.proximity import PosedObject
+from intercap_core.evaluation.slip import slip_speed
+from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.pose import Pose
+from intercap_core.schemas import METRIC_REGIONS
+
+_FEET = ("left_foot", "right_foot")  # regions of the soles
+
+
+@dataclass(frozen=True, eq=False)
+class _Both:
+    """The tracked object's ``mesh`` and ``surface``, and the ``true_surface``."""
+
+    mesh: ObjectMesh
+    surface: PosedObject
+    true_surface: DistanceField
+
+    def true_normals(self, points: np.ndarray) -> np.ndarray:
+        """Normals (N, 3) of the true surface nearest to points (N, 3), its frame."""
+        return self.true_surface.closest(points).normals
+
+
+class StageErrors:
+    """Errors of each stage by dataset name; what a stage does not estimate is left out.
+
+    ``mesh`` is the tracked object's; without one, or where there truly is none, the errors are the
+    body's alone.
+    """
+
+    def __init__(
+        self,
+        truth: truths.Truth,
+        true_distance: np.ndarray | None,
+        mesh: ObjectMesh | None,
+        threshold_m: float,
+        fps: float,
+    ) -> None:
+        self._truth = truth
+        self._true_distance = true_distance
+        self._threshold = threshold_m
+        self._fps = fps
+        self._both: _Both | None = None
+        if mesh is not None and truth.has_object:
+            self._both = _Both(
+                mesh,
+                PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight),
+                DistanceField(truth.object_vertices, truth.object_faces),
+            )
+        self._touched = np.zeros(0, int)  # vertices that truly touch in some frame
+        self._true_local = np.zeros((0, 0, 3))  # of them, in the true object's frame
+        if truth.vertices is not None and true_distance is not None:
+            touching = contact.vertex_contact(true_distance)
+            self._touched = np.flatnonzero(touching.any(0))
+            self._true_local = _local(
+                truth.vertices[:, self._touched], truth.rotation, truth.translation
+            )
+
+    def of_object(self, stage: str, track: ObjectTrack) -> Values:
+        if self._both is None:
+            return {}
+        errors = truths.object_errors(self._truth, track, self._both.mesh, self._fps)
+        return {f"truth/{stage}/{key}": value for key, value in errors.items()}
+
+    def of_body(
+        self,
+        stage: str,
+        body_track: BodyTrack,
+        track: ObjectTrack,
+        distance: np.ndarray | None = None,
+    ) -> Values:
+        """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets.
+
+        ``distance`` (T, V) of the body's vertices to the object where it is known already.
+        """
+        errors = truths.body_errors(self._truth, body_track, self._fps)
+        if self._truth.vertices is not None:
+            errors |= self._vertices(body_track, track, distance)
+        return {f"truth/{stage}/{key}": value for key, value in errors.items()}
+
+    def _vertices(
+        self, body_track: BodyTrack, track: ObjectTrack, known: np.ndarray | None
+    ) -> Values:
+        """Errors of skin, contact, hold and stand, frame by frame."""
+        pve, counts, touching, held, soles = [], [], [], [], []
+        assert self._truth.vertices is not None
+        regions = body_track.model.regions
+        for t, vertices in enumerate(body_track.vertices()):
+            held.append(vertices[self._touched])
+            soles.append([vertices[regions[foot]] for foot in _FEET])
+            pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
+            if self._both is None or self._true_distance is None:
+                continue
+            distance = np.full(len(vertices), np.inf)  # of an object that was not found
+            if known is not None:
+                distance = known[t]
+            elif track.known:
+                distance = self._both.surface.signed_distance(
+                    vertices.astype(np.float64),
+                    track.rotation[t],
+                    track.translation[t],
+                    reach=1.01 * max(self._threshold, *contact.SWEEP_M),
+                )
+            counts.append(truths.contact_counts(distance, self._true_distance[t]))
+            touching.append(contact.vertex_contact(distance, self._threshold))
+        of_body = {
+            **self._feet([np.stack(sole) for sole in zip(*soles, strict=True)], regions),
+            "body_pve": pve,
+        }
+        if not touching:
+            return of_body
+        touched = np.stack(touching)
+        return of_body | {
+            **self._slip(np.stack(held), track),
+            "vertex_contact_counts": np.stack(counts),
+            "contact_frame": touched.any(1),
+            "region_contact": contact.region_contact(touched, regions, METRIC_REGIONS),
+        }
+
+    def _slip(self, held: np.ndarray, track: ObjectTrack) -> Values:
+        """Of the skin vertices (T, N, 3) that truly touch at some time, on the tracked object."""
+        assert self._true_distance is not None and self._both is not None
+        if not track.known:
+            return {"slip": np.full(len(held), np.nan)}
+        pose, true = (Pose(of.rotation, of.translation).matrix for of in (track, self._truth))
+        symmetry = self._both.mesh.symmetry  # a spin that nothing shows is no slip
+        pose = np.array(
+            [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
+        )
+        touching = contact.vertex_contact(self._true_distance[:, self._touched])
+        speed = slip_speed(
+            _local(held, pose[:, :3, :3], pose[:, :3, 3]),
+            self._true_local,
+            touching,
+            self._both.true_normals,
+            self._fps,
+        )
+        return {"slip": speed}
+
+    def _feet(self, soles: Sequence[np.ndarray], regions: Mapping[str, np.ndarray]) -> Values:
+        """Of both soles' vertices (T, S, 3)."""
+        assert self._truth.vertices is not None
+        found = []
+        for sole, true, carrying in zip(soles, *self._true_soles(regions), strict=True):
+            found.append(foot_errors(sole, true, carrying, self._truth.floor, self._fps))
+        return {
+            "planted_speed": _since_before([foot.speed for foot in found]),
+            "planted_height": _since_before([foot.height for foot in found]),
+            "foot_swing": _since_before([foot.swing for foot in found]),
+            "foot_centre": np.stack([sole.mean(1) for sole in soles], 1),
+        }
+
+    def _true_soles(
+        self, regions: Mapping[str, np.ndarray]
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Vertices (T, S, 3) of both true soles, and which of them carry weight (T - 1, S)."""
+        truth = self._truth
+        assert truth.vertices is not None
+        soles = [truth.vertices[:, regions[foot]].astype(np.float64) for foot in _FEET]
+        carrying = [
+            support(sole, truth.floor, self._fps, level)
+            for sole, level in zip(soles, truth.support_height.T, strict=True)
+        ]
+        return soles, carrying
+
+    def about_truth(self, regions: Mapping[str, np.ndarray]) -> Values:
+        """What is true, of a body whose parts have these vertices."""
+        truth = self._truth
+        if self._both is None:
+            return self._true_skin(regions)
+        centre = object_pose.posed_point(
+            truth.rotation, truth.translation, self._both.mesh.centre_of_mass
+        )
+        return {
+            "truth/sweep": contact.SWEEP_M,
+            "truth/contact_region": truth.contact_region,
+            "truth/object_views": truth.object_views,
+            "truth/object_moving": motion.moving(truth.rotation, centre, self._fps),
+            "truth/object_centre": centre,
+            **self._true_skin(regions),
+        }
+
+    def _true_skin(self, regions: Mapping[str, np.ndarray]) -> Values:
+        truth = self._truth
+        if truth.vertices is None:
+            return {}
+        soles, carrying = self._true_soles(regions)
+        carried = [np.any(vertices, axis=1) for vertices in carrying]
+        near = {}
+        if self._both is not None and self._true_distance is not None:
+            nearest = [self._true_distance[:, regions[name]].min(1) for name in METRIC_REGIONS]
+            near = {"truth/region_distance": np.stack(nearest, 1)}
+        return near | {
+            "truth/standing": _since_before(carried) > 0,
+            "truth/foot_centre": np.stack([sole.mean(1) for sole in soles], 1),
+        }
+
+
+def _local(points: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Points (T, N, 3) in the frame of an object (T, 3, 3), (T, 3)."""
+    return (points - translation[:, None]) @ rotation
+
+
+def _since_before(feet: Sequence[np.ndarray]) -> np.ndarray:
+    """Values (T - 1,) of both feet, from each frame to the next, as (T, 2): NaN in the first."""
+    return np.concatenate([np.full((1, 2), np.nan), np.stack(feet, 1)])

@@ -1,0 +1,169 @@
+"""What a sequence adds to the dataset's figures: its metrics without distances by vertex, counts of
+contact, and how its cameras were found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts, schemas
+from intercap_core.artefacts import Artefact
+from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.extrinsics import displacement
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.schemas import JOINT, METRICS, PER_VERTEX_METRICS, SCENE, SUMMARY
+
+_RIG = "rig/"
+
+
+@dataclass(frozen=True)
+class BodyFile:
+    """Which body file a sequence was fitted with, and how many numbers of it."""
+
+    gender: str
+    digest: str
+    num_betas: int
+    num_expression: int
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceSummary:
+    """One sequence's summary artefact.
+
+    ``intent`` is "" where the table does not say; ``rig`` holds the datasets ``rig/...`` of
+    :data:`SUMMARY` by name; ``body_contact`` (V,) counts frames, None without an object;
+    ``surface`` (N, 3) and ``surface_contact`` (N,) are of the object in its own frame.
+    ``made_by``: schema version and digest of settings by stage.
+    """
+
+    metrics: SequenceMetrics
+    intent: str
+    body: BodyFile
+    rig: Mapping[str, np.ndarray] = field(repr=False)
+    body_contact: np.ndarray | None = field(repr=False)
+    surface: np.ndarray | None = field(repr=False)
+    surface_contact: np.ndarray | None = field(repr=False)
+    made_by: Mapping[str, tuple[int, str]]
+
+    @property
+    def name(self) -> str:
+        """The sequence's name."""
+        return self.metrics.name
+
+    @property
+    def residuals(self) -> list[tuple[str, float, float]]:
+        """Name, before and after of each pair of cameras, metres."""
+        names = self.rig["camera_names"]
+        return [
+            (f"{names[i]}–{names[j]}", float(before), float(after))
+            for (i, j), before, after in zip(
+                self.rig["pairs"],
+                self.rig["pair_residual_before"],
+                self.rig["pair_residual_after"],
+                strict=True,
+            )
+        ]
+
+    @classmethod
+    def read(cls, path: Path) -> SequenceSummary:
+        """Raises UserError as :func:`artefacts.read` does."""
+        with artefacts.read(path, SUMMARY) as artefact:
+
+            def optional(key: str) -> np.ndarray | None:
+                if key not in artefact:
+                    return None
+                return artefact[key]
+
+            return cls(
+                SequenceMetrics.of(artefact),
+                str(artefact.attributes["intent"]),
+                BodyFile(
+                    str(artefact.attributes["gender"]),
+                    str(artefact.attributes["body_model"]),
+                    int(artefact.attributes["num_betas"]),
+                    int(artefact.attributes["num_expression"]),
+                ),
+                {
+                    key.removeprefix(_RIG): artefact[key]
+                    for key in SUMMARY.fields
+                    if key.startswith(_RIG)
+                },
+                optional("body_contact_frames"),
+                optional("object_sample_points"),
+                optional("object_sample_contact"),
+                {
+                    stage: (int(version), settings)
+                    for stage, version, settings in zip(
+                        artefact.text("made_by/stages"),
+                        artefact["made_by/versions"],
+                        artefact.text("made_by/settings"),
+                        strict=True,
+                    )
+                },
+            )
+
+
+def write(output: Path, paths: Mapping[str, Path], *, intent: str) -> None:
+    """Write the summary of one sequence from its artefacts by stage.
+
+    ``paths`` names every stage that a sequence's result rests on, scene, joint and metrics among
+    them. Raises UserError where one is missing or broken.
+    """
+    with (
+        artefacts.read(paths["metrics"], METRICS) as metrics,
+        artefacts.read(paths["joint"], JOINT) as joint,
+    ):
+        told = {
+            **{name: metrics.attributes[name] for name in METRICS.attributes},
+            **{k: v for k, v in metrics.attributes.items() if k in METRICS.optional_attributes},
+            **{name: joint.attributes[name] for name in ("gender", "body_model")},
+            "num_betas": joint["betas"].shape[-1],
+            "num_expression": joint["expression"].shape[-1],
+        }
+        with artefacts.write(output, SUMMARY, **told, intent=intent) as writer:
+            for key in metrics.keys():  # noqa: SIM118 (not a dict)
+                if key not in PER_VERTEX_METRICS:
+                    is_text = METRICS.fields[key].dtype == "str"
+                    writer.put(key, metrics.text(key) if is_text else metrics[key])
+            if "body_to_object" in metrics:
+                touching = vertex_contact(metrics["body_to_object"], CONTACT_M)
+                writer.put("body_contact_frames", touching.sum(0).astype(np.int32))
+            with artefacts.read(paths["scene"], SCENE) as scene:
+                for key, values in _rig(scene).items():
+                    writer.put(f"{_RIG}{key}", values)
+            stages, versions, settings = [], [], []
+            for stage, path in paths.items():
+                schema = getattr(schemas, stage.upper())
+                with artefacts.read(path, schema) as source:
+                    stages.append(stage)
+                    versions.append(schema.version)
+                    settings.append(str(source.attributes.get("settings_digest", "")))
+            writer.put("made_by/stages", stages)
+            writer.put("made_by/versions", np.array(versions, np.int32))
+            writer.put("made_by/settings", settings)
+
+
+def _rig(scene: Artefact) -> dict[str, np.ndarray | list[str]]:
+    names = scene.text("camera_names")
+    start, found = scene["master_from_colour_start"], scene["master_from_colour"]
+    posed = np.flatnonzero(np.isfinite(found).all((1, 2)) & np.isfinite(start).all((1, 2)))
+    master = names.index(str(scene.attributes["master"]))
+    moved = np.full(len(names), np.nan)
+    if master in posed:
+        moved[posed] = displacement(found[posed], start[posed], int(np.argmax(posed == master)))
+        moved[master] = np.nan
+    return {
+        "camera_names": names,
+        "images": (scene["image_of"] >= 0).sum(0).astype(np.int32),
+        "time_offset": scene["time_offset"],
+        "time_offset_sigma": scene["time_offset_sigma"],
+        "depth_bias": scene["depth_bias"],
+        "moved": moved,
+        "note": scene.text("note"),
+        "pairs": scene["pairs"],
+        "pair_residual_before": scene["pair_residual_before"].astype(np.float64),
+        "pair_residual_after": scene["pair_residual_after"].astype(np.float64),
+    }

@@ -1,0 +1,227 @@
+"""The truth of a virtual recording, brought onto the fitted meshes. Only the metrics read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core import artefacts
+from intercap_core.evaluation import body, contact, motion, object_pose
+from intercap_core.evaluation.planted import Floor
+from intercap_core.evaluation.times import match_times
+from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surface_samples import SurfaceSamples
+from intercap_core.schemas import METRIC_REGIONS, TRUTH
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True body and object in the recording's T frame sets, master frame, metres.
+
+    ``vertices`` (T, V, 3) of the true skin that correspond to the fitted mesh's, or None where the
+    fitted body has another topology than the one the truth was matched to; ``visible`` (T, V) of
+    them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
+    (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
+    ``translation`` (T, 3), of a person alone NaN, and the mesh empty; ``contact_region`` (T, 12) in
+    the order of METRIC_REGIONS; the ``floor`` that bare soles are on, and how high above it what is
+    under the left and the right sole lies, ``support_height`` (T, 2); ``master_from_colour``
+    (C, 4, 4) and ``camera_names``.
+    """
+
+    vertices: np.ndarray | None
+    visible: np.ndarray | None
+    joints: np.ndarray
+    tips: np.ndarray
+    object_vertices: np.ndarray
+    object_faces: np.ndarray
+    object_visible: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    object_views: np.ndarray
+    contact_region: np.ndarray
+    floor: Floor
+    support_height: np.ndarray
+    camera_names: tuple[str, ...]
+    master_from_colour: np.ndarray
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there truly is an object."""
+        return len(self.object_faces) > 0
+
+    @classmethod
+    def load(cls, path: Path, times: np.ndarray, fps: float, num_vertices: int) -> Truth:
+        """Read the truth at the frame sets' ``times`` (T,), seconds.
+
+        Raises UserError where the file is broken or does not cover those moments.
+        """
+        with artefacts.read(path, TRUTH) as file:
+            at = match_times(path, file["times"], times, fps)
+            vertices = visible = None
+            face, weights = file["correspondence_face"], file["correspondence_weights"]
+            if len(face) == num_vertices:
+                faces = file["body_faces"]
+                vertices = body.corresponding_vertices(
+                    file["body_vertices"][at], faces, face, weights
+                )
+                seen = file["body_visible"][at].astype(np.float32)[..., None]
+                visible = body.corresponding_vertices(seen, faces, face, weights)[..., 0] > 0.5
+            names = file.text("region_names")
+            # bare feet in shoes stand as high as the soles are thick
+            soles = float(file.attributes.get("sole_m", 0.0))
+            offset = float(file.attributes["ground_offset"]) - soles
+            columns = [names.index(name) for name in METRIC_REGIONS]
+            thing = _TrueThing.read(file, at)
+            return cls(
+                vertices=vertices,
+                visible=visible,
+                joints=file["joints"][at],
+                tips=file["fingertips"][at],
+                object_vertices=thing.vertices,
+                object_faces=thing.faces,
+                object_visible=thing.visible,
+                rotation=thing.rotation,
+                translation=thing.translation,
+                object_views=thing.views,
+                contact_region=file["region_contact"][at][:, columns],
+                floor=Floor(file["ground_normal"], offset),
+                support_height=_support_height(file, at),
+                camera_names=tuple(file.text("camera_names")),
+                master_from_colour=file["master_from_colour"],
+            )
+
+    def object_samples_visible(
+        self,
+        samples: SurfaceSamples,
+        mesh: ObjectMesh,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """True object points nearest to the tracked mesh's samples, and which cameras truly see.
+
+        Returns the points (N, 3), object frame, and (T, N) bool.
+        """
+        points = samples.of(mesh.vertices, mesh.faces)
+        nearest = cKDTree(self.object_vertices).query(points)[1]
+        return self.object_vertices[nearest], self.object_visible[:, nearest]
+
+
+def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
+    return file["support_height"][at] if "support_height" in file else np.zeros((len(at), 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _TrueThing:
+    """The object's part of the file at T moments: an empty mesh without poses where there is
+    none."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    visible: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    views: np.ndarray
+
+    @classmethod
+    def read(cls, file: artefacts.Artefact, at: np.ndarray) -> _TrueThing:
+        if not file.attributes["object"]:
+            count = len(at)
+            return cls(
+                np.zeros((0, 3)),
+                np.zeros((0, 3), np.int32),
+                np.zeros((count, 0), bool),
+                np.full((count, 3, 3), np.nan),
+                np.full((count, 3), np.nan),
+                np.zeros(count, np.int8),
+            )
+        return cls(
+            file["object_vertices"].astype(np.float64),
+            file["object_faces"],
+            file["object_visible"][at],
+            file["rotation"][at],
+            file["translation"][at],
+            file["object_views"][at],
+        )
+
+
+def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
+    """Errors of T fitted bodies' joints by key of the metrics artefact."""
+    joints, tips = track.joints, track.tips
+    true = truth.joints
+    hands = np.r_[body.FINGER_JOINTS[0], body.FINGER_JOINTS[1]]
+    result = {
+        "body_mpjpe": body.joint_error(joints, true),
+        "hand_mpjpe": body.hand_error(joints, tips, true, truth.tips),
+        "hand_mpjpe_wrist": body.hand_error(joints, tips, true, truth.tips, align_wrists=True),
+        "acceleration_body": motion.acceleration_error(
+            joints[:, body.BODY_JOINTS], true[:, body.BODY_JOINTS], fps
+        ),
+        "acceleration_hands": motion.acceleration_error(joints[:, hands], true[:, hands], fps),
+        "acceleration_feet": motion.acceleration_error(
+            joints[:, body.FOOT_JOINTS], true[:, body.FOOT_JOINTS], fps
+        ),
+        "joint_offset": (joints - true)[:, body.BODY_JOINTS],
+        "fingertips": np.linalg.norm(tips - truth.tips, axis=-1).reshape(-1, 2, 5).mean(-1),
+    }
+    if track.sigma is not None:
+        result["joint_normalised"] = body.normalised_joint_error(joints, true, track.sigma)
+    return result
+
+
+def object_errors(
+    truth: Truth,
+    track: ObjectTrack,
+    mesh: ObjectMesh,
+    fps: float,
+) -> dict[str, np.ndarray]:
+    """Errors of T object poses by key of the metrics artefact."""
+    if not track.known:
+        return _missed(len(truth.rotation))
+    centre = mesh.centre_of_mass
+    fitted = object_pose.posed_point(track.rotation, track.translation, centre)
+    true = object_pose.posed_point(truth.rotation, truth.translation, centre)
+    result = {
+        "object_translation": object_pose.centre_error(fitted, true),
+        "object_rotation": object_pose.rotation_error_deg(
+            track.rotation, truth.rotation, mesh.symmetry
+        ),
+        "object_centre": fitted,
+        "object_turn": np.append(
+            np.nan, motion.turns(track.rotation, truth.rotation, mesh.symmetry)
+        ),
+        "object_flagged": track.flagged,
+        "acceleration_object": motion.acceleration_error(fitted[:, None], true[:, None], fps),
+    }
+    if track.covariance is not None:
+        result["object_normalised"] = object_pose.normalised_translation_error(
+            track.translation, truth.translation, track.covariance
+        )
+    return result
+
+
+def _missed(frames: int) -> dict[str, np.ndarray]:
+    """Errors of an object that is there and that was found in no frame: beyond any bound."""
+    unknown = np.full(frames, np.nan)
+    return {
+        "object_translation": np.full(frames, np.inf),
+        "object_rotation": np.full(frames, np.inf),
+        "object_centre": np.full((frames, 3), np.nan),
+        "object_turn": unknown,
+        "object_flagged": np.ones(frames, bool),
+        "acceleration_object": unknown,
+    }
+
+
+def contact_counts(distance: np.ndarray, true_distance: np.ndarray) -> np.ndarray:
+    """Counts (W, 4) of one frame's body vertices by threshold, from signed distances (V,)."""
+    return np.stack(
+        [
+            contact.confusion(
+                contact.vertex_contact(distance, limit),
+                contact.vertex_contact(true_distance, limit),
+            )
+            for limit in contact.SWEEP_M
+        ]
+    )

@@ -1,0 +1,160 @@
+"""The verdict on one sequence: what was held out, and the error that is stated of each part."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.config import (
+    BodyFitSettings,
+    BodyModels,
+    JointSettings,
+    ObjectEntry,
+    ObjectTrackSettings,
+)
+from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, hold_out
+from intercap_core.evaluation.verdict.part import Part
+from intercap_core.evaluation.verdict.stated import FEATURES, Stated, state
+from intercap_core.joint.inputs import JointInputs, open_inputs
+from intercap_core.joint.result import JointResult
+from intercap_core.joint.sequential import SequentialFits
+from intercap_core.schemas import BODY_FIT, JOINT, SCENE
+
+log = logging.getLogger(__name__)
+
+Values = dict[str, np.ndarray | list[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Of T frames and C cameras: what was held out, None where nothing could be, and what is stated
+    of each part: not of an object where there is none."""
+
+    cameras: tuple[str, ...]
+    frames: int
+    held: HeldOut | None
+    stated: dict[Part, Stated]
+
+    @classmethod
+    def reach(
+        cls,
+        *,
+        frames: Path,
+        scene: Path,
+        detections: Path,
+        person: Path,
+        object_track: Path,
+        body_fit: Path,
+        joint: Path,
+        object_: ObjectEntry | None,
+        body_models: BodyModels,
+        settings: JointSettings,
+        body_settings: BodyFitSettings,
+        track_settings: ObjectTrackSettings,
+    ) -> Verdict:
+        """Judge joint.h5 by what the stages before it had; no truth is read.
+
+        Raises UserError where an artefact or the mesh cannot be used.
+        """
+        with artefacts.read(scene, SCENE) as source:
+            result = JointResult.read(joint, source)
+            names = tuple(source.text("camera_names"))
+        with open_inputs(
+            frames=frames,
+            scene=scene,
+            detections=detections,
+            person=person,
+            object_track=object_track,
+            body_fit=body_fit,
+            object_=object_,
+            body_models=body_models,
+            settings=settings,
+            body_settings=body_settings,
+            track_settings=track_settings,
+        ) as inputs:
+            held = hold_out(inputs, settings, result)
+            sequential = inputs.sequential
+            parts = [part for part in Part if part != Part.OBJECT or inputs.geometry.has_object]
+            moved = _moved(inputs, result, body_fit, joint)
+        stated = {
+            part: state(
+                held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)
+            )
+            for part in parts
+        }
+        for part, said in stated.items():
+            if said.silent:
+                log.warning("no error is stated of the %s: %s", part, said.silent)
+            else:
+                low, high = 1e3 * said.error / said.factor, 1e3 * said.error * said.factor
+                log.info(
+                    "%s: stated error %.1f mm (%.1f to %.1f)", part, 1e3 * said.error, low, high
+                )
+        return cls(names, len(result.state), held, stated)
+
+    def values(self) -> Values:
+        """As the metrics artefact holds them, without their prefix."""
+        parts = list(self.stated)
+        said = [self.stated[part] for part in parts]
+        values: Values = {
+            "part_names": [str(part) for part in parts],
+            "feature_names": list(FEATURES),
+            "features": np.array([[s.features[name] for name in FEATURES] for s in said]),
+            "error": np.array([s.error for s in said]),
+            "error_factor": np.array([s.factor for s in said]),
+            "error_frame": np.stack([s.by_frame for s in said]),
+            "silent": [s.silent for s in said],
+            "camera_names": list(self.cameras),
+        }
+        if self.held is None:
+            return values
+        held = self.held
+        shape = (len(parts), len(self.cameras), self.frames)
+        shift = np.full(shape, np.nan)
+        for place, part in enumerate(parts):
+            shift[place, held.cameras] = held.shift[part]
+        values |= {
+            "held_camera": held.held,
+            "shift": shift,
+            "repeated": np.stack([held.repeated[part] for part in parts]),
+        }
+        for name, within in vars(held.within).items():
+            values[name] = within
+            values[f"{name}_held_out"] = getattr(held.without, name)
+        return values
+
+
+def _sigma(fits: SequentialFits, part: Part) -> np.ndarray:
+    """What the sequential fits state of a part (T,), metres."""
+    if part == Part.OBJECT:
+        return fits.object_sigma
+    return np.sqrt((fits.joint_sigma[:, JOINTS[part]] ** 2).mean(axis=1))
+
+
+def _moved(
+    inputs: JointInputs, result: JointResult, body_fit: Path, joint: Path
+) -> dict[Part, np.ndarray]:
+    """By how much the joint fit is elsewhere than the sequential ones (T,), metres, RMS over a
+    part's joints; of the object at its centre of mass."""
+    with artefacts.read(body_fit, BODY_FIT) as before, artefacts.read(joint, JOINT) as after:
+        apart = ((after["joints"] - before["joints"]).astype(float) ** 2).sum(axis=2)
+    found = {part: np.sqrt(apart[:, at].mean(axis=1)) for part, at in JOINTS.items()}
+    if inputs.geometry.has_object:
+        middle = inputs.geometry.mesh.centre_of_mass
+        old, new = inputs.sequential.state, result.state
+        turned = (new.rotation - old.rotation) @ middle
+        shift = turned + new.translation - old.translation
+        found[Part.OBJECT] = np.linalg.norm(shift, axis=1)
+    return found
+
+
+def _known(fits: SequentialFits, result: JointResult, part: Part) -> np.ndarray:
+    """Frames (T,) in which the part was measured, and is where it was measured."""
+    flags = fits.flags
+    if part == Part.OBJECT:
+        return ~(flags.lost | flags.carried) & ~result.contradicted
+    return ~flags.filled

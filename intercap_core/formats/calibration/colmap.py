@@ -1,0 +1,212 @@
+"""Calibrations of COLMAP: a folder with ``cameras`` and ``images``, both ``.bin`` or both ``.txt``.
+
+Poses are x_camera = R x_world + T with OpenCV's axes, the quaternion w x y z; the world has no
+scale. The first pixel's centre is at (0.5, 0.5), here at (0, 0).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.opencv import MAX_SIDE, Calibration, opencv_lens
+from intercap_core.formats.calibration.other import Recorded, fixed_cameras, put_together
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.inputs.files import MAX_MODEL_BYTES, decoded, read_bytes, read_text
+from intercap_core.inputs.json_files import whole
+from intercap_core.inputs.quotes import printable, quoted
+
+FIRST_PIXEL = 0.5  # where its centre is, in COLMAP's coordinates
+# Number, name, places of fx fy cx cy among the parameters, and of OpenCV's coefficients after them.
+MODELS = {
+    0: ("SIMPLE_PINHOLE", 3, (0, 0, 1, 2), ()),
+    1: ("PINHOLE", 4, (0, 1, 2, 3), ()),
+    2: ("SIMPLE_RADIAL", 4, (0, 0, 1, 2), (3,)),
+    3: ("RADIAL", 5, (0, 0, 1, 2), (3, 4)),
+    4: ("OPENCV", 8, (0, 1, 2, 3), (4, 5, 6, 7)),
+    6: ("FULL_OPENCV", 12, (0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
+}
+# Those that are no polynomial or rational lens in the tangent of the angle.
+UNSUPPORTED = {
+    5: "OPENCV_FISHEYE", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE",
+}  # fmt: skip
+NUMBERS = {model[0]: number for number, model in MODELS.items()}
+_ADVICE = "export the model again"
+MAX_NAME = 4096  # bytes: a path that is longer is none
+
+
+class _Image(NamedTuple):
+    quaternion: tuple[float, ...]
+    shift: tuple[float, ...]
+    camera: int
+    name: str
+
+
+def is_colmap(folder: Path) -> bool:
+    """Whether the folder holds a sparse model."""
+    return _suffix(folder) is not None
+
+
+def read_colmap_calibration(folder: Path, recorded: Recorded, scale: float | None) -> Calibration:
+    """Read a sparse model; the binary files go before the text, as in COLMAP itself.
+
+    Raises UserError naming file, camera or image.
+    """
+    suffix = _suffix(folder)
+    lenses_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
+    if suffix == ".bin":
+        lenses = dict(_binary_lenses(_Bytes(lenses_file), lenses_file))
+        images = list(_binary_images(_Bytes(images_file)))
+    else:
+        lenses = dict(_text_lenses(lenses_file))
+        images = list(_text_images(images_file))
+    placed = []
+    for image in images:
+        if image.camera not in lenses:
+            raise UserError(
+                f"{images_file}: image {quoted(image.name)} is of camera {image.camera}, which "
+                f"{lenses_file.name} does not have; export the model again"
+            )
+        placed.append((image.name, lenses[image.camera], _pose(image, images_file)))
+    cameras = fixed_cameras(folder, placed, recorded, scale=scale)
+    unit = "its reconstruction is known but for its size"
+    return put_together(folder, "COLMAP", cameras, recorded, scale=scale, unit=unit)
+
+
+def _suffix(folder: Path) -> str | None:
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def _pose(image: _Image, path: Path) -> np.ndarray:
+    w, x, y, z = image.quaternion
+    numbers = np.array([*image.quaternion, *image.shift])
+    if not np.isfinite(numbers).all() or abs(np.linalg.norm(image.quaternion) - 1) > 0.01:
+        raise UserError(
+            f"{path}: image {quoted(image.name)} has no unit quaternion and translation; export "
+            "the model again"
+        )
+    return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(image.shift))
+
+
+def _lens(model: int, size: tuple[int, int], numbers: list[float], where: str) -> Intrinsics:
+    name, count, places, bends = MODELS[model]
+    if len(numbers) != count:
+        raise UserError(
+            f"{where}: model {name} has {len(numbers)} parameters, expected {count}; export the "
+            "model again"
+        )
+    fx, fy, cx, cy = (numbers[place] for place in places)
+    matrix = [[fx, 0, cx - FIRST_PIXEL], [0, fy, cy - FIRST_PIXEL], [0, 0, 1]]
+    distortion = [numbers[place] for place in bends]
+    if not all(0 < n <= MAX_SIDE for n in size):
+        raise UserError(f"{where}: images of {size[0]}x{size[1]} pixels; export the model again")
+    return opencv_lens(size, matrix, distortion + [0.0] * max(0, 4 - len(distortion)), where)
+
+
+def _refuse(model: str, where: str) -> UserError:
+    return UserError(
+        f"{where}: model {model} cannot be represented, expected {', '.join(NUMBERS)}; undistort "
+        "the recordings (colmap image_undistorter), or reconstruct with one of these models"
+    )
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    text = read_text(path, MAX_MODEL_BYTES, advice=_ADVICE)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.lstrip().startswith("#"):
+            yield number, line.strip()
+
+
+def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    for number, line in _lines(path):
+        if not line:
+            continue
+        where = f"{path}, line {number}"
+        try:
+            identity, model, width, height, *rest = line.split()
+            camera, size = whole(identity), (whole(width), whole(height))
+            numbers = [float(word) for word in rest]
+        except ValueError:
+            raise UserError(
+                f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT and parameters; export the model "
+                "again"
+            ) from None
+        if model not in NUMBERS:
+            raise _refuse(printable(model[:40]), where)
+        yield camera, _lens(NUMBERS[model], size, numbers, where)
+
+
+def _text_images(path: Path) -> Iterator[_Image]:
+    lines = _lines(path)
+    for number, line in lines:
+        if not line:
+            continue
+        try:
+            _, *numbers, camera, name = line.split(maxsplit=9)
+            values = [float(word) for word in numbers]
+            identity = whole(camera)
+        except ValueError:
+            values = []
+        if len(values) != 7:
+            raise UserError(
+                f"{path}, line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; "
+                "export the model again"
+            )
+        yield _Image(tuple(values[:4]), tuple(values[4:]), identity, name)
+        next(lines, None)  # its points, a line that may be empty
+
+
+class _Bytes:
+    """A binary file, little endian, read from its start; ends with a UserError where it is cut."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at = path, 0
+        self._content = read_bytes(path, MAX_MODEL_BYTES, advice=_ADVICE)
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        end = self._at + struct.calcsize("<" + form)
+        if end > len(self._content):
+            raise UserError(f"{self._path}: is cut off; copy or export it again")
+        values = struct.unpack("<" + form, self._content[self._at : end])
+        self._at = end
+        return values
+
+    def name(self) -> str:
+        end = self._content.find(b"\0", self._at, self._at + MAX_NAME)
+        if end < 0:
+            raise UserError(f"{self._path}: an image has no name; copy or export it again")
+        name = decoded(self._path, self._content[self._at : end])
+        self._at = end + 1
+        return name
+
+    def skip(self, count: int) -> None:
+        self._at += count
+
+
+def _binary_lenses(content: _Bytes, path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    for _ in range(content.take("Q")[0]):
+        camera, model, width, height = content.take("iiQQ")
+        where = f"{path}: camera {camera}"
+        if model not in MODELS:
+            raise _refuse(UNSUPPORTED.get(model, f"number {model}"), where)
+        numbers = list(content.take(f"{MODELS[model][1]}d"))
+        yield camera, _lens(model, (width, height), numbers, where)
+
+
+def _binary_images(content: _Bytes) -> Iterator[_Image]:
+    for _ in range(content.take("Q")[0]):
+        _, *values, camera = content.take("i7di")
+        name = content.name()
+        content.skip(24 * content.take("Q")[0])  # its points: x, y and an identity each
+        yield _Image(tuple(values[:4]), tuple(values[4:]), camera, name)

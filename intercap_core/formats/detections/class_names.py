@@ -1,0 +1,73 @@
+"""Names of classes by number: COCO's numberings, and lists of classes in parsed files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from intercap_core.formats.detections.constants import MAX_LABEL
+from intercap_core.inputs.quotes import quoted
+
+# COCO's 80 classes, and their published ids, which have gaps.
+_CLASSES = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
+    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
+    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella",
+    "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball", "kite",
+    "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket", "bottle",
+    "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich", "orange",
+    "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch", "potted plant",
+    "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard", "cell phone",
+    "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
+    "teddy bear", "hair drier", "toothbrush",
+)  # fmt: skip
+_UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+COCO_NAMES: dict[int, str] = dict(
+    zip([i for i in range(1, 91) if i not in _UNUSED_IDS], _CLASSES, strict=True)
+)
+COCO_NAMES_FROM_0: dict[int, str] = dict(enumerate(_CLASSES))
+COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
+
+
+def names_of(content: Any) -> dict[int, str]:
+    """Class names by number of parsed JSON or YAML.
+
+    Raises ValueError, in words that fit after a file's name.
+    """
+    if isinstance(content, dict):
+        for key in ("categories", "names"):
+            if isinstance(content.get(key), list | dict):
+                return names_of(content[key])
+    if isinstance(content, list) and content and all(isinstance(v, dict) for v in content):
+        return _unique([(v.get("id"), v.get("name")) for v in content])
+    if isinstance(content, list):
+        return _unique(list(enumerate(content)))
+    if isinstance(content, dict):
+        return _unique(list(content.items()))
+    raise ValueError(f"it holds {type(content).__name__}")
+
+
+def _unique(pairs: Sequence[tuple[Any, Any]]) -> dict[int, str]:
+    names: dict[int, str] = {}
+    for number, name in pairs:
+        if isinstance(number, str) and number.isdecimal() and len(number) < 10:
+            number = int(number)
+        if type(number) is not int or not isinstance(name, str):
+            raise ValueError(f"class {quoted(number, 40)} has the name {quoted(name, 40)}")
+        if number in names:
+            raise ValueError(f"two classes have the number {number}")
+        names[number] = label_text(name)
+    if not names:
+        raise ValueError("it lists none")
+    return names
+
+
+def label_text(name: str) -> str:
+    """The name as it is; raises ValueError where it is no text or longer than ``MAX_LABEL``."""
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise ValueError(f"the category's name {quoted(name)} is not valid text") from None
+    if len(name) > MAX_LABEL:
+        raise ValueError(f"a category's name has {len(name)} characters, at most {MAX_LABEL}")
+    return name

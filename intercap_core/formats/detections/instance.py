@@ -1,0 +1,156 @@
+"""One segmented instance, whichever detector found it, and any way to write its mask.
+
+Masks end as compressed COCO RLE at the size of the colour image. A mask of the same picture at
+another resolution is scaled; one of another shape belongs to another image and is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from intercap_core.formats.detections.constants import (
+    MASK_THRESHOLD,
+    MAX_PIXELS,
+    MAX_REDUCED,
+    SAME_SHAPE_PX,
+)
+from intercap_core.geometry.camera import masks
+from intercap_core.inputs.quotes import quoted
+
+PERSON_LABEL = "person"  # what every detector's list of classes calls people
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One result: label ("" = unknown), score, box (x, y, width, height, px), compressed RLE."""
+
+    label: str
+    score: float
+    box: tuple[float, float, float, float]
+    rle: bytes
+
+
+def boxes_of(instances: list[Instance]) -> np.ndarray:
+    """(N, 4) float32."""
+    return np.array([i.box for i in instances], np.float32).reshape(-1, 4)
+
+
+def instance_of(label: str, score: float, mask: np.ndarray) -> Instance | None:
+    """The instance of a mask (H, W) of the colour image's size; None where it is empty."""
+    rle = masks.encode(mask)
+    x, y, width, height = masks.Runs(rle, *mask.shape).box
+    if not width:
+        return None
+    return Instance(label, score, (float(x), float(y), float(width), float(height)), rle)
+
+
+def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
+    """Factors (x, y) from an image of ``found`` (width, height) to one of ``size``.
+
+    Raises ValueError where one is no reduced copy of the other.
+    """
+    if found == size:
+        return 1.0, 1.0
+    x, y = size[0] / found[0], size[1] / found[1]
+    if x > MAX_REDUCED or abs(found[1] * x - size[1]) > max(x, 1) * SAME_SHAPE_PX:
+        raise ValueError(
+            f"the mask has {found[0]}x{found[1]} pixels, the image {size[0]}x{size[1]}; segment "
+            "the images as recorded"
+        )
+    return x, y
+
+
+def resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask (h, w) at ``size`` (width, height): (H, W) bool, edges midway between pixels."""
+    grey = np.where(mask, np.uint8(255), np.uint8(0))
+    return cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR) >= MASK_THRESHOLD
+
+
+def to_rle(
+    segmentation: Any, size: tuple[int, int], stated: tuple[int, int] | None = None
+) -> tuple[bytes, tuple[float, float]]:
+    """Compressed RLE at ``size`` (width, height) of a segmentation in any of the known forms.
+
+    An RLE with size and counts (compressed, also as bytes written as text; or a list of lengths),
+    polygons, one flat polygon, or lists ``x`` and ``y`` of its corners. ``stated`` is the image's
+    size as the file has it, for forms that do not say their own. Also returns the factors (x, y)
+    by which the mask was scaled. Raises ValueError, in words that fit after the entry's name.
+    """
+    if isinstance(segmentation, dict) and "counts" in segmentation:
+        return _from_rle(segmentation, size)
+    polygons = _polygons(segmentation)
+    if polygons is None:
+        raise ValueError("has no segmentation; expected an RLE with size and counts, or polygons")
+    x, y = scale_to(stated, size) if stated is not None else (1.0, 1.0)
+    scaled = [
+        [v * (y if i % 2 else x) for i, v in enumerate(_numbers(polygon))] for polygon in polygons
+    ]
+    return masks.from_polygons(scaled, size[1], size[0]), (x, y)
+
+
+def _from_rle(
+    segmentation: dict[str, Any], size: tuple[int, int]
+) -> tuple[bytes, tuple[float, float]]:
+    stated = segmentation.get("size")
+    if (
+        not isinstance(stated, list)
+        or len(stated) != 2
+        or not all(type(n) is int and n > 0 for n in stated)
+        or stated[0] * stated[1] > MAX_PIXELS
+    ):
+        raise ValueError(
+            f"the mask's size is {quoted(stated)}, expected [{size[1]}, {size[0]}] (height, "
+            "width of the colour image)"
+        )
+    height, width = stated
+    factors = scale_to((width, height), size)
+    rle = _compressed(segmentation["counts"], height, width)
+    runs = masks.Runs(rle, height, width)
+    if factors == (1.0, 1.0):
+        return rle, factors
+    return masks.encode(resized(runs.decode(), size)), factors
+
+
+def _compressed(counts: Any, height: int, width: int) -> bytes:
+    if isinstance(counts, bytes):
+        return counts
+    if isinstance(counts, str):
+        if counts[:2] in ("b'", 'b"') and counts[-1:] == counts[1]:  # bytes through str()
+            counts = counts[2:-1].replace("\\\\", "\\")
+        try:
+            return counts.encode("ascii")
+        except UnicodeEncodeError:
+            raise ValueError(
+                "its RLE holds characters that COCO's alphabet does not have"
+            ) from None
+    if isinstance(counts, list):
+        try:
+            return masks.from_counts(counts, height, width)
+        except (TypeError, OverflowError):
+            raise ValueError("its counts are not a list of whole numbers") from None
+    raise ValueError("has no segmentation; its counts are neither text nor a list")
+
+
+def _polygons(value: Any) -> list[list[Any]] | None:
+    """Polygons as flat lists; None where it is none of their forms."""
+    if isinstance(value, dict) and isinstance(value.get("x"), list):
+        x, y = value["x"], value.get("y")
+        if not isinstance(y, list) or len(x) != len(y):
+            return None
+        return [[v for corner in zip(x, y, strict=True) for v in corner]]
+    if not isinstance(value, list):
+        return None
+    if value and all(type(v) in (int, float) for v in value):
+        return [value]
+    return value if all(isinstance(polygon, list) for polygon in value) else None
+
+
+def _numbers(polygon: list[Any]) -> list[float]:
+    try:
+        return [float(v) for v in polygon]
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("a polygon is not a list of numbers") from None

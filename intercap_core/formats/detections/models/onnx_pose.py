@@ -1,0 +1,259 @@
+"""Whole-body keypoints by a user's ONNX model: RTMPose, DWPose, HRNet or ViTPose exports, top down.
+
+Such a model sees one person at a time, cut out around a box, and says for every point how likely it
+is in each column and each row, in bins finer than pixels (SimCC), or in each cell of a map that is
+coarser than the input. Cutting out and reading follow mmpose: the box is widened by a quarter and
+to the input's shape, pixels are RGB less ImageNet's mean.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from intercap_core.body.keypoints import BODY
+from intercap_core.config import DetectionsSettings
+from intercap_core.errors import UserError
+from intercap_core.formats.detections.constants import (
+    BOX_PADDING,
+    FOUND_CONFIDENCE,
+    FOUND_POINTS,
+    MAX_PEOPLE,
+    MIN_BOX_SCORE,
+    POSE_BATCH,
+    SAME_PERSON_SHARE,
+    SAME_POINT_SHARE,
+)
+from intercap_core.formats.detections.instance import PERSON_LABEL, Instance
+from intercap_core.formats.detections.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
+from intercap_core.formats.detections.models.onnx_model import OnnxModel
+from intercap_core.formats.detections.models.pose_responses import (
+    HeatmapGrid,
+    heatmap_points,
+    simcc_points,
+)
+
+_FLOATS = ("tensor(float)", "tensor(float16)")
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A piece of an image as the model sees it: input = (image - corner) * scale, pixels."""
+
+    corner: tuple[float, float]
+    scale: float
+
+    @classmethod
+    def around(cls, box: np.ndarray, size: tuple[int, int], padding: float) -> Crop:
+        """Around a box (x, y, width, height), widened to the shape of an input of ``size``."""
+        x, y, width, height = (float(v) for v in box)
+        scale = min(size[0] / max(width, 1), size[1] / max(height, 1)) / padding
+        middle = (x + width / 2, y + height / 2)
+        return cls((middle[0] - size[0] / (2 * scale), middle[1] - size[1] / (2 * scale)), scale)
+
+    def cut(self, picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """The piece of a picture (H, W, 3), black beyond its edge."""
+        shift = -self.scale * np.array(self.corner)
+        matrix = np.array([[self.scale, 0, shift[0]], [0, self.scale, shift[1]]])
+        return cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_LINEAR)
+
+    def to_image(self, places: np.ndarray) -> np.ndarray:
+        """Places (..., 2) in the input, to the image."""
+        return places / self.scale + np.array(self.corner)
+
+
+class PoseModel:
+    """A model of people's keypoints. Obtained from :meth:`load`."""
+
+    def __init__(
+        self,
+        model: OnnxModel,
+        outputs: tuple[int, ...],
+        full_confidence: float,
+        grid: HeatmapGrid,
+    ) -> None:
+        """``outputs``: the numbers of columns and rows, or of the heatmaps alone."""
+        assert model.size is not None
+        self._model, self._outputs, self._size = model, outputs, model.size
+        self._full_confidence, self._grid = full_confidence, grid
+
+    @classmethod
+    def load(cls, settings: DetectionsSettings) -> PoseModel:
+        """Open the model that the settings name.
+
+        Raises UserError where it cannot be run or is none of these.
+        """
+        assert settings.keypoint_model is not None
+        model = OnnxModel.load(settings.keypoint_model, settings.keypoint_device)
+        outputs = _simcc_outputs(model) or _heatmap_output(model)
+        if outputs is None or not model.batched:
+            raise _unknown(model, [f"{n} {list(shape)}" for n, shape, _ in model.outputs])
+        if model.size is None:
+            raise UserError(
+                f"{model.path}: its input has no fixed width and height; export it with a fixed "
+                "size, such as 288x384, and any number of people"
+            )
+        count = model.outputs[outputs[0]][1][1]
+        if isinstance(count, int) and count not in LAYOUTS:
+            raise _other_points(model, count)
+        return cls(
+            model, outputs, settings.keypoint_full_confidence, settings.keypoint_heatmap_grid
+        )
+
+    def find(self, picture: np.ndarray, instances: list[Instance]) -> np.ndarray:
+        """People (P, 135, 3) in a picture (H, W, 3) uint8 BGR, confidence as the model's.
+
+        Looks at the people among ``instances``, best first; where there are none, through the whole
+        image, and again around whom it finds.
+        """
+        size = (picture.shape[1], picture.shape[0])
+        boxes = person_boxes(instances)
+        if len(boxes):
+            return self._look(picture, boxes, BOX_PADDING)
+        people, boxes = self._found(self._look(picture, tiles(size, self._size), 1.0))
+        if len(boxes):
+            people, _ = self._found(self._look(picture, boxes, BOX_PADDING))
+        return people
+
+    def _found(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Those of the people (P, 135, 3) who are there, each once, best first, and their boxes
+        (N, 4)."""
+        sure = people[..., 2] >= FOUND_CONFIDENCE * self._full_confidence
+        there = sure[:, BODY].sum(1) >= FOUND_POINTS
+        people, sure = people[there], sure[there]
+        if not len(people):
+            return people, np.zeros((0, 4))
+        low = np.where(sure[..., None], people[..., :2], np.inf).min(1)
+        high = np.where(sure[..., None], people[..., :2], -np.inf).max(1)
+        best_first = np.argsort(-people[:, BODY, 2].mean(1), kind="stable")
+        kept: list[int] = []
+        for i in best_first.tolist():
+            near = SAME_POINT_SHARE * np.linalg.norm(high[i] - low[i])
+            apart = np.linalg.norm(people[kept, :, :2] - people[i, :, :2], axis=-1)
+            taken = ((apart < near) & sure[kept]).any(0)
+            if taken[sure[i]].mean() < SAME_PERSON_SHARE:
+                kept.append(i)
+        return people[kept][:MAX_PEOPLE], np.concatenate([low, high - low], 1)[kept][:MAX_PEOPLE]
+
+    def _look(self, picture: np.ndarray, boxes: np.ndarray, padding: float) -> np.ndarray:
+        """People (N, 135, 3) in boxes (N, 4) of x, y, width, height; confidence as the model's."""
+        crops = [Crop.around(box, self._size, padding) for box in boxes]
+        found = [points for batch in self._batches(picture, crops) for points in batch]
+        for crop, points in zip(crops, found, strict=True):
+            points[:, :2] = crop.to_image(points[:, :2])
+        return to_shared(np.stack(found), self._layout(found[0]))
+
+    def _batches(self, picture: np.ndarray, crops: list[Crop]) -> Iterator[np.ndarray]:
+        """Points (B, K, 3) in the input's pixels."""
+        most = self._model.batch or POSE_BATCH
+        for start in range(0, len(crops), most):
+            part = crops[start : start + most]
+            images = np.stack(
+                [self._model.prepared(crop.cut(picture, self._size), "imagenet") for crop in part]
+            )
+            missing = (self._model.batch or 0) - len(images)
+            if missing > 0:  # the model insists on its number
+                images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
+            outputs = self._model.run(images)
+            yield self._points([outputs[i] for i in self._outputs], len(part))[: len(part)]
+
+    def _points(self, responses: list[np.ndarray], people: int) -> np.ndarray:
+        """Points (B, K, 3) of columns (B, K, X) and rows (B, K, Y), or of heatmaps (B, K, h, w)."""
+        shapes = [r.shape for r in responses]
+        if any(len(shape) < 3 or shape[0] < people for shape in shapes):
+            raise _unknown(self._model, [str(list(shape)) for shape in shapes])
+        if len(responses) == 2 and _same_bins(shapes, self._size):
+            return simcc_points(responses[0], responses[1], self._size)
+        if len(responses) == 1 and _coarser(shapes[0][2:], self._size):
+            return heatmap_points(responses[0], self._size, self._grid)
+        raise _unknown(self._model, [str(list(shape)) for shape in shapes])
+
+    def _layout(self, points: np.ndarray) -> tuple[str, ...]:
+        if len(points) not in LAYOUTS:
+            raise _other_points(self._model, len(points))
+        return LAYOUTS[len(points)]
+
+
+def person_boxes(instances: list[Instance]) -> np.ndarray:
+    """Boxes (N, 4) of x, y, width, height of the people among instances, best first."""
+    people = [i for i in instances if i.label == PERSON_LABEL and i.score >= MIN_BOX_SCORE]
+    people.sort(key=lambda instance: -instance.score)
+    return np.array([person.box for person in people[:MAX_PEOPLE]]).reshape(-1, 4)
+
+
+def tiles(size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
+    """Boxes (N, 4) of an input's ``shape`` that cover an image of ``size`` (width, height).
+
+    As high as the image, or as wide where it is narrower, each half over the next, so that
+    somebody who is less than half as wide is whole in one.
+    """
+    scale = min(size[0] / shape[0], size[1] / shape[1])
+    tile = (shape[0] * scale, shape[1] * scale)
+    axis = 0 if size[0] - tile[0] > size[1] - tile[1] else 1
+    count = 1 + int(np.ceil((size[axis] - tile[axis]) / (tile[axis] / 2) - 1e-9))
+    starts = np.linspace(0, size[axis] - tile[axis], count)
+    boxes = np.zeros((count, 4))
+    boxes[:, axis] = starts
+    boxes[:, 2:] = tile
+    return boxes
+
+
+def _simcc_outputs(model: OnnxModel) -> tuple[int, int] | None:
+    """Which outputs are columns and rows: by name, else by their order."""
+    if len(model.outputs) != 2:
+        return None
+    if any(len(shape) != 3 or kind not in _FLOATS for _, shape, kind in model.outputs):
+        return None
+    names = [re.split(r"[^a-z0-9]+", name.lower()) for name, _, _ in model.outputs]
+    return (1, 0) if "y" in names[0] or "x" in names[1] else (0, 1)
+
+
+def _heatmap_output(model: OnnxModel) -> tuple[int] | None:
+    """The number of the only output, where that is maps coarser than the input."""
+    if len(model.outputs) != 1:
+        return None
+    _, shape, kind = model.outputs[0]
+    if len(shape) != 4 or kind not in _FLOATS:
+        return None
+    cells = tuple(n for n in shape[2:] if isinstance(n, int))
+    if len(cells) == 2 and model.size is not None and not _coarser(cells, model.size):
+        return None
+    return (0,)
+
+
+def _same_bins(shapes: list[tuple[int, ...]], size: tuple[int, int]) -> bool:
+    """Whether columns and rows are of the same people and points in bins of the same width."""
+    columns, rows = shapes
+    if len(columns) != 3 or columns[:2] != rows[:2]:
+        return False
+    return abs(columns[2] / size[0] - rows[2] / size[1]) < 1e-6
+
+
+def _coarser(cells: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Whether maps of ``cells`` (height, width) are of an input of ``size`` (width, height), whose
+    cells are squares of several pixels."""
+    if len(cells) != 2 or min(cells) < 1:
+        return False
+    stride = size[0] / cells[1]
+    return stride > 1 and abs(size[1] / cells[0] - stride) < 1e-6
+
+
+def _unknown(model: OnnxModel, found: list[str]) -> UserError:
+    return UserError(
+        f"{Path(model.path)}: its outputs ({'; '.join(found)}) are not those of a pose model; "
+        "expected simcc_x and simcc_y (people, points, bins) of RTMPose, RTMW or DWPose, or "
+        "heatmaps (people, points, height, width) of HRNet or ViTPose; export it as "
+        "docs/detectors.md shows"
+    )
+
+
+def _other_points(model: OnnxModel, count: int) -> UserError:
+    return UserError(
+        f"{Path(model.path)}: finds {count} points, expected one of {KNOWN_COUNTS} (133 = "
+        "COCO-WholeBody); name a whole-body model"
+    )

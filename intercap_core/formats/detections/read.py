@@ -1,0 +1,217 @@
+"""The detections artefact, opened for reading: people and candidates of any image."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.geometry.camera.masks import Runs
+from intercap_core.schemas import DETECTIONS, PERSON
+
+UNKNOWN_LABEL = ""  # of a candidate that no detector named
+NOBODY_LOOKED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2  # who segmented an image
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One segmented instance of one image.
+
+    ``index`` counts within the image, ``box`` (4,) is x, y, width, height, pixels. The mask is
+    parsed when first asked for. ``extent_m`` is the size of the thing where it was measured, NaN
+    where not.
+    """
+
+    index: int
+    label: str
+    score: float
+    box: np.ndarray
+    rle: bytes
+    image_size: tuple[int, int]  # width, height
+    extent_m: float = float("nan")
+
+    @cached_property
+    def runs(self) -> Runs:
+        """The mask; see :class:`Runs` for reading pixels, the box and the area."""
+        width, height = self.image_size
+        return Runs(self.rle, height, width)
+
+    def mask(self) -> np.ndarray:
+        """The mask decoded to the whole colour image (H, W) bool."""
+        return self.runs.decode()
+
+
+class PeopleOfImages(Protocol):
+    """The people of a recording's images, wherever they come from."""
+
+    @property
+    def num_sets(self) -> int:
+        """T."""
+        ...
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """Keypoints (P, 135, 3) of the image's people: x, y, confidence."""
+        ...
+
+
+@dataclass(frozen=True)
+class _CameraTable:
+    people_offsets: np.ndarray
+    people: np.ndarray
+    candidate_offsets: np.ndarray
+    labels: list[str]
+    scores: np.ndarray
+    boxes: np.ndarray
+    rle_offsets: np.ndarray
+    rle: bytes
+
+
+class Detections:
+    """Detections of all images; T frame sets, C cameras in the order of ``camera_names``.
+
+    Everything is read at once: keypoints and RLE strings are a few MB a hundred sets.
+    ``keypoints_found`` and ``candidates_found`` are (T, C) bool, ``image_sizes`` (C, 2) width and
+    height. Obtained from :meth:`load`.
+    """
+
+    def __init__(self, artefact: artefacts.Artefact) -> None:
+        self.path = artefact.path
+        self.sequence = str(artefact.attributes["sequence"])
+        self.camera_names = tuple(artefact.text("camera_names"))
+        self.image_sizes = artefact["colour_size"]
+        self.keypoints_found = artefact["keypoints_found"]
+        self.candidates_found = artefact["candidates_found"]
+        self.notes = tuple(artefact.text("note"))
+        self._tables = [_read_camera(artefact, name) for name in self.camera_names]
+        self._image_of: np.ndarray | None = None
+        self._from_images: dict[tuple[int, int], list[Candidate]] = {}
+
+    @classmethod
+    def load(cls, path: Path) -> Detections:
+        """Read the artefact and close it; raises UserError as :func:`artefacts.read` does."""
+        with artefacts.read(path, DETECTIONS) as artefact:
+            return cls(artefact)
+
+    def showing(self, image_of: np.ndarray) -> Detections:
+        """The same detections by the moment that their images show: ``t`` is then a moment.
+
+        ``image_of`` (T, C) of the scene artefact: the set whose image of each camera shows each
+        moment, -1 = none. Raises UserError where it is of another recording.
+        """
+        if image_of.shape != self.keypoints_found.shape:
+            sets, cameras = self.keypoints_found.shape
+            raise UserError(
+                f"{self.path}: holds {sets} frame sets of {cameras} cameras, the scene artefact "
+                f"{image_of.shape[0]} of {image_of.shape[1]}; re-run stages 'detections' and "
+                f"'scene' for sequence {self.sequence!r}"
+            )
+        moments = copy(self)
+        moments._image_of = image_of
+        shown, at = image_of >= 0, np.maximum(image_of, 0)
+        moments.keypoints_found = shown & np.take_along_axis(self.keypoints_found, at, 0)
+        moments.candidates_found = shown & np.take_along_axis(self.candidates_found, at, 0)
+        return moments
+
+    def with_candidates_of(self, person: Path) -> Detections:
+        """The same with the candidates that stage ``person`` found in the images alone.
+
+        They follow a detector's, or replace them where the stage was to use the images alone; only
+        of detections read by the moment (:meth:`showing`). Raises UserError where the artefact
+        cannot be read or is of another recording.
+        """
+        with artefacts.read(person, PERSON) as artefact:
+            source = artefact["mask_source"]
+            if source.shape != self.candidates_found.shape:
+                sets, cameras = self.candidates_found.shape
+                raise UserError(
+                    f"{person}: holds {source.shape[0]} frame sets of {source.shape[1]} cameras, "
+                    f"expected {sets} of {cameras} as in {self.path}; re-run stage 'person' for "
+                    f"sequence {self.sequence!r}"
+                )
+            alone = bool(artefact.attributes["images_alone"])
+            if not alone and "candidate_offsets" not in artefact:
+                return self
+            scores, extents = artefact["candidate_scores"], artefact["candidate_extents"]
+            rle = artefacts.unpack_ragged(
+                artefact["candidate_rle_offsets"], artefact["candidate_rle"]
+            )
+            offsets = artefact["candidate_offsets"]
+        both = copy(self)
+        both.candidates_found = self.candidates_found & (not alone)
+        both._from_images = {}
+        for t, c in np.ndindex(source.shape):
+            image = t * source.shape[1] + c
+            first, last = int(offsets[image]), int(offsets[image + 1])
+            named = [] if alone else self.candidates(t, c)
+            # that nothing stands before the background does not say that the object is not there
+            both.candidates_found[t, c] |= last > first
+            width, height = (int(n) for n in self.image_sizes[c])
+            both._from_images[t, c] = named + [
+                Candidate(
+                    index=len(named) + i - first,
+                    label=UNKNOWN_LABEL,
+                    score=float(scores[i]),
+                    box=np.array(Runs(rle[i], height, width).box),
+                    rle=rle[i],
+                    image_size=(width, height),
+                    extent_m=float(extents[i]),
+                )
+                for i in range(first, last)
+            ]
+        return both
+
+    def _image(self, t: int, c: int) -> int:
+        return t if self._image_of is None else int(self._image_of[t, c])
+
+    @property
+    def num_sets(self) -> int:
+        """T."""
+        return int(self.keypoints_found.shape[0])
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """Keypoints (P, 135, 3) float32 of the image's people: x, y, confidence."""
+        table, image = self._tables[c], self._image(t, c)
+        if image < 0:
+            return table.people[:0]
+        return table.people[table.people_offsets[image] : table.people_offsets[image + 1]]
+
+    def candidates(self, t: int, c: int) -> list[Candidate]:
+        """The image's segmentation candidates, in the order that the artefact holds them."""
+        if (t, c) in self._from_images:
+            return self._from_images[t, c]
+        table, image = self._tables[c], self._image(t, c)
+        if image < 0:
+            return []
+        first, last = table.candidate_offsets[image : image + 2]
+        width, height = (int(n) for n in self.image_sizes[c])
+        return [
+            Candidate(
+                index=int(i - first),
+                label=table.labels[i],
+                score=float(table.scores[i]),
+                box=table.boxes[i],
+                rle=table.rle[table.rle_offsets[i] : table.rle_offsets[i + 1]],
+                image_size=(width, height),
+            )
+            for i in range(first, last)
+        ]
+
+
+def _read_camera(artefact: artefacts.Artefact, name: str) -> _CameraTable:
+    group = f"cameras/{name}"
+    return _CameraTable(
+        people_offsets=artefact[f"{group}/people_offsets"],
+        people=artefact[f"{group}/people"],
+        candidate_offsets=artefact[f"{group}/candidate_offsets"],
+        labels=artefact.text(f"{group}/candidate_labels"),
+        scores=artefact[f"{group}/candidate_scores"],
+        boxes=artefact[f"{group}/candidate_boxes"],
+        rle_offsets=artefact[f"{group}/rle_offsets"],
+        rle=artefact[f"{group}/rle"].tobytes(),
+    )

@@ -1,0 +1,219 @@
+"""Copies one camera's images into the frames artefact, as recorded, and notes their defects."""
+
+from __future__ import annotations
+
+import logging
+import zlib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.encoded import encoded_size
+from intercap_core.formats.recordings.sound import Sound
+from intercap_core.formats.recordings.source import CameraRecording, Image, Layout
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.inputs.quotes import printable
+from intercap_core.progress import Progress
+
+log = logging.getLogger(__name__)
+
+COLOUR_BUFFER_BYTES = 4 << 20
+FINGERPRINT_BYTES = 256  # of each image's end: entropy-coded, so that no two images share them
+
+
+@dataclass
+class View:
+    """One camera: its lenses, the times of its images, and their defects.
+
+    ``colour_times`` and ``depth_times`` are device times, microseconds, in the order of the
+    artefact's images; ``depth_delay_us`` is not taken off. Images that no frame set may use are
+    False in ``colour_usable`` and ``depth_usable``. ``sound`` where the recording has any.
+    """
+
+    name: str
+    source: Path | None = None
+    camera: Camera | None = None
+    fps: float = 0.0
+    serial: str = ""
+    depth_delay_us: int = 0
+    fingerprint: int = 0
+    gravity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    truncated: bool = False
+    notes: list[str] = field(default_factory=list)
+    colour_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    depth_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    colour_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    depth_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    sound: Sound | None = None
+
+    @property
+    def present(self) -> bool:
+        """Whether frame sets may use the camera."""
+        return self.camera is not None and bool(self.colour_usable.any())
+
+    @property
+    def usable_times(self) -> np.ndarray:
+        """Device times of the colour images that frame sets may use."""
+        return self.colour_times[self.colour_usable]
+
+
+def extract(name: str, layout: Layout, writer: artefacts.Writer, *, depth: bool = True) -> View:
+    """Copy one camera's images into the artefact; whatever is wrong becomes a note of the view.
+
+    Without ``depth`` its colour alone.
+    """
+    view = View(name)
+    if name not in layout.extrinsics.master_from_colour:
+        calibration = layout.sequence.calibration.name
+        view.notes.append(f"no pose in {calibration}; add the camera there")
+        return view
+    if name not in layout.names:
+        view.notes.append(f"no recording of {name} in {layout.sequence.recordings.name}")
+        return view
+    try:
+        with layout.open(name) as recording:
+            view.source, view.camera = recording.source, recording.camera
+            view.fps, view.serial = recording.fps, recording.serial
+            view.depth_delay_us = recording.depth_delay_us
+            _Copy(recording, view, writer, depth=depth).run()
+            view.sound = recording.sound()
+    except UserError as error:
+        view.notes.append(str(error))
+        view.camera = None
+    view.notes = [printable(_without_folders(note, layout)) for note in view.notes]
+    return view
+
+
+def _without_folders(text: str, layout: Layout) -> str:
+    """An artefact holds no path of a machine: files by what is below the sequence's folders."""
+    recordings, calibration = layout.sequence.recordings, layout.sequence.calibration
+    for folder in (recordings, calibration.parent):
+        text = text.replace(f"{folder}/", "")
+    return text.replace(str(recordings), recordings.name)
+
+
+class _Copy:
+    """The copying of one recording."""
+
+    def __init__(
+        self, recording: CameraRecording, view: View, writer: artefacts.Writer, *, depth: bool
+    ) -> None:
+        self.recording, self.view, self.writer = recording, view, writer
+        lens = recording.camera.depth if depth else None
+        self.left_out = recording.camera.depth is not None and not depth
+        self.group = f"cameras/{view.name}"
+        self.colour = writer.stream(f"{self.group}/colour")
+        self.depth = (
+            writer.stream(f"{self.group}/depth", (lens.height, lens.width)) if lens else None
+        )
+        self.colour_size = (recording.camera.colour.width, recording.camera.colour.height)
+        self.colour_times: list[int] = []
+        self.depth_times: list[int] = []
+        self.offsets, self.buffer = [0], bytearray()
+        self.measured = False  # some depth image holds a distance
+        self.damaged = self.other_size = 0
+
+    def run(self) -> None:
+        """Copy all images, then write their times and say what is degraded.
+
+        Raises UserError where no image at all has the size that the calibration is for.
+        """
+        view, recording = self.view, self.recording
+        progress = Progress(log, f"{view.name}: read", None, "images")
+        try:
+            for image in recording.images():
+                (self._take_colour if image.kind == "colour" else self._take_depth)(image)
+                progress.step()
+        except UserError as error:
+            if not self.colour_times:
+                raise
+            view.truncated = True
+            view.notes.append(f"read up to image {len(self.colour_times)}: {error}")
+        finally:
+            self._finish()
+        view.truncated |= recording.truncated
+        view.gravity = recording.gravity
+        view.notes += recording.notes
+        self._note_images()
+
+    def _take_colour(self, image: Image) -> None:
+        content = bytes(image.content)
+        size = encoded_size(content)
+        if size != self.colour_size:
+            if size is None:
+                self.damaged += 1
+                return
+            self._refuse("colour", size, self.colour_size, not self.colour_times)
+            return
+        self.colour_times.append(image.time_us)
+        self.offsets.append(self.offsets[-1] + len(content))
+        self.view.fingerprint = zlib.crc32(content[-FINGERPRINT_BYTES:], self.view.fingerprint)
+        self.buffer += content
+        if len(self.buffer) >= COLOUR_BUFFER_BYTES:
+            self._flush()
+
+    def _take_depth(self, image: Image) -> None:
+        depth = np.asarray(image.content)
+        lens = self.recording.camera.depth
+        if self.depth is None or lens is None:
+            return
+        if depth.shape != (lens.height, lens.width):
+            expected = (lens.width, lens.height)
+            self._refuse("depth", depth.shape[::-1], expected, not self.depth_times)
+            return
+        self.measured = self.measured or bool(depth.any())
+        self.depth_times.append(image.time_us)
+        self.depth.append(depth[None])
+
+    def _refuse(
+        self, kind: str, found: tuple[int, ...], expected: tuple[int, ...], first: bool
+    ) -> None:
+        """Count one image of another size; the first image speaks for the whole recording."""
+        if first:
+            raise UserError(
+                f"{self.recording.source}: {kind} images are {found[0]}x{found[1]}, the "
+                f"calibration of camera {self.view.name} is for {expected[0]}x{expected[1]}; give "
+                "the calibration of this resolution"
+            )
+        self.other_size += 1
+
+    def _flush(self) -> None:
+        self.colour.append(np.frombuffer(bytes(self.buffer), np.uint8))
+        self.buffer.clear()
+
+    def _finish(self) -> None:
+        view = self.view
+        self._flush()
+        view.colour_times = np.array(self.colour_times, np.int64)
+        view.depth_times = np.array(self.depth_times, np.int64)
+        view.colour_usable = np.ones(len(self.colour_times), bool)
+        view.depth_usable = np.full(len(self.depth_times), self.measured)
+        self.writer.put(f"{self.group}/colour_offsets", self.offsets)
+        self.writer.put(f"{self.group}/colour_time", view.colour_times)
+        if self.depth is not None:
+            self.writer.put(f"{self.group}/depth_time", view.depth_times)
+
+    def _note_images(self) -> None:
+        view = self.view
+        if not self.colour_times:
+            view.notes.append("holds no colour image")
+        if self.damaged:
+            view.notes.append(f"{self.damaged} damaged images left out")
+        if self.other_size:
+            view.notes.append(f"{self.other_size} images of another size left out")
+        if self.left_out:
+            view.notes.append("its depth is left out (frames.depth)")
+            self._use_without_depth()
+        elif self.depth is None:
+            view.notes.append("has no depth")
+        elif not self.measured:
+            empty = f"depth is zero in all {len(self.depth_times)} images"
+            view.notes.append(f"{empty}: used without depth" if self.depth_times else "no depth")
+            self._use_without_depth()
+
+    def _use_without_depth(self) -> None:
+        if self.view.camera is not None:
+            self.view.camera = replace(self.view.camera, depth=None, colour_from_depth=None)

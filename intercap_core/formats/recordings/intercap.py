@@ -1,0 +1,162 @@
+"""Layout ``intercap``: the folders of the InterCap release.
+
+``recordings`` is ``RGBD_Images/<subject>/<object>/Seg_<k>`` with ``Frames_Cam<n>/color/%05d.jpg``
+and a folder of depth beside each ``color``: 16-bit PNG, millimetres, on the colour image's grid.
+``calibration`` is a folder of ``Color.json``, ``Color_2.json``, ... Cameras are named k1, k2, ...
+The release states no times: the number in a file's name is its place at 30 images a second.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.config import SequenceEntry
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import read_extrinsics
+from intercap_core.formats.calibration.plausible import check_lens
+from intercap_core.formats.recordings.image_files import AlignedRecording, Shot, common_size
+from intercap_core.formats.recordings.source import Layout
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json
+
+FPS = 30.0
+CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)
+COLOUR_FOLDER = re.compile(r"colou?r", re.IGNORECASE)
+DEPTH_FOLDER = re.compile(r"depth.*", re.IGNORECASE)
+NUMBERED = re.compile(r"(?!\.)\D*(\d{1,9})\.(?:jpe?g|png)", re.IGNORECASE)
+# A principal point farther than this share of the image's width or height from its middle is that
+# of another resolution: the release's lie within 3 %.
+FARTHEST_CENTRE = 0.15
+
+
+def time_of(number: int) -> int:
+    """Device time, microseconds, of the image with this number in its name."""
+    return round(number * 1e6 / FPS)
+
+
+def numbers_of(times_us: np.ndarray) -> np.ndarray:
+    """The numbers in the names of the images with these device times, inverse of the above."""
+    return np.rint(np.asarray(times_us) * (FPS / 1e6)).astype(np.int64)
+
+
+class ReleaseLayout(Layout):
+    """One sequence of the release."""
+
+    def __init__(self, sequence: SequenceEntry) -> None:
+        super().__init__(sequence)
+        if not sequence.calibration.is_dir():
+            raise UserError(
+                f"{sequence.calibration}: layout 'intercap' of sequence {sequence.sequence!r} "
+                "needs a folder of Color.json, Color_2.json, ..., which hold the lenses; correct "
+                "'calibration' in the table of sequences"
+            )
+        self.extrinsics = read_extrinsics(sequence.calibration)
+        self._folders = camera_folders(sequence.recordings)
+        self.names = list(self._folders)
+
+    def open(self, name: str) -> AlignedRecording:
+        """Find the camera's files; raises UserError without colour images or a fitting lens."""
+        folder = self._folders[name]
+        colour, depth = numbered_images(folder)
+        size = common_size(colour.values())
+        if size is None:
+            raise UserError(
+                f"{folder}: holds no readable color/<number>.jpg; copy the folder from the release "
+                "again"
+            )
+        number = int(name[1:])
+        lens_file = "Color.json" if number == 1 else f"Color_{number}.json"
+        lens = read_lens(self.sequence.calibration / lens_file, size)
+        shots = [
+            Shot(time_of(at), colour.get(at), depth.get(at)) for at in sorted({*colour, *depth})
+        ]
+        pose = self.extrinsics.master_from_colour[name]
+        fps = frame_rate(sorted(colour))
+        return AlignedRecording(folder, name, lens, pose, shots=shots, fps=fps)
+
+
+def frame_rate(numbers: list[int]) -> float:
+    """Images a second of increasing numbers: fewer than the release's where every n-th was kept."""
+    steps = np.diff(numbers)
+    return FPS / max(1.0, float(np.median(steps))) if len(steps) else FPS
+
+
+def camera_folders(recordings: Path) -> dict[str, Path]:
+    """The folders ``Frames_Cam<n>`` by camera name, in the cameras' order."""
+    found: dict[int, Path] = {}
+    for path in sorted(recordings.iterdir()):
+        match = CAMERA_FOLDER.fullmatch(path.name)
+        if match and path.is_dir():
+            found.setdefault(int(match.group(1)), path)
+    return {f"k{number}": found[number] for number in sorted(found)}
+
+
+def numbered_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
+    """Colour and depth files of a camera's folder by the number in their names.
+
+    Of several folders of depth one that says "align" is taken, else the first by name. Raises
+    UserError where two files have one number.
+    """
+    below = sorted(path for path in folder.iterdir() if path.is_dir())
+    colour = next((path for path in below if COLOUR_FOLDER.fullmatch(path.name)), None)
+    depths = [path for path in below if DEPTH_FOLDER.fullmatch(path.name)]
+    depths.sort(key=lambda path: "align" not in path.name.lower())
+    return _numbered(colour, (".jpg", ".jpeg", ".png")), _numbered(
+        depths[0] if depths else None, (".png",)
+    )
+
+
+def _numbered(folder: Path | None, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder is not None else ():
+        match = NUMBERED.fullmatch(path.name)
+        if not match or path.suffix.lower() not in suffixes:
+            continue
+        number = int(match.group(1))
+        if number in found:
+            raise UserError(
+                f"{folder}: image {number} is there twice, as {found[number].name} and "
+                f"{path.name}; keep one"
+            )
+        found[number] = path
+    return found
+
+
+def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
+    """Read a lens from a ``Color*.json`` for images of ``size``, which the file does not state.
+
+    ``f`` and ``c`` are focal length and principal point (x, y) in pixels, ``k`` the coefficients
+    k1, k2, p1, p2 and, where there are more, k3 to k6, as OpenCV orders them. Raises UserError for
+    a broken file and for a principal point that belongs to images of another size.
+    """
+    where = f"{path.parent.name}/{path.name}"
+    try:
+        content: Any = read_json(path)
+        focal, centre = (np.array(content[key], np.float64).reshape(2) for key in "fc")
+        k = np.array(content["k"], np.float64).ravel()
+    except (Unreadable, KeyError, TypeError, ValueError, OverflowError):
+        raise UserError(
+            f"{where}: expected 'f' and 'c' of two numbers and 'k' of 4, 5 or 8; get the file from "
+            "the release again"
+        ) from None
+    finite = all(np.isfinite(values).all() for values in (focal, centre, k))
+    if len(k) not in (4, 5, 8) or not finite or focal.min() <= 0:
+        raise UserError(
+            f"{where}: 'f', 'c' or 'k' cannot be a lens (f {focal.round(1).tolist()}, "
+            f"c {centre.round(1).tolist()}, "
+            f"{len(k)} coefficients, expected 4, 5 or 8); get the file from the release again"
+        )
+    if (np.abs(centre / size - 0.5) > FARTHEST_CENTRE).any():
+        raise UserError(
+            f"{where}: the principal point {centre[0]:.0f}, {centre[1]:.0f} is that of images of "
+            f"about {2 * centre[0]:.0f}x{2 * centre[1]:.0f}, the colour images have "
+            f"{size[0]}x{size[1]}; give the calibration of this resolution"
+        )
+    distortion = np.concatenate([k, np.zeros(8 - len(k))])
+    fx, fy, cx, cy = (float(value) for value in (*focal, *centre))
+    return check_lens(Intrinsics(*size, fx, fy, cx, cy, distortion), where)

@@ -1,0 +1,314 @@
+"""Reader of Azure Kinect MKV recordings, without the Azure Kinect SDK.
+
+Images come out as recorded: colour as JPEG packets (or raw, in the modes that record so), depth
+as the packets' own big-endian bytes.
+Device time = block time + ``K4A_START_OFFSET_NS``, whole microseconds. Sources for the tags and
+tracks: https://learn.microsoft.com/azure/kinect-dk/record-file-format and the SDK's reader (MIT).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, NamedTuple
+
+import av
+import numpy as np
+from av.stream import Discard
+
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.k4a import (
+    COLOUR_MODES,
+    DEPTH_MODES,
+    colour_from_accelerometer,
+    read_calibration,
+)
+from intercap_core.formats.calibration.plausible import check_rate
+from intercap_core.formats.recordings.container import LATEST_US, open_container
+from intercap_core.formats.recordings.encoded import RAW_FORMATS, encoded_size
+from intercap_core.formats.recordings.glance import Glance, glance_at_video, segment_end
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.inputs.files import read_bytes
+from intercap_core.inputs.quotes import quoted
+
+TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
+CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"
+IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
+LONGEST_DELAY_US = 1_000_000  # of depth or of a subordinate: the SDK allows one frame's period
+PASSIVE_INFRARED = "PASSIVE_IR"  # the depth camera as an infrared one: it measures no depth
+_EBML_MAGIC = b"\x1a\x45\xdf\xa3"
+
+Kind = Literal["colour", "depth", "imu"]
+_KINDS: dict[str, Kind] = {"COLOR": "colour", "DEPTH": "depth", "IMU": "imu"}
+
+
+class Packet(NamedTuple):
+    """One image or inertial sample as recorded."""
+
+    kind: Kind
+    device_time_us: int
+    content: bytes
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What the head of a recording says. ``depth_mode`` is None where no depth was recorded.
+
+    ``colour_format`` is MJPG or one of :data:`RAW_FORMATS`.
+    """
+
+    colour_mode: str
+    colour_format: str
+    depth_mode: str | None
+    fps: float
+    serial: str
+    start_offset_us: int
+    depth_delay_us: int
+    subordinate_delay_us: int
+    wired_sync_mode: str
+    calibration: bytes
+    truncated: bool
+
+
+class Recording:
+    """One open recording; use as a context manager.
+
+    Raises UserError, naming the file, for a file that is missing, empty or no Matroska file, and
+    for one without a colour track, a calibration, or with a mode that the SDK does not know. A file
+    that was cut off opens as long as its head is whole: ``info.truncated`` then says so.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.broken_packets = 0
+        truncated = _is_truncated(self.path)
+        try:
+            # the tracks' headers are complete; probing would only buffer packets
+            self._container = open_container(self.path, probesize="32768")
+        except (av.error.FFmpegError, OSError) as error:
+            raise UserError(
+                f"{self.path}: cannot be opened as a recording ({error.strerror}); record again, "
+                "or copy the file again if the copy was cut off"
+            ) from error
+        try:
+            self._streams = self._find_tracks()
+            self.info = self._read_info(truncated)
+        except BaseException:
+            self._container.close()
+            raise
+        for stream in self._container.streams:
+            if stream.index not in self._streams:
+                stream.discard = Discard.all  # infrared is half of the bytes; never read it
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield every packet in the file's order, one at a time: memory does not grow.
+
+        A packet that cannot be an image (a JPEG without its start or end, raw of another size) is
+        left out and counted in ``broken_packets``. A file that was cut off ends early, without an
+        error. Call once.
+        """
+        streams = [self._container.streams[index] for index in self._streams]
+        demuxed = self._container.demux(streams)
+        while True:
+            try:
+                packet = next(demuxed)
+            except (StopIteration, av.error.EOFError):
+                return
+            except (av.error.FFmpegError, OSError):
+                self.broken_packets += 1
+                return
+            if not packet.size or packet.pts is None or packet.time_base is None:
+                continue  # the mark at the end of each track
+            kind = self._streams[packet.stream_index]
+            content = bytes(packet)
+            if not self._is_whole(kind, content):
+                self.broken_packets += 1
+                continue
+            time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
+            if abs(time_us) > LATEST_US:
+                self.broken_packets += 1
+                continue
+            yield Packet(kind, time_us, content)
+
+    def _is_whole(self, kind: Kind, content: bytes) -> bool:
+        if kind == "colour" and self.info.colour_format == "MJPG":
+            return encoded_size(content) is not None
+        if kind == "colour":
+            width, height = COLOUR_MODES[self.info.colour_mode].size
+            return len(content) == round(width * height * RAW_FORMATS[self.info.colour_format])
+        if kind == "depth" and self.info.depth_mode is not None:
+            width, height = DEPTH_MODES[self.info.depth_mode].size
+            return len(content) == 2 * width * height
+        return kind == "imu"
+
+    def glance(self) -> Glance:
+        """A look at the colour track, without reading the others."""
+        index = next(index for index, kind in self._streams.items() if kind == "colour")
+        seen = glance_at_video(self.path, index, self.info.fps)
+        if self.info.colour_format != "MJPG":
+            return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size)
+        return seen
+
+    def depth_image(self, content: bytes) -> np.ndarray:
+        """Turn a depth packet into (H, W) uint16, millimetres, 0 = invalid, lossless."""
+        if self.info.depth_mode is None:
+            raise ValueError(f"{self.path} has no depth")
+        width, height = DEPTH_MODES[self.info.depth_mode].size
+        return np.frombuffer(content, ">u2").reshape(height, width).astype(np.uint16)
+
+    def camera(self, name: str, master_from_colour: np.ndarray | None = None) -> Camera:
+        """Return this device's lenses under ``name``, at the pose (4, 4) or the identity.
+
+        Raises UserError where the calibration is broken.
+        """
+        return read_calibration(
+            self.info.calibration,
+            colour_mode=self.info.colour_mode,
+            depth_mode=self.info.depth_mode,
+            name=name,
+            source=str(self.path),
+            master_from_colour=master_from_colour,
+        )
+
+    def colour_from_accelerometer(self) -> np.ndarray | None:
+        """Return the rotation (3, 3) from accelerometer to colour axes; None if not calibrated."""
+        return colour_from_accelerometer(self.info.calibration, source=str(self.path))
+
+    # --- the head of the file ---------------------------------------------------------------
+
+    def _find_tracks(self) -> dict[int, Kind]:
+        """Map stream index to kind: by tag (only the tagged track carries it), else by name."""
+        found: dict[int, Kind] = {}
+        candidates = [s for s in self._container.streams if s.type != "attachment"]
+        for name, tag in TRACKS.items():
+            tagged = [s for s in candidates if tag in s.metadata]
+            named = [s for s in candidates if s.metadata.get("title") == name]
+            for stream in (tagged or named)[:1]:
+                found[stream.index] = _KINDS[name]
+        return found
+
+    def _stream(self, kind: Kind) -> Any:
+        index = next((i for i, k in self._streams.items() if k == kind), None)
+        return None if index is None else self._container.streams[index]
+
+    def _read_info(self, truncated: bool) -> RecordingInfo:
+        colour, depth = self._stream("colour"), self._stream("depth")
+        if colour is None or colour.type != "video" or colour.codec_context is None:
+            raise UserError(
+                f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
+                "colour; record with k4arecorder and the colour camera on"
+            )
+        fps = float(colour.average_rate or 30)
+        check_rate(fps, str(self.path))
+        return RecordingInfo(
+            colour_mode=self._mode("colour", colour, "K4A_COLOR_MODE", COLOUR_MODES),
+            colour_format=self._colour_format(colour),
+            depth_mode=self._depth_mode(depth),
+            fps=fps,
+            serial=self._container.metadata.get("K4A_DEVICE_SERIAL_NUMBER", ""),
+            start_offset_us=self._microseconds("K4A_START_OFFSET_NS", LATEST_US),
+            depth_delay_us=self._microseconds("K4A_DEPTH_DELAY_NS", LONGEST_DELAY_US),
+            subordinate_delay_us=self._microseconds("K4A_SUBORDINATE_DELAY_NS", LONGEST_DELAY_US),
+            wired_sync_mode=self._container.metadata.get("K4A_WIRED_SYNC_MODE", "STANDALONE"),
+            calibration=self._calibration(),
+            truncated=truncated,
+        )
+
+    def _colour_format(self, colour: Any) -> str:
+        four_cc = colour.codec_context.codec_tag.upper()
+        if colour.codec_context.name == "mjpeg":
+            return "MJPG"
+        if four_cc in RAW_FORMATS:
+            return four_cc
+        raise UserError(
+            f"{self.path}: colour is recorded as {four_cc or colour.codec_context.name}, expected "
+            f"MJPG, {', '.join(RAW_FORMATS)}; record in one of k4arecorder's colour modes"
+        )
+
+    def _depth_mode(self, depth: Any) -> str | None:
+        if (
+            depth is None
+            or depth.codec_context is None
+            or depth.metadata.get("K4A_DEPTH_MODE") == PASSIVE_INFRARED
+        ):
+            return None
+        return self._mode("depth", depth, "K4A_DEPTH_MODE", DEPTH_MODES)
+
+    def _mode(self, kind: str, stream: Any, tag: str, known: dict[str, Any]) -> str:
+        """The mode's name: the one whose image has the track's size (no two modes share it)."""
+        size = (stream.codec_context.width, stream.codec_context.height)
+        name = next((mode for mode, entry in known.items() if entry.size == size), None)
+        if name is None:
+            raise UserError(
+                f"{self.path}: {kind} mode {stream.metadata.get(tag, 'without a name')} has images "
+                f"of {size[0]}x{size[1]}, expected one of {', '.join(known)}; record in one of them"
+            )
+        return name
+
+    def _microseconds(self, tag: str, most: int) -> int:
+        value = self._container.metadata.get(tag, "0")
+        if re.fullmatch(r"-?[0-9]{1,18}", value) and abs(found := round(int(value) / 1000)) <= most:
+            return found
+        raise UserError(
+            f"{self.path}: tag {tag} is {quoted(value)}, expected nanoseconds, at most "
+            f"{most / 1e6:g} s; the file is damaged, copy or record it again"
+        )
+
+    def _calibration(self) -> bytes:
+        attached: list[Any] = [s for s in self._container.streams if s.type == "attachment"]
+        tagged = [s for s in attached if CALIBRATION_TAG in s.metadata]
+        named = [s for s in attached if s.metadata.get("filename") == CALIBRATION_NAME]
+        for stream in tagged or named:
+            return bytes(stream.data)
+        raise UserError(
+            f"{self.path}: holds no {CALIBRATION_NAME}; attach the device's own (mkvpropedit "
+            f"--attachment-name {CALIBRATION_NAME} --add-attachment FILE) or record again"
+        )
+
+
+def imu_samples(content: bytes) -> np.ndarray:
+    """Return accelerations and turning rates (n, 6) of one packet, m/s^2 and rad/s."""
+    whole = len(content) // IMU_SAMPLE.size * IMU_SAMPLE.size
+    samples = [(*s[1:4], *s[5:8]) for s in IMU_SAMPLE.iter_unpack(content[:whole])]
+    return np.array(samples).reshape(-1, 6)
+
+
+def _is_truncated(path: Path) -> bool:
+    """Tell whether the file is shorter than its Segment says, or was never finished.
+
+    Raises UserError for a file that is missing, empty or not Matroska.
+    """
+    try:
+        size = os.path.getsize(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    head = read_bytes(path, max(size, 4096), head=4096)
+    if not head:
+        raise UserError(f"{path}: is empty (0 bytes); copy or record it again")
+    if not head.startswith(_EBML_MAGIC):
+        raise UserError(
+            f"{path}: is not a Matroska file (it starts with {head[:4]!r}); give the .mkv that "
+            "k4arecorder wrote"
+        )
+    end = segment_end(head)
+    return end is None or size < end

@@ -1,0 +1,176 @@
+"""When the image files of a folder were taken: by a file of timestamps, or by their numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.image_files import Shot
+from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
+from intercap_core.inputs.quotes import quoted
+
+SUFFIXES = (".csv", ".txt")
+LATEST_S = 1e11  # beyond all clocks that count seconds, and within 64 bits in microseconds
+LONGEST_STEP_S = 5.0  # a usual step above this is no second
+NUMBER = re.compile(r"\d+(?=\D*$)")  # the last number of a name
+Timestamps = Mapping[str | int, float]  # seconds by name, or by place where lines have no names
+_WHOLE = re.compile(r"[0-9]{1,18}")
+_SPLIT = re.compile(r"[,;\s]+")
+
+
+def find_timestamps(stem: Path) -> Path | None:
+    """Return ``<stem>.csv`` or ``<stem>.txt``, where there is one."""
+    files = [stem.with_name(stem.name + suffix) for suffix in SUFFIXES]
+    return next((file for file in files if file.is_file()), None)
+
+
+def read_timestamps(path: Path) -> Timestamps:
+    """Read times in seconds, one a line: ``seconds`` or ``name, seconds``; a header may be first.
+
+    Returns them by name, or by 0, 1, ... where the lines have no names. Raises UserError naming
+    file and line for what is no number, for a name given twice, and for milliseconds.
+    """
+    try:
+        lines = read_text(path, MAX_TABLE_BYTES).splitlines()
+    except Unreadable as error:
+        raise UserError(
+            f"{path}: cannot be read as text ({error.reason}); check the file"
+        ) from None
+    times: dict[str | int, float] = {}
+    for number, line in enumerate(lines, start=1):
+        fields = [field for field in _SPLIT.split(line.strip().lstrip("#")) if field]
+        if not fields:
+            continue
+        try:
+            seconds = float(fields[-1])
+        except ValueError:
+            seconds = np.nan
+        if not np.isfinite(seconds) or len(fields) > 2:
+            if not times and number == 1:
+                continue  # a header
+            raise UserError(
+                f"{path}, line {number}: found {quoted(line)}, expected 'seconds' or 'name, "
+                "seconds'; correct it"
+            )
+        name = fields[0] if len(fields) == 2 else len(times)
+        if name in times:
+            raise UserError(f"{path}, line {number}: {quoted(name)} is given twice; keep one")
+        if abs(seconds) > LATEST_S:
+            raise UserError(f"{path}, line {number}: {seconds:.4g} are no seconds; write seconds")
+        times[name] = seconds
+    steps = np.abs(np.diff(list(times.values())))
+    if len(steps) and np.median(steps) > LONGEST_STEP_S:
+        raise UserError(
+            f"{path}: times are {np.median(steps):.4g} apart, expected seconds, so they are likely "
+            "milliseconds or less; write seconds"
+        )
+    return times
+
+
+def rate_of(times_us: np.ndarray) -> float | None:
+    """Return images a second by the usual step of device times (N,); None for fewer than 2."""
+    steps = np.abs(np.diff(np.asarray(times_us, np.float64)))
+    steps = steps[steps > 0]
+    return float(1e6 / np.median(steps)) if len(steps) else None
+
+
+def shots_of(
+    colour: list[Path],
+    depth: list[Path],
+    *,
+    fps: float | None,
+    offset_s: float,
+    times: Timestamps | None,
+    source: Path,
+) -> list[Shot]:
+    """Bring colour and depth files of one camera together, each with its time.
+
+    The files' numbers (the last one in each name) say which belong together and, divided by
+    ``fps``, when they were taken; where some names have no number of their own, their order does.
+    ``times`` as :func:`read_timestamps` gives it overrides that: by name, by name without suffix,
+    by number, or one for each colour image in order. Raises UserError, naming ``source``, where
+    neither says the times or where times are missing.
+    """
+    found = _by_key(colour, depth, source)
+    keys = sorted(found)
+    if times is None:
+        if fps is None:
+            raise UserError(
+                f"{source}: nothing says when the images were taken; add fps to the calibration, "
+                "or a timestamps.csv"
+            )
+        seconds = {key: key / fps for key in keys}
+    else:
+        seconds = _stated(found, times, source)
+    latest = max((abs(time + offset_s) for time in seconds.values()), default=0.0)
+    if latest > LATEST_S:
+        raise UserError(
+            f"{source}: an image would be taken at {latest:.3g} s, so the numbers in the names are "
+            "likely times, or time_offset is no seconds; write a timestamps.csv in seconds"
+        )
+    return [
+        Shot(round((seconds[key] + offset_s) * 1e6), *found[key]) for key in keys if key in seconds
+    ]
+
+
+def _by_key(
+    colour: list[Path], depth: list[Path], source: Path
+) -> dict[int, tuple[Path | None, Path | None]]:
+    by_number = [{_number(path): path for path in paths} for paths in (colour, depth)]
+    whole = all(
+        len(one) == len(paths) and None not in one
+        for one, paths in zip(by_number, (colour, depth), strict=True)
+    )
+    if not whole:
+        order = {path.stem: index for index, path in enumerate(colour)}
+        strays = [path.name for path in depth if path.stem not in order]
+        if strays and colour:
+            raise UserError(
+                f"{source}: depth/{strays[0]} has neither a number nor the name of a colour image; "
+                "number both alike"
+            )
+        by_number = [
+            dict(enumerate(colour)),
+            {order.get(path.stem, index): path for index, path in enumerate(depth)},
+        ]
+    keys = {key for one in by_number for key in one if key is not None}
+    return {key: (by_number[0].get(key), by_number[1].get(key)) for key in keys}
+
+
+def _number(path: Path) -> int | None:
+    match = NUMBER.search(path.stem)
+    return int(match.group()) if match else None
+
+
+def _stated(
+    found: Mapping[int, tuple[Path | None, Path | None]], times: Timestamps, source: Path
+) -> dict[int, float]:
+    """The stated time of each key; depth alone, beside a video, goes by its place in the list."""
+    coloured = [key for key in sorted(found) if found[key][0] is not None]
+    if all(isinstance(name, int) for name in times):
+        if not coloured:
+            return {key: times[key] for key in found if key in times}
+        if len(times) == len(coloured):
+            return dict(zip(coloured, times.values(), strict=True))
+        raise UserError(
+            f"{source}: {len(times)} timestamps for {len(coloured)} colour images; write one for "
+            "each, or 'name, seconds'"
+        )
+    by_number = {int(n): t for n, t in times.items() if isinstance(n, str) and _WHOLE.fullmatch(n)}
+    seconds = {}
+    for key, files in found.items():
+        names = [name for file in files if file is not None for name in (file.name, file.stem)]
+        stated = next((times[name] for name in names if name in times), by_number.get(key))
+        if stated is not None:
+            seconds[key] = stated
+    missing = [path.name for key in coloured if key not in seconds and (path := found[key][0])]
+    if missing:
+        raise UserError(
+            f"{source}: {len(missing)} images have no timestamp (first: {missing[0]}); add them, "
+            "or remove the images"
+        )
+    return seconds

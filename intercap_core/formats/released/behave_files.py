@@ -1,0 +1,181 @@
+"""Files of BEHAVE's results: registrations in the folders of frames, and the 30 fps parameters.
+
+A frame's folder ``t0003.000`` holds ``person/fit02/person_fit.ply`` (6,890 vertices, SMPL-H's) and
+``.pkl`` (``pose``: 156 numbers of SMPL-H's 52 joints, or 72 of SMPL's 24), and of the object
+``<name>/fit01/<name>_fit.pkl`` (``angle``, a rotation vector, and ``trans``) and ``.ply``. The
+folder's name is the object's, or that of its kind, "chair" or "sports ball". The parameters at
+30 fps are ``smpl_fit_all.npz`` (``poses``, ``frame_times``) and ``object_fit_all.npz`` (``angles``,
+``trans``, ``frame_times``) of a sequence; times are texts such as "t0003.033". Everything is in the
+frame of Kinect 1's colour camera, metres and radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.behave import FRAME_FOLDER
+from intercap_core.formats.released.constants import PERSON_EXTENT_M
+from intercap_core.formats.released.file_names import BEHAVE_OBJECT, BEHAVE_PERSON
+from intercap_core.formats.released.results import check_metres, check_radians
+from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import read_arrays
+
+_PERSON, _OBJECT_FIT = "person", "fit01"
+_VERTICES = 6890  # of SMPL and SMPL-H
+_JOINTS = {156: 52, 72: 24}  # of SMPL-H and SMPL, by the numbers of a pose
+_BODY_JOINTS = 22  # pelvis to wrists, in one order in SMPL, SMPL-H and SMPL-X
+_HAND_JOINTS = slice(22, 52)  # of SMPL-H, in SMPL-X's order
+_SMPLX_HANDS = slice(25, 55)
+
+
+class Skin(NamedTuple):
+    """A person's surface: vertices (V, 3) float32, metres, and faces (F, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPoses:
+    """N poses of the centred template: rotation vectors and translations (N, 3)."""
+
+    path: Path
+    angle: np.ndarray
+    trans: np.ndarray
+
+
+def read_skin(path: Path) -> Skin:
+    """A ``person_fit.ply``; raises UserError naming it where it is no mesh of 6,890 vertices of a
+    person in metres."""
+    from intercap_core.geometry.rigid.mesh import read_mesh
+
+    mesh = read_mesh(path)
+    vertices = np.asarray(mesh.vertices, np.float32)
+    if len(vertices) != _VERTICES:
+        raise UserError(
+            f"{path}: has {len(vertices)} vertices, expected the {_VERTICES} of SMPL-H; get "
+            "BEHAVE's file again"
+        )
+    if not np.isfinite(vertices).all():
+        raise UserError(f"{path}: has a vertex that is no number; get BEHAVE's file again")
+    extent, (low, high) = float(np.ptp(vertices, axis=0).max()), PERSON_EXTENT_M
+    if not low <= extent <= high:
+        raise UserError(
+            f"{path}: is {extent:.4g} m large, expected a person of {low:g} to {high:g} m; write "
+            "it in metres"
+        )
+    check_metres(path, "its vertices", vertices)
+    return Skin(vertices, np.asarray(mesh.faces, np.int32))
+
+
+def read_person_pose(path: Path) -> np.ndarray:
+    """Rotation vectors (55, 3) in SMPL-X's order of a ``person_fit.pkl``."""
+    return _as_smplx(_numbers(_named(path), "pose", path).reshape(1, -1), path)[0]
+
+
+def read_object_pose(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation vector (3,) and translation (3,) of an ``<object>_fit.pkl``."""
+    values = _named(path)
+    angle, trans = (_numbers(values, name, path).ravel() for name in ("angle", "trans"))
+    for name, found in (("angle", angle), ("trans", trans)):
+        if found.shape != (3,) or not np.isfinite(found).all():
+            raise UserError(f"{path}: {name} holds {found.size} numbers, expected 3 finite ones")
+    check_radians(path, "angle", angle)
+    check_metres(path, "trans", trans)
+    return angle, trans
+
+
+def object_fits(frame: Path) -> list[Path]:
+    """Files ``<name>/fit01/<name>_fit.pkl`` of a frame's folder, whatever the object's name."""
+    return [
+        path
+        for folder in sorted(frame.iterdir())
+        if folder.name != _PERSON
+        and (path := folder / _OBJECT_FIT / f"{folder.name}_fit.pkl").is_file()
+    ]
+
+
+def person_poses_at_30_fps(folder: Path) -> dict[int, np.ndarray]:
+    """Rotation vectors (55, 3) in SMPL-X's order by time, microseconds; {} without the file."""
+    path = folder / BEHAVE_PERSON
+    if not path.exists():
+        return {}
+    values = _arrays(path)
+    poses = _as_smplx(_numbers(values, "poses", path), path)
+    if "frame_times" not in values and (folder / BEHAVE_OBJECT).is_file():  # as first released
+        values["frame_times"] = _arrays(folder / BEHAVE_OBJECT).get("frame_times", np.zeros(0))
+    # Some sequences have more poses than times: those whose object failed were taken off the end.
+    return dict(zip(_times(values, path, len(poses)), poses, strict=False))
+
+
+def object_poses_at_30_fps(folder: Path) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Rotation vector and translation by time, microseconds; {} without the file."""
+    path = folder / BEHAVE_OBJECT
+    if not path.exists():
+        return {}
+    values = _arrays(path)
+    angles, trans = (_numbers(values, name, path) for name in ("angles", "trans"))
+    for name, found in (("angles", angles), ("trans", trans)):
+        if found.ndim != 2 or found.shape[1] != 3 or len(found) != len(angles):
+            raise UserError(f"{path}: {name} is {found.shape}, expected ({len(angles)}, 3)")
+    check_radians(path, "angles", angles)
+    check_metres(path, "trans", trans)
+    both = zip(angles, trans, strict=True)
+    return dict(zip(_times(values, path, len(angles)), both, strict=False))
+
+
+def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
+    """Poses (T, 156) or (T, 72) as rotation vectors (T, 55, 3); jaw and eyes, and the fingers that
+    SMPL does not have, are at rest."""
+    if poses.ndim != 2 or poses.shape[1] not in _JOINTS:
+        size = poses.shape[-1] if poses.ndim else 1
+        raise UserError(
+            f"{path}: a pose has {size} numbers, expected the 156 of SMPL-H or the 72 of SMPL"
+        )
+    if not np.isfinite(poses).all():
+        raise UserError(f"{path}: a pose has values that are no numbers; get the file again")
+    check_radians(path, "a pose", poses)
+    theirs = poses.reshape(len(poses), _JOINTS[poses.shape[1]], 3)
+    found = np.zeros((len(poses), 55, 3))
+    found[:, :_BODY_JOINTS] = theirs[:, :_BODY_JOINTS]
+    if theirs.shape[1] == _JOINTS[156]:
+        found[:, _SMPLX_HANDS] = theirs[:, _HAND_JOINTS]
+    return found
+
+
+def _named(path: Path) -> Mapping[str, Any]:
+    values = safe_pickle.load(path)
+    if not isinstance(values, dict):
+        raise UserError(f"{path}: holds {type(values).__name__}, expected numbers by name")
+    return values
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    return read_arrays(path, advice="get the file again")
+
+
+def _numbers(values: Mapping[str, Any], name: str, path: Path) -> np.ndarray:
+    if name not in values:
+        raise UserError(f"{path}: has no entry {name!r}; expected BEHAVE's results")
+    try:
+        return np.asarray(values[name], np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{path}: {name} is no array of numbers") from None
+
+
+def _times(values: Mapping[str, np.ndarray], path: Path, most: int) -> list[int]:
+    """Microseconds of ``frame_times``, at most as many as there are poses."""
+    texts = np.atleast_1d(values.get("frame_times", np.zeros(0)))
+    found = [FRAME_FOLDER.fullmatch(str(text)) for text in texts]
+    if not found or not all(found) or len(found) > most:
+        raise UserError(
+            f"{path}: frame_times are not times such as 't0003.033', one for each of {most} poses; "
+            "get BEHAVE's file again"
+        )
+    return [round(float(match.group(1)) * 1e6) for match in found if match]

@@ -1,0 +1,167 @@
+"""One lens: image size, pinhole matrix and OpenCV's rational distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from intercap_core.geometry.camera import projection
+
+RAY_SPACING = 4  # px between the rays of a large image that are computed one by one
+SMALL_IMAGE = 100_000  # px: nothing is gained by interpolating
+DEFAULT_METRIC_RADIUS = 1.7  # what the Azure Kinect SDK takes where a calibration says 0
+
+# Rays by size and parameters, for as long as some lens holds them: every reader of a recording has
+# lenses of its own.
+_TABLES: WeakValueDictionary[tuple[int, int, bytes], np.ndarray] = WeakValueDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """A lens and its image; pixel (0, 0) is the centre of the first pixel.
+
+    ``distortion`` (8,) is OpenCV's k1, k2, p1, p2, k3, k4, k5, k6. The calibration holds up to
+    ``metric_radius`` = sqrt(x^2 + y^2) of the normalised plane; see :mod:`.projection` beyond it.
+    Lengths are pixels of this image. Raises ValueError for a shape or size that cannot be.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(8))
+    metric_radius: float = DEFAULT_METRIC_RADIUS
+
+    def __post_init__(self) -> None:
+        distortion = np.array(self.distortion, np.float64)
+        if distortion.shape != (8,):
+            raise ValueError(f"distortion has shape {distortion.shape}, expected (8,)")
+        if min(self.width, self.height) < 1 or min(self.fx, self.fy, self.metric_radius) <= 0:
+            raise ValueError("an image size, focal length or metric radius is not positive")
+        distortion.setflags(write=False)
+        object.__setattr__(self, "distortion", distortion)
+
+    @classmethod
+    def from_parameters(cls, size: Any, parameters: Any) -> Intrinsics:
+        """Make a lens of ``size`` (2,) = width, height from :attr:`parameters` (13,)."""
+        width, height = (int(n) for n in size)
+        fx, fy, cx, cy, *rest = (float(p) for p in parameters)
+        return cls(width, height, fx, fy, cx, cy, np.array(rest[:8]), rest[8])
+
+    @cached_property
+    def parameters(self) -> np.ndarray:
+        """(13,) float64: fx, fy, cx, cy, the distortion, metric radius (:mod:`.projection`)."""
+        head = (self.fx, self.fy, self.cx, self.cy)
+        values = np.array([*head, *self.distortion, self.metric_radius])
+        values.setflags(write=False)
+        return values
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The pinhole matrix (3, 3)."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def project(self, points: Any) -> Any:
+        """Project points (..., 3), this camera's frame, metres, to pixels (..., 2)."""
+        return projection.project(points, self.parameters)
+
+    def project_with_jacobian(self, points: Any) -> tuple[Any, Any]:
+        """Return pixels (..., 2) and d pixel / d point (..., 2, 3) of points (..., 3)."""
+        return projection.project_with_jacobian(points, self.parameters)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the undistorted rays (..., 3), z = 1, float64, of pixels (..., 2).
+
+        The exact inverse of :meth:`project` (to 1e-12 of the normalised plane), also beyond the
+        metric radius. NaN where the model has no inverse: a calibration whose image turns back
+        inside its own radius.
+        """
+        from intercap_core.geometry.camera import projection_kernels
+
+        pixels = np.asarray(pixels, np.float64)
+        flat = np.ascontiguousarray(pixels.reshape(-1, 2))
+        rays = np.ones((len(flat), 3))
+        rays[:, :2] = projection_kernels.unproject(
+            flat, tuple(self.parameters.tolist()), *self._radius_table
+        )
+        return rays.reshape(*pixels.shape[:-1], 3)
+
+    @cached_property
+    def _radius_table(self) -> tuple[np.ndarray, np.ndarray]:
+        return projection.radius_table(self.parameters)
+
+    def inside_model(self, points: Any) -> Any:
+        """Tell for points (..., 3) whether they are in front and within the metric radius."""
+        return projection.inside_model(points, self.parameters)
+
+    def sees(self, points: Any) -> Any:
+        """Tell for points (..., 3) whether they are imaged: covered and inside the image."""
+        pixels = self.project(points)
+        u, v = pixels[..., 0], pixels[..., 1]
+        inside = (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
+        return inside & self.inside_model(points)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z, computed once for all
+        lenses of the same parameters that are in use.
+
+        NaN where the calibration does not hold (outside the metric radius). A large image whose
+        calibration holds everywhere has every ``RAY_SPACING``-th ray computed and the others
+        interpolated by cubic splines, to 1e-4 px.
+        """
+        key = (self.width, self.height, self.parameters.tobytes())
+        table = _TABLES.get(key)
+        if table is None:
+            _TABLES[key] = table = self._ray_table()
+        return table
+
+    def _ray_table(self) -> np.ndarray:
+        u, v = np.arange(self.width), np.arange(self.height)
+        coarse_u, coarse_v = (np.linspace(0, n[-1], -(-n[-1] // RAY_SPACING) + 1) for n in (u, v))
+        small = self.width * self.height <= SMALL_IMAGE
+        xy = self._rays_at(u, v) if small else self._rays_at(coarse_u, coarse_v)
+        if not small and np.isfinite(xy).all():
+            from scipy.interpolate import RectBivariateSpline
+
+            splines = [RectBivariateSpline(coarse_v, coarse_u, xy[..., axis]) for axis in (0, 1)]
+            xy = np.stack([spline(v, u) for spline in splines], -1)
+        elif not small:
+            xy = self._rays_at(u, v)
+        table = xy.astype(np.float32)
+        table.setflags(write=False)
+        return table
+
+    def _rays_at(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Rays (V, U, 2) at columns (U,) and rows (V,); NaN outside the metric radius."""
+        xy = self.unproject(np.stack(np.meshgrid(u, v), -1))[..., :2]
+        xy[~(np.hypot(xy[..., 0], xy[..., 1]) <= self.metric_radius)] = np.nan
+        return xy
+
+    def scaled(self, factor: float) -> Intrinsics:
+        """Return the lens of the image resized by ``factor`` (sizes rounded, edges kept)."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.distortion,
+            self.metric_radius,
+        )
+
+    def cropped(self, x0: int, y0: int, width: int, height: int) -> Intrinsics:
+        """Return the lens of the window whose first pixel is (x0, y0)."""
+        cx, cy = self.cx - x0, self.cy - y0
+        return Intrinsics(
+            width, height, self.fx, self.fy, cx, cy, self.distortion, self.metric_radius
+        )

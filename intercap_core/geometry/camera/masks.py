@@ -1,0 +1,170 @@
+"""COCO's run-length masks: checked, and read at single pixels without decoding the image.
+
+A compressed RLE is the string of pycocotools' ``maskApi``: lengths of runs in column-major order,
+zeros first. It does not know the image's size, so every function takes it. Strings come from
+users' files, and the C decoder writes past its buffer for one that does not fill the image, so
+they are parsed and checked here first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from pycocotools import mask as coco_mask
+
+_FARTHEST_CORNER = 1e5  # px from the image's corner; the C code counts every pixel of an edge
+_LONGEST_OUTLINE = 1e6  # px; the C code keeps five points of each, and counts them in 32 bits
+
+
+class Runs:
+    """A mask of one image, kept as its runs.
+
+    ``ends`` (n,) int64: where each run ends in the column-major image; even runs are background.
+    Raises ValueError, in words that fit after a file's name, where the string is not an RLE of
+    ``height`` x ``width`` pixels.
+    """
+
+    def __init__(self, rle: bytes, height: int, width: int) -> None:
+        self.height, self.width = height, width
+        self.ends = _parse(rle)
+        filled = int(self.ends[-1]) if len(self.ends) else 0
+        if filled != height * width:
+            raise ValueError(
+                f"its runs hold {filled} pixels, expected {height * width} "
+                f"({width} x {height}, the colour image)"
+            )
+
+    @property
+    def area(self) -> int:
+        """Number of pixels set."""
+        return int(np.diff(self.ends, prepend=0)[1::2].sum())
+
+    @cached_property
+    def box(self) -> tuple[int, int, int, int]:
+        """x, y, width, height of the pixels set; all 0 where there are none."""
+        from intercap_core.geometry.camera import masks_kernel
+
+        x, y, width, height = masks_kernel.box(self.ends, self.height)
+        return x, y, width, height
+
+    def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Read the mask at integer pixels x, y (...): (...) bool, False outside the image."""
+        inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
+        index = np.where(inside, x * np.int64(self.height) + y, 0)
+        return inside & (np.searchsorted(self.ends, index, side="right") % 2 == 1)
+
+    def sample_flat(self, index: np.ndarray) -> np.ndarray:
+        """Read the mask at flat pixels (N,), row * width + column; False where negative."""
+        row, column = np.divmod(index, self.width)
+        return self.sample(np.where(index >= 0, column, -1), row)
+
+    def decode(self) -> np.ndarray:
+        """The whole mask (height, width) bool."""
+        lengths = np.diff(self.ends, prepend=0)
+        flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+        return np.ascontiguousarray(flat.reshape(self.width, self.height).T)
+
+
+def encode(mask: np.ndarray) -> bytes:
+    """Encode a mask (H, W), any type, non-zero = set."""
+    return bytes(coco_mask.encode(np.asfortranarray(mask != 0, dtype=np.uint8))["counts"])
+
+
+def encode_window(window: np.ndarray, x0: int, y0: int, height: int, width: int) -> bytes:
+    """Encode a mask (h, w) bool that lies at x0, y0 of an otherwise empty image.
+
+    The same string as of the whole image, in the time that the window takes.
+    """
+    length = window.shape[0] + 1  # of a column, and an empty pixel that ends its last run
+    columns = np.zeros(window.shape[1] * length + 1, bool)
+    columns[1:].reshape(-1, length)[:, :-1] = window.T
+    column, row = np.divmod(np.flatnonzero(columns[1:] != columns[:-1]), length)
+    flat = (column + x0) * height + (row + y0)
+    if not len(flat):
+        return encode(np.zeros((height, width), np.uint8))
+    starts, ends = flat[::2], flat[1::2]
+    apart = starts[1:] != ends[:-1]  # from one column's last pixel to the next one's first
+    starts, ends = starts[np.append(True, apart)], ends[np.append(apart, True)]
+    edges = np.concatenate([[0], np.stack([starts, ends], 1).ravel(), [height * width]])
+    lengths = np.diff(edges)
+    if lengths[-1] == 0:
+        lengths = lengths[:-1]
+    return _compress({"size": [height, width], "counts": lengths.tolist()}, height, width)
+
+
+def decode(rle: bytes, height: int, width: int) -> np.ndarray:
+    """Decode to (height, width) bool. Raises ValueError as :class:`Runs` does."""
+    return Runs(rle, height, width).decode()
+
+
+def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
+    """Compress an uncompressed RLE, a list of run lengths.
+
+    Raises ValueError where a length is not a whole number from 0 or they do not fill the image.
+    """
+    lengths = np.asarray(counts)
+    if lengths.ndim != 1 or (lengths.size and lengths.dtype.kind not in "iu"):
+        raise ValueError("its counts are not a list of whole numbers")
+    if lengths.size and lengths.min() < 0:
+        raise ValueError(f"its counts hold {int(lengths.min())}, expected 0 or more")
+    filled = sum(int(n) for n in lengths)  # of Python's integers, which do not wrap
+    if filled != height * width:
+        raise ValueError(
+            f"its runs hold {filled} pixels, expected {height * width} "
+            f"({width} x {height}, the colour image)"
+        )
+    return _compress({"size": [height, width], "counts": [int(n) for n in lengths]}, height, width)
+
+
+def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
+    """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
+
+    Raises ValueError where one has fewer than three corners, a value that is not finite or farther
+    than 1e5 px from the image's corner, or where their outlines are longer than any shape's.
+    """
+    outline = 0.0
+    for polygon in polygons:
+        values = np.asarray(polygon, np.float64)
+        if values.ndim != 1 or len(values) < 6 or len(values) % 2 or not np.isfinite(values).all():
+            raise ValueError("a polygon is not a list of three or more finite x, y corners")
+        if np.abs(values).max() > _FARTHEST_CORNER:
+            raise ValueError(
+                f"a polygon has a coordinate {values[np.abs(values).argmax()]:.6g}, expected "
+                f"pixels of the image ({width} x {height})"
+            )
+        corners = values.reshape(-1, 2)
+        outline += float(np.abs(corners - np.roll(corners, 1, 0)).max(1).sum())
+        if outline > _LONGEST_OUTLINE:
+            raise ValueError(
+                f"its polygons are more than {_LONGEST_OUTLINE:.0e} px around, expected outlines "
+                "of a shape in the image"
+            )
+    if not polygons:
+        return encode(np.zeros((height, width), np.uint8))
+    return _compress([[float(v) for v in p] for p in polygons], height, width)
+
+
+def _compress(segmentation: object, height: int, width: int) -> bytes:
+    made = coco_mask.frPyObjects(segmentation, height, width)
+    return bytes((coco_mask.merge(made) if isinstance(made, list) else made)["counts"])
+
+
+def _parse(rle: bytes) -> np.ndarray:
+    """Ends (n,) int64 of the runs of a compressed RLE."""
+    from intercap_core.geometry.camera import masks_kernel
+
+    if not rle:
+        raise ValueError("its RLE is empty")
+    ends, problem = masks_kernel.parse(np.frombuffer(rle, np.uint8))
+    if problem != masks_kernel.FINE:
+        raise ValueError(
+            {
+                masks_kernel.STRANGE: "its RLE holds characters that COCO's alphabet does not have",
+                masks_kernel.CUT: "its RLE is cut within a number",
+                masks_kernel.LONG: "its RLE holds a number that is too long",
+                masks_kernel.NEGATIVE: "its RLE holds a run of negative length",
+            }[problem]
+        )
+    return ends

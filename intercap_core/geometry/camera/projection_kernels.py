@@ -1,0 +1,124 @@
+"""The lens of :mod:`.projection`, compiled: the one form that every compiled kernel calls.
+
+One point at a time; equal to :func:`.projection.project` and
+:func:`.projection.project_with_jacobian` to rounding everywhere, also nearer
+than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow IEEE 754
+instead of raising, so that loops around these functions can be vectorised.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from intercap_core.geometry.camera.projection import MIN_DEPTH_M
+
+_NEWTON_STEPS = 8
+_CONVERGED = 1e-12  # normalised image plane; 1e-9 px at f = 1000
+_LOST = 1e-9  # a solution that is this far off after all steps is none
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def distort(x, y, distortion):
+    """Distorted (xd, yd) of a point (x, y) of the normalised plane within the metric radius.
+
+    ``distortion`` is the tuple k1, k2, p1, p2, k3, k4, k5, k6. In the precision of the arguments.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    one, two = type(x)(1), type(x)(2)  # a literal would turn single precision into double
+    s = x * x + y * y
+    d = (one + s * (k1 + s * (k2 + s * k3))) / (one + s * (k4 + s * (k5 + s * k6)))
+    xd = x * d + two * p1 * x * y + p2 * (s + two * x * x)
+    yd = y * d + p1 * (s + two * y * y) + two * p2 * x * y
+    return xd, yd
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def distort_with_jacobian(x, y, parameters):
+    """Distorted (xd, yd) of a point of the normalised plane, continued beyond the metric radius,
+    and dxd/dx, dxd/dy, dyd/dx, dyd/dy; ``parameters`` (13,)."""
+    _, _, _, _, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
+    radius = np.sqrt(x * x + y * y)
+    outside = radius > limit
+    stretch = radius / limit if outside else 1.0
+    x, y = x / stretch, y / stretch  # on the rim where outside
+    s = x * x + y * y
+    below = 1 + s * (k4 + s * (k5 + s * k6))
+    d = (1 + s * (k1 + s * (k2 + s * k3))) / below
+    slope = k1 + s * (2 * k2 + 3 * s * k3) - d * (k4 + s * (2 * k5 + 3 * s * k6))
+    dd = 2 * slope / below
+    xd, yd = distort(x, y, (k1, k2, p1, p2, k3, k4, k5, k6))
+    xx = d + x * x * dd + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * dd + 2 * p1 * x + 2 * p2 * y  # the model's Jacobian is symmetric
+    yx = xy
+    yy = d + y * y * dd + 6 * p1 * y + 2 * p2 * x
+    if outside:
+        along_x, along_y = (xd - xx * x - xy * y) / s, (yd - xy * x - yy * y) / s
+        xx, xy = xx + along_x * x, xy + along_x * y
+        yx, yy = yx + along_y * x, yy + along_y * y
+        xd, yd = xd * stretch, yd * stretch
+    return xd, yd, xx, xy, yx, yy
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def project_point(px, py, pz, parameters):
+    """Pixel (u, v) of one point, camera frame, metres; ``parameters`` (13,)."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
+    z = max(pz, MIN_DEPTH_M)
+    x, y = px / z, py / z
+    stretch = max(np.sqrt(x * x + y * y) / limit, 1.0)
+    xd, yd = distort(x / stretch, y / stretch, (k1, k2, p1, p2, k3, k4, k5, k6))
+    return fx * stretch * xd + cx, fy * stretch * yd + cy
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def project_point_with_jacobian(px, py, pz, parameters):
+    """Pixel (u, v) of one point and du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ, px/m.
+
+    ``px``, ``py``, ``pz`` in the camera's frame, metres; ``parameters`` (13,). Where the depth is
+    raised to ``MIN_DEPTH_M`` the pixel does not depend on Z and those derivatives are zero.
+    """
+    fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
+    z = max(pz, MIN_DEPTH_M)
+    x, y = px / z, py / z
+    xd, yd, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
+    ux, uy = fx * xx / z, fx * (xy / z)
+    vx, vy = fy * (yx / z), fy * yy / z
+    uz, vz = 0.0, 0.0
+    if pz > MIN_DEPTH_M:
+        uz, vz = -(ux * x + uy * y), -(vx * x + vy * y)
+    return fx * xd + cx, fy * yd + cy, ux, uy, uz, vx, vy, vz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def unproject(pixels, parameters, radii, distorted_radii):
+    """X/Z and Y/Z (N, 2) of pixels (N, 2), all float64: the exact inverse of the projection, by
+    Newton's iteration from the radial part in the lens' :func:`.projection.radius_table`. NaN where
+    the model has no inverse."""
+    fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
+    found = np.empty_like(pixels)
+    for n in range(len(pixels)):
+        xd, yd = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
+        distance = np.sqrt(xd * xd + yd * yd)
+        scale = 1.0
+        if distance > distorted_radii[-1]:
+            scale = radii[-1] / distorted_radii[-1]
+        elif distance > 0:
+            scale = np.interp(distance, distorted_radii, radii) / distance
+        x, y = xd * scale, yd * scale
+        off = np.inf
+        for _ in range(_NEWTON_STEPS):
+            at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
+            rx, ry = at_x - xd, at_y - yd
+            off = max(abs(rx), abs(ry))
+            if off < _CONVERGED:
+                break
+            determinant = xx * yy - xy * yx
+            x -= (yy * rx - xy * ry) / determinant
+            y -= (xx * ry - yx * rx) / determinant
+        if not off < _CONVERGED:
+            at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
+            off = np.sqrt((at_x - xd) ** 2 + (at_y - yd) ** 2)
+        lost = not off < _LOST
+        found[n, 0], found[n, 1] = (np.nan, np.nan) if lost else (x, y)
+    return found

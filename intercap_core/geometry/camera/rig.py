@@ -1,0 +1,181 @@
+"""The cameras of a capture: lenses and poses, in one order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.schemas import FRAMES, SCENE
+
+# Smallest eigenvalue, a camera, of the normal matrix of the point nearest to all optical axes: with
+# less they are as good as parallel, and the centre is this far ahead, metres. Tuned on the studio.
+MIN_AXES_EIGENVALUE = 0.05
+PARALLEL_AXES_DISTANCE_M = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One colour camera and, where there is one, its depth camera.
+
+    ``colour_from_depth`` and ``master_from_colour`` are (4, 4), metres.
+    """
+
+    name: str
+    colour: Intrinsics
+    depth: Intrinsics | None
+    colour_from_depth: np.ndarray | None
+    master_from_colour: np.ndarray
+
+    @cached_property
+    def colour_from_master(self) -> np.ndarray:
+        """(4, 4)."""
+        return invert(self.master_from_colour)
+
+    @cached_property
+    def master_from_depth(self) -> np.ndarray:
+        """(4, 4). Raises ValueError for a camera without depth."""
+        if self.colour_from_depth is None:
+            raise ValueError(f"camera {self.name} has no depth")
+        return self.master_from_colour @ self.colour_from_depth
+
+    @cached_property
+    def depth_from_master(self) -> np.ndarray:
+        """(4, 4). Raises ValueError for a camera without depth."""
+        return invert(self.master_from_depth)
+
+    @cached_property
+    def aligned(self) -> bool:
+        """Whether depth lies on the colour image's pixel grid: one lens, one place."""
+        if self.depth is None or self.colour_from_depth is None:
+            return False
+        same_size = (self.depth.width, self.depth.height) == (self.colour.width, self.colour.height)
+        return (
+            same_size
+            and np.array_equal(self.depth.parameters, self.colour.parameters)
+            and np.array_equal(self.colour_from_depth, np.eye(4))
+        )
+
+    def moved(self, master_from_colour: np.ndarray) -> Camera:
+        """Return the same camera at another pose (4, 4)."""
+        return replace(self, master_from_colour=np.asarray(master_from_colour, np.float64))
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All cameras of a capture, in the order of every C axis."""
+
+    cameras: tuple[Camera, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, index: int) -> Camera:
+        return self.cameras[index]
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.cameras)
+
+    @cached_property
+    def master_from_colour(self) -> np.ndarray:
+        """(C, 4, 4)."""
+        return np.stack([camera.master_from_colour for camera in self.cameras])
+
+    @cached_property
+    def colour_from_master(self) -> np.ndarray:
+        """(C, 4, 4)."""
+        return invert(self.master_from_colour)
+
+    @cached_property
+    def colour_parameters(self) -> np.ndarray:
+        """(C, 13): the colour lenses in the form :mod:`.projection` takes for a batch."""
+        return np.stack([camera.colour.parameters for camera in self.cameras])
+
+    def moved(self, master_from_colour: np.ndarray) -> Rig:
+        """Return the same cameras at other poses (C, 4, 4)."""
+        poses = zip(self.cameras, master_from_colour, strict=True)
+        return Rig(tuple(camera.moved(pose) for camera, pose in poses))
+
+    def datasets(self) -> dict[str, np.ndarray | list[str]]:
+        """What the frames and scene artefacts hold about the cameras' lenses, by dataset name."""
+        no_lens = np.full(13, np.nan)
+        no_pose = np.full((4, 4), np.nan)
+        colour = self.colour_parameters
+        depth = np.stack([c.depth.parameters if c.depth else no_lens for c in self.cameras])
+        sizes = [(c.depth.width, c.depth.height) if c.depth else (0, 0) for c in self.cameras]
+        poses = [no_pose if c.colour_from_depth is None else c.colour_from_depth for c in self]
+        return {
+            "camera_names": list(self.names),
+            "colour_size": np.array([(c.colour.width, c.colour.height) for c in self.cameras]),
+            "colour_intrinsics": colour[:, :4],
+            "colour_distortion": colour[:, 4:12],
+            "colour_metric_radius": colour[:, 12],
+            "depth_size": np.array(sizes),
+            "depth_intrinsics": depth[:, :4],
+            "depth_distortion": depth[:, 4:12],
+            "depth_metric_radius": depth[:, 12],
+            "colour_from_depth": np.stack(poses),
+        }
+
+    @classmethod
+    def from_frames(cls, path: Path) -> Rig:
+        """Read the cameras of a frames artefact, with the extrinsics as they were given.
+
+        Raises UserError as :func:`artefacts.read` does.
+        """
+        with artefacts.read(path, FRAMES) as frames:
+            return cls.from_artefact(frames)
+
+    @classmethod
+    def from_scene(cls, path: Path) -> Rig:
+        """Read the cameras of a scene artefact, with the refined extrinsics.
+
+        Raises UserError as :func:`artefacts.read` does.
+        """
+        with artefacts.read(path, SCENE) as scene:
+            return cls.from_artefact(scene)
+
+    @classmethod
+    def from_artefact(cls, artefact: artefacts.Artefact) -> Rig:
+        """Read the cameras of an open artefact that holds :meth:`datasets` and the poses."""
+        cameras = []
+        poses = artefact["master_from_colour"]
+        for index, name in enumerate(artefact.text("camera_names")):
+            lenses: dict[str, Intrinsics | None] = {}
+            for kind in ("colour", "depth"):
+                size = artefact[f"{kind}_size"][index]
+                parameters = np.concatenate(
+                    [
+                        artefact[f"{kind}_intrinsics"][index],
+                        artefact[f"{kind}_distortion"][index],
+                        artefact[f"{kind}_metric_radius"][index : index + 1],
+                    ]
+                )
+                lenses[kind] = Intrinsics.from_parameters(size, parameters) if size[0] else None
+            if lenses["colour"] is None:
+                raise ValueError(f"{artefact.path}: camera {name} has no colour image size")
+            between = artefact["colour_from_depth"][index] if lenses["depth"] else None
+            cameras.append(Camera(name, lenses["colour"], lenses["depth"], between, poses[index]))
+        return cls(tuple(cameras))
+
+
+def ring_centre(rig: Rig) -> np.ndarray:
+    """The point (3,) closest to all optical axes; for one camera, or parallel ones, 2 m ahead."""
+    poses = rig.master_from_colour
+    axes, centres = poses[:, :3, 2], poses[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    if np.linalg.eigvalsh(normal)[0] < MIN_AXES_EIGENVALUE * len(rig):
+        return (centres + PARALLEL_AXES_DISTANCE_M * axes).mean(0)
+    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))

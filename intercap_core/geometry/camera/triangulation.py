@@ -1,0 +1,238 @@
+"""Points from pixels of several views, some of which are wrong.
+
+Every pair of views proposes a point, the proposal that most views agree with wins, and the point
+is refined on the distorted pixels of the views that agree. All points at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
+
+MIN_PARALLAX_DEG = 4.0  # two rays closer in direction than this do not give a depth
+REFINE_STEPS = 4
+HUBER_PX_AT_1080P = 4.0  # typical standard deviation of good 2D detectors
+PARTNERS = 5  # of each camera, whose rays are crossed with its own before those of others
+BEST_PARALLAX_DEG = 70.0
+# Rays closer in direction than this, or opposite, agree by chance: at worst as much as two views of
+# full confidence are worth. Six views alternately high and low hardly ever have such pairs.
+CHANCE_PARALLAX_DEG, CHANCE_COST = 25.0, 2.0
+_BLOCK = 20_000  # points at once: bounds memory at some 100 MB with six views
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """``points`` (N, 3) metres, master frame, NaN = fewer than two views agree; ``inlier`` (N, C)
+    bool; ``error`` (N,) RMS reprojection error of the inliers, px, NaN = no point;
+    ``view_error`` (N, C) px, NaN = not seen or no point.
+    """
+
+    points: np.ndarray
+    inlier: np.ndarray
+    error: np.ndarray
+    view_error: np.ndarray
+
+    @property
+    def views(self) -> np.ndarray:
+        """(N,) int8: views that agree."""
+        return self.inlier.sum(1).astype(np.int8)
+
+
+def spread(found: Triangulation, rig: Rig) -> np.ndarray:
+    """What each point (N,) is off by, metres, by how the views that agree on it disagree; 0 where
+    there is none.
+
+    n views tell 3 coordinates by 2n. With an RMS distance of e pixels the variance of one of them
+    is n e^2 / (2n - 3), and each of the point's is told by about 2n / 3 of them.
+    """
+    eyes = rig.master_from_colour[:, :3, 3]
+    away = np.linalg.norm(found.points[:, None] - eyes, axis=2)
+    metres = away / np.array([camera.colour.fx for camera in rig])
+    views = np.maximum(found.inlier.sum(1), 2)
+    pixel = np.where(found.inlier, metres, 0.0).sum(1) / views
+    return np.nan_to_num(found.error * pixel * np.sqrt(1.5 / (2 * views - 3)))
+
+
+def pixel_scale(rig: Rig) -> np.ndarray:
+    """(C,) pixels of each camera for one pixel of a 1080p image (by image height)."""
+    return np.array([camera.colour.height / 1080 for camera in rig])
+
+
+def rays_of(pixels: np.ndarray, rig: Rig) -> np.ndarray:
+    """Directions (..., C, n, 3) float64 in the master frame, z = 1 in the camera, of pixels
+    (..., C, n, 2)."""
+    rays = np.empty((*pixels.shape[:-1], 3))
+    for c, camera in enumerate(rig):
+        directions = camera.colour.unproject(pixels[..., c, :, :])
+        rays[..., c, :, :] = directions @ camera.master_from_colour[:3, :3].T
+    return rays
+
+
+def midpoints(
+    first: np.ndarray, second: np.ndarray, from_first: np.ndarray, from_second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where pairs of rays come closest: midpoints (..., 3) and gaps (...), metres.
+
+    ``first``, ``second`` (..., 3) directions, ``from_first``, ``from_second`` their origins. NaN
+    where the rays are nearly parallel (:data:`MIN_PARALLAX_DEG`) or meet behind an origin.
+    """
+    between = from_second - from_first
+    aa, bb = (first * first).sum(-1), (second * second).sum(-1)
+    ab = (first * second).sum(-1)
+    a_between, b_between = (first * between).sum(-1), (second * between).sum(-1)
+    determinant = aa * bb - ab * ab
+    apart = determinant > aa * bb * np.sin(np.radians(MIN_PARALLAX_DEG)) ** 2
+    safe = np.where(apart, determinant, 1.0)
+    s = (bb * a_between - ab * b_between) / safe
+    t = (ab * a_between - aa * b_between) / safe
+    good = apart & (s > 0) & (t > 0)
+    on_first = from_first + s[..., None] * first
+    on_second = from_second + t[..., None] * second
+    point = np.where(good[..., None], (on_first + on_second) / 2, np.nan)
+    gap = np.where(good, np.linalg.norm(on_first - on_second, axis=-1), np.nan)
+    return point, gap
+
+
+def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Pairs of cameras (a, b), a < b: those to try first, and the rest.
+
+    First come each camera's :data:`PARTNERS` whose viewing directions differ from its own most
+    nearly by :data:`BEST_PARALLAX_DEG`: up to six cameras these are all pairs, beyond their number
+    grows with the cameras', not with its square.
+    """
+    axes = rig.master_from_colour[:, :3, 2]
+    angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    first = {
+        (min(a, int(b)), max(a, int(b)))
+        for a, row in enumerate(np.abs(angle - BEST_PARALLAX_DEG))
+        for b in np.argsort(np.where(np.arange(len(rig)) == a, np.inf, row), kind="stable")[
+            : min(PARTNERS, len(rig) - 1)
+        ]
+    }
+    every = list(combinations(range(len(rig)), 2))
+    return [p for p in every if p in first], [p for p in every if p not in first]
+
+
+def reproject(points: np.ndarray, rig: Rig) -> np.ndarray:
+    """Pixels (N, C, 2) of points (N, 3), master frame, in every view."""
+    seen = np.moveaxis(apply(rig.colour_from_master, points), 0, 1)
+    return projection.project(seen, rig.colour_parameters)
+
+
+def triangulate(
+    pixels: np.ndarray, weights: np.ndarray, rig: Rig, *, max_error_px: float
+) -> Triangulation:
+    """Triangulate N points from C views.
+
+    ``pixels`` (N, C, 2), distorted; ``weights`` (N, C), 0 = not seen; ``max_error_px`` is the
+    reprojection error, in pixels of a 1080p image, beyond which a view disagrees.
+    """
+    count, views = weights.shape
+    result = Triangulation(
+        points=np.full((count, 3), np.nan),
+        inlier=np.zeros((count, views), bool),
+        error=np.full(count, np.nan),
+        view_error=np.full((count, views), np.nan),
+    )
+    wanted = np.flatnonzero((weights > 0).sum(1) >= 2)
+    for start in range(0, len(wanted), _BLOCK):
+        block = wanted[start : start + _BLOCK]
+        _triangulate_block(result, block, pixels[block], weights[block], rig, max_error_px)
+    return result
+
+
+def _triangulate_block(
+    result: Triangulation,
+    rows: np.ndarray,
+    pixels: np.ndarray,
+    weights: np.ndarray,
+    rig: Rig,
+    max_error_px: float,
+) -> None:
+    limit = max_error_px * pixel_scale(rig)
+    points = _best_proposal(pixels, weights, rig, limit)
+    error = _errors(points, pixels, weights, rig)
+    for _ in range(REFINE_STEPS):
+        inlier = error < limit
+        points = _refined(points, pixels, weights * inlier, rig)
+        error = _errors(points, pixels, weights, rig)
+    inlier = error < limit
+    good = inlier.sum(1) >= 2
+    inlier &= good[:, None]
+    points[~good] = np.nan
+    mean_square = np.where(inlier, error**2, 0).sum(1) / np.maximum(inlier.sum(1), 1)
+    result.points[rows] = points
+    result.inlier[rows] = inlier
+    result.error[rows] = np.where(good, np.sqrt(mean_square), np.nan)
+    result.view_error[rows] = np.where(good[:, None] & (weights > 0), error, np.nan)
+
+
+def _errors(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:
+    """Reprojection errors (N, C), px; infinite where not seen, behind the camera or no point."""
+    found = np.isfinite(points).all(1)
+    in_camera = np.moveaxis(
+        apply(rig.colour_from_master, np.where(found[:, None], points, 0)), 0, 1
+    )
+    error = np.linalg.norm(projection.project(in_camera, rig.colour_parameters) - pixels, axis=-1)
+    return np.where((weights > 0) & (in_camera[..., 2] > 0) & found[:, None], error, np.inf)
+
+
+def _best_proposal(
+    pixels: np.ndarray, weights: np.ndarray, rig: Rig, limit: np.ndarray
+) -> np.ndarray:
+    """The pair's midpoint (N, 3) with the least truncated cost over all views; NaN = none."""
+    rays = rays_of(np.swapaxes(pixels, 0, 1), rig)  # (C, N, 3)
+    centres = rig.master_from_colour[:, :3, 3]
+    best = np.full((len(pixels), 3), np.nan)
+    best_cost = np.full(len(pixels), np.inf)
+    for pairs in view_pairs(rig):
+        rest = np.isinf(best_cost)
+        for a, b in pairs:
+            rows = np.flatnonzero(rest & (weights[:, a] > 0) & (weights[:, b] > 0))
+            if not len(rows):
+                continue
+            proposal, _ = midpoints(rays[a, rows], rays[b, rows], centres[a], centres[b])
+            error = _errors(proposal, pixels[rows], weights[rows], rig)
+            cost = (weights[rows] * np.minimum(error / limit, 1.0) ** 2).sum(1)
+            cost += _agreed_by_chance(rays[a, rows], rays[b, rows])
+            better = np.isfinite(proposal[:, 0]) & (cost < best_cost[rows])
+            best[rows[better]], best_cost[rows[better]] = proposal[better], cost[better]
+    return best
+
+
+def _agreed_by_chance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Cost (N,) of a proposal by rays (N, 3) that run nearly along each other: whatever is near the
+    line between two cameras that face each other, they agree on some point of it."""
+    sine = np.linalg.norm(np.cross(first, second), axis=1)
+    sine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    return CHANCE_COST * np.maximum(0, 1 - sine / np.sin(np.radians(CHANCE_PARALLAX_DEG)))
+
+
+def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:
+    """One Gauss-Newton step of the Huber cost of reprojection, each point on its own."""
+    rows = np.flatnonzero(np.isfinite(points[:, 0]) & ((weights > 0).sum(1) >= 2))
+    if not len(rows):
+        return points
+    rotation = rig.colour_from_master[:, :3, :3]
+    in_camera = np.moveaxis(apply(rig.colour_from_master, points[rows]), 0, 1)
+    found, by_camera = projection.project_with_jacobian(in_camera, rig.colour_parameters)
+    jacobian = by_camera @ rotation  # (n, C, 2, 3)
+    residual = found - pixels[rows]
+    huber = HUBER_PX_AT_1080P * pixel_scale(rig)
+    size = np.linalg.norm(residual, axis=-1)
+    weight = weights[rows] * np.minimum(1.0, huber / np.maximum(size, 1e-9)) / pixel_scale(rig) ** 2
+    weighted = jacobian * weight[..., None, None]
+    normal = np.einsum("ncij,ncik->njk", weighted, jacobian)
+    gradient = np.einsum("ncij,nci->nj", weighted, residual)
+    # A hair of damping keeps two nearly parallel rays from throwing the point away.
+    damping = 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    step = np.linalg.solve(normal + damping + 1e-12 * np.eye(3), gradient[..., None])[..., 0]
+    result = points.copy()
+    result[rows] -= step
+    return result

@@ -1,0 +1,112 @@
+"""Lists of the vertices of a mesh that people are likely to touch.
+
+A list is the ids alone (JSON, or a pickle as InterCap released), or ids with what they were chosen
+on, as :func:`contact_list` gives it (JSON or .npz): then a mesh that was built anew under an old
+list is noticed, also where all ids still exist.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.errors import UserError
+from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import Archive
+from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.json_files import read_json
+from intercap_core.inputs.quotes import printable, quoted
+
+_IDS, _COUNT, _DIGEST = "contact_vertices", "mesh_vertices", "mesh_digest"
+
+
+def contact_list(ids: Sequence[int] | np.ndarray, vertices: np.ndarray) -> dict[str, Any]:
+    """What a list holds of ``ids`` (K,) chosen on a mesh file's ``vertices`` (V, 3), metres."""
+    return {
+        _COUNT: len(vertices),
+        _DIGEST: vertices_digest(vertices),
+        _IDS: [int(vertex) for vertex in ids],
+    }
+
+
+def vertices_digest(vertices: np.ndarray) -> str:
+    """SHA-256 of a mesh file's vertices (V, 3) in their order, in single precision."""
+    return hashlib.sha256(np.ascontiguousarray(vertices, "<f4").tobytes()).hexdigest()
+
+
+def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.ndarray:
+    """Ids (K,) of the likely-contact vertices that the list ``path`` names.
+
+    ``vertices`` (V, 3) are those of the file ``mesh``. Raises UserError naming the list: it is not
+    there, not a list of vertex ids, or belongs to another mesh.
+    """
+    values = _read(path)
+    if isinstance(values, Mapping):
+        _check_mesh(path, values, mesh, vertices)
+        values = values.get(_IDS)
+    if isinstance(values, set | frozenset):
+        values = list(values)
+    try:
+        ids = np.asarray(values)
+    except (ValueError, TypeError, OverflowError):
+        ids = np.empty(0, object)
+    whole = ids.dtype.kind in "iu" or (
+        ids.dtype.kind == "f" and bool(np.isfinite(ids).all()) and np.array_equal(ids, ids.round())
+    )
+    if ids.ndim != 1 or len(ids) == 0 or not whole:
+        raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
+    if ids.min() < 0 or ids.max() >= len(vertices):
+        outside = quoted(int(ids.max() if ids.max() >= len(vertices) else ids.min()))
+        raise UserError(
+            f"{path}: names vertex {outside}, the mesh has {len(vertices)}; the list belongs to "
+            f"another mesh than {mesh}: choose the vertices anew, or leave 'contact_vertices' out "
+            "of objects.yaml"
+        )
+    return ids.astype(np.int64)
+
+
+def _check_mesh(path: Path, values: Mapping[str, Any], mesh: Path, vertices: np.ndarray) -> None:
+    """Raise UserError where the list says that it belongs to other vertices."""
+    for key, found in ((_COUNT, len(vertices)), (_DIGEST, vertices_digest(vertices))):
+        expected = values.get(key)
+        if expected is not None and str(expected) != str(found):
+            raise UserError(
+                f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {found}; "
+                "the mesh was built anew under an old list: choose the vertices anew, or leave "
+                "'contact_vertices' out of objects.yaml"
+            )
+
+
+def _shown(value: Any) -> str:
+    return printable(str(value)[:80])
+
+
+def _read(path: Path) -> Any:
+    if not path.is_file():
+        raise UserError(
+            f"{path}: there is no such list of contact vertices; correct 'contact_vertices' in "
+            "objects.yaml or leave it out"
+        )
+    if path.suffix == ".pkl":
+        return safe_pickle.load(path)
+    if path.suffix == ".npz":
+        return _from_npz(path)
+    try:
+        return read_json(path)
+    except Unreadable as error:
+        raise UserError(
+            f"{path}: not a JSON list of vertex ids ({error.reason}); write it as [0, 1, ...]"
+        ) from None
+
+
+def _from_npz(path: Path) -> Any:
+    archive = Archive(path, advice="save the .npz of vertex ids again")
+    names = archive.names
+    if not names:
+        raise UserError(f"{path}: not a readable .npz of vertex ids (it is empty); save it again")
+    found = {name: archive.read(name) for name in (_COUNT, _DIGEST) if name in names}
+    return {**found, _IDS: archive.read(_IDS if _IDS in names else names[0])}

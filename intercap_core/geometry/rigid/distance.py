@@ -1,0 +1,221 @@
+"""Distances to a mesh's surface: signed distance, closest points, inside or outside.
+
+Open3D's RaycastingScene (Embree) in the mesh's own frame: the tree is built once and points move,
+so a rigid object's field is built once for all its poses. Inside of a surface with open edges is
+where it winds around a point by more than a half (the generalised winding number of Jacobson et al.
+2013, by the hierarchy of Barill et al. 2018); rays that leave through a hole would call points far
+outside inside. Its holes are closed, for the depth of what is inside, by the convex hull.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import trimesh
+
+from intercap_core.geometry.rigid.open3d_core import o3d
+
+# Directions along which crossings are counted: one for a watertight mesh (measured without a sign
+# error on 10 k points), a vote of all where it says "inside", as a ray may pass along an edge. No
+# direction lies in a plane that people model in.
+_DIRECTIONS = np.array(
+    [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
+     [0.41, 0.53, -0.74]]
+)  # fmt: skip
+# Distances that differ by less are those to the same point, metres: float32 at an object's size.
+_SAME_PLACE = 1e-6
+
+
+@dataclass(frozen=True)
+class Closest:
+    """The nearest surface point of each query.
+
+    ``points`` (N, 3) metres, ``faces`` (N,) int32, ``barycentric`` (N, 3) weights of the face's
+    corners, ``normals`` (N, 3) outward unit normals of the faces.
+    """
+
+    points: np.ndarray
+    faces: np.ndarray
+    barycentric: np.ndarray
+    normals: np.ndarray
+
+
+class DistanceField:
+    """Signed distance to a triangle mesh; negative inside. The hollow of a cup is outside.
+
+    ``box`` (2, 3) are the mesh's least and largest coordinates.
+    ``vertices`` (V, 3) metres and ``faces`` (F, 3) outward; ``watertight`` says whether rays are
+    enough to tell inside from outside. Queries are in the mesh's frame, float64 in and out,
+    computed in float32: errors up to 1e-6 of the coordinates' size. ``threads`` = 0 takes all
+    cores; the result does not depend on it.
+    """
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        watertight: bool = True,
+        threads: int = 0,
+    ) -> None:
+        vertices = np.ascontiguousarray(vertices, np.float32)
+        faces = np.ascontiguousarray(faces, np.uint32)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise ValueError(f"vertices {vertices.shape} and faces {faces.shape} are no mesh")
+        self.box = np.array([vertices.min(0), vertices.max(0)], np.float64)
+        self._scene = _scene(vertices, faces, threads)
+        self._open = None if watertight else _OpenSurface(vertices, faces, threads)
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (N,) of points (N, 3) to the surface, metres, negative inside."""
+        if self._open is not None:
+            inside, closest = self.boundary(points)
+            distance = np.linalg.norm(np.reshape(points, (-1, 3)) - closest.points, axis=1)
+        else:
+            inside, distance = self.inside(points), self.distance(points)
+        return np.where(inside, -distance, distance)
+
+    def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
+        """Which of points (N, 3) are inside, and the closest point of the solid's boundary.
+
+        That of the surface; of what is inside an open one that of its hull where this is closer, so
+        that nothing is deeper than the object is thick. Faces and weights are the surface's.
+        """
+        inside, found = self.inside(points), self.closest(points)
+        if self._open is not None and inside.any():
+            found = self._open.nearer(np.reshape(points, (-1, 3)), inside, found)
+        return inside, found
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (N,) of points (N, 3) to the surface, metres, never negative."""
+        query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
+        return self._scene.compute_distance(query).numpy().astype(np.float64)
+
+    def met(self, start: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        """Whether rays from ``start`` (N, 3) along ``ahead`` (N, 3) meet the surface (N,)."""
+        rays = o3d.core.Tensor.from_numpy(np.concatenate([start, ahead], 1).astype(np.float32))
+        return self._scene.test_occlusions(rays).numpy()
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (N, 3) are inside the solid: (N,) bool.
+
+        Of a watertight mesh one ray a point; as a ray through an edge may count it twice or never,
+        the few points that are found inside are asked again with more rays.
+        """
+        query = np.asarray(points, np.float32).reshape(-1, 3)
+        if self._open is not None:
+            return self._open.inside(query)
+        low, high = self.box.astype(np.float32)
+        asked = np.flatnonzero(((query >= low) & (query <= high)).all(1))
+        asked = asked[self._odd(query[asked], _DIRECTIONS[0])]
+        votes = np.zeros(len(query), int)
+        for direction in _DIRECTIONS:
+            votes[asked] += self._odd(query[asked], direction)
+        return 2 * votes > len(_DIRECTIONS)
+
+    def _odd(self, query: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Whether rays from points (N, 3) float32 cross the surface an odd number of times."""
+        towards = np.broadcast_to(direction.astype(np.float32), query.shape)
+        rays = o3d.core.Tensor.from_numpy(np.concatenate([query, towards], 1))
+        return self._scene.count_intersections(rays).numpy() % 2 == 1
+
+    def closest(self, points: np.ndarray) -> Closest:
+        """The closest surface points of points (N, 3)."""
+        return _closest(self._scene, points)
+
+
+class SurfacePart:
+    """Distances to a part of a mesh's surface: what its vertices ``part`` (K,) span.
+
+    That is every face whose corners all belong to the part, and around a vertex that has no such
+    face all of its faces. ``whole`` says what is inside the object.
+    """
+
+    def __init__(
+        self, whole: DistanceField, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray
+    ) -> None:
+        corners = np.isin(faces, part)
+        spanned = corners.all(axis=1)
+        alone = np.setdiff1d(part, faces[spanned])
+        spanned |= np.isin(faces, alone).any(axis=1)
+        if not spanned.any():
+            raise ValueError(f"vertices {part.tolist()} are corners of no face")
+        self._whole, self.box = whole, whole.box
+        self._scene = _scene(
+            np.ascontiguousarray(vertices, np.float32),
+            np.ascontiguousarray(faces[spanned], np.uint32),
+            threads=0,
+        )
+        self._face = np.flatnonzero(spanned).astype(np.int32)
+
+    def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
+        """Which of points (N, 3) are inside the object just below the part, and its closest point.
+
+        Inside the object but nearer to another part of its surface counts as outside: there the
+        distance to this part is no depth.
+        """
+        inside, nearest = self._whole.boundary(points)
+        found = _closest(self._scene, points)
+        query = np.reshape(points, (-1, 3))
+        way = np.linalg.norm(query - found.points, axis=1)
+        depth = np.linalg.norm(query - nearest.points, axis=1)
+        faces = self._face[found.faces]
+        below = inside & (way < depth + _SAME_PLACE)
+        return below, Closest(found.points, faces, found.barycentric, found.normals)
+
+
+class _OpenSurface:
+    """The solid that a surface with open edges nearly encloses."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, threads: int) -> None:
+        self._vertices = vertices.astype(np.float64)
+        self._faces = faces.astype(np.int64)
+        self._low, self._high = vertices.min(0), vertices.max(0)
+        hull = trimesh.convex.convex_hull(self._vertices)
+        self._hull = _scene(
+            np.asarray(hull.vertices, np.float32), np.asarray(hull.faces, np.uint32), threads
+        )
+
+    def inside(self, query: np.ndarray) -> np.ndarray:
+        """Whether the surface winds around points (N, 3) by more than a half: (N,) bool."""
+        found = np.zeros(len(query), bool)
+        near = np.flatnonzero(((query > self._low) & (query < self._high)).all(1))
+        if len(near):
+            points = query[near].astype(np.float64)
+            winding = igl.fast_winding_number(self._vertices, self._faces, points)
+            found[near] = winding > 0.5
+        return found
+
+    def nearer(self, points: np.ndarray, inside: np.ndarray, found: Closest) -> Closest:
+        """``found`` (N), with the hull's points and normals where points (N, 3) are ``inside`` (N,)
+        and closer to it."""
+        at = np.flatnonzero(inside)
+        hull = _closest(self._hull, points[at])
+        way, own = (
+            np.linalg.norm(points[at] - of, axis=1) for of in (hull.points, found.points[at])
+        )
+        closer = way < own
+        place, normals = found.points.copy(), found.normals.copy()
+        place[at[closer]], normals[at[closer]] = hull.points[closer], hull.normals[closer]
+        return Closest(place, found.faces, found.barycentric, normals)
+
+
+def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> o3d.t.geometry.RaycastingScene:
+    """The search tree of float32 vertices (V, 3) and uint32 faces (F, 3)."""
+    scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
+    scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces))
+    return scene
+
+
+def _closest(scene: o3d.t.geometry.RaycastingScene, points: np.ndarray) -> Closest:
+    query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
+    answer = scene.compute_closest_points(query)
+    uv = answer["primitive_uvs"].numpy().astype(np.float64)
+    return Closest(
+        answer["points"].numpy().astype(np.float64),
+        answer["primitive_ids"].numpy().astype(np.int32),
+        np.column_stack([1 - uv.sum(1), uv]),
+        answer["primitive_normals"].numpy().astype(np.float64),
+    )

@@ -1,0 +1,317 @@
+"""A rigid mesh as the stages use it: checked, repaired where safe, contact vertices, symmetry."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from intercap_core.config import ObjectEntry
+from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.constants import (
+    HANDLED_MAX_M,
+    HANDLED_MIN_M,
+    MAX_EXTENT_M,
+    MAX_FROM_ORIGIN_M,
+    MAX_OPEN_EDGES,
+    MIN_EXTENT_M,
+    MIN_FILLED,
+    SIMPLIFIED_TOLERANCE_M,
+)
+from intercap_core.geometry.rigid.contact_vertices import read_contact_vertices
+from intercap_core.geometry.rigid.mesh_files import TEXTURE_ERRORS, load_mesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+
+log = logging.getLogger(__name__)
+
+UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMesh:
+    """A rigid object in its own frame (the file's), metres, faces outward.
+
+    ``vertices`` (V, 3) float64, ``faces`` (F, 3) int32, ``contact_vertices`` (K,) int64 sorted,
+    ``colours`` (V, 3) uint8. ``watertight``: inside and outside are defined everywhere.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    contact_vertices: np.ndarray
+    symmetry: SymmetryGroup
+    colours: np.ndarray
+    watertight: bool = True
+
+    @classmethod
+    def load(cls, entry: ObjectEntry) -> ObjectMesh:
+        """Load and check the mesh, contact vertices and symmetry of an objects.yaml entry.
+
+        Vertices that coincide are joined, inconsistent winding is turned, small holes are closed
+        and faces without area left out, each with a warning; a surface that stays open is told
+        (``watertight`` is false) and used. Raises UserError naming the file, what is wrong with it
+        and what to do: no such file, no faces, coordinates that are not numbers, another unit than
+        metres, loose faces without an inside, contact vertices that are not its vertices.
+        """
+        path = Path(entry.mesh)
+        mesh = read_mesh(path)
+        in_file = np.asarray(mesh.vertices)
+        _check_size(path, mesh)
+        mesh, place = _without_loose_vertices(path, mesh)
+        mesh, new_id = _repair(path, mesh)
+        _check_volume(path, mesh)
+        try:
+            symmetry = SymmetryGroup.from_settings(entry.symmetry)
+        except ValueError as error:
+            raise UserError(
+                f"object {entry.name!r}: symmetry is impossible ({error}); correct it in "
+                "objects.yaml"
+            ) from None
+        contact = _contact_places(entry.contact_vertices, path, in_file, place)
+        ids = np.arange(len(mesh.vertices)) if contact is None else np.unique(new_id[contact])
+        return cls(
+            entry.name,
+            np.asarray(mesh.vertices, np.float64),
+            np.asarray(mesh.faces, np.int32),
+            ids.astype(np.int64),
+            symmetry,
+            colours_of(mesh)[:, :3].copy(),
+            bool(mesh.is_watertight),
+        )
+
+    @cached_property
+    def face_normals(self) -> np.ndarray:
+        """Outward unit normals (F, 3)."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        normals = np.cross(b - a, c - a)
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
+
+    @cached_property
+    def centre_of_mass(self) -> np.ndarray:
+        """Centre of mass (3,) at uniform density; of the surface where it is not closed."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        centroids = (a + b + c) / 3
+        if not self.watertight:
+            areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            return (areas[:, None] * centroids).sum(0) / areas.sum()
+        middle = self.vertices.mean(0)  # tetrahedra from a near point keep the sum well scaled
+        volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
+        return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
+
+    def simplified(self, max_faces: int, tolerance_m: float = SIMPLIFIED_TOLERANCE_M) -> ObjectMesh:
+        """The same object with about ``max_faces`` faces, for rendering and searching.
+
+        Contact vertices are left out (the vertices are others). Returns the mesh itself where it
+        is small enough, and as many faces as it takes to keep every vertex within
+        ``tolerance_m`` of the simplified surface.
+        """
+        from intercap_core.geometry.rigid.distance import DistanceField
+        from intercap_core.geometry.rigid.open3d_core import o3d
+
+        full = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.faces)
+        )
+        count = max_faces
+        while count < 0.8 * len(self.faces):
+            simple = full.simplify_quadric_decimation(count)
+            vertices = np.asarray(simple.vertices)
+            faces = np.asarray(simple.triangles).astype(np.int32)
+            if DistanceField(vertices, faces).distance(self.vertices).max() < tolerance_m:
+                return replace(
+                    self,
+                    vertices=vertices,
+                    faces=faces,
+                    contact_vertices=np.zeros(0, np.int64),
+                    colours=np.full((len(vertices), 3), 128, np.uint8),
+                )
+            count = count * 3 // 2
+        return self
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of a vertex from the centre of mass, metres."""
+        return float(np.linalg.norm(self.vertices - self.centre_of_mass, axis=1).max())
+
+    def centre_at(self, pose: np.ndarray) -> np.ndarray:
+        """Centre of mass (3,) under a pose (4, 4), in the frame that the pose leads to, metres."""
+        return pose[:3, :3] @ self.centre_of_mass + pose[:3, 3]
+
+    @cached_property
+    def diameter(self) -> float:
+        """Largest distance between two vertices, metres (BOP's scale of pose errors)."""
+        from scipy.spatial import ConvexHull
+        from scipy.spatial.distance import pdist
+
+        return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """The mesh of a file as it is; raises UserError, naming the file, where it is no mesh."""
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
+    mesh = load_mesh(path)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        stray = faces.min() if faces.min() < 0 else faces.max()
+        raise UserError(
+            f"{path}: a face names vertex {stray}, there are {len(vertices)}; export the mesh again"
+        )
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    bad = np.flatnonzero(used & ~np.isfinite(vertices).all(1))
+    if len(bad):
+        raise UserError(
+            f"{path}: vertex {bad[0]} is not a number (and {len(bad) - 1} more); export the mesh "
+            "again"
+        )
+    return mesh
+
+
+def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
+    visual: Any = mesh.visual
+    try:
+        if visual is not None and visual.kind == "texture":
+            visual = visual.to_color()
+        colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
+    except TEXTURE_ERRORS:
+        colours = np.zeros(0, np.uint8)  # a texture that is not there, or is no image
+    if colours.shape != (len(mesh.vertices), 4):
+        return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
+    return colours
+
+
+def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
+    extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+    if extent > MAX_EXTENT_M:
+        fitting = [f"{unit} ({scale:g})" for unit, scale in UNITS.items()
+                   if HANDLED_MIN_M <= extent * scale <= HANDLED_MAX_M]  # fmt: skip
+        unit = f"; it looks like {' or '.join(fitting)}" if fitting else ""
+        raise UserError(
+            f"{path}: is {extent:.4g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
+            f"{unit}: scale it so that its unit is the metre"
+        )
+    if extent < MIN_EXTENT_M:
+        raise UserError(
+            f"{path}: is only {extent:.3g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
+            "; scale it so that its unit is the metre"
+        )
+    away = float(np.abs(mesh.vertices[np.unique(mesh.faces)]).max())
+    if away > MAX_FROM_ORIGIN_M:
+        raise UserError(
+            f"{path}: has vertices {away:.4g} m from its origin, expected at most "
+            f"{MAX_FROM_ORIGIN_M:g} m; move the object to its origin, in metres"
+        )
+    if not HANDLED_MIN_M <= extent <= HANDLED_MAX_M:
+        log.warning(
+            "%s: is %.3g m long; hardly anybody handles what is not %g to %g m, so check its unit",
+            path, extent, HANDLED_MIN_M, HANDLED_MAX_M,
+        )  # fmt: skip
+
+
+def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    volume = float(mesh.volume) if len(mesh.faces) else 0.0
+    if not volume > MIN_FILLED * extent**3:
+        raise UserError(
+            f"{path}: encloses {volume:.3g} m^3 at {extent:.3g} m of length, expected a body with "
+            "thickness; export a closed surface instead of a flat sheet"
+        )
+
+
+def _without_loose_vertices(
+    path: Path, mesh: trimesh.Trimesh
+) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return the mesh of the vertices that faces use, and each file vertex's place (V_file,).
+
+    -1 = left out: such vertices are no surface, and would count in its size.
+    """
+    count = len(mesh.vertices)
+    used = np.unique(mesh.faces)
+    place = np.full(count, -1)
+    place[used] = np.arange(len(used))
+    if len(used) == count:
+        return mesh, place
+    log.warning("%s: left out %d vertices that no face uses", path, count - len(used))
+    kept = trimesh.Trimesh(
+        np.asarray(mesh.vertices)[used],
+        place[np.asarray(mesh.faces)],
+        vertex_colors=colours_of(mesh)[used],
+        process=False,
+        validate=False,
+    )
+    return kept, place
+
+
+def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return a consistent mesh and each file vertex's new id (V_file,)."""
+    new_id = np.arange(len(mesh.vertices))
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
+        return mesh, new_id
+    colours = colours_of(mesh)
+    vertices, first, new_id = np.unique(
+        np.asarray(mesh.vertices).round(7), axis=0, return_index=True, return_inverse=True
+    )
+    faces = new_id.reshape(-1)[np.asarray(mesh.faces)]
+    proper = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    mesh = trimesh.Trimesh(
+        vertices, faces[proper], vertex_colors=colours[first], process=False, validate=False
+    )
+    done = []
+    if not proper.all():
+        done.append(f"left out {(~proper).sum()} faces without area")
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+        done.append("turned faces of inconsistent winding")
+    if not mesh.is_watertight:
+        before = len(mesh.faces)
+        trimesh.repair.fill_holes(mesh)
+        if len(mesh.faces) > before:
+            done.append(f"closed holes with {len(mesh.faces) - before} faces")
+    if mesh.volume < 0:
+        trimesh.repair.fix_inversion(mesh)
+        done.append("turned all faces outward")
+    if done:
+        log.warning("%s: %s", path, "; ".join(done))
+    if not mesh.is_watertight:
+        edges = np.sort(mesh.edges, axis=1)
+        _, count = np.unique(edges, axis=0, return_counts=True)
+        open_share = float((count != 2).mean())
+        if open_share > MAX_OPEN_EDGES:
+            raise UserError(
+                f"{path}: {open_share:.0%} of its edges do not join two faces, so it has no "
+                "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
+            )
+        log.warning(
+            "%s: not watertight, %.1f %% of its edges are open: object_track draws it from both "
+            "sides, in joint and metrics inside is what its surface winds around, so that contact "
+            "and penetration near the holes are uncertain; `intercap close-mesh` closes small ones",
+            path, 100 * open_share,
+        )  # fmt: skip
+    return mesh, new_id.reshape(-1)
+
+
+def _contact_places(
+    listed: Path | None, path: Path, vertices: np.ndarray, place: np.ndarray
+) -> np.ndarray | None:
+    """Places (K,) of likely-contact vertices, or None where there is no list.
+
+    ``vertices`` (V, 3) of the file ``path``, ``place`` (V,) of each, -1 = left out.
+    """
+    if listed is None:
+        return None
+    ids = read_contact_vertices(Path(listed), path, vertices)
+    places = place[ids]
+    if (places < 0).all():
+        raise UserError(
+            f"{listed}: no face of the mesh uses any of its {len(ids)} vertices; the list belongs "
+            f"to another mesh than {path}: choose the vertices anew"
+        )
+    return places[places >= 0]

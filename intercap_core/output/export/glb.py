@@ -1,0 +1,269 @@
+"""An animated glTF 2.0 file: the body as a skinned mesh with 55 joints, the object, where there is
+one, as a node.
+
+glTF is y up: a root node turns the motion's z-up frame. Skinning takes each vertex's four largest
+weights, as every viewer does, and the first frame's shape and expression; pose correctives of a
+licensed body file are left out, since glTF skins know none.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from intercap_core.body.joints import JOINT_NAMES, PARENTS
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.object_track.light import linear
+from intercap_core.output.export.about import About
+from intercap_core.output.export.coordinates import Coordinates
+from intercap_core.output.export.motion import Motion
+
+_FLOAT, _USHORT, _UINT, _UBYTE = 5126, 5123, 5125, 5121
+_ARRAY, _ELEMENTS = 34962, 34963  # buffer targets
+_SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_COMPONENTS = {"<f4": _FLOAT, "<u2": _USHORT, "<u4": _UINT, "|u1": _UBYTE}
+_BODY_COLOUR = (0.72, 0.60, 0.52, 1.0)
+_ROUGHNESS = 0.8
+# x right, y up, z towards the viewer, from the motion's frame
+_YUP_FROM_ZUP = Rotation.from_euler("x", -90, degrees=True)
+_YUP_FROM_CAMERA = Rotation.from_euler("x", 180, degrees=True)
+
+
+class _Document:
+    """The JSON part and the binary buffer of one file, grown accessor by accessor."""
+
+    def __init__(self) -> None:
+        self.json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "intercap-core"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+            "nodes": [],
+            "meshes": [],
+            "materials": [],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self._chunks: list[bytes] = []
+        self._length = 0
+
+    def accessor(
+        self,
+        values: np.ndarray,
+        *,
+        target: int | None = None,
+        bounds: bool = False,
+    ) -> int:
+        """Append an array (N,) or (N, k) and return its accessor; ``bounds`` adds min and max."""
+        values = np.ascontiguousarray(values)
+        data = values.tobytes()
+        view: dict[str, Any] = {
+            "buffer": 0, "byteOffset": self._length, "byteLength": len(data)
+        }  # fmt: skip
+        if target is not None:
+            view["target"] = target
+        self.json["bufferViews"].append(view)
+        padded = data + b"\0" * (-len(data) % 4)
+        self._chunks.append(padded)
+        self._length += len(padded)
+        entry: dict[str, Any] = {
+            "bufferView": len(self.json["bufferViews"]) - 1,
+            "componentType": _COMPONENTS[values.dtype.str],
+            "count": len(values),
+            "type": _SHAPES[1 if values.ndim == 1 else values.shape[1]],
+        }
+        if bounds:
+            table = values.reshape(len(values), -1)
+            entry["min"], entry["max"] = table.min(0).tolist(), table.max(0).tolist()
+        self.json["accessors"].append(entry)
+        return len(self.json["accessors"]) - 1
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Append to one of the lists of the JSON part and return the index."""
+        self.json.setdefault(kind, []).append(entry)
+        return len(self.json[kind]) - 1
+
+    def bytes(self) -> bytes:
+        """The whole file."""
+        self.json["buffers"] = [{"byteLength": self._length}]
+        text = json.dumps(self.json, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        binary = b"".join(self._chunks)
+        total = 12 + 8 + len(text) + 8 + len(binary)
+        return b"".join(
+            [
+                struct.pack("<4sII", b"glTF", 2, total),
+                struct.pack("<I4s", len(text), b"JSON"),
+                text,
+                struct.pack("<I4s", len(binary), b"BIN\0"),
+                binary,
+            ]
+        )
+
+
+def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, z_up: bool) -> None:
+    """Write the body, and the object unless ``mesh`` is None; ``z_up`` says whether the motion's
+    frame is z-up or a camera's. What ``about`` says is in the asset's extras."""
+    document = _Document()
+    root = _YUP_FROM_ZUP if z_up else _YUP_FROM_CAMERA
+    document.json["asset"]["extras"] = about.told(coordinates(motion, z_up=z_up))
+    times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
+    animation: dict[str, Any] = {"name": motion.sequence, "samplers": [], "channels": []}
+    skeleton, body = _body(document, motion, animation, times)
+    children = [skeleton]
+    if mesh is not None:
+        children.append(_object(document, motion, mesh, animation, times))
+    world = {"name": "world", "rotation": _listed(root.as_quat()), "children": children}
+    # A skinned mesh's own place means nothing to the format, so it stays at the top.
+    document.json["scenes"][0]["nodes"] = [document.add("nodes", world), body]
+    document.add("animations", animation)
+    path.write_bytes(document.bytes())
+
+
+def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
+    """Those of the scene, which the root turns."""
+    if z_up:
+        frame = f"y up, turned by the node world from: {motion.frame}"
+        return Coordinates(frame, _YUP_FROM_ZUP.apply(motion.up))
+    frame = f"y up as the camera was held, turned by the node world from: {motion.frame}"
+    return Coordinates(frame, _YUP_FROM_CAMERA.apply(motion.up))
+
+
+def rest_pose(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and joints (55, 3) of the shaped body in the T-pose, metres."""
+    params = motion.parameters
+    rest = replace(
+        motion.model.zeros(1),
+        betas=params.betas[:1].to(motion.model.dtype),
+        expression=params.expression[:1].to(motion.model.dtype),
+    )
+    with torch.no_grad():
+        posed = motion.model.forward(rest)
+    return posed.vertices[0].numpy().astype(np.float64), posed.joints[0].numpy().astype(np.float64)
+
+
+def _body(
+    document: _Document,
+    motion: Motion,
+    animation: dict[str, Any],
+    times: int,
+) -> tuple[int, int]:
+    """Add the skinned mesh and its skeleton; returns the pelvis' node and the mesh's."""
+    vertices, joints = rest_pose(motion)
+    faces = motion.model.faces.numpy()
+    weights = motion.model.skinning_weights.numpy()
+    strongest = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    kept = np.take_along_axis(weights, strongest, 1)
+    kept = kept / kept.sum(1, keepdims=True)
+    strongest = np.where(kept > 0, strongest, 0)  # the format wants joint 0 where nothing weighs
+    geometry = _geometry(document, vertices, faces)
+    geometry["attributes"]["JOINTS_0"] = document.accessor(strongest.astype("|u1"), target=_ARRAY)
+    geometry["attributes"]["WEIGHTS_0"] = document.accessor(kept.astype("<f4"), target=_ARRAY)
+    geometry["material"] = _material(document, "skin", _BODY_COLOUR)
+    shape = document.add("meshes", {"name": "body", "primitives": [geometry]})
+
+    first = len(document.json["nodes"])
+    for index, name in enumerate(JOINT_NAMES):
+        parent = PARENTS[index]
+        offset = joints[index] - (joints[parent] if parent >= 0 else 0)
+        node: dict[str, Any] = {"name": name, "translation": _listed(offset)}
+        below = [first + child for child, up in enumerate(PARENTS) if up == index]
+        if below:
+            node["children"] = below
+        document.add("nodes", node)
+    inverse = np.repeat(np.eye(4)[None], len(joints), 0)
+    inverse[:, :3, 3] = -joints
+    skin = document.add(
+        "skins",
+        {
+            "joints": list(range(first, first + len(joints))),
+            "skeleton": first,
+            "inverseBindMatrices": document.accessor(
+                np.swapaxes(inverse, 1, 2).reshape(-1, 16).astype("<f4")
+            ),
+        },
+    )
+    poses = motion.parameters.full_pose().numpy()
+    for index in range(len(joints)):
+        quaternion = _continuous(Rotation.from_rotvec(poses[:, index]).as_quat())
+        _channel(document, animation, times, first + index, "rotation", quaternion)
+    pelvis = motion.parameters.transl.numpy() + joints[0]
+    _channel(document, animation, times, first, "translation", pelvis)
+    return first, document.add("nodes", {"name": "body", "mesh": shape, "skin": skin})
+
+
+def _object(
+    document: _Document,
+    motion: Motion,
+    mesh: ObjectMesh,
+    animation: dict[str, Any],
+    times: int,
+) -> int:
+    geometry = _geometry(document, mesh.vertices, mesh.faces)
+    colours = np.column_stack([mesh.colours, np.full(len(mesh.colours), 255, np.uint8)])
+    geometry["attributes"]["COLOR_0"] = document.accessor(
+        _linear(colours).astype("<f4"), target=_ARRAY
+    )
+    geometry["material"] = _material(document, mesh.name, (1.0, 1.0, 1.0, 1.0))
+    shape = document.add("meshes", {"name": mesh.name, "primitives": [geometry]})
+    node = document.add("nodes", {"name": mesh.name, "mesh": shape})
+    quaternion = _continuous(Rotation.from_matrix(motion.rotation).as_quat())
+    _channel(document, animation, times, node, "rotation", quaternion)
+    _channel(document, animation, times, node, "translation", motion.translation)
+    return node
+
+
+def _geometry(document: _Document, vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    normals = vertex_normals(vertices, faces)
+    return {
+        "attributes": {
+            "POSITION": document.accessor(vertices.astype("<f4"), target=_ARRAY, bounds=True),
+            "NORMAL": document.accessor(normals.astype("<f4"), target=_ARRAY),
+        },
+        "indices": document.accessor(faces.ravel().astype("<u4"), target=_ELEMENTS),
+    }
+
+
+def _material(document: _Document, name: str, colour: tuple[float, ...]) -> int:
+    surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": _ROUGHNESS}
+    return document.add("materials", {"name": name, "pbrMetallicRoughness": surface})
+
+
+def _channel(
+    document: _Document,
+    animation: dict[str, Any],
+    times: int,
+    node: int,
+    path: str,
+    values: np.ndarray,
+) -> None:
+    output = document.accessor(values.astype("<f4"))
+    animation["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
+    animation["channels"].append(
+        {"sampler": len(animation["samplers"]) - 1, "target": {"node": node, "path": path}}
+    )
+
+
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """Choose signs (T, 4) so that neighbours lie in one hemisphere: players interpolate them."""
+    flips = np.sign(np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]))
+    signs = np.cumprod(np.concatenate([[1.0], np.where(flips < 0, -1.0, 1.0)]))
+    return quaternions * signs[:, None]
+
+
+def _linear(colours: np.ndarray) -> np.ndarray:
+    """sRGB bytes (V, 4) to the linear values that glTF's vertex colours are."""
+    found = linear(colours)
+    found[:, 3] = colours[:, 3] / 255.0
+    return found
+
+
+def _listed(values: np.ndarray) -> list[float]:
+    return [float(v) for v in values]

@@ -1,0 +1,84 @@
+"""Body and object of each frame as mesh files, named as the InterCap release names them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.export.about import About
+from intercap_core.output.export.coordinates import Coordinates
+from intercap_core.output.export.motion import Motion
+
+Kind = Literal["ply", "obj"]
+_DIGITS = 6  # of an obj's coordinates: micrometres
+
+
+def write(
+    folder: Path,
+    motion: Motion,
+    bodies: Iterable[np.ndarray],
+    mesh: ObjectMesh | None,
+    about: About,
+    *,
+    kind: Kind,
+    every: int,
+) -> None:
+    """Write ``Mesh/<frame>_second.<kind>``, the body, and ``<frame>_second_obj.<kind>``, the object
+    where it has a pose, of every so many frames, from the first on; and ``about.json``.
+
+    ``bodies`` (V, 3), one for each of these frames, are in the motion's frame. Vertices keep their
+    order and number. A ply says in ``contact`` of each vertex whether it touches the other mesh; an
+    obj has no place for it.
+    """
+    files = folder / "Mesh"
+    files.mkdir(parents=True)
+    coordinates = Coordinates.of(motion)
+    faces = motion.model.faces.numpy()
+    touching = about.touching
+    frames = range(0, len(motion), every)
+    for t, vertices in zip(frames, bodies, strict=True):
+        lines = [f"sequence {about.sequence}, frame {t}", *coordinates.lines()]
+        path = files / f"{t:05d}_second.{kind}"
+        body = trimesh.Trimesh(vertices, faces, process=False)
+        _save(path, body, touching.body.at(t) if touching else None, lines, kind)
+        if mesh is None or not np.isfinite(motion.translation[t]).all():
+            continue
+        placed = mesh.vertices @ motion.rotation[t].T + motion.translation[t]
+        object_ = trimesh.Trimesh(placed, mesh.faces, vertex_colors=mesh.colours, process=False)
+        path = files / f"{t:05d}_second_obj.{kind}"
+        _save(path, object_, touching.object_.at(t) if touching else None, lines, kind)
+    (folder / "about.json").write_text(about.text(coordinates), encoding="utf-8")
+
+
+def _save(
+    path: Path,
+    mesh: trimesh.Trimesh,
+    touching: np.ndarray | None,
+    lines: Sequence[str],
+    kind: Kind,
+) -> None:
+    if kind == "ply":
+        if touching is not None:
+            contact = np.zeros(len(mesh.vertices), np.uint8)
+            contact[touching] = 1
+            mesh.vertex_attributes["contact"] = contact
+        path.write_bytes(ply(mesh, lines))
+    else:
+        text = trimesh.exchange.obj.export_obj(
+            mesh, include_normals=False, include_texture=False, digits=_DIGITS,
+            header="\n".join(lines).replace("\n", "\n# "),
+        )  # fmt: skip
+        path.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")
+
+
+def ply(mesh: trimesh.Trimesh, lines: Sequence[str]) -> bytes:
+    """A binary ply without normals, with ``lines`` as comments in its head."""
+    data = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
+    first, rest = data.split(b"element vertex", 1)
+    comments = "".join(f"comment {line}\n" for line in lines)
+    return bytes(first + comments.encode("ascii", "replace") + b"element vertex" + rest)

@@ -1,0 +1,256 @@
+"""The text that goes with an export: frame, units and direction of every number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from intercap_core.body.maps import maps_path
+from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core.evaluation.verdict_figures import StatedError
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.export.about import About
+from intercap_core.output.export.body_files import Written
+from intercap_core.output.export.coordinates import Coordinates
+from intercap_core.output.export.deviations import SOURCE
+from intercap_core.output.export.motion import Motion
+
+_HEAD = """\
+{sequence}: subject {subject} ({gender} body file), object {object}, {frames} frames at {fps:g} fps
+Frame numbers count from 0 and are the frame sets of the recording.
+Bodies are parameters in SMPL-X's order for the file they were fitted with: {body}.
+Another mesh moved by them is another person.
+An object pose maps the mesh as it is stored: x = R v + t, R 3x3 applied on the left.
+Object mesh: {mesh_vertices} vertices, metres.
+"""
+
+_INTERCAP = """
+intercap/res.pkl    pickle of numpy arrays and lists, keys and shapes as the InterCap release
+  beside them "about": the body file, and what is known of each frame, below, in "by_frame"
+intercap/res.npz    the same as arrays
+  frame: {master}; {up_of_master}
+  global_orient, transl (T,3), body_pose (1,63T), betas and expression (T,10), jaw/leye/reye (T,3)
+  left_hand_pose, right_hand_pose (T,12): PCA coefficients over the mean hand
+    (flat_hand_mean=False), the nearest to the fitted pose
+  *_hand_pose_axis_angle (T,45): the fitted poses themselves, mean included
+  ob_pose, ob_trans: lists of T (3,) rotation vectors (radians) and translations (metres),
+    master camera from object
+  pose_embedding is left out: it is VPoser's, which was not used
+"""
+
+_AMASS = """
+amass/body.npz      AMASS keys (SMPL-X): poses (T,165) = root, body, jaw, eyes, hands; trans; betas
+  beside them: the body file, frame and units, and what is known of each frame, below
+amass/object.npz    rotation (T,3,3), translation (T,3): frame from object, metres
+  frame: {viewed}; {up}
+  SMPL-X turns the body about its pelvis joint, not the origin; trans allows for that
+"""
+
+_BOP = """
+bop/                one scene folder a camera, in the order of lenses.json; lengths in millimetres
+  images are numbered by frame set and show the moment that they were exposed: a camera may have
+    slipped by whole sets or expose some milliseconds later; images of no frame are left out
+  scene_gt.json: cam_R_m2c, cam_t_m2c = colour camera from model, row by row
+  scene_camera.json: world = {master}; {up_of_master}
+  cam_K is a pinhole; images, masks and boxes are of the images as recorded, which are distorted,
+    see lenses.json (OpenCV's rational model); camera.json is the first camera's
+  mask/ all of the object, mask_visib/ without what the fitted body hides; no furniture is known
+  test_targets_bop19.json: images that show a tenth of the object or more
+  scene_about.json of a scene: the frame that each image shows, and why it is flagged
+  about.json: the body file, and what is known of each frame, below, in "by_frame"
+  models/: the mesh in millimetres, with its symmetries
+"""
+
+_COCO = """
+coco/annotations.json  person and object in every image: masks as seen, boxes, COCO's 17 keypoints
+  images are named <camera>/<frame set>.jpg and are those recorded, distortion included
+  info: the body file, and what is known of each frame, below; an image says its frame in "frame"
+  keypoints: visibility 2 = seen, 1 = hidden by body or object, 0 = outside of the image
+"""
+
+_GLB = """
+glb/*.glb           skinned body (55 joints) and object, animated; metres, y up as glTF wants
+  under the node "world": {viewed}; {up}
+  four weights a vertex, first frame's expression, no pose correctives
+  asset.extras: the body file, and what is known of each frame, below; vertices keep their numbers
+"""
+
+_CONTACT = """
+contact/contact.tsv           by frame and body region: probability that it touches the object, as
+  the joint stage states it; annotated = 1 touching, 0 not, empty = not annotated
+contact/contact_vertices.npz  by frame the vertices that touch, by the meshes, as below
+contact/annotation_draft.yaml the same as intervals, in the format of an annotation file
+"""
+
+_MESHES = """
+meshes/Mesh/*_second.{kind}  body of a frame, named by its number; *_second_obj.{kind} the object
+  frame: {viewed}; {up}
+  vertices in the order of the body file and of the object's mesh{touching}
+meshes/about.json   the body file, and what is known of each frame, below
+"""
+
+_BY_FRAME = """
+Of each frame is known, by these names in the npz files and "by_frame" of the pickle (in JSON alike,
+in millimetres and degrees):
+  flagged, flag_reason: why a frame should not be trusted; empty = trusted
+{contact}{deviations}{verdict}"""
+
+_CONTACT_BY_FRAME = """\
+  contact_probability, contact_annotated (T,R): of each contact_region, by the joint stage
+  body_contact_vertices: numbers of the vertices within {threshold:g} mm of the object, or inside
+    it, frame after frame: of frame t [body_contact_offsets[t] : body_contact_offsets[t + 1]];
+    body_contact_distance (metres) their signed distances; object_contact_* of the object alike
+"""
+
+_DEVIATIONS_BY_FRAME = """\
+  joint_sigma (T,55): standard deviation of each joint along one coordinate, metres,
+    {source}{object_sigma}
+"""
+_OBJECT_SIGMA = """
+  object_position_sigma, object_rotation_sigma (T,): the object's, metres and radians, NaN = lost"""
+
+_VERDICT_BY_FRAME = """\
+  stated_error_by_frame_mm: the stated error of each of stated_error_part
+verdict.json        the same, and by camera what it shows of the result, and of one without it
+"""
+
+_BODY_FILES = """
+body/               the open body, {columns}
+  {body_file} is the file that was fitted with; the others hold the same numbers where readers of
+  SMPL-X files look for expression: after 10 columns of a short file, after 300 of a full one
+  {maps} has the vertices of keypoints, markers and contact regions: points that readers
+  take by SMPL-X's own vertex numbers are others on this mesh
+  poses hold the mean hand already (flat_hand_mean=True) but for intercap's components
+"""
+
+# Of the text above, what is said instead where there is no object.
+_WITHOUT_OBJECT = {
+    "object {object}, ": "{no_object}, ",
+    "An object pose maps the mesh as it is stored: x = R v + t, R 3x3 applied on the left.\n": "",
+    "Object mesh: {mesh_vertices} vertices, metres.\n": "",
+    """\
+  ob_pose, ob_trans: lists of T (3,) rotation vectors (radians) and translations (metres),
+    master camera from object
+""": "  ob_pose, ob_trans are left out: there is no object\n",
+    """\
+amass/object.npz    rotation (T,3,3), translation (T,3): frame from object, metres
+""": "",
+    "(55 joints) and object, animated": "(55 joints), animated",
+    "; *_second_obj.{kind} the object": "",
+    " and of the object's mesh{touching}": "",
+}
+
+_LEFT_OUT = """
+{name} is left out, though export.formats names it: it holds {holds}, and there is no object.
+"""
+_HOLDS = {"bop": "poses of an object", "contact": "what touches an object"}
+
+
+def _stated(errors: Sequence[StatedError]) -> str:
+    """What is known of the errors without truth, in words; empty where nobody asked."""
+    if not errors:
+        return ""
+    said = [
+        f"{e.part} {e.stated:.1f} mm ({e.stated / e.factor:.1f} to {e.stated * e.factor:.1f})"
+        for e in errors
+        if not e.silent
+    ]
+    silent = [f"of the {e.part} nothing is stated: {e.silent}" for e in errors if e.silent]
+    words = [f"mean {', '.join(said)}"] if said else []
+    return f"Stated errors, by cameras held out: {'; '.join([*words, *silent])}.\n"
+
+
+def _body(about: About) -> str:
+    body = about.body
+    which = f"{body.path.name}, digest {body.told()['body_file_digest']}"
+    if body.is_open:
+        return f"the open body ({which}), which is in body/; it is not SMPL-X"
+    return f"a licensed SMPL-X file ({which}), which is not part of this"
+
+
+def _body_files(files: Sequence[Written]) -> str:
+    """Which columns of each body file are whose."""
+    if not files:
+        return ""
+    columns = "".join(
+        f"\n  {file.name}, digest {file.digest}: betas {file.betas}, expression {file.expression}"
+        for file in files
+    )
+    first = files[0].name
+    return _BODY_FILES.format(
+        columns="in columns of shapedirs:" + columns,
+        body_file=first,
+        maps=maps_path(Path(first)).name,
+    )
+
+
+def _by_frame(about: About) -> str:
+    """What is known of each frame, and what it is called."""
+    contact = deviations = ""
+    if about.touching is not None:
+        contact = _CONTACT_BY_FRAME.format(threshold=1e3 * CONTACT_M)
+    if about.deviations is not None:
+        of_object = "" if about.deviations.object_position is None else _OBJECT_SIGMA
+        deviations = _DEVIATIONS_BY_FRAME.format(source=SOURCE, object_sigma=of_object)
+    verdict = _VERDICT_BY_FRAME if about.verdict.stated else ""
+    return _BY_FRAME.format(contact=contact, deviations=deviations, verdict=verdict)
+
+
+def needs_object(name: str) -> bool:
+    """Whether a format is of an object and says nothing without one."""
+    return name in _HOLDS
+
+
+def readme(
+    motion: Motion,
+    viewed: Motion,
+    mesh: ObjectMesh | None,
+    formats: Sequence[str],
+    about: About,
+    files: Sequence[Written],
+    *,
+    kind: str,
+) -> str:
+    """README.txt for these formats; ``viewed`` is the motion in the frame of amass, glb and meshes,
+    ``about`` says which body it is and what is known of each frame, ``files`` are the body's,
+    ``kind`` is the format of meshes.
+
+    Without a ``mesh`` there is no object, and the formats that need one are left out.
+    """
+    parts = {
+        "intercap": _INTERCAP,
+        "amass": _AMASS,
+        "bop": _BOP,
+        "coco": _COCO,
+        "glb": _GLB,
+        "contact": _CONTACT,
+        "meshes": _MESHES,
+    }
+    if mesh is None:
+        parts |= {n: _LEFT_OUT.format(name=n, holds=holds) for n, holds in _HOLDS.items()}
+    text = _HEAD + _stated(about.verdict.stated) + "".join(parts[name] for name in formats)
+    for said, instead in _WITHOUT_OBJECT.items() if mesh is None else ():
+        text = text.replace(said, instead)
+    says_touching = kind == "ply" and about.touching is not None
+    text = text.format(
+        sequence=motion.sequence,
+        subject=motion.subject,
+        gender=motion.gender,
+        object=motion.object_,
+        frames=len(motion),
+        fps=motion.fps,
+        body=_body(about),
+        no_object=f"object {motion.object_} found in no frame" if motion.object_ else "alone",
+        mesh_vertices=0 if mesh is None else len(mesh.vertices),
+        master=motion.frame,
+        viewed=viewed.frame,
+        up=_up(viewed),
+        up_of_master=_up(motion),
+        kind=kind,
+        touching="; contact = 1 where they touch" if says_touching else "",
+    )
+    return text + _by_frame(about) + _body_files(files)
+
+
+def _up(motion: Motion) -> str:
+    return Coordinates.of(motion).lines()[1]

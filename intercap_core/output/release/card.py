@@ -1,0 +1,258 @@
+"""The dataset's card: what it holds, how good it is, in which conventions, and under which licence.
+
+One set of facts, as JSON for programs and as Markdown for people; its head is what dataset hubs
+read of a README.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+
+from intercap_core.body.artefact import file_digest
+from intercap_core.body.loading import OPEN_BODY
+from intercap_core.config import CardSettings
+from intercap_core.evaluation import figures
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.evaluation.verdict_figures import mean_stated, stated_errors
+from intercap_core.output.release.splits import Split, split
+from intercap_core.versions import versions
+
+Facts = dict[str, Any]
+
+_TEMPLATES = Path(__file__).parent / "data"
+_NUMBER = re.compile(r"\d+(\.\d+)?")  # in a reason: what differs from frame to frame
+_MAX_REASONS = 12  # that frames are flagged for, most frequent first
+# What dataset hubs call the size, and up to how many frames.
+_SIZES = (
+    (1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"),
+    (10_000_000, "1M<n<10M"),
+)  # fmt: skip
+CONVENTIONS = {
+    "length": "metres; tables say millimetres in their columns' names",
+    "angle": "radians; rotations are 3x3 matrices or rotation vectors, applied on the left",
+    "artefacts": "the master colour camera's frame: x right, y down, z forward",
+    "exports": "amass, glb and meshes as export.json says, z up with the ground at z = 0 unless it "
+    "says otherwise; intercap, bop and coco in camera frames",
+    "frames": "numbered from 0, the frame sets of the recording; images of a camera may have "
+    "slipped, image_of in scene.h5 and the exports' own numbers say which shows which frame",
+    "body": "parameters in SMPL-X's order for the body file named; another file with the same "
+    "parameters is another person",
+    "contact": "probability by frame and body region that it touches the object",
+    "flags": "frames that the program itself does not trust, with reasons; leave them out",
+    "errors": "stated without truth, by cameras held out: the true error is within the factor in "
+    "four of five cases",
+}
+FORMATS = {
+    "intercap": "*/export/intercap/res.pkl and res.npz: as the InterCap release",
+    "amass": "*/export/amass/body.npz and object.npz: AMASS keys",
+    "bop": "*/export/bop: the object's poses, masks and lenses as BOP has them",
+    "coco": "*/export/coco/annotations.json: masks, boxes and keypoints of person and object",
+    "glb": "*/export/glb: animated body and object",
+    "contact": "*/export/contact: contact by frame and region, and the vertices that touch",
+    "meshes": "*/export/meshes: body and object of each frame as mesh files",
+}
+
+
+def facts(
+    dataset: str,
+    settings: CardSettings,
+    summaries: Sequence[SequenceSummary],
+    groups: Mapping[str, pd.DataFrame],
+    *,
+    formats: Sequence[str],
+    failed: Mapping[str, str],
+    virtual: bool,
+) -> Facts:
+    """Everything that the card says, fit for JSON.
+
+    ``groups``: the tables by "objects", "subjects" and "intents"; ``formats`` of the exports;
+    ``failed``: sequences without a result, with the reason; ``virtual``: the studio made all
+    recordings.
+    """
+    measured = [s.metrics for s in summaries]
+    frames = sum(len(s) for s in measured)
+    by_subject, by_object = _splits(measured, settings)
+    return {
+        "name": dataset,
+        "title": settings.title or dataset,
+        "version": settings.version,
+        "description": settings.description,
+        "licence": settings.licence,
+        "creators": list(settings.creators),
+        "url": settings.url,
+        "citation": settings.citation,
+        "published": settings.published.isoformat() if settings.published else "",
+        "virtual": virtual,
+        "counts": {
+            "sequences": len(measured),
+            "frames": frames,
+            "minutes": round(sum(len(s) / s.fps for s in measured) / 60, 2),
+            "subjects": len({s.subject for s in measured}),
+            "objects": len({s.object_ for s in measured} - {""}),
+            "of_another_program": sum(bool(s.made_by) for s in measured),
+            "cameras": sorted({len(s.rig["camera_names"]) for s in summaries}),
+            "frames_per_second": sorted({round(float(s.fps), 3) for s in measured}),
+        },
+        **{f"by_{name[:-1]}": _records(table) for name, table in groups.items()},
+        "accuracy": _accuracy(summaries),
+        "flagged": _flagged(summaries),
+        "failed": [{"sequence": name, "reason": why} for name, why in sorted(failed.items())],
+        "bodies": _bodies(summaries),
+        "splits": {"subject": _told(by_subject, measured, "subject"),
+                   "object": _told(by_object, measured, "object_")},
+        "formats": {name: FORMATS[name] for name in FORMATS if name in formats},
+        "conventions": CONVENTIONS,
+        "stages": _stages(summaries),
+        "software": dict(versions()),
+    }  # fmt: skip
+
+
+def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) -> pd.DataFrame:
+    """One row a sequence: its place in both splits, "" where it has none."""
+    measured = [s.metrics for s in summaries]
+    by_subject, by_object = _splits(measured, settings)
+    return pd.DataFrame(
+        [
+            {
+                "sequence": s.name,
+                "subject": s.subject,
+                "object": s.object_,
+                "frames": len(s),
+                "by_subject": "" if by_subject.why else by_subject.of(s.subject),
+                "by_object": "" if by_object.why else by_object.of(s.object_),
+            }
+            for s in measured
+        ],
+        columns=["sequence", "subject", "object", "frames", "by_subject", "by_object"],
+    )
+
+
+def markdown(card: Facts) -> str:
+    """The card for people, with the head that dataset hubs read."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        autoescape=False,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    frames = card["counts"]["frames"]
+    size = next((name for most, name in _SIZES if frames < most), "n>10M")
+    return environment.get_template("card.md.j2").render(card=card, size=size)
+
+
+def _splits(measured: Sequence[SequenceMetrics], settings: CardSettings) -> tuple[Split, Split]:
+    """By subject and by object."""
+    subjects: Counter[str] = Counter()
+    objects: Counter[str] = Counter()
+    for sequence in measured:
+        subjects[sequence.subject] += len(sequence)
+        if sequence.object_:
+            objects[sequence.object_] += len(sequence)
+    share = settings.test_share
+    return (
+        split(subjects, share=share, named=settings.test_subjects),
+        split(objects, share=share, named=settings.test_objects),
+    )
+
+
+def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """What the card says of each group; None where it is not known."""
+    columns = ["sequences", "frames", "minutes", "contact_percent", "flagged_percent"]
+    rows = []
+    for row in table.to_dict("records"):
+        own = {str(table.columns[0]): row[table.columns[0]]}
+        rows.append(own | {name: _plain(row[name]) for name in columns if name in row})
+    return rows
+
+
+def _plain(value: Any) -> int | float | None:
+    if isinstance(value, int | np.integer):
+        return int(value)
+    return round(float(value), 2) if np.isfinite(value) else None
+
+
+def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
+    measured = [s.metrics for s in summaries]
+    clouds, depth = figures.cloud_figures(measured), figures.penetration_figures(measured)
+    found: dict[str, Any] = {
+        "stated_mm": {part: round(value, 2) for part, value in mean_stated(measured).items()},
+        "nothing_stated_of": sum(bool(e.silent) for s in measured for e in stated_errors(s)),
+        "body_to_cloud_mm": _plain(clouds["body_visible_mm"]),
+        "object_to_cloud_mm": _plain(clouds.get("object_visible_mm", np.nan)),
+        "penetration_mm": _plain(depth.get("mean_mm", np.nan)),
+    }
+    if any(s.has_truth for s in measured):
+        true = figures.truth_figures(measured, "joint")
+        keys = ("body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "object_translation_mm",
+                "object_rotation_deg", "contact_region_f1")  # fmt: skip
+        found["against_truth"] = {key: _plain(true[key]) for key in keys if key in true}
+    return found
+
+
+def _flagged(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
+    counted: Counter[str] = Counter()
+    for s in summaries:
+        for said in s.metrics.values["flag_reason"]:
+            kinds = {_NUMBER.sub("…", part.strip()) for part in str(said).split(";")}
+            counted.update(kinds - {""})
+    flags = np.concatenate([s.metrics.values["flagged"] for s in summaries])
+    return {
+        "frames": int(flags.sum()),
+        "percent": round(100 * float(flags.mean()), 2),
+        "reasons": [
+            {"reason": why, "frames": count} for why, count in counted.most_common(_MAX_REASONS)
+        ],
+    }
+
+
+def _bodies(summaries: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
+    own = file_digest(OPEN_BODY)
+    bodies = {s.body for s in summaries}
+    return [
+        {
+            "gender": body.gender,
+            "open": body.digest == own,
+            "digest": body.digest,
+            "num_betas": body.num_betas,
+            "num_expression": body.num_expression,
+        }
+        for body in sorted(bodies, key=lambda b: (b.gender, b.digest))
+    ]
+
+
+def _told(found: Split, measured: Sequence[SequenceMetrics], attribute: str) -> dict[str, Any]:
+    told: dict[str, Any] = {"why_not": found.why}
+    for part, groups in (("train", found.train), ("test", found.test)):
+        own = [s for s in measured if getattr(s, attribute) in groups]
+        told[part] = {
+            "groups": list(groups),
+            "sequences": len(own),
+            "frames": sum(len(s) for s in own),
+        }
+    return told
+
+
+def _stages(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:
+    """By stage: each version of its artefact and digest of its settings, and of how many
+    sequences. More than one is a mix."""
+    found: dict[str, Counter[tuple[int, str]]] = {}
+    for s in summaries:
+        for stage, made in s.made_by.items():
+            found.setdefault(stage, Counter())[made] += 1
+    return {
+        stage: [
+            {"version": version, "settings": digest, "sequences": count}
+            for (version, digest), count in counted.most_common()
+        ]
+        for stage, counted in found.items()
+    }

@@ -1,0 +1,127 @@
+"""The dataset in the Croissant format 1.0 (mlcommons.org/croissant): where its files are, what the
+columns of its tables hold, so that loaders and search engines know it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from intercap_core.output.release.card import Facts
+
+CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
+_TEXT = "sc:Text"
+_TERMS = (
+    "citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format",
+    "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet",
+    "references", "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField",
+    "transform",
+)  # fmt: skip
+_CONTEXT = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "sc": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "dct": "http://purl.org/dc/terms/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    **{name: f"cr:{name}" for name in _TERMS},
+}
+_FILES = {  # formats of the exports: glob patterns and media type
+    "intercap": ("*/export/intercap/*", "application/octet-stream"),
+    "amass": ("*/export/amass/*.npz", "application/octet-stream"),
+    "bop": ("*/export/bop/**/*.json", "application/json"),
+    "coco": ("*/export/coco/annotations.json", "application/json"),
+    "glb": ("*/export/glb/*.glb", "model/gltf-binary"),
+    "contact": ("*/export/contact/*.tsv", "text/tab-separated-values"),
+    "meshes": ("*/export/meshes/Mesh/*", "application/octet-stream"),
+}
+
+
+def croissant(card: Facts, folder: Path, tables: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+    """Croissant's JSON of a dataset in ``folder``, whose ``tables`` are written in tables/."""
+    described: dict[str, Any] = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": CONFORMS_TO,
+        "name": card["name"],
+        "alternateName": card["title"],
+        "description": card["description"] or f"{card['title']}: people and objects in 4D",
+        "version": card["version"],
+        "keywords": ["human-object interaction", "SMPL-X", "6D object pose", "contact", "RGB-D"],
+        "distribution": [
+            *(_table_file(folder, name) for name in tables),
+            *(_file_set(name) for name in card["formats"]),
+        ],
+        "recordSet": [_records(name, table) for name, table in tables.items()],
+    }
+    optional = {
+        "license": card["licence"],
+        "url": card["url"],
+        "citeAs": card["citation"],
+        "datePublished": card["published"],
+        "creator": [{"@type": "sc:Person", "name": name} for name in card["creators"]],
+    }
+    return described | {key: value for key, value in optional.items() if value}
+
+
+def _table_file(folder: Path, name: str) -> dict[str, Any]:
+    path = folder / "tables" / f"{name}.csv"
+    data = path.read_bytes()
+    return {
+        "@type": "cr:FileObject",
+        "@id": f"{name}.csv",
+        "name": f"{name}.csv",
+        "contentUrl": f"tables/{name}.csv",
+        "contentSize": f"{len(data)} B",
+        "encodingFormat": "text/csv",
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+
+
+def _file_set(name: str) -> dict[str, Any]:
+    includes, media_type = _FILES[name]
+    return {
+        "@type": "cr:FileSet",
+        "@id": name,
+        "name": name,
+        "encodingFormat": media_type,
+        "includes": includes,
+    }
+
+
+def _records(name: str, table: pd.DataFrame) -> dict[str, Any]:
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "field": [
+            {
+                "@type": "cr:Field",
+                "@id": f"{name}/{column}",
+                "name": f"{name}/{column}",
+                "dataType": _data_type(table[column]),
+                "source": {
+                    "fileObject": {"@id": f"{name}.csv"},
+                    "extract": {"column": str(column)},
+                },
+            }
+            for column in table.columns
+        ],
+    }
+
+
+def _data_type(values: pd.Series) -> str:
+    if pd.api.types.is_bool_dtype(values):
+        return "sc:Boolean"
+    if pd.api.types.is_integer_dtype(values):
+        return "sc:Integer"
+    return "sc:Float" if pd.api.types.is_float_dtype(values) else _TEXT

@@ -1,0 +1,145 @@
+"""Pictures of the contact heatmaps: the body, each hand and each object from two sides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel
+from intercap_core.evaluation.heatmaps import SurfaceHeat
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.output.site.shading import Painted, Picture, draw
+
+# From no contact to the map's maximum, sRGB: grey skin, yellow, red, dark red
+COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
+_STOP_AT = (0.0, 0.25, 0.6, 1.0)
+_FAR = 40.0  # distance in sizes of what is shown: nearly parallel rays
+_MAX_EDGE_M = 0.012  # an object's mesh is refined to this before values are put on it
+_KERNEL_M = 0.006  # deviation of the kernel that spreads the surface points' values
+_WRIST_M = 0.03  # of the forearm shown with a hand
+_ARMS_DOWN = 1.0  # rad, of each shoulder from the T-pose
+
+
+@dataclass(frozen=True, eq=False)
+class HeatPicture:
+    """``png`` bytes, transparent around what is drawn, with a caption."""
+
+    caption: str
+    png: bytes
+    width: int
+    height: int
+
+
+def colours(values: np.ndarray, top: float) -> np.ndarray:
+    """Colours (V, 3) of values (V,), the last one at ``top``."""
+    share = np.clip(values / max(top, 1e-12), 0, 1)
+    stops = np.array(COLOUR_STOPS)
+    return np.column_stack([np.interp(share, _STOP_AT, stops[:, k]) for k in range(3)])
+
+
+def body_surfaces(
+    model: BodyModel, likelihood: np.ndarray
+) -> list[tuple[str, list[HeatPicture], float]]:
+    """The body, front and back with lowered arms, and each hand from both sides.
+
+    Each with its name and its own highest likelihood, which its last colour stands for, as in the
+    paper's figure: hands touch far more often than the rest.
+    """
+    params = model.zeros(1)
+    for index, turn in ((JOINT_INDEX["left_shoulder"], -1), (JOINT_INDEX["right_shoulder"], 1)):
+        params.body_pose[:, 3 * (index - 1) + 2] = turn * _ARMS_DOWN
+    with torch.no_grad():
+        standing = model.forward(params).vertices[0].numpy().astype(np.float64)
+    faces, top = model.faces.numpy(), highest(likelihood)
+    paint, up = colours(likelihood, top), np.array([0, 1.0, 0])
+    whole = [
+        _look(standing, faces, paint, view, up, (280, 480), name)
+        for name, view in (("front", [0, 0, 1.0]), ("back", [0, 0, -1.0]))
+    ]
+    surfaces = [("body", whole, top)]
+    template = model.template.numpy().astype(np.float64)
+    with torch.no_grad():
+        joints = model.forward(model.zeros(1)).joints[0].numpy()
+    for side, outwards in (("left", 1.0), ("right", -1.0)):
+        wrist = joints[JOINT_INDEX[f"{side}_wrist"], 0]
+        shown = outwards * (template[:, 0] - wrist) > -_WRIST_M
+        kept = faces[shown[faces].all(1)]
+        fingers = np.array([outwards, 0, 0])  # the T-pose's fingers point away from the body
+        top = highest(likelihood[shown])
+        paint = colours(likelihood, top)
+        hand = [
+            _look(template, kept, paint, view, fingers, (240, 240), f"{side} hand, {what}")
+            for what, view in (("palm", [0, -1.0, 0]), ("back", [0, 1.0, 0]))
+        ]
+        surfaces.append((f"{side} hand", hand, top))
+    return surfaces
+
+
+def highest(likelihood: np.ndarray) -> float:
+    """What a map's last colour stands for: its maximum; all grey where nothing touches."""
+    return max(float(likelihood.max(initial=0.0)), 1e-6)
+
+
+def object_pictures(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    heat: SurfaceHeat,
+    top: float,
+) -> list[HeatPicture]:
+    """Two opposite views of an object (V, 3), (F, 3), from above (its frame is z up)."""
+    fine, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, _MAX_EDGE_M, max_iter=12)
+    paint = colours(_spread(heat, fine), top)
+    up = np.array([0, 0, 1.0])
+    return [
+        _look(fine, triangles, paint, view, up, (260, 260), name)
+        for name, view in (("one side", [0.8, -0.9, 0.5]), ("other side", [-0.8, 0.9, 0.5]))
+    ]
+
+
+def _spread(heat: SurfaceHeat, points: np.ndarray) -> np.ndarray:
+    """Kernel mean (N,) of the surface points' values at other points of the surface."""
+    distance, near = cKDTree(heat.points).query(points, k=min(12, len(heat.points)))
+    weight = np.exp(-0.5 * (distance / _KERNEL_M) ** 2) + 1e-12
+    return (weight * heat.likelihood[near]).sum(1) / weight.sum(1)
+
+
+def _look(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    paint: np.ndarray,
+    towards_viewer: list[float] | np.ndarray,
+    up: np.ndarray,
+    size: tuple[int, int],
+    caption: str,
+) -> HeatPicture:
+    """Draw the faces from far away along a direction, filling a picture of width and height."""
+    backward = np.asarray(towards_viewer, np.float64)
+    backward = backward / np.linalg.norm(backward)
+    right = np.cross(up, backward)
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, -np.cross(backward, right), -backward])  # x right, y down, z forward
+    used = vertices[np.unique(faces)] @ turn.T
+    low, high = used.min(0), used.max(0)
+    middle, extent = (low + high) / 2, (high - low)[:2]
+    distance = _FAR * float(extent.max())
+    focal = 0.92 * distance * min(size[0] / extent[0], size[1] / extent[1])
+    lens = Intrinsics(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    pose = rigid(turn, np.array([0, 0, distance]) - middle)
+    picture = draw([Painted(vertices, faces, paint, pose)], lens)
+    return HeatPicture(caption, encode_png(picture), *size)
+
+
+def encode_png(picture: Picture) -> bytes:
+    """PNG with transparency."""
+    alpha = picture.alpha[..., None]
+    straight = picture.rgb / np.maximum(alpha, 1e-6)
+    bgra = np.concatenate([straight[..., ::-1], alpha], 2)
+    pixels = np.rint(np.clip(bgra, 0, 1) * 255).astype(np.uint8)
+    return cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()

@@ -1,0 +1,237 @@
+"""The page's measures: errors against truth, penetration, distances to clouds, camera poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from intercap_core.evaluation import figures, hold_figures
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.output.site import charts
+from intercap_core.stage_list import ESTIMATES
+
+_MAX_CAMERA_ROWS = 40
+_HISTOGRAM_MM = 30.0
+_BIN_MM = 1.0
+_LEAST_ACCELERATION_MM = 5.0  # top of the chart, at the least
+_PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, the paper's Experiments
+_NAMES = {"object_track": "object track", "body_fit": "body fit", "joint": "joint"}
+# key, what it is, digits, whether more is better (None: neither)
+_TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
+    ("body_pve_mm", "body, per vertex, mm", 1, False),
+    ("body_mpjpe_mm", "body, 22 joints, mm", 1, False),
+    ("hand_mpjpe_mm", "hands, joints and tips, mm", 1, False),
+    ("hand_grasp_mpjpe_mm", "hands while touching, mm", 1, False),
+    ("hand_mpjpe_wrist_mm", "hands, wrists aligned, mm", 1, False),
+    ("object_translation_mm", "object, centre of mass, mm", 1, False),
+    ("object_translation_p95_mm", "… 95th percentile, mm", 1, False),
+    ("object_rotation_deg", "object, rotation, degrees", 2, False),
+    ("object_rotation_p95_deg", "… 95th percentile, degrees", 2, False),
+    ("lost_share", "object lost (50 mm or 20 degrees), share", 3, False),
+    ("lost_unnoticed_share", "… and not flagged, share", 3, False),
+    ("first_frame_success", "first seen frame found (20 mm, 10 degrees), share", 2, True),
+    ("contact_region_f1", "contact by region, F1", 3, True),
+    ("contact_f1", "contact by vertex at 4.5 mm, F1", 3, True),
+    ("contact_recall", "frames in contact found, share", 3, True),
+    ("acceleration_body_mm", "acceleration error, body, mm/frame² at 30 fps", 2, False),
+    ("acceleration_hands_mm", "acceleration error, hands, mm/frame²", 2, False),
+    ("acceleration_object_mm", "acceleration error, object, mm/frame²", 2, False),
+    ("rest_jitter_mm", "jitter while the object rests, mm", 2, False),
+    ("rest_jitter_deg", "… its rotation, degrees", 2, False),
+    ("motion_onset_frames", "start of motion late or early by, frames", 1, False),
+    ("motion_onset_late_frames", "… signed, late is positive", 1, None),
+    ("joint_normalised_median", "error over stated deviation, joints (honest: 0.7-1.4)", 2, None),
+    ("object_normalised_median", "error over stated deviation, object (honest: 0.7-1.4)", 2, None),
+)
+
+
+def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
+    """The table against truth by stage; None without truth."""
+    known = [s for s in sequences if s.has_truth]
+    if not known:
+        return None
+    by_stage = {stage: figures.truth_figures(known, stage) for stage in ESTIMATES}
+    rows = []
+    for key, name, digits, more in _TRUTH_ROWS:
+        values = [by_stage[stage].get(key) for stage in ESTIMATES]
+        found = [v for v in values if v is not None]
+        if not found:
+            continue
+        best = None
+        if len(found) > 1 and more is not None:
+            best = max(found) if more else min(found)
+        printed = ["" if v is None else f"{v:.{digits}f}" for v in values]
+        alike = len({text for text in printed if text}) == 1
+        rows.append(
+            {
+                "name": name,
+                "cells": [
+                    {"text": text, "best": v is not None and v == best and not alike}
+                    for text, v in zip(printed, values, strict=True)
+                ],
+            }
+        )
+    own = figures.pooled(known, "truth/penetration_mean")
+    touching = figures.pooled(known, "truth/contact_frame")
+    own_mm = float("nan")
+    if own is not None and touching is not None and touching.any():
+        own_mm = 1e3 * float(own[touching].mean())
+    return {
+        "sequences": len(known),
+        "frames": sum(len(s) for s in known),
+        "stages": [_NAMES[stage] for stage in ESTIMATES],
+        "rows": rows,
+        "flags": figures.flag_figures(known),
+        "own_penetration": own_mm,
+        "sweep": _sweep(known),
+        "reliability": _reliability(known),
+    }
+
+
+def _sweep(known: Sequence[SequenceMetrics]) -> str:
+    lines = []
+    for stage, colour in (("body_fit", "c2"), ("joint", "c1")):
+        found = figures.contact_sweep(known, stage)
+        if found and np.isfinite(list(found.values())).all():
+            x, y = np.array(list(found)), np.array(list(found.values()))
+            lines.append(charts.Series(_NAMES[stage], colour, x, y))
+    if not lines:
+        return ""
+    return charts.line_chart(
+        lines,
+        x_label="threshold, mm",
+        y_label="F1 of body vertices",
+        x_range=(0, 30),
+        y_range=(0, 1),
+        marks=((4.5, "4.5 mm"),),
+    )
+
+
+def _reliability(known: Sequence[SequenceMetrics]) -> str:
+    """Share of true contact over the stated probability of contact, in bins."""
+    table = hold_figures.contact_reliability(known)
+    if table is None or len(table.count) < 2:
+        return ""
+    return charts.line_chart(
+        [
+            charts.Series("joint", "c1", table.stated, table.true),
+            charts.Series("calibrated", "c2", np.array([0.0, 1.0]), np.array([0.0, 1.0])),
+        ],
+        x_label="stated probability of contact",
+        y_label="share that truly touches",
+        x_range=(0, 1),
+        y_range=(0, 1),
+    )
+
+
+def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
+    """Histogram, cumulative curve and figures over contact frames; None where no sequence has an
+    object."""
+    touching = figures.pooled(sequences, "contact_frame")
+    if touching is None:
+        return None
+    edges = np.arange(0, _HISTOGRAM_MM + _BIN_MM / 2, _BIN_MM)
+    lines, shares, tallest = [], [], 1.0
+    for name, colour in (("max", "c2"), ("mean", "c1"), ("median", "c3")):
+        values = figures.pooled(sequences, f"penetration_{name}")
+        assert values is not None
+        depth = 1e3 * values[touching].astype(np.float64)
+        counts = np.histogram(np.clip(depth, 0, _HISTOGRAM_MM), edges)[0].astype(float)
+        tallest = max(tallest, float(counts.max()))
+        outline = np.repeat(counts, 2)
+        lines.append(charts.Series(name, colour, np.repeat(edges, 2)[1:-1], outline))
+        grid = np.linspace(0, _HISTOGRAM_MM, 121)
+        share = np.array([(depth <= g).mean() if len(depth) else 0.0 for g in grid])
+        shares.append(charts.Series(name, colour, grid, 100 * share))
+    x_range = (0.0, _HISTOGRAM_MM)
+    summary = figures.penetration_figures(sequences)
+    return {
+        **summary,
+        "frames": int(touching.sum()),
+        "bin": f"{_BIN_MM:g}",
+        "histogram": charts.line_chart(
+            lines,
+            x_label="penetration depth, mm (the last bin holds all beyond)",
+            y_label="contact frames",
+            x_range=x_range,
+            y_range=(0, 1.08 * tallest),
+        ),
+        "cumulative": charts.line_chart(
+            shares,
+            x_label="penetration depth, mm",
+            y_label="contact frames, %",
+            x_range=x_range,
+            y_range=(0, 100),
+            marks=((5, "5"), (7, "7"), (20, "20")),
+        ),
+    }
+
+
+def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
+    """Share of frames up to an acceleration, of body and object; "" where no frame has one."""
+    lines = []
+    for name, colour, key in (
+        ("body", "c1", "acceleration_body"),
+        ("object", "c2", "acceleration_object"),
+    ):
+        values = figures.pooled(sequences, key)
+        known = np.zeros(0) if values is None else 1e3 * values[np.isfinite(values)]
+        if len(known):
+            lines.append((name, colour, np.sort(known.astype(np.float64))))
+    if not lines:
+        return ""
+    top = max(_LEAST_ACCELERATION_MM, max(float(np.quantile(v, 0.99)) for _, _, v in lines))
+    grid = np.linspace(0, top, 121)
+    return charts.line_chart(
+        [
+            charts.Series(
+                name, colour, grid, 100 * np.searchsorted(values, grid, "right") / len(values)
+            )
+            for name, colour, values in lines
+        ],
+        x_label="acceleration, mm/frame² at 30 fps",
+        y_label="frames, %",
+        x_range=(0.0, top),
+        y_range=(0.0, 100.0),
+    )
+
+
+def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str, Any]]:
+    """Rows of distances to the clouds: found, floor, published; millimetres."""
+    names = ("body_mm", "object_mm", "body_visible_mm", "object_visible_mm")
+    found = figures.cloud_figures(sequences)
+    floor = figures.floor_figures(sequences)
+    rows = [{"name": dataset, "cells": [found[n] for n in names], "reference": False}]
+    if floor:
+        cells = [floor.get(n) for n in names]
+        rows.append({"name": "floor: true poses", "cells": cells, "reference": True})
+    published = [*_PUBLISHED_CLOUD_MM, None, None]
+    rows.append({"name": "InterCap, as published", "cells": published, "reference": True})
+    return rows
+
+
+def cameras(
+    sequences: Sequence[SequenceMetrics],
+    residuals: Mapping[str, Sequence[tuple[str, float, float]]],
+) -> dict[str, Any]:
+    """Residuals before and after refinement: by pair for one sequence, by sequence for several."""
+    if len(residuals) == 1:
+        rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(residuals.values()))]
+    else:
+        rows = []
+        for name, pairs in residuals.items():
+            known = [pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()]
+            values = 1e3 * np.array(known).reshape(-1, 2)
+            before, after = np.median(values, axis=0) if len(values) else (np.nan, np.nan)
+            rows.append((name, float(before), float(after)))
+        rows.sort(key=lambda row: -np.nan_to_num(row[2], nan=-1.0))
+    note = "Worst first." if len(rows) > 3 else ""
+    if len(rows) > _MAX_CAMERA_ROWS:
+        note = f"The {_MAX_CAMERA_ROWS} worst of {len(rows)}; all are in tables/sequences.csv."
+    return {
+        "chart": charts.dumbbells(rows[:_MAX_CAMERA_ROWS], "residual, mm") if rows else "",
+        "note": note,
+        "truth": figures.extrinsics_figures(sequences) or None,
+    }

@@ -1,0 +1,297 @@
+"""The site's first page: the whole dataset's figures, and the way to each sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from intercap_core.evaluation import figures, flags
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.evaluation.verdict_figures import mean_stated
+from intercap_core.output.site import measures, verdict
+from intercap_core.output.site.embed import css, embedded, render, span, tile
+from intercap_core.output.site.heat_pictures import COLOUR_STOPS, HeatPicture
+from intercap_core.versions import versions
+
+_MAX_RUNS = 400  # rows of the list of flagged frames
+_MAX_ANSWERS = 12  # values of a column that become a filter's choices in a row of their own
+
+# columns of the tables by object, subject, intent and camera with a word for readers, and the unit
+_FIGURES = {
+    "acceleration_body_mm": ("acceleration, body", "mm/frame²"),
+    "acceleration_object_mm": ("acceleration, object", "mm/frame²"),
+    "penetration.mean_mm": ("penetration", "mean, mm"),
+    "penetration.p98_mm": ("penetration", "p98, mm"),
+    "vertex_to_cloud.body_visible_mm": ("body to cloud", "visible, mm"),
+    "vertex_to_cloud.object_visible_mm": ("object to cloud", "visible, mm"),
+    "verdict.body_mm": ("body", "stated, mm"),
+    "verdict.hands_mm": ("hands", "stated, mm"),
+    "verdict.object_mm": ("object", "stated, mm"),
+    "joint.body_pve_mm": ("body PVE", "mm, truth"),
+    "joint.hand_mpjpe_mm": ("hands", "mm, truth"),
+    "joint.object_translation_mm": ("object", "mm, truth"),
+    "joint.object_rotation_deg": ("object", "deg, truth"),
+    "joint.contact_region_f1": ("contact", "F1, truth"),
+    "verdict.keypoint_px": ("keypoints", "px"),
+    "verdict.keypoint_px_held_out": ("keypoints", "held out, px"),
+    "verdict.person_mm": ("person's points", "mm"),
+    "verdict.person_held_out_mm": ("person's points", "held out, mm"),
+    "verdict.overlap": ("object's mask", "IoU"),
+    "verdict.overlap_held_out": ("object's mask", "held out, IoU"),
+    "verdict.object_depth_mm": ("object's depth", "mm"),
+    "verdict.object_depth_held_out_mm": ("object's depth", "held out, mm"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Heat:
+    """Pictures of one surface's heatmap, and the likelihood that its last colour stands for."""
+
+    name: str
+    pictures: Sequence[HeatPicture]
+    top: float
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetContent:
+    """All that the overview is made from.
+
+    ``table`` has a row a sequence, ``groups`` the tables by object, subject, intent and camera, by
+    name. ``failed``: sequences without a result and why; ``remarks``: what the merge says of
+    others. ``page_of``: the address of each sequence's page from the overview. ``changed``: name,
+    value and default of each setting that is not the program's own.
+    """
+
+    dataset: str
+    sequences: Sequence[SequenceSummary]
+    table: pd.DataFrame
+    groups: Mapping[str, pd.DataFrame]
+    surfaces: Sequence[Heat]
+    objects: Sequence[Heat]
+    body_frames: int
+    page_of: Mapping[str, str]
+    failed: Mapping[str, str] = field(default_factory=dict)
+    remarks: Mapping[str, str] = field(default_factory=dict)
+    changed: Sequence[tuple[str, str, str]] = ()
+
+
+def page(content: DatasetContent) -> str:
+    """The page as text."""
+    measured = [s.metrics for s in content.sequences]
+    rows = _rows(content)
+    runs = [
+        {
+            "sequence": s.name,
+            "page": content.page_of[s.name],
+            "frames": span(first, last),
+            "reason": reason,
+        }
+        for s in measured
+        for first, last, reason in flags.ranges(list(s.values["flag_reason"]))
+    ]
+    context = {
+        "dataset": content.dataset,
+        "headline": _headline(content, measured),
+        "tiles": _tiles(measured),
+        "rows": sorted(rows, key=lambda row: row["rank"]),
+        "filters": {
+            name: sorted({row[name] for row in rows if row[name]})
+            for name in ("subject", "object", "intent")
+        },
+        "page_of": content.page_of,
+        "failed": sorted(content.failed.items()),
+        "remarks": sorted(content.remarks.items()),
+        "counts": _counts(measured),
+        "groups": [(name, _printed(table)) for name, table in content.groups.items()],
+        "truth": measures.truth(measured),
+        "verdict": verdict.context(measured, set()),
+        "penetration": measures.penetration(measured),
+        "clouds": measures.clouds(content.dataset, measured),
+        "acceleration": measures.accelerations(measured),
+        "heat": _heat(content),
+        "cameras": measures.cameras(measured, {s.name: s.residuals for s in content.sequences}),
+        "flagged_runs": runs[:_MAX_RUNS],
+        "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
+        "flagged_frames": sum(int(s.values["flagged"].sum()) for s in measured),
+        "versions": versions(),
+        "changed": content.changed,
+        "made_by": _made_by(content.sequences),
+    }
+    return render("overview.html.j2", context)
+
+
+def _headline(content: DatasetContent, measured: Sequence[SequenceMetrics]) -> str:
+    frames = sum(len(s) for s in measured)
+    seconds = sum(len(s) / s.fps for s in measured)
+    subjects = len({s.subject for s in measured})
+    objects = len({s.object_ for s in measured if s.object_})
+    parts = [
+        _counted(len(measured), "sequence"),
+        _counted(frames, "frame"),
+        f"{seconds / 60:.1f} minutes" if seconds >= 120 else f"{seconds:.1f} seconds",
+        _counted(subjects, "subject"),
+        _counted(objects, "object") if objects else "people alone",
+    ]
+    imported = sum(bool(s.made_by) for s in measured)
+    if imported:
+        parts.append(f"{imported} with results of another program")
+    if content.failed:
+        parts.append(f"{len(content.failed)} failed")
+    return ", ".join(parts)
+
+
+def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
+    depth = figures.penetration_figures(measured)
+    cloud = figures.cloud_figures(measured)
+    flagged = np.concatenate([s.values["flagged"] for s in measured])
+    tiles = []
+    if any(s.has_truth for s in measured):
+        joint = figures.truth_figures(measured, "joint")
+        for key, name, unit, note in (
+            ("body_pve_mm", "body error", "mm", "per vertex, against truth"),
+            ("object_translation_mm", "object error", "mm", "centre, median, against truth"),
+            ("object_rotation_deg", "object rotation error", "°", "median, against truth"),
+            ("contact_region_f1", "contact", "", "F1 by body region"),
+        ):
+            if key in joint:
+                tiles.append(tile(name, joint[key], unit, note, 2 if unit in ("", "°") else 1))
+    tiles += [
+        tile(f"{part}, stated", value, "mm", "mean error, without truth")
+        for part, value in mean_stated(measured).items()
+    ]
+    handling = any(s.has_object for s in measured)
+    if handling:
+        tiles.append(tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"))
+    tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
+    if handling:
+        tiles.append(tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"))
+    share, count = 100 * float(flagged.mean()), int(flagged.sum())
+    return [*tiles, tile("flagged", share, "%", f"{count:,} frames not trusted")]
+
+
+def _rows(content: DatasetContent) -> list[dict[str, Any]]:
+    columns = {
+        "penetration": "penetration.mean_mm",
+        "penetration_p98": "penetration.p98_mm",
+        "body_visible": "vertex_to_cloud.body_visible_mm",
+        "object_visible": "vertex_to_cloud.object_visible_mm",
+        "acceleration_body": "acceleration_body_mm",
+        "acceleration_object": "acceleration_object_mm",
+        "stated_body": "verdict.body_mm",
+        "stated_object": "verdict.object_mm",
+        "pve": "joint.body_pve_mm",
+        "object_mm": "joint.object_translation_mm",
+        "object_deg": "joint.object_rotation_deg",
+    }
+    rows = []
+    for record in content.table.to_dict("records"):
+        row = {name: record.get(column) for name, column in columns.items()}
+        for name in ("sequence", "subject", "object", "intent", "frames", "rank"):
+            row[name] = record[name]
+        row["flagged"] = 100 * record["flagged_frames"] / record["frames"]
+        row["contact"] = 100 * record["contact_frames"] / record["frames"]
+        row["page"] = content.page_of[record["sequence"]]
+        rows.append(row)
+    return rows
+
+
+def _counts(measured: Sequence[SequenceMetrics]) -> dict[str, Any]:
+    """Sequences by subject (rows) and object (columns), as the paper's table of the dataset."""
+    subjects = sorted({s.subject for s in measured})
+    objects = sorted({s.object_ for s in measured})
+    count = np.zeros((len(subjects), len(objects)), int)
+    for s in measured:
+        count[subjects.index(s.subject), objects.index(s.object_)] += 1
+    return {
+        "objects": [name or "alone" for name in objects],
+        "rows": [
+            {"subject": subject, "cells": row.tolist(), "all": int(row.sum())}
+            for subject, row in zip(subjects, count, strict=True)
+        ],
+        "all": [*count.sum(0).tolist(), int(count.sum())],
+    }
+
+
+def _printed(table: pd.DataFrame) -> dict[str, Any]:
+    """Heads, each with its unit, and cells as text, of the columns that a reader looks for."""
+    shown = [str(name) for name in table if "." not in str(name) or name in _FIGURES]
+    cells = [
+        ["–" if _unknown(value) else _text(value) for value in row]
+        for row in table[shown].itertuples(index=False, name=None)
+    ]
+    return {
+        "heads": [_head(name) for name in shown],
+        "rows": cells,
+        "left_out": len(table.columns) - len(shown),
+    }
+
+
+def _head(column: str) -> tuple[str, str]:
+    """What a column holds, and its unit."""
+    if column in _FIGURES:
+        return _FIGURES[column]
+    for ending, unit in (("_mm", "mm"), ("_ms", "ms"), ("_percent", "%")):
+        if column.endswith(ending):
+            return column.removesuffix(ending).replace("_", " "), unit
+    return column.replace("_", " "), ""
+
+
+def _unknown(value: object) -> bool:
+    return value is None or value == "" or (isinstance(value, float) and not np.isfinite(value))
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.2f}" if abs(value) < 1 else f"{value:.1f}"  # shares as well
+
+
+def _heat(content: DatasetContent) -> dict[str, Any]:
+    stops = ", ".join(
+        f"{css(colour)} {100 * at:g}%"
+        for colour, at in zip(COLOUR_STOPS, (0, 0.25, 0.6, 1), strict=True)
+    )
+    return {
+        "gradient": f"linear-gradient(90deg, {stops})",
+        "body_frames": content.body_frames,
+        "surfaces": [_surface(heat) for heat in content.surfaces],
+        "objects": [_surface(heat) for heat in content.objects],
+    }
+
+
+def _surface(heat: Heat) -> dict[str, Any]:
+    return {
+        "name": heat.name,
+        "top": heat.top,
+        "frames": heat.frames,
+        "pictures": [embedded(p, p.caption) for p in heat.pictures],
+    }
+
+
+def _made_by(sequences: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
+    """For each stage, how many sequences were made with which settings: more than one is a mix."""
+    counted: dict[str, dict[str, list[str]]] = {}
+    for s in sequences:
+        for stage, (version, digest) in s.made_by.items():
+            made = f"v{version} {digest or '-'}"
+            counted.setdefault(stage, {}).setdefault(made, []).append(s.name)
+    return [
+        {
+            "stage": stage,
+            "made": [
+                {"digest": made, "count": len(names), "names": names}
+                for made, names in sorted(found.items(), key=lambda pair: -len(pair[1]))
+            ],
+        }
+        for stage, found in counted.items()
+    ]
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"

@@ -1,0 +1,288 @@
+"""The page of one sequence: one HTML file, with the 4D viewer's files beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from intercap_core.config import ContactInterval
+from intercap_core.evaluation import figures, flags
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.verdict_figures import stated_errors
+from intercap_core.output.site import body, capture, charts, measures, track, verdict
+from intercap_core.output.site.body import BodyFacts
+from intercap_core.output.site.capture import CaptureFacts
+from intercap_core.output.site.closeups import CloseUp
+from intercap_core.output.site.embed import css, embedded, render, span, tile
+from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.output.site.track import TrackFacts
+from intercap_core.schemas import METRIC_REGIONS
+from intercap_core.versions import versions
+
+_LEAST_MM = 10.0  # top of a chart of distances, at the least
+
+
+@dataclass(frozen=True)
+class ViewerParts:
+    """What the page holds for the viewer, whose data lie in a file beside it: the policy of what
+    may be loaded, its style sheet, its element, and what loads the file. HTML, put in as it is."""
+
+    policy: str
+    style: str
+    element: str
+    load: str
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceContent:
+    """All that a sequence's page is made from.
+
+    ``overlays`` by camera, or in ``note`` why there are none; ``joint`` says in words how the joint
+    fit went; ``energies``: name, before and after of each of its terms. ``made_by``: what to print
+    of each stage's artefact. ``annotated``: contact that the user stated, None = none. ``track`` is
+    None where there is no object.
+    """
+
+    metrics: SequenceMetrics
+    intent: str
+    overlays: Sequence[Overlay]
+    note: str
+    joint: str
+    energies: Sequence[tuple[str, float, float]]
+    closeups: Sequence[CloseUp]
+    capture: CaptureFacts
+    track: TrackFacts | None
+    body: BodyFacts
+    annotated: Sequence[ContactInterval] | None
+    made_by: Mapping[str, str]
+    body_file: str
+    viewer: ViewerParts | None = None
+
+
+def page(content: SequenceContent) -> str:
+    """The page as text."""
+    s = content.metrics
+    cameras: dict[str, list[dict[str, Any]]] = {}
+    for overlay in content.overlays:
+        caption = f"camera {overlay.camera}, frame {overlay.frame}"
+        if s.values["flagged"][overlay.frame]:
+            caption += f" (flagged: {s.values['flag_reason'][overlay.frame]})"
+        cameras.setdefault(overlay.camera, []).append(embedded(overlay, caption))
+    context = {
+        "name": s.name,
+        "subject": s.subject,
+        "object": s.object_,
+        "intent": content.intent,
+        "frames": len(s),
+        "fps": s.fps,
+        "tiles": _tiles(s),
+        "timeline": charts.timeline(_bands(s, content.annotated), len(s)),
+        "annotated": content.annotated is not None,
+        "residuals": _residuals(s),
+        "verdict": verdict.context([s], {s.name}),
+        "truth": measures.truth([s]),
+        "flagged_runs": [
+            {"frames": span(first, last), "reason": reason}
+            for first, last, reason in flags.ranges(list(s.values["flag_reason"]))
+        ],
+        "flagged_frames": int(s.values["flagged"].sum()),
+        "energies": _energies(content.energies),
+        "joint": content.joint,
+        "cameras": list(cameras.values()),
+        "note": content.note,
+        "closeups": [embedded(picture, picture.hold.caption) for picture in content.closeups],
+        "capture": _capture(content.capture),
+        "track": None if content.track is None else _with_sheet(track.context(content.track)),
+        "body": _with_sheet(body.context(content.body)),
+        "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
+        "made_by": list(content.made_by.items()),
+        "versions": [*versions(), ("body file", content.body_file)],
+        "viewer": None,
+    }
+    if content.viewer is not None:
+        parts = content.viewer
+        context["policy"] = parts.policy
+        context["viewer_style"] = Markup(parts.style)
+        context["viewer"] = {"element": Markup(parts.element), "load": Markup(parts.load)}
+    return render("sequence.html.j2", context)
+
+
+def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
+    tiles = [
+        tile(
+            f"{error.part}, stated",
+            error.stated,
+            "mm",
+            error.silent or f"four of five are within a factor of {error.factor:.1f}",
+        )
+        for error in stated_errors(s)
+    ]
+    if s.has_truth:
+        found = figures.truth_figures([s], "joint")
+        tiles.append(tile("body", found.get("body_pve_mm"), "mm", "per vertex, against truth"))
+        if s.has_object:
+            error = found.get("object_translation_mm")
+            tiles.append(tile("object", error, "mm", "centre, median, against truth"))
+    cloud = figures.cloud_figures([s])
+    tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
+    if s.has_object:
+        tiles.append(tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"))
+        depth = figures.penetration_figures([s]).get("mean_mm")
+        tiles.append(tile("penetration", depth, "mm", "mean over contact frames"))
+        share = 100 * float(s.values["contact_frame"].mean())
+        tiles.append(tile("in contact", share, "%", "of the frames", 0))
+    flagged = s.values["flagged"]
+    share = 100 * float(flagged.mean())
+    return [*tiles, tile("flagged", share, "%", f"{int(flagged.sum())} frames not trusted")]
+
+
+def _bands(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> list[charts.Band]:
+    """Flags; frames in contact, and of each region as annotated, as stated and by the meshes."""
+    reasons = flags.ranges(list(s.values["flag_reason"]))
+    bands = [
+        charts.Band("flagged", "flag", [(a, b, f"{span(a, b)}: {why}") for a, b, why in reasons])
+    ]
+    stated_by_user: dict[str, list[tuple[int, int, str]]] = {}
+    for interval in annotated or ():
+        last = min(interval.end, len(s)) - 1
+        if last >= interval.start:
+            says = f"{span(interval.start, last)}: annotated"
+            stated_by_user.setdefault(interval.part, []).append((interval.start, last, says))
+    if not s.has_object:
+        return bands
+    bands.append(charts.Band("in contact", "any", _runs(s.values["contact_frame"])))
+    names = list(s.values["region_names"])
+    if "any" in stated_by_user:
+        bands.append(charts.Band("any, annotated", "said", stated_by_user["any"]))
+    for region in METRIC_REGIONS:
+        says = region.replace("_", " ")
+        if region in stated_by_user:
+            bands.append(charts.Band(f"{says}, annotated", "said", stated_by_user[region]))
+        stated = s.values["contact_probability"][:, names.index(region)]
+        touching = s.values["region_contact"][:, names.index(region)]
+        if (stated >= 0.5).any() or touching.any() or region in stated_by_user:
+            runs = _stated_runs(stated)
+            bands.append(charts.Band(f"{says}, stated", "touch", runs, levels=stated))
+        if touching.any():
+            bands.append(charts.Band(f"{says}, meshes", "any", _runs(touching)))
+    return bands
+
+
+def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
+    """Charts over the frames, each with what it shows."""
+    found = [
+        _over_frames(
+            s,
+            (
+                ("body to cloud", "c1", "body_visible_to_cloud"),
+                ("object to cloud", "c2", "object_visible_to_cloud"),
+                ("penetration", "c3", "penetration_mean"),
+            ),
+            "distance, mm",
+            "Distance of the visible surfaces to the clouds, and how deep the body is inside the "
+            "object.",
+        ),
+        _over_frames(
+            s,
+            (
+                ("body", "c1", "acceleration_body"),
+                ("object", "c2", "acceleration_object"),
+            ),
+            "acceleration, mm/frame²",
+            "Second differences at 30 frames a second: what jitters stands out.",
+        ),
+    ]
+    if "verdict/error_frame" in s.values:
+        parts = zip(s.values["verdict/part_names"], ("c1", "c3", "c2"), strict=False)
+        lines = [
+            (str(part), colour, 1e3 * s.values["verdict/error_frame"][p].astype(np.float64))
+            for p, (part, colour) in enumerate(parts)
+        ]
+        says = "Error that the verdict states, by frame; no line where it says nothing."
+        found.append(_chart(lines, "stated error, mm", says))
+    return [pair for pair in found if pair is not None]
+
+
+def _over_frames(
+    s: SequenceMetrics, lines: Sequence[tuple[str, str, str]], unit: str, says: str
+) -> tuple[str, str] | None:
+    return _chart(
+        [(n, colour, 1e3 * s.values[key].astype(np.float64)) for n, colour, key in lines
+         if key in s.values],
+        unit,
+        says,
+    )  # fmt: skip
+
+
+def _chart(
+    lines: Sequence[tuple[str, str, np.ndarray]], unit: str, says: str
+) -> tuple[str, str] | None:
+    series = []
+    for name, colour, values in lines:
+        known = np.flatnonzero(np.isfinite(values))
+        # a line for each run of known frames; the first of them is named
+        for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
+            if len(run):
+                first = run[0] == known[0]
+                series.append(charts.Series(name if first else "", colour, run, values[run]))
+    if not series:
+        return None
+    top = max(_LEAST_MM, 1.1 * max(float(one.y.max()) for one in series))
+    total = len(lines[0][2])
+    drawn = charts.line_chart(
+        series,
+        x_label="frame",
+        y_label=unit,
+        x_range=(0.0, float(max(total - 1, 1))),
+        y_range=(0.0, top),
+    )
+    return drawn, says
+
+
+def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
+    """Each term's share of the joint fit's energy at the start and at the end; "" of none."""
+    if not terms:
+        return ""
+    whole = max(sum(before for _, before, _ in terms), 1e-12)
+    return charts.bar_pairs(
+        [
+            charts.BarPair(
+                name.replace("_", " "), 100 * before / whole, 100 * after / whole, "", False
+            )
+            for name, before, after in terms
+            if max(before, after) > 0
+        ],
+        "% of the energy at the start",
+    )
+
+
+def _capture(facts: CaptureFacts) -> dict[str, Any]:
+    found = capture.context(facts)
+    found["pictures"] = [[embedded(p, p.caption) for p in row] for row in found["pictures"]]
+    return found
+
+
+def _with_sheet(found: dict[str, Any]) -> dict[str, Any]:
+    """A section's context with its sheet, where it has one, as the page embeds it."""
+    sheet = found["sheet"]
+    if sheet is not None:
+        rows = ", ".join(map(str, sheet.frames))
+        found["sheet"] = embedded(sheet, f"{found['name']}, frames {rows} in every camera")
+    return found
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int, str]]:
+    runs = flags.ranges(["x" if value else "" for value in mask])
+    return [(first, last, span(first, last)) for first, last, _ in runs]
+
+
+def _stated_runs(probability: np.ndarray) -> list[tuple[int, int, str]]:
+    """Runs in which contact is likelier than not, with the mean probability (T,) in words."""
+    return [
+        (first, last, f"{says}: {100 * probability[first : last + 1].mean():.0f} %")
+        for first, last, says in _runs(probability >= 0.5)
+    ]

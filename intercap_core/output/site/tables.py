@@ -1,0 +1,275 @@
+"""The dataset's tables: a row a sequence, frame, object, subject, intent and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow
+from pyarrow import csv
+
+from intercap_core.evaluation import figures
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.evaluation.verdict_figures import TRUE, mean_stated, stated_errors
+from intercap_core.stage_list import ESTIMATES
+
+_MILLIMETRES = {
+    "penetration_mean", "penetration_median", "penetration_max", "penetration_object",
+    "ground_penetration", "body_to_cloud", "object_to_cloud", "body_visible_to_cloud",
+    "object_visible_to_cloud", "cloud_to_body",
+}  # fmt: skip
+_RANKED = {  # columns of the table of sequences and what they are a measure of
+    "vertex_to_cloud.body_visible_mm": "body_to_cloud",
+    "vertex_to_cloud.object_visible_mm": "object_to_cloud",
+    "penetration.p98_mm": "penetration",
+}
+_ACCELERATIONS = {"acceleration_body", "acceleration_object"}
+_JUDGED_VIEWS = (  # what the verdict says of a camera, and its unit in the table
+    ("keypoint_px", 1.0, ""), ("person_m", 1e3, "_mm"), ("overlap", 1.0, ""),
+    ("object_depth_m", 1e3, "_mm"),
+)  # fmt: skip
+
+
+def sequence_table(
+    sequences: Sequence[SequenceMetrics],
+    residuals: Mapping[str, tuple[float, float]],
+    intents: Mapping[str, str] | None = None,
+) -> pd.DataFrame:
+    """One row a sequence; lengths in millimetres, accelerations in mm/frame^2 at 30 fps.
+
+    ``residuals``: median point-to-plane distance between cameras before and after refinement, by
+    sequence, metres; ``intents`` by sequence, "" = not stated. Columns ``<stage>.<figure>`` are
+    errors against truth. ``rank`` orders the sequences by :func:`worst_first`, 1 = worst. What a
+    sequence does not have is NaN.
+    """
+    rows = []
+    for s in sequences:
+        row: dict[str, object] = {
+            "sequence": s.name,
+            "subject": s.subject,
+            "object": s.object_,
+            "intent": (intents or {}).get(s.name, ""),
+            "frames": len(s),
+            "fps": s.fps,
+            "made_by": s.made_by,
+            "flagged_frames": int(s.values["flagged"].sum()),
+            "contact_frames": int(s.values["contact_frame"].sum()) if s.has_object else np.nan,
+        }
+        row |= _figures([s])
+        for error in stated_errors(s):
+            row[f"verdict.{error.part}_mm"] = error.stated
+            row[f"verdict.{error.part}_factor"] = error.factor
+            row[f"verdict.{error.part}_silent"] = error.silent
+            row[f"verdict.{error.part}_odd_even_mm"] = error.repeated
+        before, after = residuals.get(s.name, (np.nan, np.nan))
+        row["extrinsics_residual_before_mm"] = 1e3 * before
+        row["extrinsics_residual_after_mm"] = 1e3 * after
+        if s.has_truth:
+            for stage in ESTIMATES:
+                for name, value in figures.truth_figures([s], stage).items():
+                    row[f"{stage}.{name}"] = value
+            for name, value in figures.extrinsics_figures([s]).items():
+                row[f"extrinsics_error.{name}"] = value
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    for name in _RANKED:
+        if name not in table:  # of no sequence, where nobody handles an object
+            table[name] = np.nan
+    table.insert(1, "rank", worst_first(table))
+    return table
+
+
+def _figures(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
+    """Penetration, distances to clouds with their floor, and accelerations of some sequences."""
+    row = {}
+    for name, value in figures.penetration_figures(sequences).items():
+        row[f"penetration.{name}"] = value
+    for name, value in figures.cloud_figures(sequences).items():
+        row[f"vertex_to_cloud.{name}"] = value
+    for name, value in figures.floor_figures(sequences).items():
+        row[f"vertex_to_cloud_floor.{name}"] = value
+    for name in sorted(_ACCELERATIONS):
+        values = figures.pooled(sequences, name)
+        if values is not None:
+            row[f"{name}_mm"] = 1e3 * _mean(values)
+    return row
+
+
+def group_table(
+    sequences: Sequence[SequenceMetrics], by: str, group_of: Mapping[str, str]
+) -> pd.DataFrame:
+    """One row a group, over all frames of its sequences, with the units of the other tables.
+
+    ``group_of`` names each sequence's group, "" = it has none and is left out; ``by`` heads the
+    first column. What a group does not have is NaN.
+    """
+    rows = []
+    for group in sorted({group_of[s.name] for s in sequences} - {""}):
+        own = [s for s in sequences if group_of[s.name] == group]
+        flagged, touching = figures.pooled(own, "flagged"), figures.pooled(own, "contact_frame")
+        assert flagged is not None
+        row: dict[str, object] = {
+            by: group,
+            "sequences": len(own),
+            "frames": len(flagged),
+            "minutes": sum(len(s) / s.fps for s in own) / 60,
+            "flagged_percent": 100 * float(flagged.mean()),
+            "contact_percent": np.nan if touching is None else 100 * float(touching.mean()),
+            **_figures(own),
+        }
+        for part, value in mean_stated(own).items():
+            row[f"verdict.{part}_mm"] = value
+        if any(s.has_truth for s in own):
+            for name, value in figures.truth_figures(own, "joint").items():
+                row[f"joint.{name}"] = value
+        rows.append(row)
+    return pd.DataFrame(rows, columns=None if rows else [by, "sequences", "frames"])
+
+
+def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
+    """One row a camera of a sequence: images, time, depth, by how much it was moved, and what the
+    verdict says of it; milliseconds, millimetres, pixels. NaN = not known."""
+    rows = []
+    for summary in summaries:
+        rig, values = summary.rig, summary.metrics.values
+        judged = list(values.get("verdict/camera_names", ()))
+        for c, name in enumerate(rig["camera_names"]):
+            row: dict[str, object] = {
+                "sequence": summary.name,
+                "camera": str(name),
+                "frames": len(summary.metrics),
+                "images": int(rig["images"][c]),
+                "time_offset_ms": 1e3 * float(rig["time_offset"][c]),
+                "time_offset_sigma_ms": 1e3 * float(rig["time_offset_sigma"][c]),
+                "depth_bias_mm": 1e3 * float(rig["depth_bias"][c]),
+                "moved_mm": 1e3 * float(rig["moved"][c]),
+                "note": str(rig["note"][c]),
+            }
+            if "verdict/held_camera" in values and name in judged:
+                place = judged.index(name)
+                held = values["verdict/held_camera"] == place
+                for key, scale, unit in _JUDGED_VIEWS:
+                    for end, frames in (("", slice(None)), ("_held_out", held)):
+                        found = scale * _median(values[f"verdict/{key}{end}"][frames, place])
+                        row[f"verdict.{key.removesuffix('_m')}{end}{unit}"] = found
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
+    """One row a camera over all its sequences: sums of images, means of the other numbers of
+    :func:`camera_table` weighted by frames, of those that know them; and how many have a note."""
+    if cameras.empty:
+        return pd.DataFrame(columns=["camera", "sequences", "frames", "images"])
+    rows = []
+    means = cameras.select_dtypes("float").columns
+    for name, own in cameras.groupby("camera", sort=True):
+        row: dict[str, object] = {
+            "camera": name,
+            "sequences": len(own),
+            "frames": int(own["frames"].sum()),
+            "images": int(own["images"].sum()),
+            "with_note": int((own["note"] != "").sum()),
+        }
+        for column in means:
+            known = own[np.isfinite(own[column])]
+            weights = known["frames"]
+            row[column] = np.average(known[column], weights=weights) if len(known) else np.nan
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def worst_first(table: pd.DataFrame) -> pd.Series:
+    """Rank of each sequence, 1 = worst: by the mean of its ranks in several measures.
+
+    Share of flagged frames, body and object visible distance to the cloud, the 98th percentile of
+    penetration, and the stated error of each judged part, worst where nothing can be said. Without
+    an object there are no measures of it. Ranks need no weights between units.
+    """
+    measures = pd.DataFrame(
+        {
+            "flagged": table["flagged_frames"] / table["frames"],
+            **{name: table[column] for column, name in _RANKED.items()},
+            **{
+                part: table[f"verdict.{part}_mm"].fillna(np.inf)
+                for part in TRUE
+                if f"verdict.{part}_mm" in table
+            },
+        }
+    )
+    ranks = measures.rank(ascending=False, na_option="bottom")
+    of_object = ranks.columns.intersection(["object_to_cloud", "penetration", "object"])
+    ranks.loc[table["contact_frames"].isna(), of_object] = np.nan
+    mean_rank = ranks.mean(axis=1)
+    return mean_rank.rank(method="first").astype(int)
+
+
+def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
+    """One row a frame; millimetres, degrees, mm/frame^2 at 30 fps."""
+    parts = []
+    for s in sequences:
+        total = len(s)
+        columns: dict[str, object] = {
+            "sequence": np.repeat(s.name, total),
+            "frame": np.arange(total),
+            "time_s": np.arange(total) / s.fps,
+            "flagged": s.values["flagged"],
+            "flag_reason": s.values["flag_reason"].astype(str),
+        }
+        if s.has_object:
+            names = s.values["region_names"]
+            columns["contact"] = s.values["contact_frame"]
+            columns["contact_regions"] = [
+                ";".join(names[row]) for row in s.values["region_contact"]
+            ]
+            for r, region in enumerate(names):
+                columns[f"contact_probability.{region}"] = s.values["contact_probability"][:, r]
+        for name in sorted((_MILLIMETRES | _ACCELERATIONS) & s.values.keys()):
+            columns[f"{name}_mm"] = 1e3 * s.values[name].astype(np.float64)
+        for place, part in enumerate(s.values.get("verdict/part_names", ())):
+            columns[f"verdict.{part}_mm"] = 1e3 * s.values["verdict/error_frame"][place]
+        for stage in ESTIMATES:
+            for name in ("body_pve", "body_mpjpe", "object_translation"):
+                if f"truth/{stage}/{name}" in s.values:
+                    values = s.values[f"truth/{stage}/{name}"].astype(np.float64)
+                    columns[f"{stage}.{name}_mm"] = 1e3 * values
+            if f"truth/{stage}/object_rotation" in s.values:
+                degrees = s.values[f"truth/{stage}/object_rotation"].astype(np.float64)
+                columns[f"{stage}.object_rotation_deg"] = degrees
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def write(folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:
+    """Write NAME.parquet and NAME.csv of each table; equal content, equal bytes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, table in tables.items():
+        table.to_parquet(folder / f"{name}.parquet", index=False)
+        rounded = table.assign(
+            **{c: _significant(table[c]) for c in table.select_dtypes("float").columns}
+        )
+        # several times as fast as pandas' own, whose time was half of a large dataset's merging
+        rows = pyarrow.Table.from_pandas(rounded, preserve_index=False)
+        csv.write_csv(rows, folder / f"{name}.csv")
+
+
+def _significant(values: pd.Series) -> np.ndarray:
+    """Six significant digits; what is not finite stays."""
+    found = values.to_numpy(np.float64, copy=True)
+    known = np.isfinite(found) & (found != 0)
+    scale = 10.0 ** (5 - np.floor(np.log10(np.abs(found[known]))))
+    found[known] = np.round(found[known] * scale) / scale
+    return found
+
+
+def _mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
+def _median(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")

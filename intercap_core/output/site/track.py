@@ -1,0 +1,227 @@
+"""The page's section on one object's track: its start, its evidence, its stated deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.object_track.absent import SOURCE as NO_TRACK
+from intercap_core.output.site import charts
+from intercap_core.output.site.overlays import choose_frames
+from intercap_core.output.site.sheets import Sheet
+from intercap_core.output.site.track_pictures import CANDIDATE_COLOUR, TRACK_COLOUR, track_sheet
+from intercap_core.schemas import OBJECT_TRACK, SCENE
+
+GOOD_OVERLAP = 0.7
+_ROWS = 5  # moments of the sheet
+_LEAST_MM, _LEAST_DEG = 5.0, 2.0  # heights of the charts at least
+_MOST_DEG = 90.0
+VIEW_STATES = {
+    "agrees": f"candidate kept, IoU from {GOOD_OVERLAP:g}",
+    "partly": "kept, less overlap",
+    "nothing": "none kept",
+}
+TRACK_STATES = {
+    "moving": "tracked",
+    "resting": "at rest",
+    "doubtful": "another pose may be the true one",
+    "carried": "not seen, carried from annotated poses",
+    "lost": "lost",
+    "gone": "not seen for so long that it seems to have left",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class TrackFacts:
+    """One object's track; metres and radians inside, NaN = not known.
+
+    ``overlap``, ``depth``, ``contour`` (T, C) of each view; ``state`` (T,) of TRACK_STATES;
+    ``sigma_mm``, ``sigma_deg`` (T,) the largest stated deviation; ``recovered`` frames.
+    """
+
+    name: str
+    object_: str
+    seed: str
+    cameras: list[str]
+    overlap: np.ndarray
+    depth: np.ndarray
+    contour: np.ndarray
+    state: list[str]
+    sigma_mm: np.ndarray
+    sigma_deg: np.ndarray
+    recovered: list[int]
+    sheet: Sheet | None
+    note: str = ""
+
+
+def read_track(
+    frames: Path,
+    scene: Path,
+    object_track: Path,
+    mesh: ObjectMesh,
+    kept: Callable[[int, int], bytes],
+) -> TrackFacts:
+    """Read and draw one track; ``kept(t, c)`` gives the RLE of the candidate that it kept.
+
+    What cannot be drawn is left out, with its reason in ``note``; of an object that was found in no
+    frame, that is why. Raises UserError as
+    :func:`artefacts.read` does.
+    """
+    with artefacts.read(object_track, OBJECT_TRACK) as track:
+        poses = np.array(
+            [rigid(r, t) for r, t in zip(track["rotation"], track["translation"], strict=True)]
+        )
+        source = track.attributes["seed_source"]
+        sheet, note = None, str(track.attributes["doubts"])
+        seed = "nowhere: it was found in no frame"
+        if source != NO_TRACK:
+            sheet, note = _sheet(frames, scene, mesh, poses, kept, track["overlap"])
+            found = "annotated" if source == "annotated" else "found by search"
+            seed = f"frame {track.attributes['seed_frame']}, {found}"
+        covariance = track["covariance"]
+        return TrackFacts(
+            name=str(track.attributes["sequence"]),
+            object_=str(track.attributes["object"]),
+            seed=seed,
+            cameras=track.text("camera_names"),
+            overlap=track["overlap"],
+            depth=track["depth_residual"],
+            contour=track["silhouette_residual"],
+            state=_states(
+                gone=track["gone"],
+                lost=track["lost"],
+                carried=track["carried"] if "carried" in track else np.zeros_like(track["lost"]),
+                doubtful=track["ambiguous"],
+                resting=track["resting"],
+            ),
+            sigma_mm=1e3 * _largest(covariance[:, 3:, 3:]),
+            sigma_deg=np.degrees(_largest(covariance[:, :3, :3])),
+            recovered=np.flatnonzero(track["recovered"]).tolist(),
+            sheet=sheet,
+            note=note,
+        )
+
+
+def _sheet(
+    frames: Path,
+    scene: Path,
+    mesh: ObjectMesh,
+    poses: np.ndarray,
+    kept: Callable[[int, int], bytes],
+    overlap: np.ndarray,
+) -> tuple[Sheet | None, str]:
+    """The sheet, or None and why: one unreadable image must not prevent the report."""
+    try:
+        with artefacts.read(scene, SCENE) as setting, Frames.open(frames) as images:
+            moments = images.showing(setting["image_of"])
+            rig = Rig.from_artefact(setting)
+            shown = choose_frames(1 - _mean(overlap, 1), _ROWS)
+            return track_sheet(moments, rig, mesh, poses, kept, shown), ""
+    except (UserError, ValueError) as error:  # ValueError: a candidate that does not decode
+        return None, str(error)
+
+
+def context(facts: TrackFacts) -> dict[str, Any]:
+    """What the template needs; the sheet is left as it is."""
+    total = len(facts.state)
+    states = charts.state_runs(facts.state, TRACK_STATES)
+    rows = [charts.StateRow("track", states, _counted(facts))]
+    for c, name in enumerate(facts.cameras):
+        overlap = facts.overlap[:, c]
+        kept = np.isfinite(overlap)
+        seen = ["nothing" if not k else _grade(v) for k, v in zip(kept, overlap, strict=True)]
+        beside = f"{100 * kept.mean():.0f} % kept"
+        if kept.any():
+            beside += f" · IoU {_median(overlap):.2f}"
+            beside += _also(1e3 * facts.depth[:, c], "mm") + _also(facts.contour[:, c], "px")
+        rows.append(charts.StateRow(name, charts.state_runs(seen, VIEW_STATES), beside))
+    marks = [(t - 1, f"{t}: found again") for t in facts.recovered]
+    return {
+        "name": facts.name,
+        "object": facts.object_,
+        "seed": facts.seed,
+        "sheet": facts.sheet,
+        "note": facts.note,
+        "timeline": charts.state_timeline(rows, total, marks),
+        "charts": [
+            _chart(values, label, least, most)
+            for values, label, least, most in (
+                (facts.sigma_mm, "deviation of place, mm", _LEAST_MM, np.inf),
+                (facts.sigma_deg, "deviation of turn, degrees", _LEAST_DEG, _MOST_DEG),
+            )
+            if np.isfinite(values).any()
+        ],
+        "track_states": list(TRACK_STATES.items()),
+        "view_states": list(VIEW_STATES.items()),
+        "colours": {
+            "track": "#{:02x}{:02x}{:02x}".format(*TRACK_COLOUR),
+            "candidate": "#{:02x}{:02x}{:02x}".format(*CANDIDATE_COLOUR),
+        },
+    }
+
+
+def _states(**flags: np.ndarray) -> list[str]:
+    """The state (T,) of each frame: the first of the ``flags`` (T,) that is set, by their names."""
+    return [
+        next((name for name, own in zip(flags, of_frame, strict=True) if own), "moving")
+        for of_frame in zip(*flags.values(), strict=True)
+    ]
+
+
+def _grade(overlap: float) -> str:
+    return "agrees" if overlap >= GOOD_OVERLAP else "partly"
+
+
+def _counted(facts: TrackFacts) -> str:
+    parts = [
+        f"{n} {word}"
+        for word in ("gone", "lost", "carried", "doubtful", "resting")
+        if (n := facts.state.count(word))
+    ]
+    return " · ".join(parts) or "no frame in doubt"
+
+
+def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
+    known = np.isfinite(values)
+    shown = np.minimum(values, most)
+    top = max(least, 1.1 * float(shown[known].max(initial=0.0)))
+    line = charts.Series("", "c1", np.flatnonzero(known), shown[known])
+    return charts.line_chart(
+        [line],
+        x_label="frame",
+        y_label=label,
+        x_range=(0.0, float(max(len(values) - 1, 1))),
+        y_range=(0.0, top),
+    )
+
+
+def _also(values: np.ndarray, unit: str) -> str:
+    return f" · {_median(values):.1f} {unit}" if np.isfinite(values).any() else ""
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values[np.isfinite(values)]))
+
+
+def _mean(values: np.ndarray, axis: int) -> np.ndarray:
+    """Means over what is known; 0 where nothing is."""
+    known = np.isfinite(values)
+    return np.where(known, values, 0).sum(axis) / np.maximum(known.sum(axis), 1)
+
+
+def _largest(covariance: np.ndarray) -> np.ndarray:
+    """The largest deviation (T,) of covariances (T, 3, 3); NaN where none is stated."""
+    result = np.full(len(covariance), np.nan)
+    known = np.isfinite(covariance).all((1, 2))
+    result[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known])[:, -1], 0))
+    return result

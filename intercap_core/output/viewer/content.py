@@ -1,0 +1,312 @@
+"""What the viewer shows of a sequence, from its artefacts: bodies, object, clouds, cameras, images,
+contact and flags, all z-up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
+from intercap_core.body.artefact import load_model, read_parameters
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.config import BodyModels, ObjectEntry
+from intercap_core.errors import UserError
+from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core.evaluation.segmented import SegmentedClouds, read_clouds
+from intercap_core.evaluation.truth import Truth
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.export.upright import z_up_frame
+from intercap_core.output.viewer.package import quantised
+from intercap_core.output.viewer.skinning import skinned
+from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
+
+MOMENTS = 40  # of clouds and images: every n-th frame, so that at most so many have them
+TRUE_MOMENTS = 60  # of the true body, which has no skeleton of its own to move it by
+CLOUD_POINTS = (2500, 800)  # of person and object in a moment, spread evenly
+IMAGE_WIDTH_PX = 256
+MESH_FACES = 20000  # of an object; a scan with more is drawn with every n-th face's corner alone
+_JPEG_QUALITY = 70
+_SURVEY_STEP = 7  # of body vertices, to find the clouds near the meshes
+
+IMPORTED = "another program's"  # in place of the joint fit
+VERSIONS = {"joint": "joint fit", "sequential": "sequential fits", "truth": "truth"}
+
+
+@dataclass
+class Content:
+    """A header for JSON and arrays by name, of T frames."""
+
+    header: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    model: BodyModel
+    parameters: BodyParameters
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+def gather(
+    paths: Mapping[str, Path],
+    *,
+    object_: ObjectEntry | None,
+    body_models: BodyModels,
+    gender: str,
+    truth: Path | None = None,
+) -> Content:
+    """What the viewer shows of a sequence.
+
+    ``paths``: artefacts by stage; frames, scene and body_fit have to be there, of the others each
+    is shown that is. Raises UserError where one of these is missing or broken.
+    """
+    there = {stage: path for stage, path in paths.items() if path.is_file()}
+    content = Content()
+    with artefacts.read(paths["scene"], SCENE) as scene:
+        zup, rig, image_of = scene["zup_from_master"], Rig.from_artefact(scene), scene["image_of"]
+        bias = scene["depth_bias"]
+        upright = z_up_frame(scene)
+    bodies: dict[str, _Body] = {}
+    flags: Sequence[str] = ()
+    imported = False
+    if "joint" in there:
+        with artefacts.read(there["joint"], JOINT) as joint:
+            model = load_model(body_models, gender, joint)
+            bodies["joint"] = _Body(
+                model, read_parameters(joint), joint["rotation"], joint["translation"]
+            )
+            rig, bias = rig.moved(joint["master_from_colour"]), joint["depth_bias"]
+            flags = joint.text("flag_reason")
+            imported = "made_by" in joint.attributes
+            _add_stated_contact(content, joint, model)
+    bodies["sequential"] = _sequential(paths["body_fit"], there, body_models, gender)
+    names = {**VERSIONS, "joint": IMPORTED} if imported else VERSIONS
+    shown = next(iter(bodies.values()))
+    total = shown.parameters.batch
+    if "metrics" in there:
+        flags = _add_measured(content, there["metrics"], shown.model.num_vertices)
+    mesh = None
+    known = np.isfinite(shown.translation).all(1)
+    if object_ is not None and any(np.isfinite(b.translation).any() for b in bodies.values()):
+        mesh = ObjectMesh.load(object_)
+        vertices, faces, colours = _light(mesh)
+        content.arrays["object/vertices"] = vertices.astype(np.float32)
+        content.arrays["object/faces"] = faces.astype(np.uint32)
+        content.arrays["object/colours"] = colours
+    content.arrays["faces"] = shown.model.faces.cpu().numpy().astype(np.uint32)
+    for name, body in bodies.items():
+        _add_body(content, name, body, zup)
+        if mesh is not None:
+            _add_poses(content, name, body.rotation, body.translation, zup)
+    with Frames.open(paths["frames"]) as recorded:
+        images = recorded.showing(image_of)
+        moments = np.unique(np.linspace(0, total - 1, min(total, MOMENTS)).round().astype(int))
+        content.header |= {
+            "name": images.sequence,
+            "fps": images.fps,
+            "frames": total,
+            "frame": upright,
+            "moments": moments.tolist(),
+            "versions": {name: names[name] for name in bodies},
+            "object": "" if mesh is None else mesh.name,
+            "flags": [[t, reason] for t, reason in enumerate(flags) if reason],
+        }
+        _add_cameras(content, rig, zup)
+        _add_images(content, images, rig, moments)
+        if {"detections", "person", "object_track"} <= there.keys():
+            objects = None if mesh is None or not known.any() else mesh
+            sources = (there[stage] for stage in ("detections", "person", "object_track"))
+            clouds = read_clouds(images, rig, bias, image_of, *sources)
+            _add_clouds(content, clouds, shown, objects, moments, zup)
+        if truth is not None and truth.is_file():
+            vertices_of = shown.model.num_vertices
+            true = Truth.load(truth, images.time_s, images.fps, vertices_of)
+            _add_truth(content, true, zup)
+    return content
+
+
+def _sequential(
+    body_fit: Path, there: Mapping[str, Path], body_models: BodyModels, gender: str
+) -> _Body:
+    with artefacts.read(body_fit, BODY_FIT) as fit:
+        model, parameters = load_model(body_models, gender, fit), read_parameters(fit)
+    rotation = np.full((parameters.batch, 3, 3), np.nan)
+    translation = np.full((parameters.batch, 3), np.nan)
+    if "object_track" in there:
+        with artefacts.read(there["object_track"], OBJECT_TRACK) as track:
+            rotation, translation = track["rotation"], track["translation"]
+    return _Body(model, parameters, rotation, translation)
+
+
+def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> None:
+    """Probability by region (T, R) in 255ths, and the region of each vertex, 255 = none."""
+    probability = np.nan_to_num(joint["contact_probability"])
+    names = joint.text("region_names")
+    region = np.full(model.num_vertices, 255, np.uint8)
+    for number, name in enumerate(names):
+        region[model.regions[name]] = number
+    content.header["regions"] = [name.replace("_", " ") for name in names]
+    content.arrays["contact/probability"] = np.rint(255 * probability).astype(np.uint8)
+    content.arrays["contact/region"] = region
+
+
+def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequence[str]:
+    """Which vertices touch, a bit each (T, ceil(V / 8)); returns the reasons of flags."""
+    with artefacts.read(metrics, METRICS) as measured:
+        if "body_to_object" in measured:
+            touching = measured["body_to_object"] <= CONTACT_M
+            if touching.shape[1] != num_vertices:
+                raise UserError(
+                    f"{metrics}: sequence {measured.attributes['sequence']!r} was measured on a "
+                    f"body of {touching.shape[1]} vertices, and its fitted body has "
+                    f"{num_vertices}; re-run stage 'metrics'"
+                )
+            content.arrays["contact/touching"] = np.packbits(touching, axis=1, bitorder="little")
+        return measured.text("flag_reason")
+
+
+def _light(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and colours (Vo, 3) uint8, with at most MESH_FACES faces."""
+    if len(mesh.faces) <= MESH_FACES:
+        return mesh.vertices, mesh.faces, mesh.colours.astype(np.uint8)
+    import open3d as o3d
+
+    full = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces)
+    )
+    full.vertex_colors = o3d.utility.Vector3dVector(mesh.colours / 255.0)
+    small = full.simplify_quadric_decimation(MESH_FACES)
+    colours = np.rint(255 * np.clip(np.asarray(small.vertex_colors), 0, 1)).astype(np.uint8)
+    return np.asarray(small.vertices), np.asarray(small.triangles), colours
+
+
+def _add_body(content: Content, name: str, body: _Body, zup: np.ndarray) -> None:
+    found = skinned(body.model, body.parameters)
+    transforms = np.einsum("ab,tjbc->tjac", zup[:3, :3], found.transforms)
+    transforms[..., 3] += zup[:3, 3]
+    largest = np.abs(found.modes).max((1, 2), initial=1e-9)
+    content.arrays |= {
+        f"{name}/rest": found.rest.astype(np.float32),
+        f"{name}/joints": found.joints.astype(np.uint8),
+        f"{name}/weights": np.rint(65535 * found.weights).astype(np.uint16),
+        f"{name}/transforms": transforms.astype(np.float32),
+        f"{name}/modes": np.rint(found.modes / largest[:, None, None] * 32767).astype(np.int16),
+        f"{name}/amounts": (found.amounts * (largest / 32767)).astype(np.float32),
+    }
+    content.header.setdefault("error_mm", {})[name] = round(1e3 * found.error_m, 3)
+
+
+def _add_poses(
+    content: Content, name: str, rotation: np.ndarray, translation: np.ndarray, zup: np.ndarray
+) -> None:
+    """(T, 3, 4) zup_from_object; NaN where there is none."""
+    poses = np.concatenate(
+        [zup[:3, :3] @ rotation, (translation @ zup[:3, :3].T + zup[:3, 3])[..., None]], 2
+    )
+    content.arrays[f"{name}/object"] = poses.astype(np.float32)
+
+
+def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
+    """Pose, focal lengths, centre and size of each camera that is known."""
+    cameras = []
+    for camera in rig:
+        pose = zup @ camera.master_from_colour
+        lens = camera.colour
+        if np.isfinite(pose).all():
+            cameras.append(
+                {
+                    "name": camera.name,
+                    "pose": pose[:3].round(6).tolist(),
+                    "focal": [lens.fx, lens.fy],
+                    "centre": [lens.cx, lens.cy],
+                    "size": [lens.width, lens.height],
+                }
+            )
+    content.header["cameras"] = cameras
+
+
+def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray) -> None:
+    """JPEGs end to end, and where each begins, by moment and camera; straightened, so that they lie
+    on a plane before the camera."""
+    data, starts = [], [0]
+    names = [camera["name"] for camera in content.header["cameras"]]
+    for t in moments:
+        for c, camera in enumerate(rig):
+            if camera.name not in names:
+                continue
+            packet = b""
+            try:
+                image = images.colour(int(t), c, reduction=4)
+            except UserError:  # an image that does not decode is told by its stages
+                image = None
+            if image is not None:
+                lens = camera.colour.scaled(IMAGE_WIDTH_PX / camera.colour.width)
+                small = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+                small = cv2.undistort(small, lens.matrix, lens.distortion)
+                options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+                packet = cv2.imencode(".jpg", small, options)[1].tobytes()
+            data.append(packet)
+            starts.append(starts[-1] + len(packet))
+    content.arrays["images/data"] = np.frombuffer(b"".join(data), np.uint8)
+    content.arrays["images/starts"] = np.array(starts, np.uint32)
+
+
+def _add_clouds(
+    content: Content,
+    clouds: SegmentedClouds,
+    shown: _Body,
+    mesh: ObjectMesh | None,
+    moments: np.ndarray,
+    zup: np.ndarray,
+) -> None:
+    """Points of person and object in each moment, quantised, and where each begins."""
+    random = np.random.default_rng(0)
+    parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for t in moments:
+        with torch.no_grad():
+            body = shown.model.forward(shown.parameters.frames(slice(int(t), int(t) + 1)))
+        near = body.vertices[0, ::_SURVEY_STEP].double().numpy()
+        if mesh is not None and np.isfinite(shown.translation[t]).all():
+            at = mesh.vertices @ shown.rotation[t].T + shown.translation[t]
+            near = np.concatenate([near, at])
+        for part, points, most in zip(parts, clouds.at(int(t), near), CLOUD_POINTS, strict=True):
+            kept = points
+            if len(points) > most:
+                kept = points[np.sort(random.choice(len(points), most, replace=False))]
+            part.append(apply(zup, kept.astype(np.float64)))
+    for name, part in zip(("person", "object"), parts, strict=True):
+        steps, low, step = quantised(np.concatenate(part))
+        ends = np.cumsum([len(points) for points in part], dtype=np.uint32)
+        content.arrays[f"clouds/{name}"] = steps
+        content.arrays[f"clouds/{name}_starts"] = np.r_[np.uint32(0), ends].astype(np.uint32)
+        content.header.setdefault("clouds", {})[name] = {"low": low, "step": step}
+
+
+def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
+    """The true body on the fitted mesh, every n-th frame, and the true object."""
+    if true.vertices is not None:
+        total = len(true.vertices)
+        chosen = np.unique(np.linspace(0, total - 1, min(total, TRUE_MOMENTS)).round().astype(int))
+        vertices = apply(zup, true.vertices[chosen].reshape(-1, 3).astype(np.float64))
+        steps, low, step = quantised(vertices.reshape(len(chosen), -1, 3))
+        # differences between moments deflate to half of what places do; they wrap around
+        moved = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1]))
+        content.arrays["truth/vertices"] = moved
+        content.header["truth"] = {"moments": chosen.tolist(), "low": low, "step": step}
+        content.header["versions"]["truth"] = VERSIONS["truth"]
+    if true.has_object and "truth" in content.header:
+        content.arrays["truth/object_vertices"] = true.object_vertices.astype(np.float32)
+        content.arrays["truth/object_faces"] = true.object_faces.astype(np.uint32)
+        _add_poses(content, "truth", true.rotation, true.translation, zup)

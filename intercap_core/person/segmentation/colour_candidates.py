@@ -1,0 +1,227 @@
+"""The person's mask and candidates of the object from colour images, where a camera has no depth.
+
+Background subtraction: a pixel that differs in colour from the recording's median is foreground.
+Foreground around the projected keypoints is the person. Without depth, a thing that occludes the
+person in the image counts as the person, and a thing that rests for most of a recording is part of
+the background.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numba
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.person.segmentation.constants import (
+    COLOUR_SCALE,
+    COLOUR_SCORE,
+    DARK,
+    DARK_CHANGE,
+    GAIN_STRIDE,
+    HIGHLIGHT,
+    MASK_MARGINS,
+    MAX_COLOUR_CANDIDATES,
+    MAX_COLOUR_SAMPLES,
+    MIN_COLOUR_CELLS,
+    MIN_COLOUR_SAMPLES,
+    OFF_COLOUR,
+    SAMPLE_MARGINS,
+    SATURATED,
+    SHADOW,
+    THING_MARGINS,
+    UNSURE_CELLS,
+)
+from intercap_core.person.segmentation.depth_masks import encode_window
+from intercap_core.person.segmentation.image_segments import ImageCandidate, ViewSegments
+from intercap_core.person.segmentation.moving_person import MovingPerson
+
+
+class ColourSegmenter:
+    """Segments the views of a recording that have colour alone.
+
+    ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
+    (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known, ``sigma`` (T, 135)
+    what they are off by.
+    """
+
+    def __init__(
+        self, frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray
+    ) -> None:
+        self._frames = frames
+        self._rig = Rig.from_artefact(scene)
+        self._person = MovingPerson(joints, sigma, scene)
+        self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+
+    def segment(self, t: int, c: int) -> ViewSegments | None:
+        """One image; None where it does not decode, or its background or the person is unknown."""
+        if c not in self._backgrounds:
+            self._backgrounds[c] = self._background(c)
+        background = self._backgrounds[c]
+        bones = self._person.bones(t, c)
+        image = self._image(t, c) if background is not None and len(bones) else None
+        if image is None or background is None:
+            return None
+        camera = self._rig[c]
+        moved = before(image, *background)
+        # clothes of the wall's colour, or a place that the person never left: take the body's
+        # volume
+        body = drawn(bones, camera, moved.shape, 0)
+        person = body | (moved & drawn(bones, camera, moved.shape, MASK_MARGINS))
+        # the volume's own border, what was cut off, and what has no background are no outline
+        block = np.ones((2 * UNSURE_CELLS + 1,) * 2, np.uint8)
+        assumed = cv2.dilate((body & ~moved).view(np.uint8), block) > 0
+        unsure = assumed | (moved & ~person) | ~background[1]
+        things = moved & ~drawn(bones, camera, moved.shape, THING_MARGINS)
+        block = np.ones((3, 3), np.uint8)
+        rest = cv2.morphologyEx(things.view(np.uint8), cv2.MORPH_OPEN, block)
+        _, label, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=8)
+        areas = stats[:, cv2.CC_STAT_AREA]
+        large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= MIN_COLOUR_CELLS]
+        candidates = [
+            ImageCandidate(self._rle(label == k, camera), COLOUR_SCORE, float("nan"), -1)
+            for k in large[:MAX_COLOUR_CANDIDATES]
+        ]
+        if not person.any():
+            return ViewSegments(b"", candidates)
+        beside = self._rle(unsure, camera) if unsure.any() else b""
+        return ViewSegments(self._rle(person, camera), candidates, beside)
+
+    def _image(self, t: int, c: int) -> np.ndarray | None:
+        jpeg = self._frames.colour_jpeg(t, c)
+        if jpeg is None:
+            return None
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
+        lens = self._rig[c].colour
+        size = (-(-lens.height // COLOUR_SCALE), -(-lens.width // COLOUR_SCALE), 3)
+        return image if image is not None and image.shape == size else None
+
+    def _background(self, c: int) -> tuple[np.ndarray, np.ndarray] | None:
+        sets = np.flatnonzero(self._frames.colour_available[:, c])
+        if len(sets) > MAX_COLOUR_SAMPLES:
+            sets = sets[np.linspace(0, len(sets) - 1, MAX_COLOUR_SAMPLES).round().astype(int)]
+        images, people = [], []
+        for t in sets:
+            image, bones = self._image(int(t), c), self._person.bones(int(t), c)
+            if image is not None:
+                images.append(image)
+                people.append(drawn(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))
+        if len(images) < MIN_COLOUR_SAMPLES:
+            return None
+        return median_without(np.stack(images), np.stack(people))
+
+    def _rle(self, mask: np.ndarray, camera: Camera) -> bytes:
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        top, left = int(rows[0]), int(columns[0])
+        window = mask[top : rows[-1] + 1, left : columns[-1] + 1].astype(np.uint8)
+        lens = camera.colour
+        return encode_window(window, left, top, COLOUR_SCALE, lens.width, lens.height)
+
+
+def median_without(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median colour (H, W, 3) float32 of images (S, H, W, 3) uint8 where nobody is, and whether it
+    is known (H, W) bool; ``people`` (S, H, W) bool.
+
+    Exposures are brought to that of the first image before.
+    """
+    gains = np.stack([_gain(image, images[0]) for image in images])
+    seen = len(images) - people.sum(0)
+    return _median(images, people, gains), seen >= MIN_COLOUR_SAMPLES
+
+
+@numba.njit(cache=True)
+def _median(images: np.ndarray, people: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    samples, height, width, channels = images.shape
+    median = np.zeros((height, width, channels), np.float32)
+    values = np.empty(samples, np.float32)
+    for y in range(height):
+        for x in range(width):
+            for channel in range(channels):
+                count = 0
+                for s in range(samples):
+                    if people[s, y, x]:
+                        continue
+                    value = min(images[s, y, x, channel] * gains[s, channel], np.float32(255))
+                    at = count  # sorted as they come: there are few
+                    while at > 0 and values[at - 1] > value:
+                        values[at] = values[at - 1]
+                        at -= 1
+                    values[at] = value
+                    count += 1
+                if count:
+                    median[y, x, channel] = values[(count - 1) // 2]
+    return median
+
+
+def before(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool of an image (H, W, 3) uint8 that differ from the ``background`` (H, W, 3)
+    float32 by more than a shadow does, holes closed; False where that is not ``known`` (H, W)."""
+    changed = _changed(image, background, _gain(image, background)) & known
+    block = np.ones((3, 3), np.uint8)
+    opened = cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, block)
+    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+@numba.njit(cache=True)
+def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    height, width, channels = image.shape
+    found = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            power = along = length = largest = np.float32(0)
+            for channel in range(channels):
+                seen = image[y, x, channel] * gain[channel]
+                known = background[y, x, channel]
+                power += known * known
+                along += seen * known
+                length += seen * seen
+                largest = max(largest, abs(seen - known))
+            if power < DARK * DARK:
+                found[y, x] = largest > DARK_CHANGE
+                continue
+            brightness = along / power
+            off = length - brightness * along  # squared distance from the background's colour
+            found[y, x] = (
+                off > OFF_COLOUR * OFF_COLOUR or brightness < SHADOW or brightness > HIGHLIGHT
+            )
+    return found
+
+
+def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Factors (3,) float32 that bring an image's exposure to the reference's."""
+    few = np.s_[::GAIN_STRIDE, ::GAIN_STRIDE]
+    a, b = image[few].astype(np.float32), reference[few].astype(np.float32)
+    good = (a > DARK / 2) & (a < SATURATED) & (b > DARK / 2) & (b < SATURATED)
+    gains = np.ones(3, np.float32)
+    for channel in range(3):
+        use = good[..., channel]
+        if use.any():
+            gains[channel] = np.median(b[..., channel][use] / a[..., channel][use])
+    return gains
+
+
+def drawn(bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: float) -> np.ndarray:
+    """Where the person's volume, ``margins`` larger, is in the reduced colour image: (H, W) bool.
+
+    ``bones`` (B, 9), master frame, of :func:`.person_volume.bones_of`.
+    """
+    mask = np.zeros(shape[:2], np.uint8)
+    if not len(bones):
+        return mask > 0
+    ends = apply(camera.colour_from_master, bones[:, :6].astype(np.float64).reshape(-1, 3))
+    pixels = (camera.colour.project(ends) / COLOUR_SCALE).reshape(-1, 4)
+    radius = bones[:, 6:8].mean(1) + margins * bones[:, 8]
+    distance = ends[:, 2].reshape(-1, 2).mean(1)
+    shown = camera.colour.inside_model(ends).reshape(-1, 2).all(1)
+    shown &= np.abs(pixels).max(1) < 1e4  # False for what is not a number
+    width = 2 * radius[shown] * camera.colour.fx / distance[shown] / COLOUR_SCALE
+    for (x0, y0, x1, y1), thick in zip(
+        np.rint(pixels[shown]).astype(int).tolist(),
+        np.rint(width).astype(int).tolist(),
+        strict=True,
+    ):
+        cv2.line(mask, (x0, y0), (x1, y1), 1, thickness=max(1, thick))
+    return mask > 0

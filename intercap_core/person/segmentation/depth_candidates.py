@@ -1,0 +1,318 @@
+"""The person's mask and candidates of the object from depth images alone, one moment at a time.
+
+Background subtraction: depth before the static background is foreground. Foreground within a body
+of average build around the triangulated keypoints is the person, the rest belongs to objects. Their
+points of all views are clustered in space into connected components, and each component is a
+candidate in every view that shows it. Four kinds of component are proposed, the object's track
+chooses:
+
+- moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
+  ``FAR_CUT``), since where hand ends and thing begins is uncertain;
+- merged: neighbouring moving components, for a thing whose middle the hand occludes;
+- static: components of the background near the person's path, for a thing that does not move now;
+- partly moved: a static component with foreground beside it, for a thing that moved by less than
+  its size, so that part of it still coincides with the background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.person.segmentation.constants import (
+    ABOVE_HEAD_M,
+    AROUND_PATH_M,
+    CELL_M,
+    CLOTHING_MARGINS,
+    FAR,
+    FAR_CUT,
+    FLOOR_M,
+    MAX_COMPONENTS,
+    MIN_POINTS,
+    MIN_VIEW_POINTS,
+    NEAR_CUT,
+    NEARBY_CELL_M,
+    ON_TOP_SCORE,
+    PARTLY_MOVED_SCORE,
+    PERSON_MARGINS,
+    PERSON_SAMPLES,
+    SAME_SHARE,
+    STATIC_SCORE,
+    TWO_ENDS_SCORE,
+)
+from intercap_core.person.segmentation.depth_masks import Cells, Projected
+from intercap_core.person.segmentation.foreground import DepthBackground, DepthView, sampled_images
+from intercap_core.person.segmentation.free_space import without_free_space, without_person_traces
+from intercap_core.person.segmentation.image_segments import ImageCandidate, ViewSegments
+from intercap_core.person.segmentation.moving_person import MovingPerson
+from intercap_core.person.segmentation.person_volume import outside
+from intercap_core.person.segmentation.static_things import extent, find_static_things
+from intercap_core.person.segmentation.voxels import components
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewPoints:
+    """Foreground and static things of one view: points (N, 3), z up, and their colour ``cells``.
+
+    ``outside`` (N,) margins outside the person; ``moving`` (N,) bool: before the static scene;
+    ``of_thing``: indices of the points of every static thing.
+    """
+
+    points: np.ndarray
+    cells: Cells
+    outside: np.ndarray
+    moving: np.ndarray
+    of_thing: list[np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class _Component:
+    """A connected component: indices of its points in each view, score (0 to 1), size."""
+
+    members: list[np.ndarray]
+    score: float
+    extent_m: float
+
+
+class DepthSegmenter:
+    """Segments the views of a recording that have depth.
+
+    ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
+    (T, 135, 3) the subject's keypoints in the master frame and ``sigma`` (T, 135) what they are off
+    by, metres, ``cameras`` which of them to look at.
+    """
+
+    def __init__(
+        self,
+        frames: Frames,
+        scene: Artefact,
+        joints: np.ndarray,
+        sigma: np.ndarray,
+        cameras: list[int],
+    ) -> None:
+        self._frames = frames
+        rig = Rig.from_artefact(scene)
+        zup = scene["zup_from_master"]
+        upright = bool(np.isfinite(zup).all())
+        grounded = bool(scene.attributes["ground_found"]) and upright
+        zup = zup if upright else np.eye(4)
+        bias = np.nan_to_num(scene["depth_bias"])
+        self.cameras = [
+            c
+            for c in cameras
+            if rig[c].depth is not None and f"cameras/{rig.names[c]}/background" in scene
+        ]
+        self._views = {
+            c: DepthView(rig[c], float(bias[c]), zup @ rig[c].master_from_depth)
+            for c in self.cameras
+        }
+        self._person = MovingPerson(joints, sigma, scene, zup)
+        joints = self._person.joints
+        everywhere = joints[np.isfinite(joints).all(-1)]
+        self._low = everywhere.min(0) - AROUND_PATH_M
+        above = ABOVE_HEAD_M if upright else AROUND_PATH_M
+        self._high = everywhere.max(0) + np.array([AROUND_PATH_M, AROUND_PATH_M, above])
+        if grounded:
+            self._low[2] = FLOOR_M
+        views = [self._views[c] for c in self.cameras]
+        backgrounds = [
+            DepthBackground.of(
+                scene[f"cameras/{rig.names[c]}/background"],
+                sampled_images(frames, c),
+                self._views[c].reach_mm(self._low, self._high),
+            )
+            for c in self.cameras
+        ]
+        backgrounds = without_free_space(views, backgrounds, self._low, self._high)
+        some = range(0, len(joints), max(1, len(joints) // PERSON_SAMPLES))
+        bodies = [self._person.bones_at(t) for t in some]
+        backgrounds = [
+            without_person_traces(view, background, bodies)
+            for view, background in zip(views, backgrounds, strict=True)
+        ]
+        self._background = dict(zip(self.cameras, backgrounds, strict=True))
+        # without the floor removed, the whole scene is one component
+        bottom = self._low if grounded else self._high
+        self._static = find_static_things(views, backgrounds, bottom, self._high, everywhere)
+        self._fixed = {c: self._static_points(number, c) for number, c in enumerate(self.cameras)}
+
+    def _static_points(self, number: int, c: int) -> list[tuple[np.ndarray, np.ndarray, Cells]]:
+        """Flat pixels, points and cells of every static thing in one camera."""
+        view, found = self._views[c], []
+        for thing in self._static.things:
+            pixels = thing.pixels[number]
+            points, local = view.points(self._background[c].depth, pixels)
+            found.append((pixels, points, Cells.of(local, view.camera)))
+        return found
+
+    def segment(self, t: int, wanted: list[int]) -> dict[int, ViewSegments]:
+        """The views ``wanted`` of moment ``t``, those that have no depth image left out."""
+        images = {
+            c: image
+            for c in wanted
+            if c in self._views and (image := self._frames.depth(t, c)) is not None
+        }
+        if not images:
+            return {}
+        seen = [self._view_points(t, c, image) for c, image in images.items()]
+        moving = _moving_components(seen)
+        proposed = [
+            *moving,
+            *_merged_neighbours(seen, moving),
+            *self._static_components(seen),
+            *self._partly_moved(seen),
+        ]
+        return {
+            c: _masks(view, [(one, one.members[number]) for one in proposed])
+            for number, (c, view) in enumerate(zip(images, seen, strict=True))
+        }
+
+    def _view_points(self, t: int, c: int, image: np.ndarray) -> _ViewPoints:
+        view, background = self._views[c], self._background[c]
+        index = background.before(image)
+        points, local = view.points(image, index)
+        inside = ((points > self._low) & (points < self._high)).all(1)
+        points, local, index = points[inside], local[inside], index[inside]
+        bones = self._person.bones(t, c)
+        away = outside(points, bones)
+        # background unknown to this view may be known to another one
+        rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
+        scene = rest[self._static.surface.holds(points[rest])]
+        moving = np.ones(len(points), bool)
+        moving[scene] = False
+        shown = background.shows(image).ravel()
+        parts, cells, of_thing = [points], [Cells.of(local, view.camera)], []
+        count = len(points)
+        for thing, (pixels, fixed, fixed_cells) in zip(
+            self._static.things, self._fixed[c], strict=True
+        ):
+            here = shown[pixels]
+            parts.append(fixed[here])
+            cells.append(fixed_cells[here])
+            own = scene[thing.cells.holds(points[scene])]
+            of_thing.append(np.concatenate([own, count + np.arange(here.sum())]))
+            count += int(here.sum())
+        more = count - len(points)
+        return _ViewPoints(
+            np.concatenate(parts),
+            Cells.joined(cells),
+            np.concatenate([away, np.full(more, FAR, np.float32)]),
+            np.concatenate([moving, np.zeros(more, bool)]),
+            of_thing,
+        )
+
+    def _static_components(self, seen: list[_ViewPoints]) -> list[_Component]:
+        return [
+            _Component(
+                [view.of_thing[k] for view in seen],
+                ON_TOP_SCORE if thing.on_top else STATIC_SCORE,
+                thing.extent_m,
+            )
+            for k, thing in enumerate(self._static.things)
+        ]
+
+    def _partly_moved(self, seen: list[_ViewPoints]) -> list[_Component]:
+        """Components of static things together with foreground that touches them.
+
+        For a thing that moved by less than its size, such as a chair that was pushed: part of it
+        coincides with its place in the background, the rest is foreground.
+        """
+        chosen = []
+        touched = False
+        for view in seen:
+            moving = np.flatnonzero(view.moving & (view.outside > NEAR_CUT))
+            parts = [moving]
+            for k, thing in enumerate(self._static.things):
+                if not thing.carries:
+                    parts.append(view.of_thing[k])
+                    touched |= bool(thing.cells.holds(view.points[moving]).any())
+            chosen.append(np.unique(np.concatenate(parts)))
+        if not touched:
+            return []
+        found = []
+        for members, points in _connected(seen, chosen):
+            moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
+            if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
+                found.append(_Component(members, PARTLY_MOVED_SCORE, extent(points)))
+        return found[:MAX_COMPONENTS]
+
+
+def _connected(
+    seen: list[_ViewPoints], chosen: list[np.ndarray], cell_m: float = CELL_M
+) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """Components of the points ``chosen`` in each view: their indices by view, and points."""
+    ends = np.cumsum([0, *map(len, chosen)])
+    points = np.concatenate([view.points[own] for view, own in zip(seen, chosen, strict=True)])
+    for group in components(points, cell_m, MIN_POINTS):
+        cuts = np.searchsorted(group, ends)
+        members = [own[group[cuts[v] : cuts[v + 1]] - ends[v]] for v, own in enumerate(chosen)]
+        yield members, points[group]
+
+
+def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
+    """Components of the foreground farther from the person than either cut; clothing left out."""
+    proposed: list[_Component] = []
+    for cut in (NEAR_CUT, FAR_CUT):
+        kept = 0
+        chosen = [np.flatnonzero(view.moving & (view.outside > cut)) for view in seen]
+        for members, points in _connected(seen, chosen):
+            away = np.concatenate([v.outside[m] for v, m in zip(seen, members, strict=True)])
+            reach = float(np.percentile(away, 95))
+            if reach < CLOTHING_MARGINS or any(
+                _is_same(members, other.members) for other in proposed
+            ):
+                continue
+            proposed.append(
+                _Component(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), extent(points))
+            )
+            kept += 1
+            if kept == MAX_COMPONENTS:
+                break
+    return proposed
+
+
+def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> list[_Component]:
+    """Unions of components less than a hand's breadth apart.
+
+    For a thing that a hand holds in its middle: both ends are components of their own.
+    """
+    if len(proposed) < 2:
+        return []
+    chosen = [
+        np.unique(np.concatenate([one.members[v] for one in proposed])) for v in range(len(seen))
+    ]
+    found: list[_Component] = []
+    for members, points in _connected(seen, chosen, NEARBY_CELL_M):
+        parts = components(points, CELL_M, MIN_POINTS)
+        if len(parts) > 1 and len(found) < MAX_COMPONENTS:
+            found.append(_Component(members, TWO_ENDS_SCORE, extent(points)))
+    return found
+
+
+def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    """Whether ``own``, a subset of ``other``, holds nearly all of its points."""
+    size = sum(map(len, other))
+    return sum(map(len, own)) > SAME_SHARE * size and any(
+        len(a) and len(b) and a[0] in b for a, b in zip(own, other, strict=True)
+    )
+
+
+def _masks(seen: _ViewPoints, proposed: list[tuple[_Component, np.ndarray]]) -> ViewSegments:
+    projected = Projected.of(seen.cells)
+    person = seen.moving & (seen.outside < PERSON_MARGINS)
+    things = ~person
+    candidates = []
+    for component, (one, members) in enumerate(proposed):
+        if len(members) < MIN_VIEW_POINTS:
+            continue
+        chosen = np.zeros(len(person), bool)
+        chosen[members] = True
+        rle = projected.rle(chosen, person & ~chosen)
+        if rle:
+            candidates.append(ImageCandidate(rle, one.score, one.extent_m, component))
+    return ViewSegments(projected.rle(person, things), candidates)

@@ -1,0 +1,169 @@
+"""Sets of depth pixels as masks of the colour image, at the resolution that depth has there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numba
+import numpy as np
+
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.person.segmentation.constants import OCCLUDED_BEHIND_M
+
+_CLOSING = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Where points (N,) lie in a colour image of (height, width) cells of ``scale`` pixels.
+
+    ``cell`` (N,) flat, -1 outside the image; ``z`` (N,) depth in the colour camera, metres.
+    """
+
+    cell: np.ndarray
+    z: np.ndarray
+    height: int
+    width: int
+    scale: int
+    colour_size: tuple[int, int]
+
+    @classmethod
+    def of(cls, points: np.ndarray, camera: Camera) -> Cells:
+        """Of ``points`` (N, 3) float32 in the depth camera's frame."""
+        colour, depth = camera.colour, camera.depth
+        assert depth is not None and camera.colour_from_depth is not None
+        scale = max(1, round(colour.fx / depth.fx))
+        width, height = -(-colour.width // scale), -(-colour.height // scale)
+        moved = apply(camera.colour_from_depth, points)
+        pixel = np.nan_to_num((colour.project(moved) + 0.5) / scale, nan=-1.0)
+        column, row = np.floor(pixel).astype(np.int64).T
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        inside &= colour.inside_model(moved)
+        cell = np.where(inside, row * width + column, -1)
+        return cls(cell, moved[:, 2], height, width, scale, (colour.width, colour.height))
+
+    def __getitem__(self, chosen: np.ndarray) -> Cells:
+        """Some of the points."""
+        return replace(self, cell=self.cell[chosen], z=self.z[chosen])
+
+    @classmethod
+    def joined(cls, parts: list[Cells]) -> Cells:
+        """All points of one image, end to end."""
+        cell, z = (np.concatenate([getattr(part, key) for part in parts]) for key in ("cell", "z"))
+        return replace(parts[0], cell=cell, z=z)
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Depth pixels on cells of the colour image.
+
+    ``cell`` (N,) flat cell of each pixel, -1 where a nearer pixel or the image's edge hides it;
+    the grid is (height, width) cells of ``scale`` x ``scale`` colour pixels.
+    """
+
+    cell: np.ndarray
+    height: int
+    width: int
+    scale: int
+    colour_size: tuple[int, int]  # width, height
+
+    @classmethod
+    def of(cls, cells: Cells) -> Projected:
+        """The pixels of ``cells``; each hides what is clearly behind it."""
+        hidden = _hidden(cells.cell, cells.z, cells.height * cells.width)
+        cell = np.where(hidden, -1, cells.cell)
+        return cls(cell, cells.height, cells.width, cells.scale, cells.colour_size)
+
+    def rle(self, chosen: np.ndarray, others: np.ndarray) -> bytes:
+        """The mask of the pixels ``chosen`` (N,) bool as COCO RLE.
+
+        Holes of the projection are closed, but not over cells of ``others`` (N,) bool. Empty
+        bytes where nothing is left.
+        """
+        cells = self.cell[chosen & (self.cell >= 0)]
+        if not len(cells):
+            return b""
+        row, column = np.divmod(cells, self.width)
+        top, left = max(int(row.min()) - 2, 0), max(int(column.min()) - 2, 0)
+        bottom, right = int(row.max()) + 3, int(column.max()) + 3
+        drawn = np.zeros((bottom - top, right - left), np.uint8)
+        drawn[row - top, column - left] = 1
+        mask = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, _CLOSING)
+        taken_row, taken_column = np.divmod(self.cell[others & (self.cell >= 0)], self.width)
+        near = (taken_row >= top) & (taken_row < bottom)
+        near &= (taken_column >= left) & (taken_column < right)
+        mask[taken_row[near] - top, taken_column[near] - left] = 0
+        mask[row - top, column - left] = 1
+        width, height = self.colour_size
+        return encode_window(mask, left, top, self.scale, width, height)
+
+
+def encode_window(
+    mask: np.ndarray, left: int, top: int, scale: int, width: int, height: int
+) -> bytes:
+    """COCO compressed RLE of an image (height, width) that is set where a window of cells is.
+
+    ``mask`` (h, w) uint8; cell (0, 0) covers the ``scale`` x ``scale`` pixels from (left, top) *
+    ``scale`` on. What lies outside the image is cut off.
+    """
+    columns = min(mask.shape[1] * scale, width - left * scale)
+    rows = min(mask.shape[0] * scale, height - top * scale)
+    if columns <= 0 or rows <= 0:
+        return bytes(_compressed(np.array([width * height], np.int64)))
+    counts = _counts(mask, left, top, scale, width, height)
+    return bytes(_compressed(counts))
+
+
+@numba.njit(cache=True)
+def _hidden(cell: np.ndarray, z: np.ndarray, cells: int) -> np.ndarray:
+    """Pixels (N,) bool behind a nearer one of their cell by more than a surface's slope there."""
+    nearest = np.full(cells, np.float32(1e9))
+    for i in range(len(cell)):
+        if cell[i] >= 0 and z[i] < nearest[cell[i]]:
+            nearest[cell[i]] = z[i]
+    hidden = np.zeros(len(cell), np.bool_)
+    for i in range(len(cell)):
+        hidden[i] = cell[i] >= 0 and z[i] > nearest[cell[i]] + np.float32(OCCLUDED_BEHIND_M)
+    return hidden
+
+
+@numba.njit(cache=True)
+def _counts(
+    mask: np.ndarray, left: int, top: int, scale: int, width: int, height: int
+) -> np.ndarray:
+    """Lengths of the runs of the image in column-major order, zeros first."""
+    counts = np.empty(2 + 2 * mask.size * scale, np.int64)
+    number, start, inside = 0, 0, False  # runs written, where this one starts, what it is
+    for column in range(left * scale, min((left + mask.shape[1]) * scale, width)):
+        x = column // scale - left
+        for y in range(mask.shape[0] + 1):
+            row = min((top + y) * scale, height)
+            here = y < mask.shape[0] and mask[y, x] != 0 and row < height
+            if here != inside:
+                at = column * height + row
+                counts[number] = at - start
+                number += 1
+                start, inside = at, here
+    counts[number] = width * height - start
+    return counts[: number + 1]
+
+
+@numba.njit(cache=True)
+def _compressed(counts: np.ndarray) -> np.ndarray:
+    """The string of run lengths (pycocotools' maskApi.c, rleToString)."""
+    text = np.empty(len(counts) * 8, np.uint8)
+    length = 0
+    for i in range(len(counts)):
+        value = counts[i] - counts[i - 2] if i > 2 else counts[i]
+        more = True
+        while more:
+            bits = value & 0x1F
+            value >>= 5
+            more = value != -1 if bits & 0x10 else value != 0
+            if more:
+                bits |= 0x20
+            text[length] = bits + 48
+            length += 1
+    return text[:length]

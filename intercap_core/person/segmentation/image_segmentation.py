@@ -1,0 +1,56 @@
+"""Masks and candidates from the images alone, by depth where a camera measures it, else colour."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from intercap_core.artefacts import Artefact
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.person.segmentation.colour_candidates import ColourSegmenter
+from intercap_core.person.segmentation.depth_candidates import DepthSegmenter
+from intercap_core.person.segmentation.image_segments import ViewSegments
+from intercap_core.progress import Progress
+
+log = logging.getLogger(__name__)
+
+
+def segment_images(
+    frames: Frames,
+    scene: Artefact,
+    joints: np.ndarray,
+    wanted: np.ndarray,
+    sigma: np.ndarray | None = None,
+) -> dict[tuple[int, int], ViewSegments]:
+    """Segment the images ``wanted`` (T, C) bool; by moment and camera, those that can be.
+
+    ``frames`` are read by the moment that their images show, ``scene`` is the scene artefact,
+    ``joints`` (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known,
+    ``sigma`` (T, 135) what they are off by, metres, None = nothing.
+    """
+    sigma = np.zeros(joints.shape[:2]) if sigma is None else sigma
+    posed = np.isfinite(scene["master_from_colour"]).all((1, 2)) & scene["present"]
+    wanted = wanted & posed
+    found: dict[tuple[int, int], ViewSegments] = {}
+    depth = wanted & frames.depth_available
+    if depth.any() and np.isfinite(joints).any():
+        segmenter = DepthSegmenter(
+            frames, scene, joints, sigma, np.flatnonzero(depth.any(0)).tolist()
+        )
+        moments = np.flatnonzero(depth.any(1)).tolist()
+        progress = Progress(log, "segmented", len(moments), "frames by depth")
+        for t in moments:
+            segments = segmenter.segment(t, np.flatnonzero(depth[t]).tolist())
+            found.update({(t, c): view for c, view in segments.items()})
+            progress.step()
+    colour = wanted & ~depth & frames.colour_available
+    if colour.any() and np.isfinite(joints).any():
+        by_colour = ColourSegmenter(frames, scene, joints, sigma)
+        progress = Progress(log, "segmented", int(colour.sum()), "images by colour")
+        for t, c in np.argwhere(colour).tolist():
+            view = by_colour.segment(t, c)
+            if view is not None:
+                found[t, c] = view
+            progress.step()
+    return found

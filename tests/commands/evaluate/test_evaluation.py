@@ -1,0 +1,225 @@
+"""What `intercap evaluate` refuses and prints; the workflow itself is tested elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from intercap_core.cli import BODY_SETTINGS, OBJECT_SETTINGS
+from intercap_core.commands.evaluate import bodies as body_evaluation
+from intercap_core.commands.evaluate import objects as object_evaluation
+from intercap_core.commands.evaluate.captures import flat as capture_figures
+from intercap_core.commands.evaluate.captures import print_captures
+from intercap_core.commands.evaluate.objects import lost_by_draw, print_objects
+from intercap_core.commands.evaluate.part import Measured, require_truth
+from intercap_core.commands.evaluate.run import QUICK_SETTINGS
+from intercap_core.errors import UserError
+from intercap_core.evaluation.body_clouds import CLOUD_KEYS
+from intercap_core.evaluation.body_errors import BodyErrors
+from intercap_core.evaluation.capture import CaptureErrors, SlipCounts
+from intercap_core.evaluation.object_errors import ObjectErrors
+from intercap_core.project import load_project
+
+CONFIGS = sorted(Path("config/capture").glob("*.yaml"))
+
+
+def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
+    seeds: list[int] = []
+    for path in CONFIGS:
+        studio = load_project(path).config.studio
+        assert studio is not None and studio.slips == "silent"
+        rooms = [entry.room for entry in studio.captures.values()]
+        assert {"furnished", "bare"} == set(rooms)
+        seeds += [entry.seed for entry in studio.captures.values()]
+    of_config = ("no_detector", "redrawn_1", "redrawn_2")
+    objects = [path for path in OBJECT_SETTINGS if path.stem not in of_config]
+    others = [
+        Path(f"config/{other}/config.yaml")
+        for other in ("demo", "test", "bench", "evaluation", "annotate")
+    ]
+    others += [QUICK_SETTINGS, Path("config/evaluation/long.yaml")]
+    others += sorted(Path("config/field").glob("*.yaml"))
+    for path in [*others, *objects]:
+        studio = load_project(path).config.studio
+        assert studio is not None
+        seeds += {entry.seed for entry in studio.captures.values()}
+    assert len(CONFIGS) == 3 and len(seeds) == len(set(seeds))
+
+
+def test_all_objects_are_evaluated_with_and_without_a_detector() -> None:
+    project, without = (
+        load_project(Path(f"config/object/{n}.yaml")) for n in ("config", "no_detector")
+    )
+    assert {row.object for row in project.sequences.values()} == set(project.objects)
+    assert all(row.candidates is None for row in without.sequences.values())
+    assert [row.recordings for row in without.sequences.values()] == [
+        row.recordings for row in project.sequences.values()
+    ]
+
+
+def test_detections_are_drawn_anew_of_the_same_recordings() -> None:
+    one, *others = (
+        load_project(Path(f"config/object/{name}.yaml"))
+        for name in ("config", "redrawn_1", "redrawn_2")
+    )
+    for number, other in enumerate(others, 1):
+        for name, capture in other.config.studio.captures.items():
+            first = one.config.studio.captures[name]
+            assert capture == first.model_copy(update={"redrawn_detections": number})
+        assert list(other.sequences) == list(one.sequences)
+
+
+def test_the_spread_of_what_is_lost_is_by_object() -> None:
+    def measured(dataset: str, shares: dict[str, float]) -> Any:
+        errors = [
+            SimpleNamespace(object_=name, lost=np.arange(100) < 100 * share)
+            for name, share in shares.items()
+        ]
+        return SimpleNamespace(dataset=dataset, errors=errors)
+
+    draws = [
+        measured("object", {"cup": 0.3, "chair": 0.0}),
+        measured("object_noise2", {"cup": 0.9}),
+        measured("object_redrawn1", {"cup": 0.04, "chair": 0.0}),
+        measured("object_redrawn2", {"cup": 0.1, "chair": 0.02}),
+    ]
+    assert lost_by_draw(draws) == {"cup": [0.3, 0.04, 0.1], "chair": [0.0, 0.0, 0.02]}
+    assert lost_by_draw(draws[:2]) == {}
+
+
+def test_captures_without_truth_cannot_be_evaluated() -> None:
+    with pytest.raises(UserError, match="has no truth to be evaluated against"):
+        require_truth(load_project(Path("config/config.yaml")))
+
+
+def test_every_capture_and_figure_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    none = np.zeros(0)
+    slips = SlipCounts(found=1, missed=1, false=0, images_wrong=3, images=50)
+    many = CaptureErrors(
+        "many", "bare", np.array([0.02]), np.array([0.004]), np.array([-0.001]), np.array([np.nan]),
+        slips, 0.0015, 0.05, none,
+    )  # fmt: skip
+    alone = CaptureErrors("alone", "", none, none, none, none, slips, np.nan, np.nan, none)
+    found = Measured("capture", [many, alone], ["broken"])
+    print_captures([found])
+    flat = capture_figures([found])
+    assert flat["capture.captures"] == 2 and "capture.captures_spread" not in flat
+    printed = capsys.readouterr().out
+    for words in ("many", "alone", "broken", "1 of 2", "1.50", "extrinsics_floor_only_mm"):
+        assert words in printed
+    assert "nan" not in printed
+
+
+def test_keys_of_a_variant_come_after_the_area_and_the_object() -> None:
+    count = 3
+    cup = ObjectErrors(
+        "a", "cup", 15.0, np.array([0.002, 0.003, 0.1]), np.zeros(count), np.full(count, np.nan),
+        np.zeros((count, 3)), np.zeros((count, 3)), np.array([6, 2, 1]), np.ones(count, bool),
+        np.zeros(count, bool),
+    )  # fmt: skip
+    flat = object_evaluation.flat([Measured("object", [cup])])
+    assert flat["object.translation_median_mm"] == pytest.approx(2.5)
+    assert flat["object.cup.lost_share"] == flat["object.views_0_to_1.lost_share"] / 3
+    flat = object_evaluation.flat([Measured("object_noise2", [cup])])
+    assert flat["object.noise2_translation_median_mm"] == pytest.approx(2.5)
+    assert flat["object.cup.noise2_lost_share"] == pytest.approx(1 / 3)
+    assert flat["object.noise2_views_2.frames"] == 1
+
+
+def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    cup = ObjectErrors(
+        "a", "cup", 15.0, np.array([0.0021]), np.array([0.5]), np.full(1, np.nan),
+        np.zeros((1, 3)), np.zeros((1, 3)), np.array([4]), np.zeros(1, bool), np.zeros(1, bool),
+    )  # fmt: skip
+    print_objects([Measured("object", [cup], ["kick_s09"])])
+    printed = capsys.readouterr().out
+    for words in ("cup", "all", "kick_s09: no track", "2.1", "0.50"):
+        assert words in printed
+    assert "nan" not in printed
+
+
+def test_bodies_with_less_are_fitted_to_recordings_that_others_make() -> None:
+    projects = [load_project(path) for path in BODY_SETTINGS]
+    first = projects[0]
+    assert first.config.studio is not None
+    made = {row.recordings for row in first.sequences.values()}
+    others = [project for project in projects if project.config.studio is None]
+    assert len(others) == 7
+    for project in others:
+        assert {row.recordings for row in project.sequences.values()} <= made
+    assert [body_evaluation.rig_of(project.config) for project in others] == [
+        "all views, a shape a frame",
+        "all views, no depth",
+        "4 views",
+        "4 views, no depth",
+        "2 views",
+        "2 views, no depth",
+        "1 view",
+    ]
+    assert {path for path in Path("config/body").glob("*.yaml")} < set(BODY_SETTINGS)
+
+
+def _body(name: str, pve_mm: float, *, interaction: str = "drink", flagged: bool = False):
+    def of(*shape: int) -> np.ndarray:
+        return np.full((2, *shape), 1e-3 * pve_mm)
+
+    return BodyErrors(
+        name, interaction, Path(f"{name}.h5"), 6, of(), of(), of(22), of(2), of(2),
+        np.ones((2, 2), bool), of(), of(), of(), np.ones((2, 22)), np.ones((2, 30)),
+        np.full(2, flagged), {},
+    )  # fmt: skip
+
+
+def _bodies() -> list[Measured[BodyErrors]]:
+    main = [_body("a", 5), _body("b", 7, interaction="sit")]
+    return [
+        Measured("object", main, rig="all views"),
+        Measured("object_noise2", [_body("c", 50, flagged=True)], rig="all views"),
+        Measured("body_two_view", [_body("b", 90)], ["a"], "2 views"),
+    ]
+
+
+def test_figures_that_versions_are_compared_by_keep_their_names() -> None:
+    clouds = {key: np.ones(1) for key in CLOUD_KEYS}
+    error = replace(_body("a", 50, flagged=True), clouds=clouds)
+    kinds = ("object", "object_noise2", "body_per_frame_shape", "body_rgb_only", "body_two_view")
+    flat = body_evaluation.flat([Measured(kind, [error]) for kind in kinds])
+    names = (
+        "pve_mm", "mpjpe_mm", "hand_mpjpe_mm", "hand_grasp_mpjpe_mm", "face_mm", "noise2_pve_mm",
+        "per_frame_shape_pve_mm", "cloud_to_mesh_mm", "mesh_to_cloud_visible_mm",
+        "rgb_only_mpjpe_mm", "two_view_mpjpe_mm", "bad_frames_recall", "bad_frames_precision",
+    )  # fmt: skip
+    assert {f"body.{name}" for name in names} <= flat.keys()
+
+
+def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
+    flat = body_evaluation.flat(_bodies())
+    assert flat["body.pve_mm"] == pytest.approx(6)
+    assert flat["body.pve_mm_spread"] == pytest.approx(1)  # of 5 and 7 mm
+    assert flat["body.sit.mpjpe_mm"] == pytest.approx(7)
+    assert flat["body.noise2_pve_mm"] == flat["body.drink.noise2_pve_mm"] == pytest.approx(50)
+    assert flat["body.two_view_mpjpe_mm"] == pytest.approx(90)
+    assert "body.drink.two_view_mpjpe_mm" not in flat
+    assert flat["body.compared_pve_mm"] == pytest.approx(7)  # of b, which two views saw as well
+    assert flat["body.joint_left_knee_mm"] == pytest.approx(6)
+    # bad frames are those of c, which are flagged, and those of b by two views, which are not
+    assert flat["body.bad_frames_recall"] == pytest.approx(0.5)
+    assert flat["body.bad_frames_precision"] == 1
+    assert flat["body.bad_frames_share"] == pytest.approx(0.5)
+    assert flat["body.two_view_bad_frames_recall"] == 0
+
+
+def test_bodies_are_printed_by_interaction_rig_joint_and_worst_frame(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    body_evaluation.print_bodies(_bodies())
+    printed = capsys.readouterr().out
+    for words in ("drink", "sit", "2 views: a: no fit", "left_knee", "object_noise2/c", "yes"):
+        assert words in printed
+    assert "bad frames in all: 4 of 8; flags' recall 0.50, precision 1.00" in printed
+    assert "nan" not in printed

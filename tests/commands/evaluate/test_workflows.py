@@ -1,0 +1,125 @@
+"""Which projects wait for which, what a run is expected to take, and what was done before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from intercap_core.cli import (
+    BODY_SETTINGS,
+    CAPTURE_SETTINGS,
+    FIELD_SCENE_SETTINGS,
+    FIELD_SETTINGS,
+    OBJECT_SETTINGS,
+    SEQUENCE_SETTINGS,
+)
+from intercap_core.commands.evaluate import budget
+from intercap_core.commands.evaluate.part import Targets
+from intercap_core.commands.evaluate.reference import worse
+from intercap_core.commands.evaluate.run import PARTS
+from intercap_core.commands.evaluate.workflows import Order, orders_of, progress
+from intercap_core.project import load_project
+
+SETTINGS = {
+    "sequences": SEQUENCE_SETTINGS,
+    "captures": CAPTURE_SETTINGS,
+    "objects": OBJECT_SETTINGS,
+    "bodies": BODY_SETTINGS,
+    "field_scenes": FIELD_SCENE_SETTINGS,
+    "field": FIELD_SETTINGS,
+}
+
+
+@pytest.fixture(scope="module")
+def wanted() -> dict[str, Targets]:
+    return {
+        name: PARTS[name].targets([load_project(path) for path in paths])
+        for name, paths in SETTINGS.items()
+    }
+
+
+def _frames(wanted: dict[str, Targets]) -> dict[Path, int]:
+    return budget.frames_of([project for targets in wanted.values() for _, project in targets])
+
+
+def test_projects_wait_for_those_that_make_their_recordings(
+    wanted: dict[str, Targets],
+) -> None:
+    orders = orders_of(wanted, _frames(wanted))
+    by_name = {order.project.config.dataset: order for order in orders}
+    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 5 + 7
+    assert orders[0] is by_name["object"]  # what most wait for comes first
+    stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
+    assert by_name["object"].stages == stages
+    for name in ("object_no_detector", "body_two_view"):
+        assert by_name[name].after == [by_name["object"]]
+    assert by_name["object_noise2"].after == []
+
+
+def test_people_alone_are_taken_to_the_export_and_nobody_else(wanted: dict[str, Targets]) -> None:
+    orders = orders_of(wanted, _frames(wanted))
+    to_export = [order for order in orders if "export" in order.stages]
+    assert [order.project.config.dataset for order in to_export] == ["field_alone"]
+    assert to_export[0].stages == ["export"]
+    jobs = [(name, stage) for _, name, stage in budget.jobs_of(to_export[0].project, ["export"])]
+    for name in to_export[0].project.sequences:
+        own = [stage for of, stage in jobs if of == name]
+        assert own[0] == "studio" and own[-2:] == ["metrics", "export"] and len(own) == 10
+
+
+def test_a_smaller_ring_is_expected_to_take_less() -> None:
+    """Of the studio what it records counts, of a stage what it is given."""
+    four, six = (load_project(Path(f"config/field/{name}.yaml")) for name in ("rates", "shoes"))
+    for stage in ("studio", "scene"):
+        some, every = (
+            budget.expected_seconds(project, stage, 60) - budget.SECONDS_PER_START
+            for project in (four, six)
+        )
+        assert some == pytest.approx(4 / 6 * every)
+    of_six = load_project(Path("config/body/four_view.yaml"))
+    made = {stage: budget.expected_seconds(of_six, stage, 60) for stage in ("studio", "scene")}
+    assert made["scene"] == budget.expected_seconds(four, "scene", 60)
+    assert made["studio"] >= budget.expected_seconds(six, "studio", 60)
+
+
+def test_each_part_is_expected_to_keep_to_its_budget(
+    wanted: dict[str, Targets],
+) -> None:
+    frames = _frames(wanted)
+    minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
+    for part in PARTS:
+        assert minutes[f"{part}_minutes_expected"] <= minutes[f"{part}_minutes_budget"]
+    added_later = 11 + 33  # detections drawn anew; the field
+    assert sum(budget.BUDGET_MINUTES[part] for part in PARTS) <= 75 + added_later < 120
+
+
+def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
+    project = load_project(Path("config/test/config.yaml"))
+    order = Order(project, ["scene"], {"frames": [10.0, 30.0], "scene": [60.0, 60.0]})
+    assert order.left() == (160.0, 0.0)
+
+    class Watcher:
+        transcript = tmp_path / "snakemake.log"
+
+        def jobs(self) -> dict[str, object]:
+            return {"a: frames": type("State", (), {"state": "finished"})}
+
+    order.watcher = Watcher()  # type: ignore[assignment]
+    order.watcher.transcript.write_text(
+        "Job stats:\njob  count\n---\nframes  1\nscene  2\ntotal  3\n"
+    )
+    assert order.left() == (120.0, 20.0)
+    assert progress([order], 2, 0.0) == "0 of 1 projects done after 0 minutes, at most 1 left"
+    order.status = 0
+    assert order.left() == (0.0, 140.0)
+
+
+def test_worse_goes_beyond_the_spread_in_the_bad_direction() -> None:
+    assert worse("joint.body_pve_mm", 8.0, 7.0, 0.3)
+    assert not worse("joint.body_pve_mm", 8.0, 7.0, 0.6)
+    assert not worse("joint.body_pve_mm", 6.0, 7.0, 0.1)
+    assert worse("joint.contact_region_f1", 0.8, 0.95, 0.02)
+    assert worse("object.cup.lost_share", 0.3, 0.0, 0.0)
+    assert not worse("object.recordings", 3, 5, 0.0)
+    assert not worse("joint.rest_jitter_mm", 3e-4, 2e-4, 0.0)  # nothing rests more still

@@ -1,0 +1,309 @@
+"""Every measure on a case small enough to work out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from intercap_core.config import ContinuousSymmetry, Symmetry
+from intercap_core.evaluation import body, contact, flags, motion, object_pose, penetration
+from intercap_core.evaluation.clouds import Cloud, vertex_to_cloud, visible_to_cloud
+from intercap_core.evaluation.extrinsics import displacement, rig_centre
+from intercap_core.evaluation.proximity import PosedBody, PosedObject, Sight, face_normals
+from intercap_core.geometry.rigid.surface_samples import sample_surface
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _turn_z(degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def _box(side: float) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.box((side, side, side))
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def test_vertex_and_joint_errors_are_mean_distances() -> None:
+    vertices = np.array([[[0.0, 0, 0], [1, 0, 0]]])
+    moved = vertices + np.array([[[0, 0.03, 0.04], [0, 0, 0.01]]])
+    assert body.vertex_error(moved, vertices) == pytest.approx([0.03])
+    joints = np.zeros((1, 55, 3))
+    off = joints.copy()
+    off[0, 21] = [0.022, 0, 0]  # the last of the 22 body joints
+    off[0, 22] = [9, 9, 9]  # the jaw is not one
+    assert body.joint_error(off, joints) == pytest.approx([0.001])
+
+
+def test_hand_errors_count_fingers_and_tips_and_can_follow_the_wrist() -> None:
+    joints, tips = np.zeros((1, 55, 3)), np.zeros((1, 10, 3))
+    moved, moved_tips = joints.copy(), tips.copy()
+    moved[0, 20] = moved[0, 25:40] = [0.01, 0, 0]  # the whole left hand, with its wrist
+    moved_tips[0, :5] = [0.01, 0, 0]
+    moved_tips[0, 9] = [0, 0.04, 0]  # the right little finger's tip alone
+    plain = body.hand_error(moved, moved_tips, joints, tips)
+    assert plain == pytest.approx(np.array([[0.01, 0.04 / 20]]))
+    aligned = body.hand_error(moved, moved_tips, joints, tips, align_wrists=True)
+    assert aligned == pytest.approx(np.array([[0.0, 0.04 / 20]]))
+
+
+def test_corresponding_vertices_interpolate_the_true_faces() -> None:
+    found = body.corresponding_vertices(
+        SQUARE[None], SQUARE_FACES, np.array([0, 1]), np.array([[0.5, 0.5, 0], [0, 0, 1.0]])
+    )
+    assert found == pytest.approx(np.array([[[0.5, 0, 0], [0, 1, 0]]]))
+
+
+def test_honest_uncertainty_has_a_normalised_error_of_one() -> None:
+    random = np.random.default_rng(0)
+    true = np.zeros((400, 55, 3))
+    fitted = random.normal(0, 0.01, true.shape)
+    sigma = np.full((400, 55), 0.01)
+    assert np.median(body.normalised_joint_error(fitted, true, sigma)) == pytest.approx(1, abs=0.03)
+    covariance = np.repeat(np.diag([1, 1, 1, 1e-4, 4e-4, 9e-4])[None], 5000, 0)
+    error = random.normal(0, 1, (5000, 3)) * [0.01, 0.02, 0.03]
+    length = object_pose.normalised_translation_error(error, np.zeros_like(error), covariance)
+    assert np.median(length) == pytest.approx(1, abs=0.03)
+
+
+def test_normalised_error_is_unknown_without_a_covariance() -> None:
+    covariance = np.stack([np.full((6, 6), np.nan), np.zeros((6, 6)), np.eye(6)])
+    length = object_pose.normalised_translation_error(np.ones((3, 3)), np.zeros((3, 3)), covariance)
+    assert np.isnan(length[:2]).all()
+    assert length[2] == pytest.approx(np.sqrt(3) / body.MEDIAN_CHI_3)
+
+
+def test_object_error_is_taken_at_the_centre_and_over_the_symmetry_group() -> None:
+    centre = np.array([0.1, 0, 0])
+    quarter = _turn_z(90)
+    at = object_pose.posed_point(quarter, np.zeros(3), centre)
+    assert at == pytest.approx([0, 0.1, 0])
+    true = object_pose.posed_point(np.eye(3), np.zeros(3), centre)
+    assert object_pose.centre_error(at, true) == pytest.approx(0.1 * np.sqrt(2))
+    none = SymmetryGroup.none()
+    round_ = SymmetryGroup.from_settings(
+        Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
+    )
+    assert object_pose.rotation_error_deg(quarter, np.eye(3), none) == pytest.approx(90)
+    assert object_pose.rotation_error_deg(quarter, np.eye(3), round_) == pytest.approx(0, abs=1e-6)
+
+
+def test_lost_and_first_frame() -> None:
+    translation = np.array([0.01, 0.051, 0.01])
+    rotation = np.array([19.0, 0.0, 21.0])
+    assert object_pose.lost(translation, rotation).tolist() == [False, True, True]
+    views = np.array([0, 2, 2])
+    assert object_pose.first_seen_found(translation, rotation, views) is False
+    assert object_pose.first_seen_found(np.full(3, 0.019), np.full(3, 9.9), views) is True
+    assert object_pose.first_seen_found(translation, rotation, np.zeros(3)) is None
+
+
+def test_contact_counts_and_scores() -> None:
+    distance = np.array([[-0.02, 0.0045, 0.0046, 0.1], [0.0, 0.1, 0.1, 0.0]])
+    true = np.array([[True, False, True, False], [True, False, False, False]])
+    found = contact.vertex_contact(distance)
+    assert found.tolist() == [[True, True, False, False], [True, False, False, True]]
+    counts = contact.confusion(found, true)
+    assert counts.tolist() == [[1, 1, 1, 1], [1, 1, 0, 2]]
+    assert contact.f1(counts.sum(0)) == pytest.approx(2 * 2 / (2 * 2 + 2 + 1))
+    assert np.isnan(contact.f1(np.array([0, 0, 0, 9])))
+    regions = {"a": np.array([0]), "b": np.array([2, 3])}
+    assert contact.region_contact(found, regions, ("b", "a")).tolist() == [
+        [False, True],
+        [True, True],
+    ]
+    assert contact.recall(np.array([1, 0, 1], bool), np.array([1, 1, 0], bool)) == 0.5
+    assert contact.precision(np.array([1, 0, 1], bool), np.array([1, 1, 0], bool)) == 0.5
+    assert np.isnan(contact.recall(np.array([True]), np.array([False])))
+
+
+def test_penetration_of_one_frame_and_over_contact_frames() -> None:
+    depth = penetration.depths(np.array([0.1, -0.001, -0.002, -0.006]))
+    assert depth == pytest.approx((0.003, 0.002, 0.006))
+    assert penetration.depths(np.array([0.1])) == (0, 0, 0)
+    figures = penetration.summarise(
+        np.array([0.002, 0.006, 0.030, 0.5]), np.array([True, True, True, False])
+    )
+    assert figures["mean_mm"] == pytest.approx(38 / 3)
+    assert figures["median_mm"] == pytest.approx(6)
+    assert figures["share_le_5mm"] == pytest.approx(1 / 3)
+    assert figures["share_le_7mm"] == pytest.approx(2 / 3)
+    assert figures["share_le_20mm"] == pytest.approx(2 / 3)
+    assert figures["p98_mm"] == pytest.approx(6 + 0.96 * 24)
+    nothing = penetration.summarise(np.array([0.1]), np.array([False]))
+    assert all(np.isnan(value) for value in nothing.values())
+
+
+def test_ground_penetration_is_the_deepest_vertex() -> None:
+    vertices = np.array([[0, -1.0, 0], [0, 0.02, 0], [0, 0.005, 0]])
+    up = np.array([0, -1.0, 0])
+    assert penetration.ground_penetration(vertices, np.zeros(3), up) == pytest.approx(0.02)
+    assert penetration.ground_penetration(vertices[:1], np.zeros(3), up) == 0
+    assert np.isnan(penetration.ground_penetration(vertices, np.full(3, np.nan), up))
+
+
+@pytest.mark.parametrize("fps", [15.0, 30.0])
+def test_acceleration_is_per_frame_squared_at_30_fps(fps: float) -> None:
+    time = np.arange(6) / fps
+    fall = np.zeros((6, 1, 3))
+    fall[:, 0, 1] = 0.5 * 9.81 * time**2
+    found = motion.acceleration(fall, fps)
+    assert np.isnan(found[[0, -1]]).all()
+    assert found[1:-1] == pytest.approx(9.81 / 30**2)
+    drifting = fall + np.array([0.02, 0, 0]) * np.arange(6)[:, None, None]
+    assert motion.acceleration_error(drifting, fall, fps)[1:-1] == pytest.approx(0, abs=1e-12)
+    assert motion.acceleration_error(drifting * 0, fall, fps)[1:-1] == pytest.approx(9.81 / 30**2)
+    assert np.isnan(motion.acceleration(fall[:2], fps)).all()
+
+
+def test_moving_jitter_and_onset() -> None:
+    fps = 30.0
+    centre = np.zeros((30, 3))
+    centre[15:, 0] = 0.02 * np.arange(1, 16)  # 0.6 m/s from frame 15 on
+    rotation = np.repeat(np.eye(3)[None], 30, 0)
+    moves = motion.moving(rotation, centre, fps)
+    assert moves.tolist() == [False] * 14 + [True] * 16
+    turning = np.stack([_turn_z(angle) for angle in [0, 0, 0, 3, 6]])
+    assert motion.moving(turning, np.zeros((5, 3)), fps).tolist() == [
+        False,
+        False,
+        True,
+        True,
+        True,
+    ]
+
+    late = np.roll(centre, 3, axis=0)
+    late[:3] = 0
+    assert motion.motion_onset_lags(late, centre, moves, fps) == [3.0]
+    assert motion.motion_onset_lags(centre, centre, moves, fps) == [0.0]
+    frozen = np.zeros_like(centre)
+    assert motion.motion_onset_lags(frozen, centre, moves, fps) == [15.0]
+
+    shaking = centre.copy()
+    shaking[:, 1] += 0.001 * (-1.0) ** np.arange(30)
+    assert motion.steps(shaking, centre) == pytest.approx(0.002)
+    assert motion.steps(centre, centre) == pytest.approx(0)
+    assert motion.resting_steps(moves).tolist() == [True] * 13 + [False] * 16
+
+
+def test_turns_are_beyond_the_true_ones_and_over_the_symmetry_group() -> None:
+    none = SymmetryGroup.none()
+    round_ = SymmetryGroup.from_settings(
+        Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
+    )
+    found = np.stack([_turn_z(angle) for angle in (0, 2, 2)])
+    true = np.stack([_turn_z(angle) for angle in (40, 40, 43)])
+    assert motion.turns(found, true, none) == pytest.approx([2, 3], abs=1e-5)
+    still = np.repeat(np.eye(3)[None], 3, 0)
+    assert motion.turns(found, still, round_) == pytest.approx([0, 0], abs=1e-5)
+
+
+def test_cloud_distances_count_all_or_only_visible_points() -> None:
+    cloud = Cloud(np.array([[0.0, 0, 0.1], [1, 0, 0.3]]))
+    assert vertex_to_cloud(SQUARE[:2], cloud) == pytest.approx(0.2)
+    visible = np.array([True, False])
+    assert visible_to_cloud(SQUARE[:2], visible, cloud) == pytest.approx(0.1)
+    assert np.isnan(visible_to_cloud(SQUARE[:2], ~visible & visible, cloud))
+    assert np.isnan(vertex_to_cloud(SQUARE, Cloud(np.empty((0, 3)))))
+
+
+def test_samples_cover_area_not_vertices() -> None:
+    vertices = np.array([[0.0, 0, 0], [3, 0, 0], [3, 1, 0], [0, 1, 0], [4, 0, 0], [4, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]])  # 3 by 1 beside 1 by 1
+    samples = sample_surface(vertices, faces, 4000)
+    points = samples.of(vertices, faces)
+    assert (points[:, 0] < 3).mean() == pytest.approx(0.75, abs=0.002)
+    assert points.mean(0) == pytest.approx([2, 0.5, 0], abs=0.01)
+    counts = np.histogram2d(points[:, 0], points[:, 1], bins=(16, 4))[0]
+    assert counts.min() > 40  # of 62.5 on average: even, not random
+    assert np.array_equal(sample_surface(vertices, faces, 4000).barycentric, samples.barycentric)
+
+
+def test_distance_to_a_posed_box_both_ways() -> None:
+    vertices, faces = _box(0.2)
+    surface = PosedObject(vertices, faces)
+    rotation, translation = _turn_z(90), np.array([1.0, 2, 3])
+    points = translation + np.array([[0.0, 0, 0], [0.13, 0, 0], [0.05, 0, 0], [3, 0, 0]])
+    expected = [-0.1, 0.03, -0.05, 0.10]
+    assert surface.signed_distance(points, rotation, translation) == pytest.approx(
+        expected, abs=1e-6
+    )
+    posed = vertices @ rotation.T + translation
+    body = PosedBody(posed, faces, SurfaceTree(vertices, faces))
+    assert body.signed_distance(points) == pytest.approx(expected, abs=1e-6)
+    assert body.distance(points) == pytest.approx([0.1, 0.03, 0.05, 0.25], abs=1e-6)
+
+
+def test_depths_are_told_further_than_distances() -> None:
+    vertices, faces = _box(0.6)  # half a metre and more: deeper than REACH_M and DEEPEST_M
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.37, 0, 0], [0.45, 0, 0]])
+    found = PosedObject(vertices, faces).signed_distance(points, np.eye(3), np.zeros(3))
+    assert found == pytest.approx([-0.25, -0.2, -0.05, 0.07, 0.10], abs=1e-6)
+
+
+def test_sight_knows_occlusion_facing_and_image() -> None:
+    from intercap_core.geometry.camera.intrinsics import Intrinsics
+    from intercap_core.geometry.camera.rig import Camera
+
+    lens = Intrinsics(100, 100, 100.0, 100.0, 49.5, 49.5)
+    camera = Camera("k1", lens, None, None, np.eye(4))
+    vertices, faces = _box(0.2)
+    right = np.array([1.0, 0, 0])
+    ahead = np.array([0, 0, 1.0])
+    far, near = vertices + 2 * ahead, vertices * 0.2 + ahead
+    normals = face_normals(far, faces)
+    middles = far[faces].mean(1)
+    tree = SurfaceTree(vertices, faces)
+
+    def sight(*placed: np.ndarray) -> Sight:
+        return Sight([tree.shaped(one) for one in placed])
+
+    seen = sight(far).seen(middles, normals, [camera])
+    assert np.array_equal(seen, normals[:, 2] < -0.5)
+    assert not sight(far, vertices * 0.6 + ahead).seen(middles, normals, [camera]).any()
+    assert sight(far, near + right).seen(middles, normals, [camera]).any()
+    aside = middles + 5 * right
+    assert not sight(far).seen(aside, normals, [camera]).any()
+
+
+def test_extrinsics_displacement_of_a_shift_and_a_turn() -> None:
+    true = np.repeat(np.eye(4)[None], 3, 0)
+    true[1, :3, :3], true[2, :3, :3] = _around_y(120), _around_y(240)
+    for pose in true:
+        pose[:3, 3] = -2.0 * pose[:3, 2]  # all look at the origin from 2 m
+    assert rig_centre(true) == pytest.approx(np.zeros(3), abs=1e-4)
+    estimated = true.copy()
+    estimated[1, 0, 3] += 0.01
+    turn = _around_y(1.0)
+    estimated[2, :3] = turn @ true[2, :3]
+    found = displacement(estimated, true, 0)
+    # a turn by a about an axis through the cube's centre moves a point at distance r by 2 r sin a/2
+    # and the mean of r^2 = x^2 + z^2 over the cube is 2 * side^2 / 12
+    expected = 2 * np.sin(np.radians(0.5)) * np.sqrt(2 * 4 / 12)
+    assert found == pytest.approx([0, 0.01, expected], abs=1e-5)
+    moved = _rigid(_around_y(30), [1, 2, 3])
+    assert displacement(moved @ estimated, true, 0) == pytest.approx(found, abs=1e-9)
+
+
+def _around_y(degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def _rigid(rotation: np.ndarray, translation: list[float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
+def test_flags_join_reasons_and_runs() -> None:
+    first, second = np.array([1, 1, 0, 0, 1], bool), np.array([0, 1, 1, 0, 0], bool)
+    reasons = flags.merge_reasons([(first, "a"), (second, "b")])
+    assert reasons == ["a", "a; b", "b", "", "a"]
+    assert flags.ranges(["a", "a", "", "b", "a", "a"]) == [(0, 1, "a"), (3, 3, "b"), (4, 5, "a")]

@@ -1,0 +1,208 @@
+"""Pose models from the image to the people, on a model that finds coloured dots."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime")
+tiny_pose = pytest.importorskip("tiny_pose", exc_type=ImportError)
+
+import tiny_onnx  # noqa: E402
+
+from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
+from intercap_core.config import DetectionsSettings  # noqa: E402
+from intercap_core.errors import UserError  # noqa: E402
+from intercap_core.formats.detections.instance import Instance  # noqa: E402
+from intercap_core.formats.detections.keypoint_layouts import LAYOUTS  # noqa: E402
+from intercap_core.formats.detections.models.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
+
+SIZE = (640, 360)
+SEEN = [KEYPOINT_NAMES.index(name) for name in tiny_pose.NAMES]
+LEFT, RIGHT = tiny_pose.person((170.25, 40), 250), tiny_pose.person((450, 60.5), 260)
+
+
+def around(places: np.ndarray, label: str = "person", score: float = 0.9) -> Instance:
+    low, high = places.min(0) - 8, places.max(0) + 8
+    return Instance(label, score, (*low, *(high - low)), b"")
+
+
+def model(tmp_path, **options) -> PoseModel:
+    full = options.get("gain", 1.0)
+    path = tiny_pose.simcc(tmp_path / "pose.onnx", **options)
+    return PoseModel.load(DetectionsSettings(keypoint_model=path, keypoint_full_confidence=full))
+
+
+def map_model(tmp_path, **options) -> PoseModel:
+    settings = {"keypoint_full_confidence": options.get("gain", 1.0),
+                "keypoint_heatmap_grid": options.get("grid", "msra")}  # fmt: skip
+    path = tiny_pose.heatmaps(tmp_path / "maps.onnx", **options)
+    return PoseModel.load(DetectionsSettings(keypoint_model=path, **settings))
+
+
+def apart(people: np.ndarray, places: np.ndarray) -> float:
+    """Largest distance, px, of the one person's dots."""
+    (found,) = people
+    assert (np.delete(found, SEEN, 0)[:, 2] == 0).all()
+    return float(np.linalg.norm(found[SEEN, :2] - places, axis=1).max())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"size": (288, 384)}, {"batch": 1}, {"batch": 3}, {"names": ("simcc_y", "simcc_x")},
+     {"names": ("x", "y")}, {"gain": 5.0}, {"split": (1, 1)}],
+    ids=["192x256", "288x384", "one", "three", "rows first", "short names", "raw", "whole bins"],
+)  # fmt: skip
+def test_people_in_their_boxes(tmp_path, options):
+    image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
+    pose = model(tmp_path, **options)
+    both = [around(LEFT, score=0.5), around(RIGHT), around(LEFT, "chair"), around(LEFT, score=0.2)]
+    people = pose.find(image, both)
+    assert people.shape == (2, 135, 3)
+    for one, places in zip(people, (RIGHT, LEFT), strict=True):
+        assert apart(one[None], places) < 1.6, "a pixel of the input, of 1.3 of the image"
+        assert (one[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"size": (288, 384)}, {"batch": 1}, {"batch": 3}, {"grid": "udp"}, {"gain": 5.0},
+     {"stride": (2, 2)}],
+    ids=["192x256", "288x384", "one", "three", "udp", "raw", "fine"],
+)  # fmt: skip
+def test_people_in_their_boxes_by_heatmaps(tmp_path, options):
+    image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
+    people = map_model(tmp_path, **options).find(image, [around(LEFT, score=0.5), around(RIGHT)])
+    assert people.shape == (2, 135, 3)
+    for one, places in zip(people, (RIGHT, LEFT), strict=True):
+        assert apart(one[None], places) < 1.0, "a fifth of a cell, of 5.4 pixels of the image"
+        assert (one[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
+
+
+def test_the_grid_that_a_model_was_not_trained_with_is_off_by_half_a_cell(tmp_path):
+    """What the setting is for: up to 0.75 of a cell at the far edge."""
+    image = tiny_pose.picture(SIZE, [LEFT])
+    for grid, other in (("msra", "udp"), ("udp", "msra")):
+        path = tiny_pose.heatmaps(tmp_path / f"{grid}.onnx", grid=grid)
+        settings = DetectionsSettings(keypoint_model=path, keypoint_heatmap_grid=other)
+        assert 2.0 < apart(PoseModel.load(settings).find(image, [around(LEFT)]), LEFT) < 4.5
+
+
+def test_heatmaps_without_a_box_and_with_nobody(tmp_path):
+    pose = map_model(tmp_path)
+    assert apart(pose.find(tiny_pose.picture(SIZE, [RIGHT]), []), RIGHT) < 1.0
+    assert pose.find(tiny_pose.picture(SIZE, []), []).shape == (0, 135, 3)
+    (ghost,) = pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])
+    assert (ghost[:, 2] == 0).all()
+
+
+@pytest.mark.parametrize("places", [LEFT, RIGHT, tiny_pose.person((115, 20), 330)])
+def test_without_a_box_the_whole_image_is_looked_through(tmp_path, places):
+    image = tiny_pose.picture(SIZE, [places])
+    people = model(tmp_path).find(image, [around(places, "chair")])
+    assert apart(people, places) < 1.6
+
+
+def test_two_people_without_boxes_are_found_once_each(tmp_path):
+    image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
+    people = model(tmp_path).find(image, [])
+    assert len(people) == 2
+    order = np.argsort(people[:, SEEN[0], 0])
+    for index, places in zip(order, (LEFT, RIGHT), strict=True):
+        assert apart(people[index][None], places) < 1.6
+
+
+def test_nobody_is_found_where_nobody_is(tmp_path):
+    pose = model(tmp_path)
+    assert pose.find(tiny_pose.picture(SIZE, []), []).shape == (0, 135, 3)
+    (ghost,) = pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])
+    assert (ghost[:, 2] == 0).all(), "a detector's person of whom nothing is seen"
+
+
+def test_somebody_cut_by_the_edge_keeps_what_is_seen(tmp_path):
+    places = tiny_pose.person((20.0, 40.0), 250)
+    image = tiny_pose.picture(SIZE, [places])
+    (found,) = model(tmp_path).find(image, [around(places)])
+    inside = places[:, 0] > 8
+    assert np.linalg.norm(found[SEEN, :2] - places, axis=1)[inside].max() < 1.6
+    assert found[SEEN, 2][places[:, 0] < -20].max() < 0.3
+
+
+@pytest.mark.parametrize("size", [(192, 256), (288, 384), (256, 256)])
+def test_pieces_are_mmposes(size):
+    """Its own words: centre and size of the box, a quarter larger, widened to the input's shape; a
+    point is at ``place / input size * size + centre - size / 2``."""
+    rng = np.random.default_rng(0)
+    for box in rng.uniform((0, 0, 20, 20), (900, 500, 500, 700), (20, 4)):
+        centre, extent = box[:2] + box[2:] / 2, 1.25 * box[2:]
+        aspect = size[0] / size[1]
+        if extent[0] > extent[1] * aspect:
+            extent = np.array([extent[0], extent[0] / aspect])
+        else:
+            extent = np.array([extent[1] * aspect, extent[1]])
+        places = rng.uniform(0, size, (30, 2))
+        expected = places / size * extent + centre - extent / 2
+        crop = Crop.around(box, size, 1.25)
+        np.testing.assert_allclose(crop.to_image(places), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [(1920, 1080), (640, 360), (1080, 1920), (300, 400), (100, 900)])
+def test_tiles_cover_the_image(size):
+    boxes = tiles(size, (192, 256))
+    np.testing.assert_allclose(boxes[:, 2] / boxes[:, 3], 0.75)
+    assert (boxes[:, :2] >= -1e-9).all() and (
+        boxes[:, :2] + boxes[:, 2:] <= np.add(size, 1e-9)
+    ).all()
+    corners = (boxes[:, :2] + boxes[:, 2:]).max(0)
+    np.testing.assert_allclose(boxes[:, :2].min(0), 0, atol=1e-9)
+    np.testing.assert_allclose(corners, size)
+    steps = np.diff(boxes[:, :2], axis=0).max(1)
+    assert (steps <= boxes[0, 2:][int(size[0] < 0.75 * size[1])] / 2 + 1e-9).all()
+
+
+def test_the_best_people_of_a_crowd_are_looked_at():
+    crowd = [around(LEFT + 5 * n, score=0.3 + n / 50) for n in range(20)]
+    boxes = person_boxes(crowd)
+    assert len(boxes) == 10 and boxes[0, 0] == crowd[-1].box[0]
+    assert person_boxes([around(LEFT, score=0.29), around(LEFT, "cup")]).shape == (0, 4)
+
+
+def test_body_models_are_taken_and_others_refused(tmp_path):
+    image = tiny_pose.picture(SIZE, [LEFT])
+    (body,) = model(tmp_path, layout=LAYOUTS[17]).find(image, [around(LEFT)])
+    assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
+    with pytest.raises(UserError, match="finds 21 points, expected one of 17, 23, 26, 133, 134"):
+        model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
+
+
+def test_heatmaps_of_other_points_or_shapes_are_told(tmp_path):
+    (body,) = map_model(tmp_path, layout=LAYOUTS[17]).find(
+        tiny_pose.picture(SIZE, [LEFT]), [around(LEFT)]
+    )
+    assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
+    with pytest.raises(UserError, match="finds 21 points, expected one of 17, 23, 26, 133, 134"):
+        map_model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
+    with pytest.raises(UserError, match=r"\['batch', 133, 32, 48\].* not those of a pose"):
+        map_model(tmp_path, stride=(4, 8))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda p: tiny_onnx.thresholder(p), r"outputs \(out \[1, 1, 32, 32\]\) are not those"),
+        (lambda p: tiny_onnx.yolo(p, (160, 160), {}), "are not those of a pose model"),
+        (lambda p: p.write_text("no model"), "is no ONNX model that can be run"),
+        (lambda p: None, "is no ONNX model that can be run"),
+    ],
+)
+def test_models_of_another_kind_are_told(tmp_path, make, words):
+    path = tmp_path / "pose.onnx"
+    make(path)
+    with pytest.raises(UserError, match=words):
+        PoseModel.load(DetectionsSettings(keypoint_model=path))
+
+
+def test_bins_that_differ_are_told(tmp_path):
+    pose = model(tmp_path, split=(2, 3))
+    with pytest.raises(UserError, match=r"\[1, 133, 384\]; \[1, 133, 768\].* not those of a pose"):
+        pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])

@@ -1,0 +1,227 @@
+"""Segmentation models from the image to the instance, on models that find red and blue things."""
+
+from __future__ import annotations
+
+import builtins
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime")
+tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+
+from intercap_core.config import DetectionsSettings  # noqa: E402
+from intercap_core.errors import UserError  # noqa: E402
+from intercap_core.formats.detections.models.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
+from intercap_core.formats.detections.models.onnx_outputs import suppressed  # noqa: E402
+from intercap_core.formats.detections.models.onnx_segmentation import Segmenter  # noqa: E402
+from intercap_core.geometry.camera import masks  # noqa: E402
+
+WIDTH, HEIGHT = 320, 180
+NAMES = {"names": "{0: 'suitcase', 1: 'cup'}", "task": "segment", "imgsz": "[160, 160]"}
+GREY, RED, BLUE = (120, 120, 120), (20, 20, 230), (230, 20, 20)  # BGR
+
+
+def picture(red=(60, 90), blue=(230, 60)):
+    image = np.full((HEIGHT, WIDTH, 3), GREY, np.uint8)
+    shapes = {}
+    for name, centre, colour in (("suitcase", red, RED), ("cup", blue, BLUE)):
+        if centre is None:
+            continue
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        cv2.ellipse(mask, centre, (34, 22), 30, 0, 360, 1, -1)
+        image[mask > 0] = colour
+        shapes[name] = mask > 0
+    return image, shapes
+
+
+def found(settings, images):
+    segmenter = Segmenter.load(settings)
+    return dict(segmenter.segment(enumerate(images)))
+
+
+def overlap(instance, mask):
+    found = masks.decode(instance.rle, HEIGHT, WIDTH)
+    return (found & mask).sum() / (found | mask).sum()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: tiny_onnx.yolo(path, (160, 160), NAMES),
+        lambda path: tiny_onnx.yolo(path, (192, 128), NAMES),
+        lambda path: tiny_onnx.yolo(path, (160, 160), NAMES, ends_itself=True),
+        lambda path: tiny_onnx.mask_rcnn(path, "torchvision"),
+        lambda path: tiny_onnx.mask_rcnn(path, "detectron2"),
+        lambda path: tiny_onnx.mask_rcnn(path, "benchmark"),
+    ],
+    ids=["yolo", "yolo wide", "yolo end to end", "torchvision", "detectron2", "benchmark"],
+)
+def test_every_kind_of_export_finds_masks_labels_and_scores(tmp_path, make):
+    settings = DetectionsSettings(segmentation_model=make(tmp_path / "model.onnx"))
+    (image, shapes), (lonely, _) = picture(), picture(red=None)
+    results = found(settings, [image, lonely])
+    assert [i.label for i in results[0]] == ["suitcase", "cup"]
+    assert [i.label for i in results[1]] == ["cup"]
+    for instance, score in zip(results[0], (0.9, 0.8), strict=True):
+        mask = shapes[instance.label]
+        assert instance.score == pytest.approx(score)
+        assert overlap(instance, mask) > 0.9, instance.label
+        y, x = np.nonzero(mask)
+        expected = [x.min(), y.min(), np.ptp(x) + 1, np.ptp(y) + 1]
+        assert np.abs(np.array(instance.box) - expected).max() <= 3
+
+
+def test_masks_over_the_whole_image_are_exact(tmp_path):
+    model = tiny_onnx.mask_rcnn(tmp_path / "model.onnx", "torchvision")
+    image, shapes = picture()
+    for instance in found(DetectionsSettings(segmentation_model=model), [image])[0]:
+        np.testing.assert_array_equal(
+            masks.decode(instance.rle, HEIGHT, WIDTH), shapes[instance.label]
+        )
+
+
+def test_class_names_from_a_file_and_scores_that_are_too_low(tmp_path):
+    labels = tmp_path / "names.txt"
+    labels.write_text("red thing\nblue thing\n")
+    settings = DetectionsSettings(
+        segmentation_model=tiny_onnx.yolo(tmp_path / "model.onnx", (160, 160), NAMES),
+        segmentation_labels=labels,
+        min_score=0.85,
+    )
+    assert [i.label for i in found(settings, [picture()[0]])[0]] == ["red thing"]
+
+
+def test_the_way_that_pixels_go_in_can_be_said(tmp_path):
+    model = tiny_onnx.mask_rcnn(tmp_path / "model.onnx", "torchvision")
+    settings = DetectionsSettings(segmentation_model=model, segmentation_input="bgr255")
+    image, shapes = picture()
+    best, _ = found(settings, [image])[0]
+    assert overlap(best, shapes["cup"]) > 0.95, "blue is where the model looks for red"
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("{0: 'person', 1: 'sports ball'}", {0: "person", 1: "sports ball"}),
+        ('{"0": "person", "7": "it\'s, {a} cup"}', {0: "person", 7: "it's, {a} cup"}),
+        ("{0: 'it\\'s'}", {0: "it's"}),
+        ("['a', \"b\",]", {0: "a", 1: "b"}),
+        ("{}", {}),
+        ("", {}),
+        ("{0: __import__('os').system('true')}", {}),
+        ("{0: 'a', 1: }", {}),
+        ("{" * 10000, {}),
+        ("{0: 'a" + "\\" * 5000, {}),
+    ],
+)
+def test_names_in_the_model_are_read_and_never_run(text, names):
+    assert parse_names(text) == names
+
+
+@pytest.mark.parametrize("size", [(640, 640), (320, 192), (57, 91)])
+@pytest.mark.parametrize("centred", [True, False])
+def test_pictures_keep_their_shape_and_boxes_come_back(size, centred):
+    fit = fit_within((1920, 1080), size, centred=centred)
+    box = np.array([[100.0, 200.0, 900.0, 1000.0]], np.float32)
+    inside = box * np.array(fit.scale * 2) + np.array([fit.left, fit.top] * 2)
+    np.testing.assert_allclose(fit.to_image(inside), box, atol=1e-3)
+    assert abs(fit.scale[0] / fit.scale[1] - 1) < 0.05
+    assert fit.left >= 0 and fit.left + round(1920 * fit.scale[0]) <= size[0]
+
+
+def test_overlapping_boxes_of_one_class_leave_the_best():
+    boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [0, 0, 10, 10], [30, 30, 40, 40]], float)
+    kept = suppressed(boxes, np.array([0.5, 0.9, 0.8, 0.7]), np.array([0, 0, 1, 0]))
+    assert kept.tolist() == [1, 2, 3]
+
+
+def _no_model(path):
+    path.write_bytes(b"not a model")
+
+
+def _cut(path):
+    tiny_onnx.yolo(path, (160, 160), NAMES)
+    path.write_bytes(path.read_bytes()[:300])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (_no_model, "no ONNX model"),
+        (_cut, "no ONNX model"),
+        (tiny_onnx.thresholder, "no kind that is known"),
+        (lambda path: tiny_onnx.yolo(path, (160, 160), {"task": "detect"}), "model for 'detect'"),
+    ],
+)
+def test_models_that_cannot_be_used_are_told(tmp_path, make, words):
+    path = tmp_path / "model.onnx"
+    make(path)
+    with pytest.raises(UserError, match=words) as caught:
+        Segmenter.load(DetectionsSettings(segmentation_model=path))
+    assert str(path) in str(caught.value)
+
+
+def test_a_device_that_is_not_there_is_told(tmp_path):
+    import onnxruntime
+
+    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
+        pytest.skip("this machine has CUDA")
+    path = tiny_onnx.yolo(tmp_path / "model.onnx", (160, 160), NAMES)
+    with pytest.raises(UserError, match=r"finds no cuda here.*onnxruntime-gpu"):
+        OnnxModel.load(path, "cuda")
+
+
+def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name == "onnxruntime":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(UserError, match=r"intercap-core\[onnx\]"):
+        OnnxModel.load(tmp_path / "model.onnx")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "names"),
+    [
+        ("a.txt", "person\nsports ball\n", {0: "person", 1: "sports ball"}),
+        ("a.json", '["person", "cup"]', {0: "person", 1: "cup"}),
+        ("a.json", '{"1": "person", "47": "cup"}', {1: "person", 47: "cup"}),
+        ("a.json", '{"categories": [{"id": 3, "name": "cup", "synonyms": ["mug"]}]}', {3: "cup"}),
+        ("a.yaml", "names:\n  0: person\n  1: cup\n", {0: "person", 1: "cup"}),
+        ("a.yaml", "names: [person, cup]\n", {0: "person", 1: "cup"}),
+    ],
+)
+def test_label_maps(tmp_path, name, text, names):
+    from intercap_core.formats.detections.converters.label_maps import read_label_map
+
+    (tmp_path / name).write_text(text)
+    assert read_label_map(tmp_path / name) == names
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", "["),
+        ("a.json", "3"),
+        ("a.json", '{"a": "b"}'),
+        ("a.json", "[]"),
+        ("a.json", json.dumps([{"id": 1, "name": "a"}, {"id": 1, "name": "b"}])),
+        ("a.yaml", "a: [1"),
+        ("a.yaml", "!!python/object/apply:os.system ['true']"),
+        ("a.txt", ""),
+        ("a.txt", "c" * 500),
+    ],
+)
+def test_wrong_label_maps_are_named(tmp_path, name, text):
+    from intercap_core.formats.detections.converters.label_maps import read_label_map
+
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match="is no list of classes"):
+        read_label_map(tmp_path / name)

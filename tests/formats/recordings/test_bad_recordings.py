@@ -1,0 +1,252 @@
+"""Recordings with faults: what is survived, how, and in which words."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core.config import SequenceEntry
+from intercap_core.formats.recordings.clocks import WRONG, best_epoch, drift_us, epochs
+from intercap_core.formats.recordings.frames import Frames
+from tests.helpers.kinect_files import PERIOD_US, depth_at, entry_of, jpeg_at, notes_of, record, run
+
+TICKS = 12
+
+
+@pytest.fixture
+def capture(tmp_path) -> SequenceEntry:
+    """Three cameras, twelve ticks each."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for camera in range(3):
+        record(folder, camera, range(TICKS))
+    return entry_of(folder, cameras=3)
+
+
+def with_clock(camera: int, tick_from: int, clock_us: int):
+    """The camera's clock says ``clock_us`` at tick ``tick_from`` and runs on from there."""
+
+    def fault(folder: Path) -> None:
+        def time(tick: int) -> int:
+            if tick < tick_from:
+                return 3_000_000 + tick * PERIOD_US
+            return clock_us + (tick - tick_from) * PERIOD_US
+
+        record(folder, camera, range(TICKS), clock_us=0, times_us=time)
+
+    return fault
+
+
+def all_reset(folder: Path) -> None:
+    for camera in range(3):
+        with_clock(camera, 4, 1_000_000)(folder)
+
+
+def one_wrong_time(folder: Path) -> None:
+    def time(tick: int) -> int:
+        return 3_000_000 + tick * PERIOD_US - (900_000 if tick == 5 else 0)
+
+    record(folder, 1, range(TICKS), clock_us=0, times_us=time)
+
+
+def same_serial(folder: Path) -> None:
+    record(folder, 2, range(TICKS), serial="1")
+
+
+def copied(folder: Path) -> None:
+    shutil.copy(folder / "k2.mkv", folder / "k3.mkv")
+
+
+def zero_depth(folder: Path) -> None:
+    record(folder, 1, range(TICKS), image_of=lambda camera, tick: 0 * depth_at(camera, tick))
+
+
+def died(folder: Path) -> None:
+    record(folder, 1, range(TICKS // 2))
+
+
+def cut_short(folder: Path) -> None:
+    content = (folder / "k2.mkv").read_bytes()
+    (folder / "k2.mkv").write_bytes(content[: len(content) // 2])
+
+
+def overwritten_middle(folder: Path) -> None:
+    content = bytearray((folder / "k2.mkv").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 300_000] = bytes(300_000)
+    (folder / "k2.mkv").write_bytes(content)
+
+
+def stays(missing=(), depth=True, count=TICKS):
+    """Which of a camera's ticks the sets hold: all but ``missing``."""
+    return {"ticks": [t for t in range(count) if t not in missing], "depth": depth}
+
+
+@pytest.mark.parametrize(
+    ("fault", "camera", "words", "kept"),
+    [
+        (same_serial, 1, "k2.mkv and k3.mkv have the same serial number 1", stays()),
+        (same_serial, 2, "k2.mkv and k3.mkv have the same serial number 1", stays()),
+        (copied, 1, "k2.mkv and k3.mkv hold the same images", stays()),
+        (copied, 2, "k2.mkv and k3.mkv hold the same images", stays(missing=range(TICKS))),
+        (zero_depth, 1, "depth is zero in all 12 images", stays(depth=False)),
+        (died, 1, "ends 6 frame sets early", stays(missing=range(6, 12))),
+        (with_clock(1, 7, 500_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
+        (with_clock(1, 4, 500_000), 1, "jump back 1 times: 8 images", stays(range(4, 12))),
+        (with_clock(1, 7, 3_150_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
+        (with_clock(1, 5, 3_000_000), 1, "jump back 1 times: 7 images", stays(range(5, 12))),
+        (with_clock(0, 7, 500_000), 0, "jump back 1 times: 5 images", stays(range(7, 12))),
+        (one_wrong_time, 1, "1 images with device times out of order", stays(missing=[5])),
+    ],
+)  # fmt: skip
+def test_one_camera_at_fault_costs_no_other(capture, fault, camera, words, kept):
+    fault(capture.recordings)
+    output = run(capture)
+    assert words in notes_of(output)[f"k{camera + 1}"]
+    with Frames.open(output) as frames:
+        assert frames.num_sets == TICKS
+        assert np.allclose(np.diff(frames.time_s), PERIOD_US * 1e-6, atol=5e-4)
+        for c in range(3):
+            at_fault = c == camera or fault in (same_serial, copied, zero_depth)
+            if not at_fault:
+                assert frames.depth_available[:, c].all()
+            for t in np.flatnonzero(frames.colour_available[:, c]):
+                source = 1 if fault is copied and c == 2 else c
+                assert frames.colour_jpeg(t, c) == jpeg_at(source, t)
+            for t in np.flatnonzero(frames.depth_available[:, c]):
+                assert np.array_equal(frames.depth(t, c), depth_at(c, t))
+        assert np.flatnonzero(frames.colour_available[:, camera]).tolist() == kept["ticks"]
+        if kept["depth"]:
+            expected = frames.colour_available[:, camera]
+            assert np.array_equal(frames.depth_available[:, camera], expected)
+        else:
+            assert frames.rig[camera].depth is None
+            assert not frames.depth_available[:, camera].any()
+
+
+def test_when_all_clocks_are_reset_the_longer_part_is_kept(capture):
+    all_reset(capture.recordings)
+    output = run(capture)
+    for note in notes_of(output).values():
+        assert note.count("4 images outside the stretch of 8") == 1
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 8 and frames.available.all()
+        assert frames.colour_jpeg(0, 1) == jpeg_at(1, 4)
+
+
+@pytest.mark.parametrize("fault", [cut_short, overwritten_middle])
+def test_a_damaged_file_gives_what_can_be_read(capture, fault):
+    fault(capture.recordings)
+    output = run(capture)
+    assert notes_of(output)["k2"] != "" and notes_of(output)["k1"] == ""
+    with Frames.open(output) as frames:
+        assert frames.num_sets == TICKS
+        assert 1 <= frames.colour_available[:, 1].sum() < TICKS
+        for t in np.flatnonzero(frames.colour_available[:, 1]):
+            assert frames.colour_jpeg(t, 1) == jpeg_at(1, t)
+
+
+def test_a_master_on_another_clock_leaves_the_others(capture):
+    record(capture.recordings, 0, range(TICKS), clock_us=90_000_000)
+    output = run(capture)
+    notes = notes_of(output)
+    assert "do not overlap those of k2" in notes["k1"] and "frame sets follow k2" in notes["k1"]
+    with Frames.open(output) as frames:
+        assert frames.present.tolist() == [False, True, True] and frames.master == "k1"
+        assert frames.num_sets == TICKS and frames.available[:, 1:].all()
+
+
+def test_hidden_files_of_other_systems_are_passed_over(capture):
+    (capture.recordings / "._k2.mkv").write_bytes(b"\0\5\x16\7")
+    with Frames.open(run(capture)) as frames:
+        assert frames.rig.names == ("k1", "k2", "k3") and frames.available.all()
+
+
+def test_a_moment_that_no_camera_has_is_noted(capture):
+    for camera in range(3):
+        record(capture.recordings, camera, [t for t in range(TICKS) if t not in (5, 6, 9)])
+    output = run(capture)
+    expected = "no camera has an image for 3 periods in 2 places, the first after frame set 4"
+    assert expected in notes_of(output)["k1"]
+    with Frames.open(output) as frames:
+        assert frames.num_sets == TICKS - 3 and frames.available.all()
+
+
+def test_a_clock_that_runs_away_is_followed_and_noted(capture):
+    def time(tick: int) -> int:
+        return 3_000_000 + round(tick * PERIOD_US * 1.008)
+
+    record(capture.recordings, 2, range(TICKS), times_us=time)
+    output = run(capture)
+    assert "its clock runs away from k1's by 5." in notes_of(output)["k3"]
+    with Frames.open(output) as frames:
+        assert frames.available.all()
+
+
+def test_a_clock_that_is_off_by_more_than_the_window_is_told(capture):
+    record(capture.recordings, 2, range(TICKS), clock_us=3_012_000)
+    output = run(capture)
+    expected = "12 images fit no frame set: their device times are 12.3 ms from the nearest one"
+    assert expected in notes_of(output)["k3"]
+    with Frames.open(output) as frames:
+        assert frames.num_sets == TICKS and not frames.available[:, 2].any()
+
+
+def test_delays_that_jitter_and_unequal_counts_are_normal(capture):
+    rng = np.random.default_rng(3)
+    late = {c: rng.integers(-3000, 3000, TICKS) for c in range(3)}
+    lost = {0: {3}, 1: {0, 7}, 2: {11}}
+    for c in range(3):
+        ticks = [t for t in range(TICKS) if t not in lost[c]]
+        record(
+            capture.recordings, c, ticks,
+            times_us=lambda tick, c=c: 3_010_000 + tick * PERIOD_US + int(late[c][tick]),
+        )  # fmt: skip
+    with Frames.open(run(capture)) as frames:
+        assert frames.num_sets == TICKS
+        for c in range(3):
+            assert set(np.flatnonzero(~frames.available[:, c])) == lost[c]
+            for t in np.flatnonzero(frames.available[:, c]):
+                assert frames.colour_jpeg(t, c) == jpeg_at(c, t)
+                assert np.array_equal(frames.depth(t, c), depth_at(c, t))
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ([1, 2, 3, 4], [0, 0, 0, 0]),
+        ([10, 11, 1, 2, 3], [0, 0, 1, 1, 1]),
+        ([10, 11, 5, 12, 13], [0, 0, WRONG, 0, 0]),
+        ([10, 11, 90, 12, 13], [0, 0, WRONG, 0, 0]),
+        ([10, 10, 11], [0, WRONG, 0]),
+        ([10, 11, 1, 2, 0, 1], [0, 0, 1, 1, 2, 2]),
+        ([5], [0]),
+    ],
+)
+def test_epochs(times, expected):
+    assert epochs(np.array(times)).tolist() == expected
+
+
+def test_the_stretch_in_the_others_time_wins_over_the_longer_one():
+    times = np.array([0, 1, 2, 3, 4, -9, -8, -7])
+    stretch = epochs(times)
+    assert best_epoch(times, stretch, np.arange(-12, -6), 0.5) == 1
+    assert best_epoch(times, stretch, np.array([-50, -8, 70]), 0.5) == 1
+    assert best_epoch(times, stretch, np.array([100, 200]), 0.5) == 0
+    assert best_epoch(times, stretch, np.zeros(0), 0.5) == 0
+    times = np.array([5, 6, 7, 8, 5, 6, 7, 8, 9])  # both among the others': the reset is at fault
+    assert best_epoch(times, epochs(times), np.arange(20), 0.5) == 0
+    times = np.array([7, 5, 6, 7, 8, 9])  # an image left from before the common start
+    assert best_epoch(times, epochs(times), np.arange(20), 0.5) == 1
+
+
+def test_drift_ignores_jitter_and_gaps():
+    times = np.arange(0, 60_000_000, 33_333)
+    rng = np.random.default_rng(0)
+    skew = 50e-6 * times + rng.normal(0, 300, len(times)) + 160
+    skew[rng.random(len(times)) < 0.3] = np.nan
+    assert drift_us(times, skew) == pytest.approx(3000, abs=80)
+    assert drift_us(times[:3], skew[:3]) == 0

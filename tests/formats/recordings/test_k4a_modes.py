@@ -1,0 +1,165 @@
+"""Every colour and depth mode that the device has, written and read back through the layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from intercap_core.config import SequenceEntry
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
+from intercap_core.formats.recordings.encoded import JPEG_QUALITY
+from intercap_core.formats.recordings.k4a_layout import KinectLayout
+from intercap_core.formats.recordings.source import CameraRecording, Image
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.studio.calibration import write_calibration
+from intercap_core.studio.mkv import MkvWriter
+
+COLOUR_LENS = Intrinsics(1280, 720, 612.0, 611.0, 641.0, 365.0, np.full(8, 0.01))
+DEPTH_LENS = Intrinsics(640, 576, 504.0, 505.0, 322.0, 331.0, np.full(8, 0.02))
+BETWEEN = rigid(cv2.Rodrigues(np.array([0.1, 0, 0]))[0], np.array([-0.032, 0, 0]))
+CALIBRATION = write_calibration(
+    Camera("k1", COLOUR_LENS, DEPTH_LENS, BETWEEN, np.eye(4)),
+    serial="1", colour_mode="720P", depth_mode="NFOV_UNBINNED",
+)  # fmt: skip
+
+
+def picture(width: int, height: int) -> np.ndarray:
+    """Smooth colour, so that halved chroma and JPEG change it little."""
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    bands = [40 + 150 * x, 60 + 120 * y, 200 - 100 * x * y]
+    return np.stack(bands, -1).astype(np.uint8)
+
+
+def raw_bytes(image: np.ndarray, colour_format: str) -> bytes:
+    """The image as the device sends it: planes of 4:2:0, pairs of 4:2:2, or four channels."""
+    if colour_format == "BGRA":
+        return cv2.cvtColor(image, cv2.COLOR_BGR2BGRA).tobytes()
+    height, width = image.shape[:2]
+    planes = cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420)
+    luma, rest = planes[:height], planes[height:].ravel()
+    u, v = (plane.reshape(height // 2, width // 2) for plane in np.split(rest, 2))
+    if colour_format == "NV12":
+        return luma.tobytes() + np.stack([u, v], -1).tobytes()
+    packed = np.empty((height, width, 2), np.uint8)
+    packed[..., 0] = luma
+    packed[:, 0::2, 1], packed[:, 1::2, 1] = np.repeat(u, 2, axis=0), np.repeat(v, 2, axis=0)
+    return packed.tobytes()
+
+
+def open_written(folder: Path) -> CameraRecording:
+    write_rig_file(folder / "rig.json", Extrinsics("k1", {"k1": np.eye(4)}))
+    entry = SequenceEntry(
+        sequence="s", subject="a", object="b", recordings=folder, calibration=folder / "rig.json"
+    )
+    return KinectLayout(entry).open("k1")
+
+
+def read(folder: Path) -> tuple[CameraRecording, list[Image]]:
+    with open_written(folder) as recording:
+        return recording, list(recording.images())
+
+
+@pytest.mark.parametrize("mode", DEPTH_MODES)
+def test_every_depth_mode(tmp_path, mode):
+    width, height = DEPTH_MODES[mode].size
+    depth = np.random.default_rng(0).integers(0, 5000, (height, width), dtype=np.uint16)
+    with MkvWriter(
+        tmp_path / "k1.mkv", calibration_json=CALIBRATION, colour_mode="720P", depth_mode=mode,
+        fps=5, serial="1",
+    ) as writer:  # fmt: skip
+        writer.write_depth(depth, 100)
+    recording, images = read(tmp_path)
+    assert [(i.kind, i.time_us) for i in images] == [("depth", 100)]
+    assert np.array_equal(images[0].content, depth)
+    lens = recording.camera.depth
+    assert (lens.width, lens.height) == (width, height)
+    # All modes see through one lens: the same ray falls on pixels that binning and cropping relate.
+    ray = np.array([[0.05, -0.1, 1.0]])
+    corner = DEPTH_LENS.project(ray) + 0.5 + DEPTH_MODES["NFOV_UNBINNED"].crop
+    binning = 1024 / DEPTH_MODES[mode].binned[0]
+    assert np.allclose(lens.project(ray), corner / binning - 0.5 - DEPTH_MODES[mode].crop)
+    assert np.allclose(recording.camera.colour_from_depth, BETWEEN)
+
+
+@pytest.mark.parametrize("mode", COLOUR_MODES)
+def test_every_colour_mode_is_copied(tmp_path, mode):
+    width, height = COLOUR_MODES[mode].size
+    jpeg = cv2.imencode(".jpg", np.zeros((height, width, 3), np.uint8))[1].tobytes()
+    with MkvWriter(
+        tmp_path / "k1.mkv", calibration_json=CALIBRATION, colour_mode=mode, depth_mode=None,
+        fps=30, serial="1",
+    ) as writer:  # fmt: skip
+        writer.write_colour(jpeg, 0)
+    recording, images = read(tmp_path)
+    assert images == [Image("colour", 0, jpeg)] and recording.notes == []
+    lens = recording.camera.colour
+    assert (lens.width, lens.height) == (width, height) and recording.camera.depth is None
+    ray = np.array([[0.05, -0.1, 1.0]])
+    corner = COLOUR_LENS.project(ray) + 0.5 + COLOUR_MODES["720P"].crop
+    size = COLOUR_MODES[mode].binned[0] / 1280
+    assert np.allclose(lens.project(ray), corner * size - 0.5 - COLOUR_MODES[mode].crop)
+
+
+@pytest.mark.parametrize(
+    ("colour_format", "mode"), [("NV12", "720P"), ("YUY2", "720P"), ("BGRA", "1080P")]
+)
+def test_raw_colour_is_stored_as_jpeg_with_a_note(tmp_path, colour_format, mode):
+    width, height = COLOUR_MODES[mode].size
+    image = picture(width, height)
+    raw = raw_bytes(image, colour_format)
+    with MkvWriter(
+        tmp_path / "k1.mkv", calibration_json=CALIBRATION, colour_mode=mode, depth_mode=None,
+        fps=30, serial="1", colour_format=colour_format,
+    ) as writer:  # fmt: skip
+        writer.write_colour(raw, 0)
+        writer.write_colour(raw[:-2], 40_000)  # cut short
+        writer.write_colour(raw, 80_000)
+    recording, images = read(tmp_path)
+    assert [i.time_us for i in images] == [0, 80_000]
+    read_back = cv2.imdecode(np.frombuffer(images[0].content, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(read_back.astype(int) - image).mean() < 1.5
+    assert recording.notes == [
+        f"colour was recorded as {colour_format} and is stored as JPEG of quality {JPEG_QUALITY}",
+        "1 damaged packets left out",
+    ]
+
+
+def test_passive_infrared_is_no_depth(tmp_path):
+    path = tmp_path / "k1.mkv"
+    with MkvWriter(
+        path, calibration_json=CALIBRATION, colour_mode="720P", depth_mode="WFOV_UNBINNED",
+        fps=30, serial="1", with_ir=True,
+    ) as writer:  # fmt: skip
+        writer.write_ir(np.ones((1024, 1024), np.uint16), 0)
+    content = path.read_bytes()
+    assert content.count(b"WFOV_UNBINNED") == 1
+    path.write_bytes(content.replace(b"WFOV_UNBINNED", b"PASSIVE_IR\0\0\0"))
+    recording, images = read(tmp_path)
+    assert recording.camera.depth is None and images == []
+
+
+def test_an_unknown_codec_is_named(tmp_path):
+    path = tmp_path / "k1.mkv"
+    with MkvWriter(
+        path, calibration_json=CALIBRATION, colour_mode="720P", depth_mode=None, fps=30, serial="1"
+    ) as writer:
+        writer.write_colour(bytes(100), 0)
+    path.write_bytes(path.read_bytes().replace(b"MJPG\0", b"Y800\0"))
+    with pytest.raises(UserError, match="recorded as Y800, expected MJPG, NV12"):
+        read(tmp_path)
+
+
+def test_the_real_recording(tmp_path, real_recording):
+    (tmp_path / "k1.mkv").symlink_to(real_recording)
+    recording, images = read(tmp_path)
+    kinds = [image.kind for image in images]
+    assert (kinds.count("colour"), kinds.count("depth")) == (1, 1)
+    assert recording.notes == [] and not recording.truncated
+    assert recording.serial == "001514394512" and recording.gravity[1] > 0.8

@@ -1,0 +1,420 @@
+"""The plain layout: folders of images and videos with a calibration in OpenCV's terms."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.schemas import FRAMES
+from intercap_core.stages import frames as stage
+
+SIZE, DEPTH_SIZE = (64, 48), (32, 24)
+FPS = 25
+
+
+def picture(camera: int, number: int) -> np.ndarray:
+    image = np.full((SIZE[1], SIZE[0], 3), (40 * camera, 5 * number, 128), np.uint8)
+    cv2.circle(image, (5 + number, 20), 6, (255, 255, 255), -1)
+    return image
+
+
+def jpeg(camera: int, number: int) -> bytes:
+    return cv2.imencode(".jpg", picture(camera, number))[1].tobytes()
+
+
+def depth_of(camera: int, number: int, size=DEPTH_SIZE) -> np.ndarray:
+    return np.full((size[1], size[0]), 1000 + 100 * camera + number, np.uint16)
+
+
+def lens(size=SIZE) -> dict:
+    matrix = [[60.0, 0, size[0] / 2], [0, 60.0, size[1] / 2], [0, 0, 1]]
+    coefficients = [0.1, -0.05, 0.001, -0.001, 0.01]
+    return dict(image_size=size, camera_matrix=matrix, distortion_coefficients=coefficients)
+
+
+def calibrated(**changes) -> dict:
+    own_depth = lens(DEPTH_SIZE) | {"colour_from_depth": np.eye(4).tolist()}
+    cameras = {
+        "left": lens() | {"R": [0, 0, 0], "T": [0, 0, 0], "depth": own_depth},
+        "right": lens() | {"R": [0, 0.5, 0], "T": [1, 0, 0.2], "depth": "aligned"},
+        "top": lens() | {"R": np.eye(3).tolist(), "T": [[0], [1], [0]]},
+    }
+    for name, change in changes.items():
+        cameras[name] |= change
+    return {"master": "left", "fps": FPS, "cameras": cameras}
+
+
+def write_images(folder: Path, camera: int, numbers, *, depth_size=None, colour="", suffix="jpg"):
+    (folder / colour).mkdir(parents=True, exist_ok=True)
+    for number in numbers:
+        path = folder / colour / f"{number:05d}.{suffix}"
+        path.write_bytes(cv2.imencode(f".{suffix}", picture(camera, number))[1].tobytes())
+        if depth_size:
+            (folder / "depth").mkdir(exist_ok=True)
+            image = depth_of(camera, number, depth_size)
+            cv2.imwrite(str(folder / "depth" / f"{number:05d}.png"), image)
+
+
+def write_video(path: Path, camera: int, count: int, codec: str, *, fps=FPS, **options) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(fps), **options)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for number in range(count):
+            frame = av.VideoFrame.from_ndarray(picture(camera, number), format="bgr24")
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+@pytest.fixture
+def capture(tmp_path) -> SequenceEntry:
+    """Three folders of eight images: own depth lens, aligned depth, no depth."""
+    folder = tmp_path / "recordings"
+    write_images(folder / "left", 0, range(8), depth_size=DEPTH_SIZE)
+    write_images(folder / "right", 1, range(8), depth_size=SIZE, colour="colour")
+    write_images(folder / "top", 2, range(8), suffix="png")
+    (tmp_path / "calibration.json").write_text(json.dumps(calibrated()))
+    return SequenceEntry(
+        sequence="s1", subject="a", object="b", layout="plain", recordings=folder,
+        calibration=tmp_path / "calibration.json",
+    )  # fmt: skip
+
+
+def run(capture: SequenceEntry) -> Path:
+    output = capture.recordings.parent / "out" / "frames.h5"
+    stage.run(sequence=capture, output=output, settings=FramesSettings())
+    return output
+
+
+def notes_of(path: Path) -> dict[str, str]:
+    with artefacts.read(path, FRAMES) as frames:
+        return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
+
+
+def test_files_come_out_as_they_are(capture):
+    output = run(capture)
+    assert notes_of(output) == {"left": "", "right": "", "top": "has no depth"}
+    with Frames.open(output) as frames:
+        assert frames.rig.names == ("left", "right", "top") and frames.fps == FPS
+        assert frames.num_sets == 8 and frames.colour_available.all()
+        assert np.allclose(np.diff(frames.time_s), 1 / FPS, atol=1e-6)
+        for t in range(8):
+            left = capture.recordings / "left" / f"{t:05d}.jpg"
+            assert frames.colour_jpeg(t, 0) == left.read_bytes()
+            assert np.array_equal(frames.colour(t, 2), picture(2, t))
+            assert np.array_equal(frames.depth(t, 0), depth_of(0, t))
+            assert np.array_equal(frames.depth(t, 1), depth_of(1, t, SIZE))
+            assert frames.depth(t, 2) is None
+        left, right, top = frames.rig
+        assert (left.depth.width, left.depth.height) == DEPTH_SIZE
+        assert np.array_equal(right.depth.parameters, right.colour.parameters)
+        assert np.array_equal(right.colour_from_depth, np.eye(4)) and top.depth is None
+        world = np.array([0.3, -0.2, 2.0, 1])
+        turn = cv2.Rodrigues(np.array([0, 0.5, 0]))[0]
+        assert np.allclose((right.colour_from_master @ world)[:3], turn @ world[:3] + [1, 0, 0.2])
+        assert np.allclose(top.colour_from_master @ world, world + np.eye(4)[1])
+
+
+def test_missing_numbers_are_gaps(capture):
+    (capture.recordings / "top" / "00003.png").unlink()
+    (capture.recordings / "left" / "depth" / "00002.png").unlink()
+    for path in capture.recordings.rglob("00005.*"):
+        path.unlink()
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 7
+        assert np.allclose(frames.time_s * FPS, [0, 1, 2, 3, 4, 6, 7], atol=1e-4)
+        assert frames.colour_available[:, 2].tolist() == [True] * 3 + [False] + [True] * 3
+        assert frames.depth_available[:, 0].tolist() == [True] * 2 + [False] + [True] * 4
+    notes = notes_of(output)
+    assert "no image in 1 frame sets" in notes["top"]
+    assert "no camera has an image for 1 periods in 1 places" in notes["left"]
+
+
+def test_hidden_files_of_other_systems_are_passed_over(capture):
+    (capture.recordings / "left" / "._00003.jpg").write_bytes(b"\0\5\x16\7")
+    (capture.recordings / "left" / "depth" / "._00003.png").write_bytes(b"\0\5\x16\7")
+    output = run(capture)
+    assert notes_of(output)["left"] == ""
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 8 and frames.available.all()
+
+
+def test_timestamps_override_numbers(capture):
+    times = 100 + np.arange(8) / 10 + 0.001 * np.arange(8)
+    for name in ("left", "top"):
+        text = "\n".join(f"{value:.6f}" for value in times)
+        (capture.recordings / name / "timestamps.txt").write_text(text + "\n")
+    named = "name,seconds\n" + "".join(f"{t:05d}.jpg,{times[t] + 0.002}\n" for t in range(8))
+    (capture.recordings / "right" / "timestamps.csv").write_text(named)
+    content = calibrated(right={"time_offset": 0.001})
+    del content["fps"]
+    capture.calibration.write_text(json.dumps(content))
+    with Frames.open(run(capture)) as frames:
+        assert frames.fps == pytest.approx(1 / 0.101)
+        assert np.allclose(frames.time_s, times - 100, atol=1e-6)
+        assert frames.available.all()
+        assert np.allclose(frames.skew_s[:, 1], 0.003, atol=2e-6)
+
+
+@pytest.mark.parametrize("suffix", ["avi", "mkv", "mov", "mp4"])
+def test_packets_of_an_mjpeg_video_are_copied(capture, suffix):
+    path = capture.recordings / f"top.{suffix}"
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    write_video(path, 2, 8, "mjpeg")
+    with av.open(str(path)) as container:
+        packets = [bytes(p) for p in container.demux(video=0) if p.size]
+    output = run(capture)
+    assert notes_of(output)["top"] == "has no depth"
+    with Frames.open(output) as frames:
+        assert frames.colour_available.all()
+        assert [frames.colour_jpeg(t, 2) for t in range(8)] == packets
+        assert np.abs(frames.colour(7, 2).astype(int) - picture(2, 7)).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [("mp4", "h264"), ("mkv", "h264"), ("avi", "mpeg4"), ("webm", "libvpx")]
+)
+def test_other_videos_are_stored_as_jpeg_with_a_note(capture, suffix, codec):
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    path = capture.recordings / f"top.{suffix}"
+    options = {"bf": "2"} if codec == "h264" else {}
+    try:
+        write_video(path, 2, 8, codec, options=options)
+    except av.codec.codec.UnknownCodecError:
+        pytest.skip(f"this build of FFmpeg has no {codec} encoder")
+    reader, expected = cv2.VideoCapture(str(path)), []
+    while (read := reader.read())[0]:
+        expected.append(read[1])
+    output = run(capture)
+    assert f"recorded as {'vp8' if codec == 'libvpx' else codec}, stored" in notes_of(output)["top"]
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 8 and frames.colour_available.all()
+        for t in range(8):
+            assert np.abs(frames.colour(t, 2).astype(int) - expected[t]).mean() < 3
+
+
+def test_a_camera_of_half_the_rate_is_in_every_second_set(capture):
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    half = Fraction(FPS, 2)
+    write_video(capture.recordings / "top.mp4", 2, 4, "mjpeg", fps=half)
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 8 and frames.fps == FPS
+        assert frames.colour_available[:, 2].tolist() == [True, False] * 4
+        assert np.abs(frames.colour(6, 2).astype(int) - picture(2, 3)).mean() < 4
+    assert "12.5 images a second beside 25 frame sets: those between" in notes_of(output)["top"]
+    with artefacts.read(output, FRAMES) as read:
+        assert not read["truncated"].any()  # its last image is a set before the last
+
+
+def test_a_master_of_half_the_rate_leaves_images_out_and_says_so(capture):
+    for number in range(1, 8, 2):
+        (capture.recordings / "left" / f"{number:05d}.jpg").unlink()
+    with Frames.open(run(capture)) as frames:  # the stated rate: sets of the others between
+        assert frames.num_sets == 8 and frames.colour_available[:, 1:].all()
+    for number in (2, 4, 6):
+        path = capture.recordings / "left" / f"{number:05d}.jpg"
+        path.rename(path.with_name(f"{number // 2:05d}.jpg"))
+    capture.calibration.write_text(json.dumps(calibrated(left={"fps": FPS / 2})))
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.num_sets == 4 and frames.colour_available.all()
+    note = notes_of(output)["right"]
+    assert "25 images a second beside 12.5 frame sets" in note and "4 images are left out" in note
+    assert "max_skew_ms" not in note
+
+
+def test_uneven_images_are_in_the_sets_of_their_times_and_told(capture):
+    stamps = np.arange(8) / FPS + np.tile([0.0, 0.006], 4)
+    times = "".join(f"{number:05d}, {time:.6f}\n" for number, time in enumerate(stamps))
+    (capture.recordings / "right" / "timestamps.csv").write_text(times)
+    output = run(capture)
+    with Frames.open(output) as frames:
+        assert frames.colour_available.all()
+        np.testing.assert_allclose(frames.skew_s[:, 1], np.tile([0.0, 0.006], 4), atol=1e-6)
+    assert "unevenly beside their sets, usually 3.0 ms off" in notes_of(output)["right"]
+    assert "unevenly" not in notes_of(output)["left"]
+
+
+def test_a_video_beside_a_folder_of_depth(capture):
+    for image in (capture.recordings / "left").glob("*.jpg"):
+        image.unlink()
+    write_video(capture.recordings / "left.mp4", 0, 8, "mpeg4")
+    with Frames.open(run(capture)) as frames:
+        assert frames.available.all() and frames.depth_available[:, :2].all()
+        assert np.array_equal(frames.depth(6, 0), depth_of(0, 6))
+
+
+def test_a_phones_video_is_turned_as_viewers_turn_it(capture):
+    path = capture.recordings / "top.mp4"
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    write_video(path, 2, 8, "mpeg4")
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 40  # version, times, id, duration, layer, volume
+    one = 1 << 16
+    quarter = np.array([0, one, 0, -one, 0, 0, 48 * one, 0, 1 << 30], ">i4")
+    content[matrix : matrix + 36] = quarter.tobytes()
+    path.write_bytes(content)
+    reader = cv2.VideoCapture(str(path))
+    expected = reader.read()[1]
+    assert expected.shape == (64, 48, 3)
+    size = {"image_size": [48, 64], "camera_matrix": [[60, 0, 24], [0, 60, 32], [0, 0, 1]]}
+    capture.calibration.write_text(json.dumps(calibrated(top=size)))
+    with Frames.open(run(capture)) as frames:
+        assert np.abs(frames.colour(0, 2).astype(int) - expected).mean() < 3
+
+
+def test_same_files_same_bytes(capture):
+    write_video(capture.recordings / "left.mp4", 0, 8, "mpeg4")
+    for image in (capture.recordings / "left").glob("*.jpg"):
+        image.unlink()
+    first = run(capture).read_bytes()
+    assert run(capture).read_bytes() == first
+
+
+def other_resolution(capture):
+    content = calibrated(top=lens((128, 96)))
+    capture.calibration.write_text(json.dumps(content))
+
+
+def recorded_twice(capture):
+    write_video(capture.recordings / "top.mp4", 2, 8, "mpeg4")
+
+
+def broken_video(capture):
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    (capture.recordings / "top.mp4").write_bytes(b"no video")
+
+
+def unknown_codec(capture):
+    for image in (capture.recordings / "top").iterdir():
+        image.unlink()
+    path = capture.recordings / "top.avi"
+    write_video(path, 2, 8, "mjpeg")
+    path.write_bytes(path.read_bytes().replace(b"MJPG", b"ZZZZ"))
+
+
+def too_few_timestamps(capture):
+    (capture.recordings / "top" / "timestamps.txt").write_text("1.0\n2.0\n")
+
+
+def milliseconds(capture):
+    text = "\n".join(str(40 * t) for t in range(8))
+    (capture.recordings / "top" / "timestamps.txt").write_text(text)
+
+
+def one_huge_time(capture):
+    for image in sorted((capture.recordings / "top").iterdir())[1:]:
+        image.unlink()
+    (capture.recordings / "top" / "timestamps.txt").write_text("1700000000000000000\n")
+
+
+def not_a_number(capture):
+    (capture.recordings / "top" / "timestamps.txt").write_text("1.0\nnoon\n")
+
+
+def unnamed_image(capture):
+    text = "".join(f"{t:05d}.png {t / FPS}\n" for t in range(7))
+    (capture.recordings / "top" / "timestamps.txt").write_text(text)
+
+
+def times_as_names(capture):
+    for path in sorted((capture.recordings / "top").iterdir()):
+        path.rename(path.with_name(f"17000000000000{path.name}"))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (times_as_names, "the numbers in the names are likely times, or time_offset"),
+        (other_resolution, "colour images are 64x48, the calibration of camera top is for 128x96"),
+        (recorded_twice, "camera top is recorded as top.mp4 and top/"),
+        (broken_video, "top.mp4: cannot be opened as a video"),
+        (unknown_codec, "top.avi: holds no video that can be decoded"),
+        (too_few_timestamps, "top: 2 timestamps for 8 colour images"),
+        (milliseconds, "timestamps.txt: times are 40 apart, expected seconds"),
+        (one_huge_time, "timestamps.txt, line 1: 1.7e+18 are no seconds; write seconds"),
+        (not_a_number, "timestamps.txt, line 2: found 'noon'"),
+        (unnamed_image, "top: 1 images have no timestamp (first: 00007.png)"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_set_aside(capture, fault, words):
+    fault(capture)
+    output = run(capture)
+    assert words in notes_of(output)["top"]
+    assert str(capture.recordings.parent) not in notes_of(output)["top"]
+    with Frames.open(output) as frames:
+        assert frames.present.tolist() == [True, True, False] and frames.num_sets == 8
+
+
+def test_degraded_cameras_are_noted(capture):
+    left, right = capture.recordings / "left", capture.recordings / "right"
+    whole = (left / "00004.jpg").read_bytes()
+    (left / "00004.jpg").write_bytes(whole[: len(whole) // 2])
+    cv2.imwrite(str(left / "00006.jpg"), np.zeros((10, 10, 3), np.uint8))
+    (left / "depth" / "00001.png").write_bytes(b"")
+    for path in (right / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint16))
+    for path in (capture.recordings / "top").iterdir():
+        if path.stem > "00003":
+            path.unlink()
+    output = run(capture)
+    notes = notes_of(output)
+    assert "2 damaged images left out (first: 00001.png is no PNG)" in notes["left"]
+    assert "1 images of another size left out" in notes["left"]
+    assert "depth is zero in all 8 images" in notes["right"]
+    assert "ends 4 frame sets early" in notes["top"]
+    with Frames.open(output) as frames:
+        assert frames.rig[1].depth is None and not frames.depth_available[:, 1].any()
+
+
+def test_depth_without_a_lens_is_not_read(capture):
+    content = calibrated()
+    del content["cameras"]["left"]["depth"]
+    capture.calibration.write_text(json.dumps(content))
+    output = run(capture)
+    assert "the calibration says nothing of depth" in notes_of(output)["left"]
+    with Frames.open(output) as frames:
+        assert frames.rig[0].depth is None
+
+
+@pytest.mark.parametrize("count", [1, 16])
+def test_rigs_of_one_camera_and_of_sixteen(tmp_path, count):
+    names = [f"c{index:02d}" for index in range(count)]
+    for index, name in enumerate(names):
+        write_images(tmp_path / "recordings" / name, index, range(3))
+    cameras = {name: lens() | {"R": [0, 0, 0], "T": [i, 0, 0]} for i, name in enumerate(names)}
+    (tmp_path / "rig.json").write_text(json.dumps({"fps": FPS, "cameras": cameras}))
+    entry = SequenceEntry(
+        sequence="s1", subject="a", object="b", layout="plain",
+        recordings=tmp_path / "recordings", calibration=tmp_path / "rig.json",
+    )  # fmt: skip
+    with Frames.open(run(entry)) as frames:
+        assert frames.rig.names == tuple(names) and frames.master == "c00"
+        assert frames.colour_available.shape == (3, count) and frames.available.all()
+        assert not frames.depth_available.any()
+
+
+def test_a_rig_whose_times_nobody_says_is_refused(capture):
+    content = calibrated()
+    del content["fps"]
+    capture.calibration.write_text(json.dumps(content))
+    with pytest.raises(UserError, match="add fps to the calibration"):
+        run(capture)

@@ -1,0 +1,499 @@
+"""The frames stage on folders as InterCap and BEHAVE release them, good ones and bad ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from intercap_core import artefacts
+from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.clouds import master_points
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.schemas import FRAMES
+from intercap_core.stages import frames as stage
+from intercap_core.studio.calibration import write_calibration
+from intercap_core.studio.mkv import MkvWriter
+from tests.helpers.release_folders import convert_frames, write_behave, write_intercap
+from tests.helpers.synthetic_capture import COLOUR, FURNITURE, ring, room_depth, to_millimetres
+
+LENS = COLOUR.scaled(0.1)
+NUMBERS = (0, 1, 2, 4, 5)  # 3 was lost by all cameras
+TIMES = ("0003.000", "0004.000", "0005.000", "0008.000")
+
+
+def rig_of(count: int) -> tuple[Rig, np.ndarray]:
+    rig, zup_from_master = ring(count=count)
+    cameras = [
+        replace(camera, colour=LENS, depth=LENS, colour_from_depth=np.eye(4)) for camera in rig
+    ]
+    return Rig(tuple(cameras)), zup_from_master
+
+
+def jpeg_at(t: int, c: int) -> bytes:
+    image = np.full((LENS.height, LENS.width, 3), (20 * c, 10 * t, 128), np.uint8)
+    cv2.putText(image, f"{t} {c}", (20, 60), cv2.FONT_HERSHEY_SIMPLEX, 1, (255, 255, 255))
+    return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def depth_at(t: int, c: int) -> np.ndarray:
+    return np.full((LENS.height, LENS.width), 1000 + 100 * c + t, np.uint16)
+
+
+def entry(layout: str, recordings: Path, calibration: Path) -> SequenceEntry:
+    return SequenceEntry(
+        sequence="s",
+        subject="a",
+        object="b",
+        layout=layout,
+        recordings=recordings,
+        calibration=calibration,
+    )
+
+
+@pytest.fixture
+def release(tmp_path) -> SequenceEntry:
+    rig, _ = rig_of(3)
+    folders = write_intercap(tmp_path, rig, numbers=NUMBERS, colour=jpeg_at, depth=depth_at)
+    return entry("intercap", *folders)
+
+
+@pytest.fixture
+def behave(tmp_path) -> SequenceEntry:
+    rig, _ = rig_of(4)
+    folders = write_behave(tmp_path, rig, times=TIMES, colour=jpeg_at, depth=depth_at)
+    return entry("behave", *folders)
+
+
+def run(sequence: SequenceEntry) -> Path:
+    output = sequence.recordings.parent / "out" / "frames.h5"
+    stage.run(sequence=sequence, output=output, settings=FramesSettings())
+    return output
+
+
+def notes_of(path: Path) -> dict[str, str]:
+    with artefacts.read(path, FRAMES) as frames:
+        return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
+
+
+def cam(sequence: SequenceEntry, number: int) -> Path:
+    return sequence.recordings / f"Frames_Cam{number}"
+
+
+def test_release_images_are_copied_and_the_number_is_the_time(release):
+    with Frames.open(run(release)) as frames:
+        assert (frames.num_sets, frames.fps, frames.master) == (5, 30.0, "k1")
+        assert np.allclose(frames.time_s, np.array(NUMBERS) / 30, atol=1e-6)
+        for t, number in enumerate(NUMBERS):
+            for c in range(3):
+                assert frames.colour_jpeg(t, c) == jpeg_at(number, c)
+                assert np.array_equal(frames.depth(t, c), depth_at(number, c))
+    assert "no camera has an image for 1 periods" in notes_of(run(release))["k1"]
+
+
+def test_release_cameras_are_as_calibrated(release):
+    made, _ = rig_of(3)
+    rig = Rig.from_frames(run(release))
+    assert rig.names == ("k1", "k2", "k3")
+    for camera, expected in zip(rig, made, strict=True):
+        assert np.allclose(camera.colour.parameters, expected.colour.parameters)
+        assert np.array_equal(camera.depth.parameters, camera.colour.parameters)
+        assert np.array_equal(camera.colour_from_depth, np.eye(4))
+        assert np.allclose(camera.master_from_colour, expected.master_from_colour, atol=1e-9)
+
+
+def test_behave_images_times_and_cameras(behave):
+    made, _ = rig_of(4)
+    with Frames.open(run(behave)) as frames:
+        assert (frames.num_sets, frames.fps, frames.master) == (4, 1.0, "k1")
+        assert np.allclose(frames.time_s, [0, 1, 2, 5])
+        for t in range(4):
+            for c in range(4):
+                assert frames.colour_jpeg(t, c) == jpeg_at(t, c)
+                assert np.array_equal(frames.depth(t, c), depth_at(t, c))
+        rig = frames.rig
+    assert rig.names == ("k0", "k1", "k2", "k3")
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    for camera, expected in zip(rig, made, strict=True):
+        assert np.allclose(camera.colour.parameters, expected.colour.parameters)
+        truth = made[1].colour_from_master @ expected.master_from_colour
+        assert np.allclose(apply(camera.master_from_colour, points), apply(truth, points))
+
+
+def test_behave_sets_stand_on_the_clock_of_the_folders(behave):
+    """What was found elsewhere for these folders is told by it, also where the first is dropped."""
+    with Frames.open(run(behave)) as frames:
+        assert frames.first_set_s == pytest.approx(3.0)
+    output = behave.recordings.parent / "dropped.h5"
+    stage.run(sequence=behave, output=output, settings=FramesSettings(), frames_to_drop=[0, 2])
+    with Frames.open(output) as frames:
+        times = frames.first_set_s + frames.time_s
+        assert times == pytest.approx([float(text) for text in TIMES])
+
+
+def test_behave_times_at_thirty_frames_a_second(tmp_path):
+    rig, _ = rig_of(2)
+    times = [f"{2 + i / 30:08.3f}" for i in range(6)]
+    folders = write_behave(tmp_path, rig, times=times, colour=jpeg_at, depth=depth_at)
+    with Frames.open(run(entry("behave", *folders))) as frames:
+        assert frames.fps == 30 and frames.num_sets == 6 and frames.available.all()
+
+
+@pytest.mark.parametrize("layout", ["intercap", "behave"])
+def test_clouds_of_all_cameras_lie_on_one_room(tmp_path, layout):
+    """Poses, lenses and depth agree: every camera's points are on the same planes."""
+    rig, zup_from_master = rig_of(4)
+    rng = np.random.default_rng(1)
+    depths = [
+        to_millimetres(room_depth(camera, zup_from_master, FURNITURE), rng, 0) for camera in rig
+    ]
+    images = dict(colour=jpeg_at, depth=lambda t, c: depths[c])
+    if layout == "intercap":
+        folders, master = write_intercap(tmp_path, rig, numbers=[0], **images), 0
+    else:
+        folders, master = write_behave(tmp_path, rig, times=["0000.000"], **images), 1
+    zup_from_frame = zup_from_master @ rig[master].master_from_colour
+    with Frames.open(run(entry(layout, *folders))) as frames:
+        for c, camera in enumerate(frames.rig):
+            points = apply(zup_from_frame, master_points(frames.depth(0, c), camera).points)
+            low = (np.abs(points[:, 2]) < 0.03) & (np.abs(points[:, :2]) < 3.4).all(1)
+            assert low.sum() > 1000 and np.percentile(np.abs(points[low, 2]), 90) < 0.001
+
+
+@pytest.fixture(scope="module")
+def kinect_frames(tmp_path_factory) -> Path:
+    """The room recorded by two Kinects, as the layout ``k4a`` reads it."""
+    folder = tmp_path_factory.mktemp("kinects")
+    modes = dict(colour_mode="720P", depth_mode="NFOV_2X2BINNED")
+    size, depth_size = COLOUR_MODES["720P"].size, DEPTH_MODES["NFOV_2X2BINNED"].size
+    colour = Intrinsics(*size, 612.0, 611.0, 639.5, 366.0, COLOUR.distortion)
+    depth = Intrinsics(*depth_size, 252.0, 252.0, 160.0, 150.0)
+    rig, zup_from_master = ring(2)
+    rig = Rig(tuple(replace(camera, colour=colour, depth=depth) for camera in rig))
+    for index, camera in enumerate(rig):
+        image = np.full((size[1], size[0], 3), 60 * index, np.uint8)
+        millimetres = np.rint(room_depth(camera, zup_from_master, FURNITURE) * 1000)
+        with MkvWriter(
+            folder / f"{camera.name}.mkv",
+            calibration_json=write_calibration(camera, serial=str(index), **modes),
+            **modes,
+            fps=15,
+            serial=str(index),
+            start_offset_ns=0,
+            depth_delay_ns=0,
+            wired_sync_mode="STANDALONE",
+            subordinate_delay_ns=0,
+            with_imu=False,
+        ) as writer:
+            for tick in range(2):
+                writer.write_colour(cv2.imencode(".jpg", image)[1].tobytes(), 66_666 * tick)
+                writer.write_depth(millimetres.astype(np.uint16), 66_666 * tick)
+    poses = {camera.name: camera.master_from_colour for camera in rig}
+    write_rig_file(folder / "rig.json", Extrinsics("k1", poses))
+    return run(entry("k4a", folder, folder / "rig.json"))
+
+
+@pytest.mark.parametrize("layout", ["intercap", "behave"])
+def test_clouds_of_a_released_copy_lie_on_those_of_the_recording(kinect_frames, tmp_path, layout):
+    with Frames.open(kinect_frames) as original:
+        folders = convert_frames(original, tmp_path, layout, range(2))
+        clouds = [
+            master_points(original.depth(1, c), camera).points
+            for c, camera in enumerate(original.rig)
+        ]
+        jpegs = [original.colour_jpeg(1, c) for c in range(2)]
+        master = 0 if layout == "intercap" else 1
+        frame_from_master = original.rig[master].colour_from_master
+    with Frames.open(run(entry(layout, *folders))) as copy:
+        assert copy.num_sets == 2
+        for c, camera in enumerate(copy.rig):
+            assert copy.colour_jpeg(1, c) == jpegs[c]
+            points = master_points(copy.depth(1, c), camera).points[::97]
+            distance = off_surface(points, apply(frame_from_master, clouds[c]))
+            assert np.median(distance) < 0.0015 and np.percentile(distance, 90) < 0.006
+
+
+def off_surface(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """Distance (N,) of points from the plane through the nearest points of a cloud."""
+    near = cloud[cKDTree(cloud).query(points, k=8)[1]].astype(np.float64)
+    centre = near.mean(axis=1, keepdims=True)
+    normal = np.linalg.svd(near - centre)[2][:, -1]
+    return np.abs(((points - centre[:, 0]) * normal).sum(axis=1))
+
+
+def missing_images(sequence):
+    (cam(sequence, 2) / "color" / "00001.jpg").unlink()
+    (cam(sequence, 2) / "depth" / "00002.png").unlink()
+
+
+def missing_camera(sequence):
+    shutil.rmtree(cam(sequence, 2))
+
+
+def no_depth_folder(sequence):
+    shutil.rmtree(cam(sequence, 2) / "depth")
+
+
+def cut_depth(sequence):
+    path = cam(sequence, 2) / "depth" / "00001.png"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def damaged_depth(sequence):
+    path = cam(sequence, 2) / "depth" / "00001.png"
+    content = bytearray(path.read_bytes())
+    content[50:60] = bytes(10)
+    path.write_bytes(bytes(content))
+
+
+def empty_colour(sequence):
+    (cam(sequence, 2) / "color" / "00004.jpg").write_bytes(b"")
+
+
+def depth_of_8_bits(sequence):
+    for path in (cam(sequence, 2) / "depth").glob("*.png"):
+        cv2.imwrite(str(path), np.full((LENS.height, LENS.width), 100, np.uint8))
+
+
+def one_depth_of_8_bits(sequence):
+    path = cam(sequence, 2) / "depth" / "00001.png"
+    cv2.imwrite(str(path), np.full((LENS.height, LENS.width), 100, np.uint8))
+
+
+def depth_in_its_own_size(sequence):
+    for path in (cam(sequence, 2) / "depth").glob("*.png"):
+        cv2.imwrite(str(path), np.full((64, 80), 1000, np.uint16))
+
+
+def colour_of_another_size(sequence):
+    for path in (cam(sequence, 2) / "color").glob("*.jpg"):
+        path.write_bytes(cv2.imencode(".jpg", np.zeros((72, 128, 3), np.uint8))[1].tobytes())
+
+
+def no_colour_folder(sequence):
+    shutil.rmtree(cam(sequence, 2) / "color")
+
+
+def lens_without_focal_length(sequence):
+    path = sequence.calibration / "Color_2.json"
+    content = json.loads(path.read_text())
+    del content["f"]
+    path.write_text(json.dumps(content))
+
+
+def lens_with_six_coefficients(sequence):
+    path = sequence.calibration / "Color_2.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "k": [0.0] * 6}))
+
+
+def depth_all_zero(sequence):
+    for path in (cam(sequence, 2) / "depth").glob("*.png"):
+        cv2.imwrite(str(path), np.zeros((LENS.height, LENS.width), np.uint16))
+
+
+# what is broken, the words of the note, whether k2 stays, how many of its images, has it depth
+SURVIVED = [
+    (missing_images, "no image in 1 frame sets", True, 4, True),
+    (missing_images, "no depth image beside 1 of its colour images", True, 4, True),
+    (missing_camera, "no recording of k2", False, 0, False),
+    (no_depth_folder, "has no depth", True, 5, False),
+    (cut_depth, "1 damaged images left out (first: 00001.png is cut off)", True, 5, True),
+    (damaged_depth, "00001.png does not decode", True, 5, True),
+    (empty_colour, "00004.jpg is no whole JPEG", True, 4, True),
+    (depth_of_8_bits, "no depth used: 00000.png is no 16-bit grey PNG (8 bits", True, 5, False),
+    (one_depth_of_8_bits, "00001.png is no 16-bit grey PNG", True, 5, True),
+    (depth_in_its_own_size, "has 80x64 pixels, the colour images 192x108", True, 5, False),
+    (colour_of_another_size, "the colour images have 128x72", False, 0, False),
+    (no_colour_folder, "no readable color/<number>.jpg", False, 0, False),
+    (lens_without_focal_length, "calibration_first/Color_2.json: expected 'f'", False, 0, False),
+    (lens_with_six_coefficients, "6 coefficients", False, 0, False),
+    (depth_all_zero, "depth is zero in all 5 images", True, 5, False),
+]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "present", "images", "depth"),
+    SURVIVED,
+    ids=[f"{case[0].__name__}-{index}" for index, case in enumerate(SURVIVED)],
+)
+def test_a_faulty_release_folder_is_survived_and_named(
+    release, fault, words, present, images, depth
+):
+    fault(release)
+    output = run(release)
+    notes = notes_of(output)
+    assert words in notes["k2"]
+    assert str(release.recordings.parents[3]) not in notes["k2"]  # no path of a machine
+    with Frames.open(output) as frames:
+        assert frames.present.tolist() == [True, present, True]
+        assert frames.colour_available[:, 1].sum() == images
+        assert (frames.rig[1].depth is not None) == depth
+        assert frames.depth_available[:, [0, 2]].all()
+
+
+def test_depth_folders_of_other_names_are_found_and_the_aligned_one_is_taken(release):
+    for number, name in ((1, "Depth"), (2, "depth_aligned"), (3, "DEPTH_raw")):
+        (cam(release, number) / "depth").rename(cam(release, number) / name)
+    (cam(release, 2) / "depth").mkdir()
+    with Frames.open(run(release)) as frames:
+        assert frames.depth_available.all()
+
+
+def calibration_is_a_file(sequence):
+    return sequence.model_copy(update={"calibration": sequence.calibration / "Color.json"})
+
+
+def calibration_without_master(sequence):
+    (sequence.calibration / "Color.json").unlink()
+
+
+def no_camera_folders(sequence):
+    for number in (1, 2, 3):
+        shutil.rmtree(cam(sequence, number))
+
+
+def calibration_of_another_resolution(sequence):
+    for path in sequence.calibration.glob("*.json"):
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({**content, "c": [959.0, 540.0], "f": [913.0, 913.0]}))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (calibration_is_a_file, "needs a folder of Color.json"),
+        (calibration_without_master, "holds no Color.json"),
+        (no_camera_folders, "no recording of k1"),
+        (calibration_of_another_resolution, "give the calibration of this resolution"),
+    ],
+)
+def test_a_release_folder_that_cannot_be_used_fails_in_one_sentence(release, fault, words):
+    with pytest.raises(UserError, match=words):
+        run(fault(release) or release)
+
+
+def test_hidden_files_of_other_systems_are_passed_over(release):
+    for folder in cam(release, 2).iterdir():
+        (folder / "._00001.png").write_bytes(b"\0\5\x16\7")
+    assert notes_of(run(release))["k2"] == ""
+
+
+def test_one_number_twice_sets_the_camera_aside(release):
+    folder = cam(release, 2) / "color"
+    shutil.copy(folder / "00001.jpg", folder / "1.jpg")
+    assert "image 1 is there twice, as 00001.jpg and 1.jpg" in notes_of(run(release))["k2"]
+
+
+def no_pose_of_a_kinect(sequence):
+    shutil.rmtree(sequence.calibration / "2")
+
+
+def no_lens_of_a_kinect(sequence):
+    shutil.rmtree(sequence.calibration.parents[1] / "intrinsics" / "2")
+
+
+def lens_of_another_resolution(sequence):
+    path = sequence.calibration.parents[1] / "intrinsics" / "2" / "calibration.json"
+    content = json.loads(path.read_text())
+    content["color"] |= {"width": 2048, "height": 1536}
+    path.write_text(json.dumps(content))
+
+
+def frame_without_images_of_a_kinect(sequence):
+    (sequence.recordings / "t0004.000" / "k2.color.jpg").unlink()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "present"),
+    [
+        (no_pose_of_a_kinect, "no pose in config", False),
+        (no_lens_of_a_kinect, "no intrinsics/2/calibration.json", False),
+        (lens_of_another_resolution, "are for 2048x1536, its colour images have 192x108", False),
+        (frame_without_images_of_a_kinect, "no image in 1 frame sets", True),
+    ],
+)
+def test_a_faulty_behave_folder_is_survived_and_named(behave, fault, words, present):
+    fault(behave)
+    output = run(behave)
+    assert words in notes_of(output)["k2"]
+    with Frames.open(output) as frames:
+        assert frames.present[list(frames.rig.names).index("k2")] == present
+
+
+def no_master_pose(sequence):
+    shutil.rmtree(sequence.calibration / "1")
+
+
+def rotation_that_is_none(sequence):
+    path = sequence.calibration / "2" / "config.json"
+    path.write_text(json.dumps({"rotation": [1.0] * 9, "translation": [0, 0, 0]}))
+
+
+def pose_in_millimetres(sequence):
+    path = sequence.calibration / "2" / "config.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "translation": [2000.0, 0, 0]}))
+
+
+def no_frame_folders(sequence):
+    for path in sequence.recordings.glob("t*"):
+        shutil.rmtree(path)
+
+
+def two_folders_of_one_time(sequence):
+    shutil.copytree(sequence.recordings / "t0003.000", sequence.recordings / "t3")
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (no_master_pose, "no 1/config.json"),
+        (rotation_that_is_none, "2/config.json: expected a rotation matrix"),
+        (pose_in_millimetres, "translation of 2000 m"),
+        (no_frame_folders, "no frame folders"),
+        (two_folders_of_one_time, "t0003.000 and t3 have one time"),
+    ],
+)
+def test_a_behave_folder_that_cannot_be_used_fails_in_one_sentence(behave, fault, words):
+    fault(behave)
+    with pytest.raises(UserError, match=words):
+        run(behave)
+
+
+@pytest.mark.parametrize("layout", ["release", "behave"])
+def test_same_folders_same_bytes(layout, request):
+    sequence = request.getfixturevalue(layout)
+    first = run(sequence).read_bytes()
+    assert run(sequence).read_bytes() == first
+
+
+def test_release_folders_with_every_other_image_are_slower(tmp_path):
+    rig, _ = rig_of(2)
+    folders = write_intercap(tmp_path, rig, numbers=[4, 6, 8, 12], colour=jpeg_at, depth=depth_at)
+    with Frames.open(run(entry("intercap", *folders))) as frames:
+        assert frames.fps == 15 and frames.available.all()
+        assert np.allclose(frames.time_s, np.array([0, 2, 4, 8]) / 30, atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["release", "behave"])
+def test_colour_may_be_png(layout, request):
+    sequence = request.getfixturevalue(layout)
+    for path in sequence.recordings.rglob("*.jpg"):
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path.with_suffix(".png")), image)
+        path.unlink()
+    with Frames.open(run(sequence)) as frames:
+        assert frames.available.all()
+        assert frames.colour(1, 1).shape == (LENS.height, LENS.width, 3)

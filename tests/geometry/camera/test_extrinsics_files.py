@@ -1,0 +1,82 @@
+"""Rig files and release folders: every way one can be wrong is told in one sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import read_extrinsics
+
+EYE = np.eye(4).tolist()
+
+
+def _moved(x: float) -> list[list[float]]:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose.tolist()
+
+
+def _rig(pose: object = EYE, name: str = "k2") -> str:
+    cameras = {"k1": {"master_from_camera": EYE}, name: {"master_from_camera": pose}}
+    return json.dumps({"master": "k1", "cameras": cameras})
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "rig.json"
+    path.write_bytes(b"\xef\xbb\xbf" + _rig(_moved(1.5)).encode())
+    assert read_extrinsics(path).master_from_colour["k2"][0, 3] == 1.5
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "not valid JSON"),
+        (b"\xff\xfe{}", "not valid JSON"),
+        ("[" * 100000, "not valid JSON"),
+        ('{"master": ' + "1" * 5000 + "}", "not valid JSON"),
+        ("[]", "found list"),
+        ("{}", "expected 'master'"),
+        ('{"master": "k9", "cameras": {"k1": {}}}', "'k9' is none of the cameras"),
+        (_rig(None), "camera 'k2' has no rigid"),
+        (_rig([[1, 2], [3]]), "camera 'k2' has no rigid"),
+        (_rig((2 * np.eye(4)).tolist()), "camera 'k2' has no rigid"),
+        (_rig(np.diag([1.0, 1, -1, 1]).tolist()), "camera 'k2' has no rigid"),
+        (_rig(_moved(np.nan)), "camera 'k2' has no rigid"),
+        (_rig(_moved(np.inf)), "camera 'k2' has no rigid"),
+        (_rig([[10**400] * 4] * 4), "camera 'k2' has no rigid"),
+        (_rig(_moved(1500.0)), "1500 m.*millimetres"),
+        (_rig(name="../k2"), "rename"),
+        (_rig(name="k 2"), "rename"),
+        (_rig(name=""), "rename"),
+        (_rig(name="k2\n"), "rename"),
+    ],
+)
+def test_wrong_rig_files_are_named(tmp_path: Path, content: str | bytes, words: str) -> None:
+    path = tmp_path / "rig.json"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(UserError, match=words) as caught:
+        read_extrinsics(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"R": [0, 0, 0]}, "rotation vector 'R'"),
+        ({"R": [0, 0], "T": [0, 0, 0]}, "rotation vector 'R'"),
+        ({"R": [0, 0, 10**400], "T": [0, 0, 0]}, "rotation vector 'R'"),
+        ({"R": [0, 0, float("nan")], "T": [0, 0, 0]}, "finite"),
+        ({"R": [0, 0, 0], "T": [0, float("inf"), 0]}, "finite"),
+        ({"R": [0, 0, 0], "T": [0, 1500, 0]}, "1500 m.*millimetres"),
+    ],
+)
+def test_wrong_release_files_are_named(tmp_path: Path, content: object, words: str) -> None:
+    (tmp_path / "Color.json").write_text('{"R": [0, 0, 0], "T": [0, 0, 0]}')
+    (tmp_path / "Color_2.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=words) as caught:
+        read_extrinsics(tmp_path)
+    assert str(tmp_path / "Color_2.json") in str(caught.value)

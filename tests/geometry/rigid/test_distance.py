@@ -1,0 +1,148 @@
+"""Signed distances against closed forms."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
+
+
+def test_box_against_the_closed_form():
+    half = np.array([0.2, 0.1, 0.05])
+    box = trimesh.creation.box(2 * half)
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (5000, 3))
+    outside = np.abs(points) - half
+    expected = np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(1), 0)
+    field = DistanceField(box.vertices, box.faces)
+    signed = field.signed_distance(points)
+    np.testing.assert_allclose(signed, expected, atol=1e-6)
+    np.testing.assert_array_equal(field.inside(points), expected < 0)
+    np.testing.assert_allclose(field.distance(points), np.abs(expected), atol=1e-6)
+
+
+def test_sphere_against_the_closed_form():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.11)
+    points = np.random.default_rng(1).normal(size=(4000, 3)) * 0.1
+    signed = DistanceField(ball.vertices, ball.faces).signed_distance(points)
+    np.testing.assert_allclose(signed, np.linalg.norm(points, axis=1) - 0.11, atol=1e-4)
+
+
+def test_closest_points_lie_on_their_faces():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.11)
+    points = np.random.default_rng(2).normal(size=(1000, 3)) * 0.1
+    field = DistanceField(ball.vertices, ball.faces)
+    found = field.closest(points)
+    corners = np.asarray(ball.vertices)[np.asarray(ball.faces)[found.faces]]
+    np.testing.assert_allclose(
+        (corners * found.barycentric[..., None]).sum(1), found.points, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(points - found.points, axis=1), field.distance(points), atol=1e-6
+    )
+    assert (np.einsum("ij,ij->i", found.normals, found.points) > 0).all()
+
+
+def test_inside_survives_missing_faces():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.11)
+    rng = np.random.default_rng(3)
+    kept = rng.permutation(len(ball.faces))[: int(0.98 * len(ball.faces))]
+    points = rng.normal(size=(4000, 3)) * 0.07
+    points = points[np.abs(np.linalg.norm(points, axis=1) - 0.11) > 0.005]
+    truth = np.linalg.norm(points, axis=1) < 0.11
+    field = DistanceField(ball.vertices, ball.faces[kept], watertight=False)
+    assert (field.inside(points) != truth).mean() < 0.005
+
+
+def box_without_its_lid() -> tuple[trimesh.Trimesh, DistanceField]:
+    box = trimesh.creation.box((0.4, 0.3, 0.2)).subdivide().subdivide().subdivide()
+    kept = box.triangles_center[:, 2] < 0.0999
+    return box, DistanceField(box.vertices, box.faces[kept], watertight=False)
+
+
+def test_what_is_outside_a_holed_mesh_is_never_inside():
+    """Rays that leave through the hole used to vote points a decimetre above it inside."""
+    box, field = box_without_its_lid()
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-0.5, 0.5, size=(20000, 3))
+    outside = ~trimesh.bounds.contains(box.bounds, points)
+    assert not field.inside(points[outside]).any()
+    away = field.signed_distance(points[outside])
+    solid = DistanceField(box.vertices, box.faces)
+    np.testing.assert_array_less(solid.signed_distance(points[outside]) - 1e-6, away)
+
+
+def test_nothing_is_deeper_in_a_holed_mesh_than_in_the_closed_one():
+    """Below the missing lid the nearest face is a side, the way out is up."""
+    box, field = box_without_its_lid()
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-0.5, 0.5, size=(4000, 3)) * box.extents
+    solid = DistanceField(box.vertices, box.faces)
+    depth, true = field.signed_distance(points), solid.signed_distance(points)
+    inside = depth < 0
+    assert (depth >= true - 1e-6).all()
+    np.testing.assert_allclose(depth[inside], true[inside], atol=1e-6)
+    assert inside.mean() > 0.8  # near the hole half of the surface is not around a point
+    below = np.array([[0.0, 0.0, 0.02], [0.03, 0.02, 0.03]])
+    found, closest = field.boundary(below)
+    assert found.all()
+    np.testing.assert_allclose(closest.points, [[0, 0, 0.1], [0.03, 0.02, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(closest.normals, [[0, 0, 1.0]] * 2, atol=1e-6)
+
+
+def test_a_tenth_of_the_faces_may_be_missing():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.11)
+    rng = np.random.default_rng(7)
+    kept = rng.permutation(len(ball.faces))[: int(0.9 * len(ball.faces))]
+    points = rng.normal(size=(4000, 3)) * 0.07
+    points = points[np.abs(np.linalg.norm(points, axis=1) - 0.11) > 0.005]
+    true = 0.11 - np.linalg.norm(points, axis=1)
+    field = DistanceField(ball.vertices, ball.faces[kept], watertight=False)
+    found = -field.signed_distance(points)
+    assert (np.sign(found) != np.sign(true)).mean() < 0.002
+    np.testing.assert_allclose(found, true, atol=0.006)
+
+
+def test_a_part_that_is_all_of_a_surface_is_that_surface():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.11)
+    field = DistanceField(ball.vertices, ball.faces)
+    part = SurfacePart(field, ball.vertices, ball.faces, np.arange(len(ball.vertices)))
+    points = np.random.default_rng(3).normal(size=(1000, 3)) * 0.1
+    below, found = part.boundary(points)
+    inside, expected = field.boundary(points)
+    np.testing.assert_array_equal(below, inside)
+    np.testing.assert_equal(vars(found), vars(expected))
+
+
+def test_distances_to_the_top_of_a_box():
+    """Of what is inside only what is nearest to the top is below it."""
+    half = np.array([0.2, 0.1, 0.05])
+    box = trimesh.creation.box(2 * half)
+    top = np.flatnonzero(box.vertices[:, 2] > 0)
+    field = DistanceField(box.vertices, box.faces)
+    points = np.random.default_rng(4).uniform(-0.3, 0.3, (5000, 3))
+    below, found = SurfacePart(field, box.vertices, box.faces, top).boundary(points)
+    expected = np.column_stack(
+        [np.clip(points[:, :2], -half[:2], half[:2]), np.full(len(points), half[2])]
+    )
+    np.testing.assert_allclose(found.points, expected, atol=1e-6)
+    assert (np.asarray(box.vertices)[np.asarray(box.faces)[found.faces]][..., 2] > 0).all()
+    room = half - np.abs(points)  # to the nearest side along each axis
+    inside = (room > 0).all(1)
+    assert below.any() and (inside & ~below).any()
+    np.testing.assert_array_equal(
+        below, inside & (points[:, 2] > 0) & (room[:, 2] <= room[:, :2].min(1))
+    )
+
+
+def test_a_vertex_without_a_face_of_its_own_part_stands_for_those_around_it():
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    field = DistanceField(box.vertices, box.faces)
+    part = SurfacePart(field, box.vertices, box.faces, np.array([5]))
+    around = (np.asarray(box.faces) == 5).any(1)
+    only = DistanceField(box.vertices, np.asarray(box.faces)[around])
+    points = np.random.default_rng(5).normal(size=(200, 3)) * 0.2
+    found = part.boundary(points)[1]
+    np.testing.assert_allclose(found.points, only.closest(points).points, atol=1e-9)
+    assert around[found.faces].all()
+    with pytest.raises(ValueError, match="no face"):
+        SurfacePart(field, box.vertices, np.asarray(box.faces)[~around], np.array([5]))

@@ -1,0 +1,383 @@
+"""Bad meshes and lists get one sentence that names the file and the next step."""
+
+import io
+import json
+import logging
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core.config import ObjectEntry, Symmetry
+from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.contact_vertices import contact_list
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.inputs import safe_pickle
+
+
+def _entry(path, **values):
+    return ObjectEntry(name="thing", mesh=path, **values)
+
+
+def _write(mesh, path: Path) -> Path:
+    mesh.export(path)
+    return path
+
+
+def _ball(subdivisions=3):
+    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.11)
+
+
+def _no_faces(path):
+    trimesh.PointCloud(_ball().vertices).export(path)
+    return path
+
+
+def _not_a_number(path):
+    ball = _ball()
+    ball.vertices[7, 1] = np.nan
+    return _write(ball, path)
+
+
+def _millimetres(path):
+    ball = _ball()
+    ball.apply_scale(1000)
+    return _write(ball, path)
+
+
+def _centimetres(path):
+    ball = _ball()
+    ball.apply_scale(100)
+    return _write(ball, path)
+
+
+def _all_faces_without_area(path):
+    ball = _ball()
+    ball.faces[:, 2] = ball.faces[:, 1]
+    return _write(trimesh.Trimesh(ball.vertices, ball.faces, process=False), path)
+
+
+def _empty(path):
+    path.write_bytes(b"")
+    return path
+
+
+def _no_vertices(path):
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    return path
+
+
+def _tiny(path):
+    ball = _ball()
+    ball.apply_scale(0.001)
+    return _write(ball, path)
+
+
+def _half_open(path):
+    ball = _ball()
+    soup = ball.vertices[ball.faces[::2]].reshape(-1, 3)
+    loose = trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False)
+    return _write(loose, path)
+
+
+def _flat(path):
+    ball = _ball()
+    ball.vertices[:, 2] *= 1e-9
+    return _write(ball, path)
+
+
+def _garbage(path):
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n1 2")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path, "no such mesh"),
+        (_no_faces, "0 faces"),
+        (_not_a_number, "vertex 7 is not a number"),
+        (_millimetres, r"220 m long.*millimetres \(0\.001\)"),
+        (_centimetres, r"22 m long.*centimetres \(0\.01\)"),
+        (_all_faces_without_area, "encloses"),
+        (_empty, "not a readable mesh|0 faces"),
+        (_no_vertices, "0 faces|not a readable mesh"),
+        (_tiny, "unit is the metre"),
+        (_half_open, "no inside"),
+        (_flat, "flat sheet"),
+        (_garbage, "export"),
+    ],
+)
+def test_bad_meshes_are_refused(tmp_path, make, words):
+    path = tmp_path / "thing.ply"
+    make(path)
+    with pytest.raises(UserError, match=words) as caught:
+        ObjectMesh.load(_entry(path))
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(("scale", "doubted"), [(0.05, True), (1, False), (20, True)])
+def test_unusual_sizes_are_doubted_and_used(tmp_path, caplog, scale, doubted):
+    ball = _ball()
+    ball.apply_scale(scale)
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
+    assert mesh.diameter == pytest.approx(0.22 * scale, rel=1e-3)
+    assert ("check its unit" in caplog.text) == doubted
+
+
+def test_an_open_mesh_is_told_and_used(tmp_path, caplog):
+    """A box without its lid: what lies deep inside is inside, what lies outside is not."""
+    box = trimesh.creation.box((0.4, 0.4, 0.4)).subdivide().subdivide()
+    lid = box.triangles_center[:, 2] > 0.199
+    box = trimesh.Trimesh(box.vertices, box.faces[~lid], process=True)
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(_write(box, tmp_path / "thing.ply")))
+    assert not mesh.watertight and "not watertight" in caplog.text
+    assert "thing.ply" in caplog.text
+    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+    rng = np.random.default_rng(0)
+    inner = rng.uniform(-0.19, 0.19, (500, 3)) - (0, 0, 0.1) * rng.random((500, 1))
+    inner[:, 2] = inner[:, 2].clip(-0.19, -0.02)
+    outer = inner + np.array([0.5, 0.1, 0])
+    assert field.inside(inner).mean() > 0.95 and not field.inside(outer).any()
+    assert 0 < mesh.radius < 0.5 and np.isfinite(mesh.centre_of_mass).all()
+
+
+@pytest.mark.parametrize("stray", [np.nan, 40.0])
+def test_vertices_without_a_face_do_not_count(tmp_path, caplog, stray):
+    ball = _ball()
+    vertices = np.concatenate([[[stray, 0, 0]], ball.vertices])
+    path = _write(trimesh.Trimesh(vertices, ball.faces + 1, process=False), tmp_path / "thing.ply")
+    contact = tmp_path / "thing.json"
+    contact.write_text("[0, 1, 6]")
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
+    assert "left out 1 vertices that no face uses" in caplog.text
+    assert mesh.watertight and mesh.diameter == pytest.approx(0.22, rel=1e-3)
+    assert len(mesh.vertices) == len(ball.vertices) == len(mesh.colours)
+    np.testing.assert_array_equal(mesh.contact_vertices, [0, 5])
+    contact.write_text("[0]")
+    with pytest.raises(UserError, match="no face of the mesh uses any"):
+        ObjectMesh.load(_entry(path, contact_vertices=contact))
+
+
+def test_faces_without_area_are_left_out(tmp_path, caplog):
+    ball = _ball()
+    faces = np.concatenate([ball.faces, [[0, 0, 1], [5, 7, 7]]])
+    ball = trimesh.Trimesh(ball.vertices, faces, process=False)
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
+    assert mesh.watertight and len(mesh.faces) == len(_ball().faces)
+    assert "left out 2 faces without area" in caplog.text
+
+
+def _inside_out(ball):
+    ball.invert()
+
+
+def _one_face_turned(ball):
+    ball.faces[3] = ball.faces[3][::-1]
+
+
+def _one_face_missing(ball):
+    ball.update_faces(np.arange(len(ball.faces)) != 11)
+
+
+def _corners_not_joined(ball):
+    soup = ball.vertices[ball.faces].reshape(-1, 3)
+    ball.vertices, ball.faces = soup, np.arange(len(soup)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(
+    "harm", [_inside_out, _one_face_turned, _one_face_missing, _corners_not_joined]
+)
+def test_small_faults_are_repaired(tmp_path, caplog, harm):
+    ball = _ball()
+    volume = ball.volume
+    ball = trimesh.Trimesh(ball.vertices.copy(), ball.faces.copy(), process=False)
+    harm(ball)
+    path = _write(ball, tmp_path / "thing.ply")
+    listed = [0, 1, 5]
+    positions = np.asarray(ball.vertices)[listed]
+    contact = tmp_path / "thing.json"
+    contact.write_text(json.dumps(listed))
+    with caplog.at_level(logging.WARNING):
+        mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
+    repaired = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert mesh.watertight and repaired.is_winding_consistent
+    assert repaired.volume == pytest.approx(volume, rel=1e-3)
+    distance = np.linalg.norm(
+        positions[:, None] - mesh.vertices[mesh.contact_vertices][None], axis=-1
+    )
+    assert distance.min(1).max() < 1e-6, "contact vertices follow the joined vertices"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1, 2, 100000]", "names vertex 100000"),
+        ("[-1]", "names vertex -1"),
+        ("[]", "not a list"),
+        ('{"a": 1}', "not a list"),
+        ("[0.5]", "not a list"),
+        ("[[1], [2, 3]]", "not a list"),
+        ("[1, 2", "not a JSON list"),
+        ("", "not a JSON list"),
+        ("[" * 100000, "not a JSON list"),
+        ("[1, Infinity]", "not a list"),
+        ("[1, NaN]", "not a list"),
+        ('["a"]', "not a list"),
+        ("[1" + "0" * 400 + "]", "not a list"),
+    ],
+)
+def test_bad_contact_lists_are_refused(tmp_path, text, words):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    contact = tmp_path / "thing.contact.json"
+    contact.write_text(text)
+    with pytest.raises(UserError, match=words) as caught:
+        ObjectMesh.load(_entry(mesh, contact_vertices=contact))
+    assert str(contact) in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["json", "npz"])
+def test_a_list_knows_the_mesh_that_it_was_chosen_on(tmp_path, suffix):
+    """A mesh built anew is noticed by its number of vertices, and by where they are."""
+    ball = _ball()
+    stored = contact_list([3, 9], ball.vertices)
+    contact = tmp_path / f"thing.contact.{suffix}"
+    if suffix == "json":
+        contact.write_text(json.dumps(stored))
+    else:
+        np.savez(contact, **stored)
+    entry = _entry(_write(ball, tmp_path / "thing.ply"), contact_vertices=contact)
+    np.testing.assert_array_equal(ObjectMesh.load(entry).contact_vertices, [3, 9])
+    reordered = trimesh.Trimesh(
+        ball.vertices[::-1], len(ball.vertices) - 1 - ball.faces, process=False
+    )
+    for other, words in ((_ball(2), "mesh_vertices 642.*has 162"), (reordered, "mesh_digest")):
+        again = _entry(_write(other, tmp_path / "again.ply"), contact_vertices=contact)
+        with pytest.raises(UserError, match=f"{words}.*built anew.*choose") as caught:
+            ObjectMesh.load(again)
+        assert str(contact) in str(caught.value) and "again.ply" in str(caught.value)
+
+
+def _npz(**arrays):
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _npy(values):
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("c.npz", b"", "not a readable .npz"),
+        ("c.npz", b"no archive", "not a readable .npz"),
+        ("c.npz", _npz(contact_vertices=np.arange(9))[:-30], "not a readable .npz"),
+        ("c.npz", _npz(), "not a readable .npz"),
+        ("c.npz", _npy(np.arange(9)), "a single array"),
+        ("c.npz", _npz(contact_vertices=np.array(["a"])), "not a list"),
+        ("c.npz", _npz(contact_vertices=np.array(3)), "not a list"),
+        ("c.pkl", pickle.dumps({"a": 1}), "not a list"),
+        ("c.pkl", pickle.dumps({1, 2.5}), "not a list"),
+        ("c.pkl", pickle.dumps({1, (1, 2)}), "not a list"),
+        ("c.pkl", pickle.dumps(3), "not a list"),
+        ("c.pkl", pickle.dumps(None), "not a list"),
+    ],
+)
+def test_bad_contact_archives_are_refused(tmp_path, name, data, words):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    contact = tmp_path / name
+    contact.write_bytes(data)
+    with pytest.raises(UserError, match=words) as caught:
+        ObjectMesh.load(_entry(mesh, contact_vertices=contact))
+    assert str(contact) in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["list", "array", "npz", "none"])
+def test_contact_lists_of_every_kind(tmp_path, kind):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    path: Path | None = tmp_path / ("03.npz" if kind == "npz" else "03.pkl")
+    if kind == "npz":
+        np.savez(path, contact_vertices=np.array([9, 3, 3]))
+    elif kind == "none":
+        path = None
+    else:
+        ids = [9, 3, 3] if kind == "list" else np.array([9, 3, 3])
+        path.write_bytes(pickle.dumps(ids, protocol=2))
+    loaded = ObjectMesh.load(_entry(mesh, contact_vertices=path)).contact_vertices
+    expected = np.arange(642) if kind == "none" else [3, 9]
+    np.testing.assert_array_equal(loaded, expected)
+
+
+def test_impossible_symmetry_names_the_object(tmp_path):
+    mesh = _write(_ball(), tmp_path / "thing.ply")
+    flat = tuple(np.diag([2.0, 1, 1, 1]).ravel())
+    with pytest.raises(UserError, match="object 'thing': symmetry"):
+        ObjectMesh.load(_entry(mesh, symmetry=Symmetry(discrete=(flat,))))
+
+
+class _Attack:
+    def __reduce__(self):
+        return os.system, ("touch should_not_exist",)
+
+
+class _Huge:
+    def __reduce__(self):
+        return np.ndarray, ((1 << 33,),)
+
+
+class _Evaluate:
+    def __reduce__(self):
+        return eval, ("1 + 1",)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [_Attack(), [np.arange(3), _Evaluate()], {"a": Path("x")}, range(3), slice(3), 1j, _Huge()],
+)
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_pickles_that_call_anything_are_refused(tmp_path, monkeypatch, value, protocol):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "evil.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=protocol))
+    with pytest.raises(UserError, match=r"evil\.pkl: not a pickle of numpy arrays"):
+        safe_pickle.load(path)
+    assert not (tmp_path / "should_not_exist").exists()
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
+def test_pickles_of_plain_values_load(tmp_path, protocol):
+    value = {
+        "ob_pose": [np.arange(3.0), np.ones((2, 2), np.float32)],
+        "names": ("a", b"b", None, True, 3, 2.5),
+        "scalar": np.float32(1.5),
+        "ids": {1, 2},
+    }
+    path = tmp_path / "plain.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=protocol))
+    loaded = safe_pickle.load(path)
+    np.testing.assert_array_equal(loaded["ob_pose"][1], value["ob_pose"][1])
+    assert loaded["names"] == value["names"] and loaded["ids"] == value["ids"]
+    assert loaded["scalar"] == np.float32(1.5)
+
+
+@pytest.mark.parametrize("data", [b"", b"not a pickle", pickle.dumps([1] * 50)[:-5]])
+def test_damaged_pickles_are_refused(tmp_path, data):
+    path = tmp_path / "damaged.pkl"
+    path.write_bytes(data)
+    with pytest.raises(UserError, match="damaged"):
+        safe_pickle.load(path)

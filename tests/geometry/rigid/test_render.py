@@ -1,0 +1,153 @@
+"""Rendering against closed forms, projected vertices and an independent ray caster."""
+
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.rigid.render import render, render_scene
+from intercap_core.geometry.rigid.shots import Drawable
+from intercap_core.geometry.rigid.visibility import OcclusionScene
+
+PINHOLE = Intrinsics(640, 576, 504.0, 505.0, 321.3, 287.6)
+LENS = Intrinsics(  # a Kinect's colour lens at half size: strong rational distortion
+    960, 540, 456.0, 456.5, 478.2, 272.4,
+    np.array([0.45, -2.6, 1e-3, -4e-4, 1.43, 0.33, -2.42, 1.36]),
+)  # fmt: skip
+
+
+def _pose(translation, rotation_vector=(0, 0, 0)):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
+    pose[:3, 3] = translation
+    return pose
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, LENS], ids=["pinhole", "lens"])
+def test_sphere_depth_and_outline(lens):
+    """Radius 110 mm; 82 k triangles lie up to 0.02 mm inside the true sphere."""
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.11)
+    centre = np.array([0.35, -0.25, 1.7])
+    image = render(ball.vertices, ball.faces, lens, _pose(centre))
+    rays = lens.rays[image.window].astype(float)
+    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+    a, b = (rays**2).sum(-1), rays @ centre
+    root = b**2 - a * (centre @ centre - 0.11**2)
+    expected = (b - np.sqrt(np.maximum(root, 0))) / a
+    miss = np.sqrt(centre @ centre - b**2 / a)  # distance of the ray from the centre
+    assert image.mask[miss < 0.1098].all() and not image.mask[miss > 0.11].any()
+    inner = miss < 0.100
+    assert np.abs(image.depth - expected)[inner].max() < 1e-4
+    assert image.mask.sum() > 1500 and (image.depth[~image.mask] == 0).all()
+
+
+def test_box_area():
+    """A box's front face 200 x 100 mm at 1 m covers f^2 times its area."""
+    box = trimesh.creation.box((0.2, 0.1, 0.04))
+    image = render(box.vertices, box.faces, PINHOLE, _pose((0.01, 0.02, 1.02)))
+    expected = 504 * 0.2 * 505 * 0.1
+    assert image.mask.sum() == pytest.approx(expected, rel=0.01)
+    np.testing.assert_allclose(image.depth[image.mask], 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["stool", "tennis_racquet", "cup"])
+def test_equals_an_independent_ray_caster(objects, name):
+    mesh = objects[name]
+    pose = _pose((0.3, -0.2, 1.4), (0.7, -0.4, 0.9))
+    image = render(mesh.vertices, mesh.faces, LENS, pose, margin_px=5)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    rows, columns = image.window
+    v, u = np.mgrid[rows, columns]
+    rays = LENS.unproject(np.stack([u, v], -1)) @ pose[:3, :3]
+    eye = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], rays.shape)
+    answer = scene.cast_rays(o3d.core.Tensor(np.concatenate([eye, rays], -1).astype(np.float32)))
+    depth = answer["t_hit"].numpy()
+    hit = np.isfinite(depth)
+    assert (hit != image.mask).mean() < 1e-3
+    both = hit & image.mask
+    close = np.abs(depth - image.depth)[both] < 1e-5
+    assert close.mean() > 0.998
+
+
+@pytest.mark.parametrize("corner", [(-0.7, -0.4), (0.75, 0.35), (0.1, 0.4)])
+def test_large_triangles_bend_as_the_lens_bends_them(corner):
+    """Twelve triangles of hundreds of pixels cover what thousands of small ones do."""
+    box = trimesh.creation.box((0.5, 0.35, 0.2))
+    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
+    for turn in (0.0, 0.5, 1.1):
+        pose = _pose((*corner, 1.1), (turn, 0.4 - turn, 0.7 * turn))
+        few = render(vertices, faces, LENS, pose, margin_px=8)
+        fine = render(*trimesh.remesh.subdivide_to_size(vertices, faces, 0.03), LENS, pose)
+        assert fine.mask.sum() > 10_000
+        assert (few.full_mask(LENS) != fine.full_mask(LENS)).sum() <= 4
+
+
+def test_projected_vertices_fall_into_the_mask(objects):
+    mesh = objects["suitcase"]
+    pose = _pose((-0.5, 0.2, 1.5), (0.3, 1.0, -0.2))
+    image = render(mesh.vertices, mesh.faces, LENS, pose, margin_px=3)
+    pixels = LENS.project(mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
+    full = image.full_mask(LENS)
+    corner = np.floor(pixels).astype(int)
+    around = np.zeros(len(pixels), bool)
+    for du in (0, 1):
+        for dv in (0, 1):
+            around |= full[corner[:, 1] + dv, corner[:, 0] + du]
+    assert around.all()
+    rows, columns = np.nonzero(full)
+    np.testing.assert_allclose(
+        [columns.min(), rows.min(), columns.max(), rows.max()],
+        [*pixels.min(0), *pixels.max(0)],
+        atol=1.01,
+    )
+
+
+def test_nearer_mesh_hides_the_farther():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    near = Drawable(ball.vertices, ball.faces, _pose((0, 0, 1.0)))
+    far = Drawable(ball.vertices, ball.faces, _pose((0.2, 0, 2.0)))
+    for order in ([near, far], [far, near]):
+        image = render_scene(order, PINHOLE)
+        number = order.index(near)
+        alone = render(ball.vertices, ball.faces, PINHOLE, near.camera_from_mesh)
+        assert (image.body == number).sum() == alone.mask.sum()
+    assert (image.body == order.index(far)).sum() > 0
+
+
+def test_out_of_view_and_behind():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    for translation in ((5, 0, 1), (0, 0, -1), (0, -9, 2)):
+        image = render(ball.vertices, ball.faces, PINHOLE, _pose(translation))
+        assert not image.mask.any()
+    partly = render(ball.vertices, ball.faces, PINHOLE, _pose((0.63, 0, 1)))
+    assert partly.mask.any() and partly.x0 + partly.mask.shape[1] == PINHOLE.width
+
+
+def test_rendering_repeats_exactly(objects):
+    mesh = objects["chair"]
+    images = [
+        render(mesh.vertices, mesh.faces, LENS, _pose((0, 0, 2), (0, 1, 0))) for _ in range(2)
+    ]
+    assert np.array_equal(images[0].depth, images[1].depth)
+    assert np.array_equal(images[0].face, images[1].face)
+
+
+def test_visible_vertices_of_a_sphere_and_behind_a_screen():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+    vertices = np.asarray(ball.vertices)
+    pose = _pose((0, 0, 2.0))
+    seen = OcclusionScene(vertices, ball.faces).visible(PINHOLE, pose)
+    horizon = -0.1 * 0.1 / 2.0  # z of the tangent circle in the ball's frame
+    clear = np.abs(vertices[:, 2] - horizon) > 0.003
+    np.testing.assert_array_equal(seen[clear], (vertices[:, 2] < horizon)[clear])
+
+    screen = trimesh.creation.box((0.2, 0.4, 0.01))
+    screen.apply_translation((-0.1, 0, -0.5))  # hides the left half
+    occluder = (np.asarray(screen.vertices), np.asarray(screen.faces))
+    behind = OcclusionScene(vertices, ball.faces, [occluder]).visible(PINHOLE, pose)
+    assert not behind[vertices[:, 0] < -0.003].any()
+    right = clear & (vertices[:, 0] > 0.003)
+    np.testing.assert_array_equal(behind[right], seen[right])

@@ -1,0 +1,50 @@
+"""Velocities of positions some of which are wrong."""
+
+import numpy as np
+
+from intercap_core.geometry.solve.velocity import limited_velocity
+
+TIMES = np.array([0.0, 0.066, 0.134, 0.2, 0.266, 0.333, 0.4])
+
+
+def test_a_parabola_has_its_exact_slope_inside():
+    """To what the steps are uneven."""
+    v, a = np.array([1.0, -0.5, 0.2]), np.array([0.5, 1.0, -0.3])
+    positions = v * TIMES[:, None] + 0.5 * a * TIMES[:, None] ** 2
+    found = limited_velocity(positions, TIMES, max_speed=10)
+    assert np.allclose(found[1:-1], (v + a * TIMES[:, None])[1:-1], atol=1e-3)
+    assert np.abs(found - (v + a * TIMES[:, None])).max() < 0.05
+
+
+def test_a_hand_that_waves_keeps_its_speed():
+    times = np.arange(60) / 15
+    rate = 2 * np.pi * 2
+    found = limited_velocity(np.sin(rate * times)[:, None], times, max_speed=100)
+    true = rate * np.cos(rate * times)[:, None]
+    fast = np.abs(true) > 0.9 * rate
+    assert (found / true)[2:-2][fast[2:-2]].mean() > 0.97
+
+
+def test_one_wrong_position_does_not_throw_its_neighbours():
+    positions = np.outer(TIMES, [1.0, 0.0])
+    positions[3] += [0.0, 5.0]
+    found = limited_velocity(positions, TIMES, max_speed=100)
+    assert np.allclose(found[[1, 5]], [1.0, 0.0])
+    assert np.linalg.norm(found[[2, 4]], axis=1).max() < 2.01
+    assert np.allclose(found[3], [1.0, 0.0], atol=1.5), "the jump there and back cancels"
+
+
+def test_speed_is_bounded_and_unknown_positions_have_no_say():
+    positions = np.outer(TIMES, [50.0, 0.0])[:, None].repeat(2, 1)
+    known = np.ones((len(TIMES), 2), bool)
+    known[3, 1] = False
+    positions[3, 1] = np.nan
+    found = limited_velocity(positions, TIMES, max_speed=8, known=known)
+    assert np.allclose(found[:, 0], [8, 0])
+    assert np.allclose(found[[2, 4], 1], [8, 0]) and not found[3, 1].any()
+
+
+def test_nothing_to_differ_from():
+    assert not limited_velocity(np.ones((1, 3)), np.zeros(1), max_speed=1).any()
+    apart = limited_velocity(np.array([[0.0], [1.0]]), np.array([0.0, 5.0]), max_speed=1)
+    assert not apart.any()

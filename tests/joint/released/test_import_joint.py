@@ -1,0 +1,164 @@
+"""Our own export, read back as another program's results: the same bodies, metrics, pages."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.config import ExportSettings, MetricsSettings
+from intercap_core.errors import UserError
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.pipeline.outcome import line
+from intercap_core.schemas import JOINT, SCENE
+from intercap_core.stage_list import STAGES
+from intercap_core.stages import export, joint, metrics
+from tests.helpers import fitted_capture as fitted
+from tests.helpers.site import write_site
+
+NAME = "s01_o03"
+MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+    made = fitted.make_capture(tmp_path_factory.mktemp("ours"), name=NAME)
+    _measure(made)
+    return made
+
+
+def _measure(capture: fitted.Capture) -> None:
+    metrics.run(
+        **capture.inputs(*MEASURED),
+        output=capture.paths["metrics"],
+        object_=capture.object_,
+        subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS,
+        settings=MetricsSettings(),
+        **fitted.OTHER_SETTINGS,
+        truth=capture.paths["truth"],
+    )
+
+
+@pytest.fixture(scope="module")
+def results(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export") / "files"
+    export.run(
+        **capture.inputs(*STAGES["export"].reads),
+        object_=capture.object_,
+        subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS,
+        settings=ExportSettings(formats=("intercap",)),
+        output=folder,
+    )
+    return folder / "intercap"
+
+
+def _import(capture: fitted.Capture, results: Path, folder: Path) -> fitted.Capture:
+    """The capture with a joint artefact that is made of ``results``."""
+    paths = capture.paths | {"joint": folder / "joint.h5", "metrics": folder / "metrics.h5"}
+    joint.run(
+        **capture.inputs(*MEASURED[:-1]),
+        output=paths["joint"],
+        results=results,
+        object_=capture.object_,
+        subject=fitted.SUBJECT,
+        body_models=fitted.BODY_MODELS,
+        settings=fitted.OTHER_SETTINGS["joint_settings"],
+        **{k: v for k, v in fitted.OTHER_SETTINGS.items() if k != "joint_settings"},
+    )
+    return fitted.Capture(**{**capture.__dict__, "paths": paths})
+
+
+@pytest.fixture(scope="module")
+def imported(
+    capture: fitted.Capture, results: Path, tmp_path_factory: pytest.TempPathFactory
+) -> fitted.Capture:
+    made = _import(capture, results, tmp_path_factory.mktemp("theirs"))
+    _measure(made)
+    return made
+
+
+def test_bodies_and_objects_are_those_of_the_file(
+    capture: fitted.Capture, imported: fitted.Capture
+) -> None:
+    with (
+        artefacts.read(capture.paths["joint"], JOINT) as ours,
+        artefacts.read(imported.paths["joint"], JOINT) as theirs,
+        artefacts.read(capture.paths["scene"], SCENE) as scene,
+    ):
+        for key in ("betas", "expression", "global_orient", "transl", "body_pose", "jaw_pose",
+                    "left_hand_pose", "joints", "rotation", "translation"):  # fmt: skip
+            assert theirs[key] == pytest.approx(ours[key], abs=2e-6), key
+        # the results belong to the cameras that were given
+        assert np.array_equal(theirs["master_from_colour"], scene["master_from_colour_start"])
+        assert np.isnan(theirs["contact_probability"]).all() and not theirs["flagged"].any()
+        seen = np.isfinite(theirs["keypoint_residual"])
+        assert seen.any() and np.nanmedian(theirs["keypoint_residual"]) < 3
+        assert theirs.attributes["made_by"] == "another program: res.pkl"
+    assert line("joint", imported.paths["joint"]).startswith("made by another program")
+
+
+def test_metrics_measure_them_and_state_no_error(
+    capture: fitted.Capture, imported: fitted.Capture
+) -> None:
+    ours, theirs = (SequenceMetrics.read(c.paths["metrics"]) for c in (capture, imported))
+    assert (ours.made_by, theirs.made_by) == ("", "another program: res.pkl")
+    assert not any(key.startswith("verdict/") for key in theirs.values)
+    for key in ("truth/joint/body_pve", "truth/joint/object_translation", "penetration_mean"):
+        assert theirs.values[key] == pytest.approx(ours.values[key], abs=1e-5), key
+
+
+def test_report_and_viewer_say_whose_they_are(imported: fitted.Capture, tmp_path: Path) -> None:
+    out = write_site({NAME: imported}, tmp_path / "site")
+    overview = (out / "site" / "index.html").read_text()
+    page = (out / "site" / "sequences" / NAME / "index.html").read_text()
+    assert "1 with results of another program" in overview
+    assert "made by another program: res.pkl" in page and "energy of each term" not in page
+    assert "1 sequences hold results of another program" in (out / "card.md").read_text()
+
+
+def test_gaps_are_filled_and_flagged(
+    capture: fitted.Capture, results: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = pickle.loads((results / "res.pkl").read_bytes())
+    del found["about"], found["left_hand_pose_axis_angle"], found["right_hand_pose_axis_angle"]
+    found["transl"][1] = np.nan
+    found["betas"][3] += 3.0
+    (tmp_path / "theirs.pkl").write_bytes(pickle.dumps(found))
+    with caplog.at_level(logging.WARNING):
+        made = _import(capture, tmp_path / "theirs.pkl", tmp_path)
+    assert "varies by frame" in caplog.text
+    with artefacts.read(made.paths["joint"], JOINT) as theirs:
+        assert theirs["flagged"].tolist() == [False, True, False, False, False]
+        assert theirs.text("flag_reason")[1] == "no result in the imported file"
+        assert np.isfinite(theirs["joints"]).all()
+        ours = _left_hand(capture)
+        # twelve components are not the whole pose, but near it
+        assert np.abs(theirs["left_hand_pose"] - ours).max() < 0.5
+
+
+def _left_hand(capture: fitted.Capture) -> np.ndarray:
+    with artefacts.read(capture.paths["joint"], JOINT) as ours:
+        return ours["left_hand_pose"]
+
+
+def test_results_of_another_recording_are_refused(
+    capture: fitted.Capture, results: Path, tmp_path: Path
+) -> None:
+    found = pickle.loads((results / "res.pkl").read_bytes())
+    short = {
+        key: value[:3] if len(value) == 5 else value for key, value in found.items()
+        if key != "about"
+    } | {"body_pose": found["body_pose"][:, : 63 * 3]}  # fmt: skip
+    (tmp_path / "res.pkl").write_bytes(pickle.dumps(short))
+    with pytest.raises(UserError, match="holds 3 frames, sequence 's01_o03' has 5"):
+        _import(capture, tmp_path, tmp_path)
+    many = found | {"betas": np.zeros((5, 600))}
+    (tmp_path / "res.pkl").write_bytes(pickle.dumps(many))
+    with pytest.raises(UserError, match="600"):
+        _import(capture, tmp_path, tmp_path)

@@ -1,0 +1,259 @@
+"""Contact by vertex, deviations and the verdict, in every format that holds them."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pygltflib
+import pytest
+import trimesh
+
+from intercap_core import artefacts
+from intercap_core.errors import UserError
+from intercap_core.inputs import safe_pickle
+from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK
+from tests.helpers import exported
+from tests.helpers import fitted_capture as fitted
+
+LIMIT_M = 0.0045
+WITHIN_M = 2e-4  # of the limit, the two ways to measure may disagree
+
+
+def _by_frame(offsets: np.ndarray, vertices: np.ndarray) -> list[set[int]]:
+    return [set(np.asarray(vertices[a:b]).tolist()) for a, b in pairwise(offsets)]
+
+
+@pytest.fixture(scope="module")
+def touching(everything: Path) -> dict[str, list[set[int]]]:
+    with np.load(everything / "contact" / "contact_vertices.npz") as told:
+        return {
+            name: _by_frame(told[f"{name}_contact_offsets"], told[f"{name}_contact_vertices"])
+            for name in ("body", "object")
+        }
+
+
+def test_the_vertices_are_those_that_another_library_finds_in_contact(
+    capture: fitted.Capture, touching: dict[str, list[set[int]]], everything: Path
+) -> None:
+    with artefacts.read(capture.paths["joint"], JOINT) as joint:
+        bodies, _ = exported.posed(capture.model, joint)
+        rotation, translation = joint["rotation"], joint["translation"]
+    with np.load(everything / "contact" / "contact_vertices.npz") as told:
+        assert float(told["contact_threshold_m"]) == LIMIT_M
+        distance = told["body_contact_distance"]
+    assert min(len(found) for found in touching["body"]) > 5
+    for t, body in enumerate(bodies):
+        cup = trimesh.Trimesh(
+            capture.mesh.vertices @ rotation[t].T + translation[t], capture.mesh.faces
+        )
+        near = np.flatnonzero(np.linalg.norm(body - cup.centroid, axis=1) < 0.15)
+        signed = -trimesh.proximity.signed_distance(cup, body[near])  # trimesh: positive inside
+        sure = set(near[signed < LIMIT_M - WITHIN_M].tolist())
+        maybe = set(near[signed < LIMIT_M + WITHIN_M].tolist())
+        assert sure <= touching["body"][t] <= maybe
+        start = sum(len(found) for found in touching["body"][:t])
+        own = dict(zip(near.tolist(), signed.tolist(), strict=True))
+        for place, vertex in enumerate(sorted(touching["body"][t])):
+            assert distance[start + place] == pytest.approx(own[vertex], abs=WITHIN_M)
+
+
+def _told(folder: Path) -> dict[str, Any]:
+    """What each format says of every frame, by the name of its file."""
+    found: dict[str, Any] = {}
+    for name in ("amass/body.npz", "amass/object.npz", "intercap/res.npz"):
+        with np.load(folder / name) as file:
+            found[name] = {key: file[key] for key in file.files}
+    found["res.pkl"] = safe_pickle.load(folder / "intercap" / "res.pkl")["about"]["by_frame"]
+    for name in ("bop/about.json", "meshes/about.json"):
+        found[name] = json.loads((folder / name).read_text())["by_frame"]
+    coco = json.loads((folder / "coco" / "annotations.json").read_text())
+    found["coco"] = coco["info"]["by_frame"]
+    glb = pygltflib.GLTF2().load(str(folder / "glb" / "cap.glb"))
+    found["glb"] = glb.asset.extras["by_frame"]
+    return found
+
+
+def _is_json(told: Any) -> bool:
+    return isinstance(told["contact_probability"], list)
+
+
+def test_contact_is_in_every_format(
+    capture: fitted.Capture, everything: Path, touching: dict[str, list[set[int]]]
+) -> None:
+    with artefacts.read(capture.paths["joint"], JOINT) as joint:
+        regions, probability = joint.text("region_names"), joint["contact_probability"]
+    told = _told(everything)
+    assert len(told) == 8
+    for name, found in told.items():
+        for surface in ("body", "object"):
+            vertices = _by_frame(
+                np.array(found[f"{surface}_contact_offsets"]),
+                np.array(found[f"{surface}_contact_vertices"]),
+            )
+            assert vertices == touching[surface], (name, surface)
+        assert list(found["contact_region"]) == regions, name
+        said = np.array(found["contact_probability"])
+        assert said == pytest.approx(probability, abs=1e-4), name
+        assert np.shape(found["contact_annotated"]) == probability.shape
+
+
+def test_deviations_and_stated_errors_are_in_every_format(
+    capture: fitted.Capture, everything: Path
+) -> None:
+    with artefacts.read(capture.paths["body_fit"], BODY_FIT) as fit:
+        joint = fit["joint_sigma"]
+    with artefacts.read(capture.paths["object_track"], OBJECT_TRACK) as track:
+        lost = track["lost"]
+    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
+        parts = measured.text("verdict/part_names")
+        errors = dict(zip(parts, 1e3 * measured["verdict/error_frame"], strict=True))
+        silent = dict(zip(parts, measured.text("verdict/silent"), strict=True))
+    assert lost.tolist() == [True, False, False, False, False]
+    for name, found in _told(everything).items():
+        if _is_json(found):
+            sigma = np.array(found["joint_sigma_mm"]) / 1e3
+            at = [None if v is None else v / 1e3 for v in found["object_position_sigma_mm"]]
+            turn = found["object_rotation_sigma_deg"]
+            stated = found["stated_error_mm"]
+            assert at[0] is turn[0] is None
+            turn = np.radians(turn[1:])
+        else:
+            sigma, at = found["joint_sigma"], found["object_position_sigma"]
+            turn = found["object_rotation_sigma"]
+            rows = zip(found["stated_error_part"], found["stated_error_by_frame_mm"], strict=True)
+            stated = {str(part): row for part, row in rows}
+            assert np.isnan(at[0]) and np.isnan(turn[0])
+            turn = turn[1:]
+        assert sigma == pytest.approx(joint, abs=1e-4), name
+        assert len(found["joint_name"]) == 55
+        # the fixture's covariance is that of 4 mm and 4 mrad along each axis
+        assert np.array(at[1:], float) == pytest.approx(0.004, abs=1e-5)
+        assert turn == pytest.approx(0.004, abs=1e-5)
+        assert set(stated) == {part for part in parts if not silent[part]} and stated, name
+        for part, row in stated.items():
+            expected = errors[part]
+            known = np.isfinite(expected)
+            assert known.any()
+            said = np.array(row, dtype=float)
+            assert said[known] == pytest.approx(expected[known], abs=0.006), (name, part)
+            assert np.isnan(said[~known]).all()
+
+
+def test_the_verdict_of_each_camera_is_said(capture: fitted.Capture, everything: Path) -> None:
+    told = json.loads((everything / "verdict.json").read_text())
+    manifest = json.loads((everything / "export.json").read_text())
+    assert manifest["verdict_by_camera"] == told["verdict_by_camera"]
+    cameras = {one["camera"]: one for one in told["verdict_by_camera"]}
+    assert set(cameras) == {"k1", "k2", "k3"} and "held_out" in told["meaning"]
+    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
+        held = measured["verdict/held_camera"]
+        for c, name in enumerate(measured.text("verdict/camera_names")):
+            for key, dataset, scale in (
+                ("keypoint", "keypoint_px", 1.0),
+                ("person", "person_m", 1e3),
+                ("overlap", "overlap", 1.0),
+                ("object_depth", "object_depth_m", 1e3),
+            ):
+                for said, end in (("held_in", ""), ("held_out", "_held_out")):
+                    found = cameras[name][key][said]
+                    values = measured[f"verdict/{dataset}{end}"][held == c, c]
+                    values = values[np.isfinite(values)]
+                    if not len(values):
+                        assert found is None
+                        continue
+                    assert found == pytest.approx(scale * np.median(values), abs=1e-3)
+            for p, part in enumerate(measured.text("verdict/part_names")):
+                shift = measured["verdict/shift"][p, c]
+                expected = 1e3 * np.sqrt(np.nanmean(shift**2))
+                assert cameras[name]["shift_mm"][part] == pytest.approx(expected, abs=0.01)
+    with np.load(everything / "amass" / "body.npz") as file:
+        assert file["verdict_camera"].tolist() == ["k1", "k2", "k3"]
+        said = [cameras[name]["keypoint"]["held_out"] for name in file["verdict_camera"]]
+        known = [value is not None for value in said]
+        assert any(known)
+        assert file["verdict_held_out"][known, 0] == pytest.approx(
+            [value for value in said if value is not None], abs=1e-3
+        )
+    for where in ("bop/about.json", "meshes/about.json"):
+        there = json.loads((everything / where).read_text())
+        assert there["verdict_by_camera"] == told["verdict_by_camera"]
+
+
+def test_an_image_of_bop_says_which_frame_it_shows(
+    capture: fitted.Capture, everything: Path
+) -> None:
+    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
+        reasons = measured.text("flag_reason")
+    for number, camera in enumerate(capture.rig):
+        scene = everything / "bop" / "scenes" / f"{number:06d}"
+        told = json.loads((scene / "scene_about.json").read_text())
+        assert told["camera"] == camera.name
+        assert told["images"].keys() == json.loads((scene / "scene_gt.json").read_text()).keys()
+        for image, said in told["images"].items():
+            assert said == {"frame": int(image), "flagged": reasons[int(image)]}
+
+
+def test_of_another_programs_result_no_deviation_is_stated(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    made, path = exported.changed(capture, "joint", tmp_path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["made_by"] = "another program: res.pkl"
+    out = exported.run(made, tmp_path / "out", formats=("amass", "intercap"))
+    with np.load(out / "amass" / "body.npz") as told:
+        assert str(told["made_by"]) == "another program: res.pkl"
+        assert "joint_sigma" not in told and "object_position_sigma" not in told
+        assert "body_contact_vertices" in told
+    assert "joint_sigma" not in (out / "README.txt").read_text()
+
+
+def _replace(path: Path, key: str, values: np.ndarray) -> None:
+    """Put other values in the place of an artefact's dataset, its attributes kept."""
+    with h5py.File(path, "r+") as file:
+        kept = dict(file[key].attrs)
+        del file[key]
+        file.create_dataset(key, data=values, fletcher32=True, chunks=True).attrs.update(kept)
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "words"),
+    [
+        ("body_to_object", (5, 10475), ["5 frames of 10475", "open_body.npz", "13492 vertices"]),
+        ("object_to_body", (5, 12), ["5 frames of 12", "mesh of object 'cup'"]),
+    ],
+)
+def test_metrics_of_another_body_or_object_are_named(
+    key: str, shape: tuple[int, int], words: list[str], capture: fitted.Capture, tmp_path: Path
+) -> None:
+    made, path = exported.changed(capture, "metrics", tmp_path)
+    _replace(path, key, np.zeros(shape, np.float32))
+    with pytest.raises(UserError) as caught:
+        exported.run(made, tmp_path / "out")
+    for word in [str(path), key, "sequence 'cap'", "re-run stage 'metrics'", *words]:
+        assert word in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_metrics_without_the_object_are_named(capture: fitted.Capture, tmp_path: Path) -> None:
+    made, path = exported.changed(capture, "metrics", tmp_path)
+    with h5py.File(path, "r+") as file:
+        del file["body_to_object"]
+    with pytest.raises(UserError, match="holds no body_to_object, though sequence 'cap' has"):
+        exported.run(made, tmp_path / "out")
+
+
+def test_fits_of_another_number_of_frames_are_named(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    longer = fitted.make_capture(tmp_path, object_name="cup", total=6)
+    for stage in ("body_fit", "object_track"):
+        made = fitted.Capture(
+            **{**vars(capture), "paths": capture.paths | {stage: longer.paths[stage]}}
+        )
+        with pytest.raises(UserError, match=f"6 frames.*sequence 'cap' 5; re-run stage '{stage}'"):
+            exported.run(made, tmp_path / "out")

@@ -1,0 +1,52 @@
+"""No group is in both parts, the test part is near the share, and the choice is stable."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from intercap_core.output.release.splits import TEST, TRAIN, split
+
+NAMES = st.text("abcdefghij0123456789_", min_size=1, max_size=6)
+
+
+@given(st.dictionaries(NAMES, st.integers(1, 500), min_size=2, max_size=30), st.floats(0.05, 0.6))
+def test_every_group_is_in_one_part_and_no_group_would_come_nearer(
+    frames: dict[str, int], share: float
+) -> None:
+    found = split(frames, share=share)
+    assert not found.why and found.train and found.test
+    assert sorted([*found.train, *found.test]) == sorted(frames)
+    held, total = sum(frames[name] for name in found.test), sum(frames.values())
+    if len(found.test) > 1:  # the last one that was taken brought it nearer
+        assert abs(held - share * total) <= share * total
+    assert split(dict(reversed(frames.items())), share=share) == found
+    assert all(found.of(name) == (TEST if name in found.test else TRAIN) for name in frames)
+    assert found.of("") == ""
+
+
+def test_ten_equal_subjects_give_two() -> None:
+    found = split({f"s{i:02d}": 100 for i in range(10)}, share=0.2)
+    assert len(found.test) == 2 and len(found.train) == 8
+
+
+@pytest.mark.parametrize(
+    ("frames", "share", "named", "test", "why"),
+    [
+        ({"a": 5}, 0.2, (), (), "only one"),
+        ({}, 0.2, (), (), "there is none"),
+        ({"a": 5, "b": 5}, 0.0, (), (), "none is asked for"),
+        ({"a": 5, "b": 500}, 0.2, (), ("a",), ""),
+        ({"a": 5, "b": 5, "c": 5}, 0.2, ("b", "not_recorded"), ("b",), ""),
+        ({"a": 5, "b": 5}, 0.0, ("b",), ("b",), ""),
+        ({"a": 5, "b": 5}, 0.2, ("a", "b"), (), "all there are"),
+        ({"a": 5, "b": 5}, 0.2, ("x",), (), "none of x"),
+    ],
+)
+def test_few_and_named(
+    frames: dict[str, int], share: float, named: tuple[str, ...], test: tuple[str, ...], why: str
+) -> None:
+    found = split(frames, share=share, named=named)
+    assert found.test == test
+    assert why in found.why if why else not found.why

@@ -1,0 +1,165 @@
+"""A dataset of people with an object, alone, and with one that was found in no frame."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+
+from intercap_core.commands.evaluate.sequences import areas
+from intercap_core.config import MetricsSettings, PageSettings
+from intercap_core.evaluation.figures import SequenceMetrics, flag_figures, truth_figures
+from intercap_core.evaluation.heatmaps import collect
+from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.object_track.absent import SOURCE, absent_track
+from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.stages import metrics
+from tests.helpers import fitted_capture as fitted
+from tests.helpers.site import write_site
+
+STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
+TOTAL = 4
+HELD, ALONE, MISSED = "held", "alone", "missed"
+WHY = "the track is of nothing"
+
+
+def _miss(capture: fitted.Capture) -> None:
+    """The object is there, and its track is lost in every frame."""
+    with h5py.File(capture.paths["object_track"], "r+") as file:
+        file.attrs["seed_source"], file.attrs["doubts"] = SOURCE, WHY
+        for key, values in absent_track(TOTAL, len(capture.rig)).items():
+            file[key][...] = values
+    with h5py.File(capture.paths["joint"], "r+") as file:
+        for key in ("rotation", "translation", "contact_probability"):
+            file[key][...] = np.nan
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Capture]:
+    made = {}
+    for name in (HELD, ALONE, MISSED):
+        made[name] = capture = fitted.make_capture(
+            tmp_path_factory.mktemp(name), name=name, total=TOTAL
+        )
+        if name == ALONE:
+            fitted.take_object_away(capture)
+        if name == MISSED:
+            _miss(capture)
+        metrics.run(
+            **capture.inputs(*STAGES),
+            output=capture.paths["metrics"],
+            object_=None if name == ALONE else capture.object_,
+            subject=fitted.SUBJECT,
+            body_models=fitted.BODY_MODELS,
+            settings=MetricsSettings(),
+            **fitted.OTHER_SETTINGS,
+            truth=capture.paths["truth"],
+        )
+    return made
+
+
+@pytest.fixture(scope="module")
+def measured(captures: dict[str, fitted.Capture]) -> dict[str, SequenceMetrics]:
+    return {name: SequenceMetrics.read(made.paths["metrics"]) for name, made in captures.items()}
+
+
+@pytest.fixture(scope="module")
+def out(captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset")
+    return write_site(captures, folder, name="mixed", settings=PageSettings(cameras=1, frames=1))
+
+
+def test_the_body_is_measured_alike(measured: dict[str, SequenceMetrics]) -> None:
+    held, alone, missed = (measured[name] for name in (HELD, ALONE, MISSED))
+    assert (held.object_, alone.object_, missed.object_) == ("football", "", "football")
+    assert [s.has_object for s in (held, alone, missed)] == [True, False, False]
+    for key in ("body_to_cloud", "truth/joint/body_pve", "truth/joint/planted_speed"):
+        np.testing.assert_allclose(alone.values[key], held.values[key], rtol=1e-4)
+    assert list(held.values["verdict/part_names"]) == ["body", "hands", "object"]
+    for nothing in (alone, missed):
+        assert list(nothing.values["verdict/part_names"]) == ["body", "hands"]
+    judged = {key for key in alone.values if key.startswith("verdict/")}
+    about = {key.rpartition("/")[2].partition("_")[0] for key in alone.values.keys() - judged}
+    assert not about & {"object", "contact", "region", "penetration", "vertex"}
+
+
+def test_an_object_that_was_missed_is_lost(measured: dict[str, SequenceMetrics]) -> None:
+    missed = measured[MISSED]
+    assert np.isposinf(missed.values["truth/joint/object_translation"]).all()
+    for stage in ("object_track", "joint"):
+        found = truth_figures([missed], stage)
+        assert found["lost_share"] == 1 and found["lost_unnoticed_share"] == 0
+        assert "object_translation_mm" not in found
+    assert truth_figures([missed], "joint")["contact_recall"] == 0
+    assert missed.values["flagged"].all()
+    assert flag_figures([missed, measured[ALONE]])["bad_frames"] == 0.5
+
+
+def test_figures_of_a_mixed_dataset_are_those_of_its_parts(
+    measured: dict[str, SequenceMetrics],
+) -> None:
+    held, alone = measured[HELD], measured[ALONE]
+    both, one = areas([held, alone]), areas([held])
+    for area in ("joint", "body_fit", "penetration", "vertex_to_cloud"):
+        for key, value in one[area].items():
+            assert both[area][key] == pytest.approx(value, rel=1e-4), key
+    assert not [key for key in areas([alone])["joint"] if "object" in key or "contact" in key]
+
+
+def test_heatmaps_count_those_who_could_touch(out: Path) -> None:
+    summaries = [
+        SequenceSummary.read(out / "summaries" / f"{name}.h5") for name in (ALONE, HELD, MISSED)
+    ]
+    found, held = collect(summaries), collect(summaries[1:2])
+    assert found.body_frames == TOTAL and list(found.objects) == ["football"]
+    np.testing.assert_array_equal(found.body, held.body)
+    assert found.objects["football"].frames == TOTAL
+
+
+def test_tables_have_gaps_and_no_zeros(out: Path) -> None:
+    table = pd.read_csv(out / "tables" / "sequences.csv").set_index("sequence")
+    assert table.loc[HELD, "contact_frames"] == TOTAL
+    for name in (ALONE, MISSED):
+        row = table.loc[name]
+        columns = [c for c in table if "penetration" in c or c.startswith("vertex_to_cloud.object")]
+        assert row[[*columns, "contact_frames", "acceleration_object_mm"]].isna().all()
+        assert row["vertex_to_cloud.body_mm"] > 0
+    assert sorted(table["rank"]) == [1, 2, 3]
+    assert (table[[f"verdict.{part}_odd_even_mm" for part in ("body", "hands")]] > 0).all().all()
+    assert table["verdict.object_odd_even_mm"].notna().tolist() == [
+        name == HELD for name in table.index
+    ]
+    frames = pd.read_parquet(out / "tables" / "frames.parquet").set_index("sequence")
+    region = f"contact_probability.{CONTACT_REGIONS[0]}"
+    assert frames.loc[ALONE, ["contact", region, "object_to_cloud_mm"]].isna().all().all()
+    assert frames.loc[HELD, ["contact", region]].notna().all().all()
+    assert json.loads((out / "summary.json").read_text())["sequences"] == 3
+
+
+def test_the_pages_show_each_sequence_what_it_has(out: Path) -> None:
+    overview = (out / "site" / "index.html").read_text()
+    assert "3 sequences, 12 frames" in overview and "1 object<" in overview.replace(
+        "1 object\n", "1 object<"
+    )
+    parts = {
+        name: (out / "site" / "sequences" / name / "index.html").read_text()
+        for name in (HELD, ALONE, MISSED)
+    }
+    assert all("data:image/jpeg" in part for part in parts.values())
+    assert ">in contact<" in parts[HELD] and "touches the object" in parts[HELD]
+    for name in (ALONE, MISSED):
+        assert ">in contact<" not in parts[name]
+    table = pd.read_csv(out / "tables" / "sequences.csv").set_index("sequence")
+    for name, part in parts.items():
+        section = part.split('id="verdict"')[1].split("</table>")[0]
+        judged = ["body", "hands", *(["object"] if name == HELD else [])]
+        assert section.count("<small>odd against even, mm</small>") == len(judged)
+        for of in judged:
+            assert f"<td>{table.loc[name, f'verdict.{of}_odd_even_mm']:.1f}</td>" in section
+    assert "p01, alone, 4 frames" in parts[ALONE] and 'id="track"' not in parts[ALONE]
+    missed = parts[MISSED].split('id="track"')[1].split('id="body"')[0]
+    assert WHY in missed and "found in no frame" in missed and "deviation of place" not in missed

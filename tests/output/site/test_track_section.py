@@ -1,0 +1,89 @@
+"""The report's part on an object's track: the sheet of crops, states of track and views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core.geometry.camera.masks import encode
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.output.site import track
+from intercap_core.output.site.track_pictures import CANDIDATE_COLOUR, TRACK_COLOUR
+from tests.helpers import fitted_capture as fitted
+
+SETS = 6
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+    found = fitted.make_capture(tmp_path_factory.mktemp("track"), total=SETS)
+    with h5py.File(found.paths["scene"], "r+") as scene:
+        scene["image_of"][...] = np.arange(SETS)[:, None]
+    with h5py.File(found.paths["object_track"], "r+") as file:
+        file["lost"][...] = np.arange(SETS) == 1
+        file["ambiguous"][...] = np.arange(SETS) == 2
+        file["resting"][...] = np.arange(SETS) > 2
+        file["recovered"][2] = True
+        file["overlap"][...] = np.nan
+        file["overlap"][:, 0] = np.linspace(0.5, 0.9, SETS)
+        file["covariance"][...] = np.diag([1e-4] * 3 + [4e-6] * 3)
+    return found
+
+
+def _facts(made: fitted.Capture, frames: Path | None = None) -> track.TrackFacts:
+    whole = encode(np.ones((270, 480), bool))
+    kept = [whole, b"", b""]
+    return track.read_track(
+        frames or made.paths["frames"],
+        made.paths["scene"],
+        made.paths["object_track"],
+        ObjectMesh.load(made.object_),
+        lambda t, c: kept[c],
+    )
+
+
+def test_states_of_track_and_views(made: fitted.Capture) -> None:
+    facts = _facts(made)
+    assert facts.state == ["moving", "lost", "doubtful", "resting", "resting", "resting"]
+    assert facts.recovered == [2]
+    assert facts.sigma_mm == pytest.approx(np.full(SETS, 2.0))
+    assert facts.sigma_deg == pytest.approx(np.full(SETS, np.degrees(0.01)))
+    found = track.context(facts)
+    timeline = found["timeline"]
+    assert timeline.count('class="state lost"') == 1 and "1 lost · 1 doubtful" in timeline
+    assert 'class="state partly"' in timeline and 'class="state agrees"' in timeline
+    assert "2: found again" in timeline and "0 % kept" in timeline
+
+
+def test_a_carried_frame_is_told_as_such_before_it_is_doubtful() -> None:
+    none, all_ = np.zeros(3, bool), np.ones(3, bool)
+    found = track._states(
+        gone=none, lost=np.arange(3) == 0, carried=np.arange(3) < 2, doubtful=all_, resting=none
+    )
+    assert found == ["lost", "carried", "doubtful"] and set(found) <= set(track.TRACK_STATES)
+
+
+def test_the_sheet_shows_both_outlines_in_every_camera(made: fitted.Capture) -> None:
+    sheet = _facts(made).sheet
+    assert sheet is not None and len(sheet.frames) == 5
+    bgr = cv2.imdecode(np.frombuffer(sheet.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr.shape == (sheet.height, sheet.width, 3)
+    columns = np.array_split(bgr[..., ::-1].astype(int), 3, axis=1)
+    for column in columns:
+        assert (np.abs(column - TRACK_COLOUR).max(-1) < 70).sum() > 100
+    # a mask of the whole image has no rim inside a cell
+    assert all((np.abs(c - CANDIDATE_COLOUR).max(-1) < 40).sum() < 400 for c in columns)
+
+
+def test_images_that_do_not_decode_cost_the_sheet_alone(
+    made: fitted.Capture, tmp_path: Path
+) -> None:
+    broken = tmp_path / "frames.h5"
+    broken.write_bytes(b"no frames")
+    facts = _facts(made, broken)
+    assert facts.sheet is None and "frames.h5" in facts.note
+    assert len(facts.state) == SETS

@@ -1,0 +1,272 @@
+"""The viewer in a real browser, from disk: loads, plays, seeks, shows what is there."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from intercap_core import artefacts
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.output.viewer import page
+from intercap_core.output.viewer.content import gather
+from intercap_core.schemas import JOINT, SCENE
+from tests.helpers import fitted_capture as fitted
+from tests.helpers.browser import PHONE, Visit, needs_chromium, visit
+
+FRAMES, SIZE = 6, (900, 1000)
+NAME = "s01_o03"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+    return fitted.make_capture(tmp_path_factory.mktemp("capture"), name=NAME, total=FRAMES)
+
+
+def _write(capture: fitted.Capture, folder: Path, name: str = NAME, **without: bool) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {stage: path for stage, path in capture.paths.items() if stage not in without}
+    page.write_script(
+        folder / page.SCRIPT,
+        paths,
+        object_=capture.object_,
+        body_models=fitted.BODY_MODELS,
+        gender=fitted.SUBJECT.gender,
+        truth=None if "truth" in without else capture.paths["truth"],
+    )
+    (folder / "index.html").write_text(page.standalone(name))
+    return folder / "index.html"
+
+
+@pytest.fixture(scope="module")
+def shown(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _write(capture, tmp_path_factory.mktemp("page"))
+
+
+_AT_HAND = """
+  const root = document.querySelector(".viewer");
+  const viewer = window.intercapViewer, result = {};
+  const key = (name, more) => root.dispatchEvent(
+    new KeyboardEvent("keydown", { key: name, bubbles: true, ...more }));
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  const become = async (test) => { while (!test()) await pause(20); };
+"""
+
+
+def _browse(shown: Path, script: str = "", address: str = "") -> dict[str, Any]:
+    """What ``script`` leaves in ``result`` when the viewer stands, what the console printed, the
+    page's text and a picture."""
+    with visit(shown, size=SIZE, address=address) as visited:
+        visited.wait()
+        result = visited.page.evaluate("async () => {" + _AT_HAND + script + "\nreturn result; }")
+        return {
+            "result": result,
+            "console": visited.console,
+            "dom": visited.page.content(),
+            "picture": visited.picture(),
+        }
+
+
+@needs_chromium
+def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> None:
+    found = _browse(
+        shown,
+        """
+        result.first = viewer.state.frame;
+        key("ArrowRight"); result.right = viewer.state.frame; result.address = location.hash;
+        key("End"); result.end = viewer.state.frame;
+        key("Home"); result.home = viewer.state.frame;
+        location.hash = "#t=0.2"; await become(() => viewer.state.frame === 3);
+        key(" "); result.playing = viewer.state.playing; await become(() => !viewer.state.playing);
+        result.played = viewer.state.frame;
+        const layers = [...root.querySelectorAll("[data-layer]")];
+        result.layers = layers.map((label) => label.dataset.layer);
+        key("2"); result.sequential = viewer.versions.sequential.group.visible;
+        key("1"); result.joint = viewer.versions.joint.group.visible;
+        result.images = viewer.header.cameras.length;
+        """,
+        "#t=0.14",
+    )
+    assert found["console"] == []
+    result = found["result"]
+    assert result is not None, "the viewer did not come to an end of what it was asked"
+    assert result["first"] == 2  # 0.14 s of 15 a second
+    assert (result["right"], result["end"], result["home"]) == (3, FRAMES - 1, 0)
+    assert result["address"] == "#t=0.20"
+    assert result["playing"] and result["played"] == FRAMES - 1
+    assert result["layers"][:3] == ["joint", "sequential", "truth"]
+    assert {"object", "contact", "clouds", "cameras", "images"} <= set(result["layers"])
+    assert result["sequential"] and not result["joint"] and result["images"] == 3
+
+
+def _expected_pixels(
+    capture: fitted.Capture, box: dict[str, float], frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the first camera sees body vertices and the object's centre, on the page's canvas."""
+    with artefacts.read(capture.paths["joint"], JOINT) as joint:
+        poses, ball = joint["master_from_colour"], joint["translation"][frame]
+    with artefacts.read(capture.paths["scene"], SCENE) as scene:
+        camera = Rig.from_artefact(scene).moved(poses)[0]
+    with artefacts.read(capture.paths["joint"], JOINT) as joint:
+        joints = joint["joints"][frame]
+    to_camera = invert(camera.master_from_colour)
+    lens = camera.colour
+    scale = min(box["width"] / lens.width, box["height"] / lens.height)
+    middle = np.array([box["left"] + box["width"] / 2, box["top"] + box["height"] / 2])
+
+    def on_page(points: np.ndarray) -> np.ndarray:
+        local = apply(to_camera, points)
+        pinhole = local[:, :2] / local[:, 2:] * [lens.fx, lens.fy]
+        return middle + scale * pinhole
+
+    return on_page(joints[[0, 3, 6, 9]]), on_page(ball[None])[0]
+
+
+@needs_chromium
+def test_body_and_object_are_where_the_camera_sees_them(
+    capture: fitted.Capture, shown: Path, tmp_path: Path
+) -> None:
+    found = _browse(
+        shown,
+        """
+        for (const name of ["contact", "cameras"])
+          root.querySelector(`[data-layer="${name}"] input`).click();
+        viewer.show(3); viewer.look(0); await pause(300); viewer.draw();
+        const box = root.querySelector("canvas").getBoundingClientRect();
+        result.box = { left: box.left, top: box.top, width: box.width, height: box.height };
+        result.plane = viewer.cameras[0].plane.visible;
+        """,
+    )
+    assert found["console"] == [] and found["result"]["plane"]
+    body, ball = _expected_pixels(capture, found["result"]["box"], 3)
+    picture = found["picture"][..., ::-1].astype(int)
+
+    def at(point: np.ndarray) -> np.ndarray:
+        x, y = np.rint(point).astype(int)
+        return np.median(picture[y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3), axis=0)
+
+    for point in body:  # along the spine: skin, which is blue
+        red, _, blue = at(point)
+        assert blue > red + 25, (point, at(point))
+    red, _, blue = at(ball)
+    assert not blue > red + 25
+
+
+@needs_chromium
+def test_layers_change_the_picture(shown: Path, tmp_path: Path) -> None:
+    off = 'root.querySelector(`[data-layer="joint"] input`).click(); await pause(100);'
+    pictures = [
+        _browse(shown, script)["picture"].astype(int) for name, script in (("on", ""), ("off", off))
+    ]
+    assert (np.abs(pictures[0] - pictures[1]).max(2) > 40).mean() > 0.01
+
+
+def _far(visited: Visit) -> tuple[float, np.ndarray]:
+    """How far the eye is from the body's middle, and the direction in which it is."""
+    found = visited.page.evaluate(
+        """() => {
+          const { eye, versions, state } = intercapViewer;
+          return [eye.position.toArray(), versions.joint.centre(state.frame).toArray()];
+        }"""
+    )
+    away = np.subtract(*found)
+    return float(np.linalg.norm(away)), away / np.linalg.norm(away)
+
+
+@needs_chromium
+def test_fingers_turn_come_nearer_play_seek_and_switch(shown: Path) -> None:
+    with visit(shown, size=PHONE, phone=True) as visited:
+        visited.wait()
+        page = visited.page
+        assert page.evaluate("document.documentElement.scrollWidth") == PHONE[0]
+        box = page.locator("[data-part=canvas]").bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+        far, before = _far(visited)
+        visited.touch("touchStart", (x, y))
+        for by in range(10, 101, 10):
+            visited.touch("touchMove", (x + by, y))
+        visited.touch("touchEnd")
+        same, after = _far(visited)
+        assert same == pytest.approx(far, rel=0.02)
+        assert np.degrees(np.arccos(before @ after)) > 20
+        assert page.evaluate("scrollY") == 0  # the page stays, the scene turns
+
+        visited.touch("touchStart", (x - 30, y), (x + 30, y))
+        for by in range(40, 91, 10):
+            visited.touch("touchMove", (x - by, y), (x + by, y))
+        visited.touch("touchEnd")
+        near, _ = _far(visited)
+        assert near < 0.6 * far
+        page.get_by_role("button", name="Overview").tap()
+        assert _far(visited)[0] == pytest.approx(far, rel=0.05)
+
+        bar = page.get_by_label("Frame").bounding_box()
+        assert bar is not None and bar["height"] >= 30
+        page.touchscreen.tap(bar["x"] + 0.99 * bar["width"], bar["y"] + bar["height"] / 2)
+        assert page.evaluate("intercapViewer.state.frame") == FRAMES - 1
+        page.get_by_role("button", name="Play").tap()  # from the start, as it stood at the end
+        visited.wait("!intercapViewer.state.playing")
+        assert page.evaluate("location.hash") == f"#t={(FRAMES - 1) / fitted.FPS:.2f}"
+        page.get_by_label("truth").tap()
+        assert page.evaluate("intercapViewer.versions.truth.group.visible")
+        for control in page.locator(".viewer :is(button, select, label)").all():
+            at = control.bounding_box()
+            assert at is not None and at["height"] >= 40, control.inner_text()
+        assert visited.console == []
+
+
+@needs_chromium
+def test_words_from_files_are_words(capture: fitted.Capture, tmp_path: Path) -> None:
+    shutil.copy(capture.paths["joint"], tmp_path / "joint.h5")
+    with h5py.File(tmp_path / "joint.h5", "r+") as file:
+        reasons = file["flag_reason"][()].astype("S60")
+        reasons[0] = b"<img src=x onerror=alert(1)> </script>"
+        del file["flag_reason"]
+        file["flag_reason"] = reasons
+    changed = fitted.Capture(**{**capture.__dict__, "paths": {
+        **{k: v for k, v in capture.paths.items() if k != "metrics"},
+        "joint": tmp_path / "joint.h5",
+    }})  # fmt: skip
+    shown = _write(changed, tmp_path / "page", name='<b onclick="x">"name"</b>')
+    found = _browse(
+        shown,
+        "result.flag = root.querySelector('[data-part=flag]').innerHTML;",
+    )
+    assert found["console"] == [] and "<b onclick" not in found["dom"]
+    assert found["result"]["flag"].startswith("flagged: &lt;img src=x")
+
+
+@needs_chromium
+def test_a_page_without_its_file_says_so(shown: Path, tmp_path: Path) -> None:
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / page.SCRIPT).write_text("")
+    (tmp_path / "none" / "index.html").write_text(shown.read_text())
+    with visit(tmp_path / "none" / "index.html") as visited:
+        assert visited.page.get_by_role("status").inner_text() == (
+            "This page's file viewer.js is not beside it."
+        )
+        assert visited.page.evaluate("window.intercapViewer") is None
+
+
+def test_any_artefact_from_the_body_fit_on_is_enough(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    some = {stage: capture.paths[stage] for stage in ("frames", "scene", "body_fit")}
+    found = gather(some, object_=capture.object_, body_models=fitted.BODY_MODELS, gender="neutral")
+    assert list(found.header["versions"]) == ["sequential"] and found.header["object"] == ""
+    assert "clouds/person" not in found.arrays and found.header["frames"] == FRAMES
+    whole = gather(
+        capture.paths, object_=capture.object_, body_models=fitted.BODY_MODELS, gender="neutral",
+        truth=capture.paths["truth"],
+    )  # fmt: skip
+    assert list(whole.header["versions"]) == ["joint", "sequential", "truth"]
+    starts = whole.arrays["clouds/person_starts"]
+    assert len(starts) == len(whole.header["moments"]) + 1 and starts[-1] > 0
+    assert max(whole.header["error_mm"].values()) <= 1.0

@@ -1,0 +1,281 @@
+"""The parts of the segmentation without a detector, each against something independent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from intercap_core.geometry.camera import masks
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.person.segmentation.colour_candidates import before, drawn, median_without
+from intercap_core.person.segmentation.depth_masks import Cells, Projected, encode_window
+from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
+from intercap_core.person.segmentation.free_space import without_free_space
+from intercap_core.person.segmentation.person_volume import FAR, bones_of, outside
+from intercap_core.person.segmentation.static_things import find_static_things
+from intercap_core.person.segmentation.voxels import Occupied, components, connected
+from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
+from tests.helpers.synthetic_people import stick_person
+
+RIG, UP = ring()
+LOW, HIGH = np.array([-2.0, -2.0, 0.025]), np.array([2.0, 2.0, 2.3])
+
+
+# --- cells ---------------------------------------------------------------------------------------
+
+
+def test_components_are_those_of_a_dense_grid():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (600, 3)).astype(np.float32)
+    cells = np.floor(points / 0.06).astype(int)
+    grid = np.zeros(cells.max(0) - cells.min(0) + 1, bool)
+    at = tuple((cells - cells.min(0)).T)
+    grid[at] = True
+    dense, count = ndimage.label(grid, np.ones((3, 3, 3)))
+    label, found = connected(points, 0.06)
+    assert found == count
+    pairs = np.unique(np.column_stack([dense[at], label]), axis=0)
+    assert len(pairs) == count  # one to one
+    sizes = [len(np.unique(cells[label == k], axis=0)) for k in range(found)]
+    assert sizes == sorted(sizes, reverse=True)
+    groups = components(points, 0.06, 5)
+    assert [len(g) for g in groups] == [n for n in np.bincount(label) if n >= 5]
+    assert all((np.diff(g) > 0).all() for g in groups)
+
+
+def test_no_points_are_no_component():
+    assert connected(np.zeros((0, 3), np.float32), 0.1)[1] == 0
+    assert components(np.zeros((0, 3), np.float32), 0.1, 1) == []
+    assert not Occupied(np.zeros((0, 3), np.float32), 0.1, 1).holds(np.zeros((2, 3))).any()
+
+
+def test_occupied_holds_cells_and_those_beside_them():
+    known = Occupied(np.array([[0.05, 0.05, 0.05], [-0.95, 0.05, 0.05]]), 0.1, 1)
+    asked = np.array([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [0.05, -0.05, 0.05],
+                      [0.15, 0.15, 0.05], [0.25, 0.05, 0.05], [-0.85, 0.05, 0.05]])  # fmt: skip
+    np.testing.assert_array_equal(known.holds(asked), [1, 1, 1, 0, 0, 1])
+
+
+# --- the person ----------------------------------------------------------------------------------
+
+
+def test_outside_is_the_distance_to_a_cone_in_margins():
+    bone = np.array([[0, 0, 0, 0, 0, 1, 0.1, 0.2, 0.05]], np.float32)
+    points = np.array([[0.3, 0, 0.5], [0, 0.1, 0], [0, 0, 1.4], [0, 0, 0.5], [9, 0, 0]], np.float32)
+    expected = [(0.3 - 0.15) / 0.05, 0.0, (0.4 - 0.2) / 0.05, -0.15 / 0.05, FAR]
+    np.testing.assert_allclose(outside(points, bone), expected, atol=1e-4)
+
+
+def test_outside_passes_over_no_bone_that_counts():
+    joints = stick_person()
+    bones = bones_of(joints)
+    points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 2], (3000, 3)).astype(np.float32)
+    start, along = bones[:, :3], bones[:, 3:6] - bones[:, :3]
+    share = np.einsum("nbj,bj->nb", points[:, None] - start, along)
+    share = np.clip(share / np.maximum((along**2).sum(1), 1e-10), 0, 1)
+    away = np.linalg.norm(points[:, None] - start - share[..., None] * along, axis=-1)
+    radius = bones[:, 6] + share * (bones[:, 7] - bones[:, 6])
+    brute = np.minimum(((away - radius) / bones[:, 8]).min(1), FAR)
+    np.testing.assert_allclose(outside(points, bones), brute, atol=2e-3)
+
+
+def test_bones_without_an_end_are_left_out():
+    joints = np.full((135, 3), np.nan)
+    assert bones_of(joints).shape == (0, 9)
+    assert (outside(np.zeros((3, 3), np.float32), bones_of(joints)) == FAR).all()
+    blind = stick_person()
+    blind[25:67] = np.nan
+    assert 0 < len(bones_of(blind)) < len(bones_of(stick_person()))
+
+
+# --- depth ---------------------------------------------------------------------------------------
+
+
+def depth_views() -> list[DepthView]:
+    return [DepthView(camera, 0.0, UP @ camera.master_from_depth) for camera in RIG]
+
+
+def test_points_and_reach_of_a_view():
+    view = depth_views()[1]
+    room = room_depth(RIG[1], UP, FURNITURE)
+    image = np.rint(1000 * room).astype(np.uint16)
+    index = np.flatnonzero(image)
+    points, _ = view.points(image, index)
+    assert np.abs(points[points[:, 2] < 0.2, 2]).min() < 0.002  # the floor
+    reach = view.reach_mm(LOW, HIGH).ravel()[index]
+    inside = ((points > LOW + 0.02) & (points < HIGH - 0.02)).all(1)
+    assert (image.ravel()[index][inside] <= reach[inside]).all()
+
+
+def test_a_thing_that_gives_way_is_no_background():
+    steady = np.full((40, 60), 3000, np.uint16)
+    thing = steady.copy()
+    thing[10:30, 20:40] = 2000
+    empty = steady.copy()
+    empty[10:30, 20:40] = 0
+    reach = np.full(steady.shape, 5000, np.uint16)
+    background = DepthBackground.of(thing, [thing] * 20 + [empty] * 4, reach)
+    assert (background.depth[12:28, 22:38] == 0).all() and background.depth[0, 0] == 3000
+    before = np.zeros(steady.shape, bool)
+    before.ravel()[background.before(thing)] = True
+    assert before[12:28, 22:38].all() and before.sum() <= 400
+    assert background.shows(thing)[:8].all() and not background.shows(thing)[12:28, 22:38].any()
+    kept = DepthBackground.of(thing, [thing] * 24, reach)
+    assert (kept.depth == thing).all() and not len(kept.before(thing))
+
+
+def test_pixels_that_float_at_an_edge_are_left_out():
+    image = np.full((20, 20), 3000, np.uint16)
+    image[:, 10:] = 2000
+    image[5, 9] = 2400
+    background = DepthBackground(
+        np.zeros_like(image), np.full_like(image, 4000), np.full_like(image, 4000)
+    )
+    found = background.before(image)
+    assert 5 * 20 + 9 not in found and 5 * 20 + 10 in found and len(found) == 399
+
+
+def test_what_another_camera_sees_through_is_no_background():
+    """A box that only the first camera holds for background: the others saw the floor there."""
+    rng = np.random.default_rng(2)
+    box = np.array([[[-0.2, -0.2, 0.3], [0.2, 0.2, 0.8]]])
+    views, backgrounds = depth_views(), []
+    for c, view in enumerate(views):
+        boxes = np.concatenate([FURNITURE, box]) if c == 0 else FURNITURE
+        image = to_millimetres(room_depth(RIG[c], UP, boxes), rng)
+        reach = view.reach_mm(LOW, HIGH)
+        backgrounds.append(DepthBackground.of(image, [image] * 3, reach))
+    points, _ = views[0].points(backgrounds[0].depth, np.arange(backgrounds[0].depth.size))
+    on_box = ((points > box[0, 0] - 0.02) & (points < box[0, 1] + 0.02)).all(1)
+    found = without_free_space(views, backgrounds, LOW, HIGH)
+    assert on_box.sum() > 300
+    assert (found[0].depth.ravel()[on_box] == 0).mean() > 0.85
+    assert (found[0].limit.ravel()[on_box & (found[0].depth.ravel() == 0)] > 0).all()
+    for old, new in zip(backgrounds[1:], found[1:], strict=True):
+        assert ((old.depth > 0) & (new.depth == 0)).mean() < 0.01
+
+
+def test_static_things_near_the_person_and_on_a_table():
+    """A mug on a table, a stool; furniture that nobody comes near is none."""
+    rng = np.random.default_rng(2)
+    table = np.array([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.7]])
+    mug = np.array([[-0.05, -0.05, 0.7], [0.07, 0.07, 0.82]])
+    stool = np.array([[0.3, 0.7, 0.0], [0.6, 1.0, 0.4]])
+    far = np.array([[-1.9, -1.9, 0.0], [-1.5, -1.5, 0.5]])
+    views = depth_views()
+    backgrounds = []
+    for camera, view in zip(RIG, views, strict=True):
+        room = room_depth(camera, UP, np.stack([table, mug, stool, far]))
+        image = to_millimetres(room, rng)
+        backgrounds.append(DepthBackground.of(image, [image], view.reach_mm(LOW, HIGH)))
+    person = stick_person() + np.array([0.0, 0.55, 0.0])
+    scene = find_static_things(views, backgrounds, LOW, HIGH, person)
+    sizes = [thing.extent_m for thing in scene.things]
+    assert len(scene.things) == 3
+    for box, on_top, carries in ((table, False, True), (mug, True, False), (stool, False, False)):
+        size = np.linalg.norm(box[1] - box[0])
+        thing = scene.things[int(np.argmin(np.abs(np.array(sizes) - size)))]
+        assert abs(thing.extent_m - size) < 0.12 * size + 0.05
+        assert (thing.on_top, thing.carries) == (on_top, carries)
+        assert sum(len(pixels) > 0 for pixels in thing.pixels) >= 4
+    assert scene.surface.holds(np.array([[0.0, 0.3, 0.35]]))[0]
+    assert not scene.surface.holds(np.array([[0.0, 0.0, 1.5]]))[0]
+
+
+# --- masks ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_a_window_of_cells_is_encoded_as_the_whole_image(scale):
+    rng = np.random.default_rng(scale)
+    height, width = 47, 61
+    for _ in range(20):
+        left, top = rng.integers(0, 15, 2)
+        window = (rng.random((rng.integers(1, 12), rng.integers(1, 12))) < 0.5).astype(np.uint8)
+        whole = np.zeros((60 * scale, 60 * scale), bool)
+        large = window.repeat(scale, 0).repeat(scale, 1) > 0
+        y, x = top * scale, left * scale
+        whole[y : y + large.shape[0], x : x + large.shape[1]] = large
+        expected = np.zeros((height, width), bool)
+        cut = whole[:height, :width]
+        expected[: cut.shape[0], : cut.shape[1]] = cut
+        rle = encode_window(window, int(left), int(top), scale, width, height)
+        np.testing.assert_array_equal(masks.decode(rle, height, width), expected)
+
+
+def test_nearer_pixels_hide_farther_ones_and_holes_close_over_nobody_else():
+    camera = RIG[0]
+    index = np.arange(camera.depth.height * camera.depth.width)
+    near = np.zeros((camera.depth.height, camera.depth.width), np.uint16)
+    near[80:100, 80:120] = 1500
+    far = np.zeros_like(near)
+    far[70:110, 70:130] = 2500
+    view = depth_views()[0]
+    local = np.concatenate(
+        [view.points(image, index[image.ravel() > 0])[1] for image in (near, far)]
+    )
+    first = np.arange(len(local)) < (near > 0).sum()
+    projected = Projected.of(Cells.of(local, camera))
+    front = masks.decode(projected.rle(first, ~first), 1080, 1920)
+    back = masks.decode(projected.rle(~first, first), 1080, 1920)
+    assert front.any() and back.sum() > front.sum() and not (front & back).any()
+    rows, columns = np.flatnonzero(front.any(1)), np.flatnonzero(front.any(0))
+    assert front[rows[0] : rows[-1], columns[0] : columns[-1]].mean() > 0.85  # no holes
+
+
+# --- colour --------------------------------------------------------------------------------------
+
+
+def coloured_room(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(60, 180, (6, 8, 3)).repeat(20, 0).repeat(20, 1).astype(np.float32)
+
+
+def test_median_without_the_person_and_with_changing_exposure():
+    rng = np.random.default_rng(0)
+    room = coloured_room(rng)
+    images, people = [], []
+    for k in range(9):
+        image = room * (0.8 + 0.05 * k) + rng.normal(0, 2, room.shape)
+        where = np.zeros(room.shape[:2], bool)
+        where[40:90, 40:80] = k < 6  # stands there for most of the time
+        image[where] = 20
+        images.append(np.clip(image, 0, 255).astype(np.uint8))
+        people.append(where)
+    median, known = median_without(np.stack(images), np.stack(people))
+    assert known.all()
+    assert np.median(np.abs(median / images[0][0, 0].mean() - room / room[0, 0].mean())) < 0.05
+    assert np.abs(median - 0.8 * room).max() < 12
+
+
+def test_a_shadow_or_another_exposure_is_not_before_the_scene_but_a_thing_is():
+    rng = np.random.default_rng(1)
+    room = coloured_room(rng)
+    known = np.ones(room.shape[:2], bool)
+    known[:, :20] = False
+    image = 1.25 * room
+    image[60:100, 20:60] *= 0.7
+    image[20:50, 90:120] = (200, 40, 40)
+    image[60:90, :15] = (200, 40, 40)  # where nothing is known of the background
+    found = before(np.clip(image, 0, 255).astype(np.uint8), room, known)
+    assert found[22:48, 92:118].mean() > 0.9
+    found[20:50, 90:120] = False
+    assert found.mean() < 0.01
+
+
+def test_the_person_is_drawn_where_the_points_within_the_body_are_seen():
+    camera = RIG[2]
+    joints = apply(invert(UP), stick_person())
+    bones = bones_of(joints)
+    mask = drawn(bones, camera, (540, 960), 0.0)
+    points = np.random.default_rng(4).uniform([-0.4, -0.5, 0], [0.4, 0.5, 1.8], (4000, 3))
+    in_master = apply(invert(UP), points)
+    away = outside(in_master.astype(np.float32), bones)
+    pixel = np.rint(camera.colour.project(apply(camera.colour_from_master, in_master)) / 2)
+    column, row = np.clip(pixel.astype(int), 0, (959, 539)).T
+    assert mask[row[away < -0.5], column[away < -0.5]].mean() > 0.97
+    assert mask.mean() < 0.1
+    assert not drawn(bones[:0], camera, (540, 960), 0.0).any()
+    behind = bones.copy()
+    behind[:, [2, 5]] -= 20
+    assert not drawn(behind, camera, (540, 960), 0.0).all()
