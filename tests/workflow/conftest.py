@@ -21,11 +21,11 @@ def flow(tmp_path_factory: pytest.TempPathFactory) -> Flow:
 
 @pytest.fixture(scope="session")
 def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
-    """The same recordings as a user would bring them: no studio, no truth, another folder.
+    """The same recordings without studio and truth, in another folder, run by `intercap run`.
 
-    One of the two sequences has recordings that cannot be read. `intercap run` has run.
+    The recordings of one of the two sequences cannot be read. The stages are replayed.
     """
-    other = Flow.copy(tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml")
+    other = Flow.copy(tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml", replay=flow.results)
     shutil.copytree(flow.results / "recordings", other.folder / "captures")
     for path in (other.folder / "captures" / OTHER).glob("*.mkv"):
         path.write_bytes(b"not a recording")

@@ -119,30 +119,30 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
 @pytest.mark.parametrize(
     ("term", "stages"),
     [
-        ("ground", {"joint"}),
-        ("object_silhouette", {"object_track", "joint"}),
-        ("body_priors", {"body_fit", "joint"}),
+        ("joint/terms/ground", {"joint"}),
+        ("object_track/smooth", {"object_track", "joint"}),
+        ("body_fit/problem", {"body_fit", "joint"}),
     ],
 )
 def test_editing_an_energy_term_re_runs_what_reaches_it(
     flow: Flow, term: str, stages: set[str]
 ) -> None:
-    path = flow.folder / "intercap_core" / "energy" / f"{term}.py"
+    path = flow.folder / "intercap_core" / f"{term}.py"
     with edited(path, path.read_text() + "\nEDITED = 1\n"):
-        pending = {rule for _, rule in flow.pending(anew=term == "ground")}
+        pending = {rule for _, rule in flow.pending(anew=term == "joint/terms/ground")}
     assert pending == stages | {"metrics", *AFTER_METRICS, "dataset"}
 
 
 def test_an_import_inside_a_function_counts(flow: Flow) -> None:
     core = flow.folder / "intercap_core"
-    term = core / "energy" / "hidden_term.py"
+    term = core / "body_fit" / "hidden_term.py"
     person = core / "stages" / "person.py"
     with (
         edited(term, "WEIGHT = 1\n"),
         edited(
             person,
             person.read_text()
-            + "\n\ndef _late():\n    from intercap_core.energy import hidden_term\n\n"
+            + "\n\ndef _late():\n    from intercap_core.body_fit import hidden_term\n\n"
             "    return hidden_term\n",
         ),
     ):
@@ -155,7 +155,7 @@ def test_an_import_inside_a_function_counts(flow: Flow) -> None:
 
 
 def test_rewording_a_docstring_re_runs_nothing(flow: Flow) -> None:
-    path = flow.folder / "intercap_core" / "energy" / "ground.py"
+    path = flow.folder / "intercap_core" / "joint" / "terms" / "ground.py"
     with edited(path, "# a comment\n" + path.read_text().replace('"""', '"""Reworded: ', 1)):
         assert flow.pending() == set()
 

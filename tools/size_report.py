@@ -1,0 +1,131 @@
+"""Print the size of the package, by folder: files, lines, constants, class names, documentation.
+
+    python tools/size_report.py [ROOT]
+
+A constant is a name in capitals that a module binds to a number or to a tuple of numbers. It has a
+source if the comment on its line or above it cites one: a paper, a data sheet, a standard, anatomy,
+or a measurement. "Tuned" counts those whose comment says that they were tuned on the studio.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import statistics
+import sys
+from collections import Counter, defaultdict
+from pathlib import Path
+
+PACKAGE = "intercap_core"
+GENERATED = ("artefacts.md", "workflow.md")
+CODE = (PACKAGE, "snakemake_executor_plugin_intercap_slurm", "tests", "bench", "tools", "workflow")
+SOURCE = re.compile(
+    r"et al|\b(19|20)\d\d\b|data ?sheet|doi|arXiv|ISO|IEEE|BOP|COCO|SMPL|Kinect|OpenPose|anatom|"
+    r"measured|standard|paper|equation|specification|python -m bench",
+    re.IGNORECASE,
+)
+TUNED = re.compile(r"\btuned\b|\bstudio\b", re.IGNORECASE)
+
+
+def main() -> None:
+    root = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[1]
+    classes: dict[str, set[Path]] = defaultdict(set)
+    constants: Counter[str] = Counter()
+    print(f"{'folder':42}{'files':>6}{'lines':>8}{'constants':>10}{'source':>7}{'tuned':>6}")
+    totals: dict[str, list[int]] = {}
+    sizes: list[int] = []
+    for folder in _folders(root):
+        counts: Counter[str] = Counter()
+        for path in _modules(root / folder, deep=folder != PACKAGE):
+            text = path.read_text(encoding="utf-8")
+            counts["files"] += 1
+            counts["lines"] += len(text.splitlines())
+            if not folder.startswith(PACKAGE):
+                continue
+            sizes.append(len(text.splitlines()))
+            counts += _constants(text)
+            for node in ast.walk(ast.parse(text)):
+                if isinstance(node, ast.ClassDef):
+                    classes[node.name].add(path)
+        constants += counts
+        row = [counts[key] for key in ("files", "lines", "constants", "source", "tuned")]
+        print(f"{folder:42}{row[0]:6}{row[1]:8}{row[2]:10}{row[3]:7}{row[4]:6}")
+        total = totals.setdefault(folder.partition("/")[0], [0] * 5)
+        totals[folder.partition("/")[0]] = [a + b for a, b in zip(total, row, strict=True)]
+    print()
+    for name, row in totals.items():
+        print(f"{name:42}{row[0]:6}{row[1]:8}{row[2]:10}{row[3]:7}{row[4]:6}")
+    ambiguous = sorted(name for name, paths in classes.items() if len(paths) > 1)
+    print(f"\nmedian file of {PACKAGE}: {statistics.median(sizes):.0f} lines")
+    print(f"class names with several meanings: {len(ambiguous)} {' '.join(ambiguous)}")
+    words = {path: len(path.read_text(encoding="utf-8").split()) for path in _documents(root)}
+    for path, count in words.items():
+        print(f"{count:8} words  {path.relative_to(root)}")
+    guides = {path: n for path, n in words.items() if path.parent.name == "docs"}
+    written = sum(n for path, n in guides.items() if path.name not in GENERATED)
+    print(f"{sum(words.values()):8} words in all, {written} of them in docs/ and not generated")
+
+
+def _folders(root: Path) -> list[str]:
+    """The package, its subpackages, and the other folders that hold code."""
+    found = [PACKAGE]
+    found += sorted(
+        f"{PACKAGE}/{path.name}" for path in (root / PACKAGE).iterdir() if any(path.glob("*.py"))
+    )
+    return found + [name for name in CODE[1:] if (root / name).is_dir()]
+
+
+def _modules(folder: Path, *, deep: bool) -> list[Path]:
+    return sorted(folder.rglob("*.py") if deep else folder.glob("*.py"))
+
+
+def _constants(text: str) -> Counter[str]:
+    """How many constants a module has, and how many of them cite a source or were tuned."""
+    counts: Counter[str] = Counter()
+    lines = text.splitlines()
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.AnnAssign):
+            targets = [node.target]
+        elif isinstance(node, ast.Assign):
+            targets = node.targets
+        else:
+            continue
+        if node.value is None or not _is_numeric(node.value):
+            continue
+        names = [n for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+        names = [name for name in names if name.id.lstrip("_").isupper()]
+        comment = _comment(lines, node.lineno, node.end_lineno or node.lineno)
+        counts["constants"] += len(names)
+        counts["source"] += len(names) * bool(SOURCE.search(comment))
+        counts["tuned"] += len(names) * bool(TUNED.search(comment))
+    return counts
+
+
+def _is_numeric(value: ast.expr) -> bool:
+    parts = [node for node in ast.walk(value) if isinstance(node, ast.Constant)]
+    return bool(parts) and all(type(node.value) in (int, float) for node in parts)
+
+
+def _comment(lines: list[str], first: int, last: int) -> str:
+    """The comments on a statement's own lines and directly above it."""
+    own = " ".join(line.partition("#")[2] for line in lines[first - 1 : last])
+    above = []
+    for line in reversed(lines[: first - 1]):
+        if not line.startswith("#"):
+            break
+        above.append(line)
+    return " ".join([own, *above])
+
+
+def _documents(root: Path) -> list[Path]:
+    top = [root / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+    return [
+        *top,
+        root / "config/README.md",
+        root / "bench/RESULTS.md",
+        *sorted(root.glob("docs/*.md")),
+    ]
+
+
+if __name__ == "__main__":
+    main()
