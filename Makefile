@@ -1,36 +1,22 @@
-# make demo      three virtual recordings, everything computed, the report's path at the end
-# make test      the whole test suite, on all cores (PYTEST=-n0 for one process)
-# make test-fast what a developer runs after each edit: all tests but the slow ones, which start
-#                processes, render whole captures or fit whole sequences
-# make test-slurm  the workflow on a real Slurm (Debian: slurm-wlm, munge; as root), the small dataset as
-#                jobs and what goes wrong on clusters, into results/bench.json; a short part is in `make test`
-# make lint      ruff, import-linter, snakefmt, mypy, snakemake --lint
-# make evaluate  the evaluation captures against truth (those of config/capture to the scene alone,
-#                of config/object to the object's track and the body's fit, those of config/body to
-#                the latter), tables and results/evaluation.json; about an hour on two cores, goes
-#                on where it was ended. Then, on three of them, the joint fit's oracle floors and what
-#                a mesh with holes costs it; last, two recordings mended in a real browser
-# make evaluate-quick  six recordings to the end within ten minutes, beside the recorded figures
-# make bench     seconds a frame and peak memory, extraction alone and its bytes, the object's tracker,
-#                the body's fit and the joint stage beside the paper's recipe, the joint stage's memory
-#                on long sequences, results/bench.json
-# make ablation  what each term of the joint fit is worth: the fit without it on the recordings of
-#                evaluate-quick (run that first), a table, results/ablation.json and three pictures
-# make oracle    how far the studio's cameras, depth biases and mesh take the joint fit, and what a mesh
-#                with holes costs it, on the recordings of evaluate-quick (run that first):
-#                results/oracle.json
-# make report    the site of the demo from what is computed
-# make scale-report  what 223 sequences of 300 frames cost the site, of the demo's (run that first):
-#                into results/bench.json
-# make scale     223 sequences: a start with nothing to do, a check, the jobs of an edit, into
-#                results/bench.json
-# make fuzz      10,000 damaged files of every kind that a user supplies, each read in a process of its
-#                own: accepted and plausible, or refused by name; into results/bench.json. A quarter of
-#                an hour on two cores; what it prints reproduces a case
-# make chaos     a small dataset whose runs are killed in every stage, whose disk is full, whose results
-#                are damaged, whose clock jumps; each time one command goes on, and in the end every
-#                byte is as without: into results/bench.json. A quarter of an hour; as root also disks
-# make docs      the generated pages and schemas, and the rule graph
+# make demo            three virtual recordings to a report; prints the report's path at the end
+# make test            the tests, on all cores (PYTEST=-n0 for one process)
+# make test-fast       without the tests that start processes, render captures or fit sequences
+# make test-all        all tests: also every browser and Slurm test, chaos and fuzz
+# make test-slurm      the workflow on a real Slurm (Debian: slurm-wlm, munge; as root), with faults
+# make chaos           runs that are killed, disks that are full, results that are damaged
+# make fuzz            damaged files of every kind that a user supplies
+# make lint            ruff, import-linter, snakefmt, mypy, snakemake --lint
+# make evaluate        all evaluation recordings against truth, into results/evaluation.json
+# make evaluate-quick  six recordings; fails if a figure is worse than bench/reference-quick.json
+# make bench           seconds per frame and memory, also of the paper's recipe
+# make ablation        the joint fit without each of its terms (after make evaluate-quick)
+# make oracle          the joint fit with true cameras and meshes (after make evaluate-quick)
+# make report          the site of the demo, from the results that are there
+# make scale           223 sequences: a start with nothing to do, a check, the jobs of an edit
+# make scale-report    the site of 223 sequences of 300 frames
+# make docs            generated pages and schemas, and the rule graph
+#
+# Figures of bench, ablation, oracle, scale, chaos, fuzz and test-slurm go to results/*.json.
 PYTHON ?= python3
 VENV ?= .venv
 CORES ?= 0
@@ -38,20 +24,26 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH := torch==2.13.0
 EXTRAS := workflow,test,bench,dev
+RUN_TESTS = $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-fast test-slurm lint ruff-check ruff-format imports snakefmt mypy \
+.PHONY: demo test test-fast test-all test-slurm lint ruff-check ruff-format imports snakefmt mypy \
     snakemake-lint evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz chaos \
     docs environment clean
 
 demo: $(STAMP)
 	$(BIN)/intercap run config/demo/config.yaml --cores $(CORES)
 
-# A file's tests stay on one worker, and those that share a whole run: see tests/conftest.py.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(PYTEST)
+	$(RUN_TESTS) -m "not full" $(PYTEST)
 
 test-fast: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not slow" $(PYTEST)
+	$(RUN_TESTS) -m "not slow and not full" $(PYTEST)
+
+test-all: $(STAMP)
+	$(RUN_TESTS) $(PYTEST)
+	$(BIN)/python -m bench.slurm
+	$(BIN)/python -m tests.chaos.run
+	$(BIN)/python -m tests.fuzz.run
 
 test-slurm: $(STAMP)
 	$(BIN)/python -m bench.slurm $(PYTEST)
@@ -120,9 +112,9 @@ docs: $(STAMP)
 
 environment: $(STAMP)
 
-# A stamp, so that the environment is made once, and again only when what it needs has changed. Torch
-# comes first and by its exact version, so that pip does not fetch several of its large builds to
-# choose from. For a build without CUDA: PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu.
+# The stamp is older than pyproject.toml if the requirements have changed. Torch is installed first, by
+# its exact version: pip would otherwise download several large builds to choose from.
+# For a build without CUDA: PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu.
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"

@@ -20,10 +20,9 @@ from tests.helpers.bodies import open_body
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 
-# Folders whose tests share a result that takes minutes: they stay with one worker.
+# Folders whose tests share a long run: all their tests stay on one worker.
 TOGETHER = ("workflow", "slurm")
-# Folders and files that start processes, render whole captures or fit whole sequences;
-# `make test-fast` leaves them out, and what is marked `slow` elsewhere.
+# Folders and files that start processes, render captures or fit sequences: not in `make test-fast`.
 SLOW = (
     "annotate/browser",
     "bench",
@@ -46,10 +45,29 @@ SLOW = (
 )
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """Tests of one file stay with one worker, for their fixtures, those of ``TOGETHER`` by folder.
+# Folders and files of the second tier, `make test-all`: a browser, a Slurm of their own.
+FULL = (
+    "annotate/browser",
+    "output/site/test_site_in_a_browser.py",
+    "output/viewer/test_browser.py",
+    "slurm/test_faults.py",
+    "slurm/test_short.py",
+)
+# One test of each that `make test` runs as well.
+SMOKE = frozenset(
+    {
+        "test_a_step_is_drawn_in_all_views_in_time",
+        "test_pages_print_no_errors_and_ask_for_nothing",
+        "test_loads_plays_and_seeks_without_an_error",
+        "test_a_mistake_is_submitted_once_and_told",
+    }
+)
 
-    ``--dist loadgroup`` would need marks that xdist 3.8 no longer hands on under pytest 9.2.
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Return a scheduler that keeps the tests of one file, or of a folder of TOGETHER, on one worker.
+
+    ``--dist loadgroup`` would need marks that xdist 3.8 does not pass on under pytest 9.2.
     """
     from xdist.scheduler import LoadFileScheduling
 
@@ -63,11 +81,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Slow tests are marked, and what shares a long run comes first: a worker is busy with it."""
+    """Mark slow tests and tests of the second tier; put the folders of TOGETHER first."""
     places = {item: item.path.relative_to(PROJECT_ROOT / "tests") for item in items}
     for item, place in places.items():
-        if any(place.is_relative_to(one) for one in SLOW):
+        if any(place.is_relative_to(folder) for folder in SLOW):
             item.add_marker(pytest.mark.slow)
+        smoke = getattr(item, "originalname", item.name) in SMOKE
+        if not smoke and any(place.is_relative_to(folder) for folder in FULL):
+            item.add_marker(pytest.mark.full)
     items.sort(key=lambda item: places[item].parts[0] not in TOGETHER)
 
 
