@@ -25,7 +25,9 @@ def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
 
     The recordings of one of the two sequences cannot be read. The stages are replayed.
     """
-    other = Flow.copy(tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml", replay=flow.results)
+    other = Flow.copy(
+        tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml", replay=flow.results
+    )
     shutil.copytree(flow.results / "recordings", other.folder / "captures")
     for path in (other.folder / "captures" / OTHER).glob("*.mkv"):
         path.write_bytes(b"not a recording")
