@@ -23,7 +23,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.formats.recordings.k4a import KinectFile
 
 Blosc, Blosc2, Bitshuffle = hdf5plugin.Blosc, hdf5plugin.Blosc2, hdf5plugin.Bitshuffle
 CODECS: dict[str, Mapping[str, Any]] = {
@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("recording", type=Path)
     parser.add_argument("--repeat", type=int, default=40, help="images to write, at least")
     arguments = parser.parse_args()
-    with Recording(arguments.recording) as recording:
+    with KinectFile(arguments.recording) as recording:
         packets = [p for p in recording.packets() if p.kind == "depth"]
         images = np.stack([recording.depth_image(p.content) for p in packets])
     images = np.concatenate([images] * -(-arguments.repeat // len(images)))

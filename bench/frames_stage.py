@@ -19,7 +19,7 @@ import numpy as np
 from intercap_core.config import FramesSettings, SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.stages import frames as stage
 from intercap_core.studio.mkv import MkvWriter
 
@@ -28,7 +28,7 @@ FPS = 30
 
 def repeat_recording(source: Path, target: Path, sets: int) -> None:
     """Write a recording of ``sets`` colour and depth images that cycles through the source's."""
-    with Recording(source) as recording:
+    with KinectFile(source) as recording:
         info = recording.info
         packets = list(recording.packets())
         colour = [p.content for p in packets if p.kind == "colour"]

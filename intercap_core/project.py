@@ -21,7 +21,7 @@ from intercap_core.config import (
     SubjectEntry,
 )
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.converters.label_maps import read_label_map
+from intercap_core.formats.detections.class_names import read_label_map
 from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
 from intercap_core.inputs.quotes import printable, quoted
 from intercap_core.inputs.yaml_files import read_yaml

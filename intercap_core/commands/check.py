@@ -13,7 +13,7 @@ from intercap_core.project import Project, tidy
 
 if TYPE_CHECKING:
     from intercap_core.commands.check_recordings import Looked
-    from intercap_core.formats.recordings.source import Layout
+    from intercap_core.formats.recordings.source import RecordingLayout
 
 LABELS_TOLD = 8  # labels that a note names
 
@@ -214,11 +214,11 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
 def _notes_of_keypoints(
     settings: DetectionsSettings,
     folder: Path,
-    layout: Layout,
+    layout: RecordingLayout,
     cameras: list[str],
 ) -> list[str]:
     """What a look at the first people of each camera shows: their form, place and confidence."""
-    from intercap_core.formats.detections.keypoint_check import look_at_keypoints
+    from intercap_core.formats.detections.keypoint_files import look_at_keypoints
 
     notes: list[str] = []
     for name in cameras:
@@ -229,7 +229,7 @@ def _notes_of_keypoints(
     return notes
 
 
-def _colour_size(layout: Layout, camera: str) -> tuple[int, int] | None:
+def _colour_size(layout: RecordingLayout, camera: str) -> tuple[int, int] | None:
     """Width and height of a camera's images, None = told as a fault elsewhere."""
     try:
         with layout.open(camera) as recording:
@@ -241,12 +241,12 @@ def _colour_size(layout: Layout, camera: str) -> tuple[int, int] | None:
 def _notes_of_candidates(
     project: Project,
     row: SequenceEntry,
-    layout: Layout,
+    layout: RecordingLayout,
     cameras: list[str],
 ) -> list[str]:
     """What a look at the first results of each camera shows: their form, size and labels."""
-    from intercap_core.formats.detections.candidate_check import look_at_candidates
-    from intercap_core.formats.detections.converters.label_maps import class_names
+    from intercap_core.formats.detections.candidate_files import look_at_candidates
+    from intercap_core.formats.detections.class_names import class_names
 
     assert row.candidates is not None
     settings = project.config.detections

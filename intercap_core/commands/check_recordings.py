@@ -13,8 +13,8 @@ import numpy as np
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
-from intercap_core.formats.recordings.glance import Glance
-from intercap_core.formats.recordings.source import Layout
+from intercap_core.formats.recordings.containers import RecordingPreview
+from intercap_core.formats.recordings.source import RecordingLayout
 
 # Of what the others last, or of what a file or its rate states: below the first a recording is of
 # little use and a problem, below the second it is noted.
@@ -26,14 +26,14 @@ _IMAGE_ID = re.compile(rb'"(?:image_id|file_name)"\s*:\s*("[^"]*"|[^,}\s]+)')
 
 
 class Seen(NamedTuple):
-    """One camera's recording that opened: its glance, and what the calibration expects."""
+    """One camera's recording that opened: its preview, and what the calibration expects."""
 
     source: Path
     size: tuple[int, int]
     fps: float
     depth: bool
     truncated: bool
-    glance: Glance
+    preview: RecordingPreview
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Looked:
 
 
 def look_at_recordings(
-    row: SequenceEntry, layout: Layout, cameras: Iterable[str], without_depth: bool = False
+    row: SequenceEntry, layout: RecordingLayout, cameras: Iterable[str], without_depth: bool = False
 ) -> Looked:
     """Open each of ``cameras``, which have a recording and a pose, and look at it.
 
@@ -63,7 +63,7 @@ def look_at_recordings(
                     recording.fps,
                     depth is not None and not without_depth,
                     recording.truncated,
-                    recording.glance(),
+                    recording.preview(),
                 )
         except UserError as error:
             looked.faults.append(str(error))
@@ -75,14 +75,14 @@ def look_at_recordings(
     usual = _usual(seen)
     for name, one in seen.items():
         _judge(looked, row, name, one, usual.get(name))
-        looked.notes += _notes_of_detections(row, name, one.glance.images)
+        looked.notes += _notes_of_detections(row, name, one.preview.images)
     looked.summary = _summary(row, seen)
     return looked
 
 
 def _usual(seen: dict[str, Seen]) -> dict[str, float]:
     """How long the others of each camera last, seconds; the longest half, as most may be cut."""
-    lasting = {name: one.glance.seconds for name, one in seen.items()}
+    lasting = {name: one.preview.seconds for name, one in seen.items()}
     usual = {}
     for name in lasting:
         others = sorted(s for other, s in lasting.items() if other != name and s is not None)
@@ -92,7 +92,7 @@ def _usual(seen: dict[str, Seen]) -> dict[str, float]:
 
 
 def _judge(looked: Looked, row: SequenceEntry, name: str, one: Seen, usual: float | None) -> None:
-    source, found = one.source, one.glance
+    source, found = one.source, one.preview
     if found.size is None:
         looked.faults.append(
             f"{source}: camera {name} has no image that can be read, expected "
@@ -174,9 +174,9 @@ def _count(whole: Path | None, files: list[Path]) -> int | None:
 def _summary(row: SequenceEntry, seen: dict[str, Seen]) -> str:
     if not seen:
         return ""
-    sizes = sorted({size for one in seen.values() if (size := one.glance.size) is not None})
-    images = [one.glance.images for one in seen.values() if one.glance.images is not None]
-    seconds = [one.glance.seconds for one in seen.values() if one.glance.seconds is not None]
+    sizes = sorted({size for one in seen.values() if (size := one.preview.size) is not None})
+    images = [one.preview.images for one in seen.values() if one.preview.images is not None]
+    seconds = [one.preview.seconds for one in seen.values() if one.preview.seconds is not None]
     depth = sum(one.depth for one in seen.values())
     detected = [
         f"{kind} of {count}"

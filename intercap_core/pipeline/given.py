@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from intercap_core.config import Annotation, BodyModels, Config, SequenceEntry
-from intercap_core.formats.recordings.behave import intrinsics_of
+from intercap_core.formats.recordings.behave import find_intrinsics_folder
 from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.formats.released.file_names import intercap_file
 from intercap_core.output.site.settings import changed
@@ -194,7 +194,7 @@ def _row_told(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
         else:
             values[name] = value
     if "calibration" in row.model_fields_set and row.layout == "behave":
-        lenses = intrinsics_of(row.calibration)
+        lenses = find_intrinsics_folder(row.calibration)
         paths |= {lenses.name: lenses} if lenses is not None else {}
     return values, paths
 

@@ -15,12 +15,11 @@ from intercap_core.config import DetectionsSettings, SequenceEntry, digest
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.candidate_files import Candidates
-from intercap_core.formats.detections.converters.data_sets import BehaveFiles
-from intercap_core.formats.detections.converters.label_maps import class_names
+from intercap_core.formats.detections.class_names import class_names
 from intercap_core.formats.detections.image_numbers import CameraImages, camera_images
 from intercap_core.formats.detections.instance import Instance, boxes_of
-from intercap_core.formats.detections.keypoint_files import People
-from intercap_core.formats.detections.keypoint_values import NOBODY, Values
+from intercap_core.formats.detections.keypoint_files import NOBODY, People, Values
+from intercap_core.formats.detections.mask_files import BehaveFiles
 from intercap_core.progress import Progress
 from intercap_core.schemas import DETECTIONS, FRAMES
 

@@ -16,17 +16,20 @@ from intercap_core import artefacts
 from intercap_core.config import FramesSettings, SequenceEntry, digest
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics
-from intercap_core.formats.recordings.clocks import WRONG, best_epoch, drift_us, epochs
-from intercap_core.formats.recordings.extract import View, extract
+from intercap_core.formats.recordings.extract import ExtractedCamera, extract
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.sound_delays import sound_starts
 from intercap_core.formats.recordings.synchronise import (
+    OUTLIER,
     SetTable,
+    choose_epoch,
+    clock_drift_us,
     distance_to,
     nearest_images,
+    split_into_epochs,
     synchronise,
 )
-from intercap_core.formats.recordings.timestamps import rate_of
+from intercap_core.formats.recordings.timestamps import frame_rate
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import FRAMES
@@ -63,7 +66,7 @@ def run(
         views = [
             extract(name, layout, writer, depth=settings.depth)
             if name in used
-            else View(name, notes=["left out (frames.cameras)"])
+            else ExtractedCamera(name, notes=["left out (frames.cameras)"])
             for name in names
         ]
         _note_same_devices(views)
@@ -128,7 +131,7 @@ def _used(names: Sequence[str], settings: FramesSettings, sequence: SequenceEntr
     return set(settings.cameras or names)
 
 
-def _note_same_devices(views: list[View]) -> None:
+def _note_same_devices(views: list[ExtractedCamera]) -> None:
     """Say where two recordings are of one device; set the second aside where they are one."""
     for first, second in combinations([view for view in views if view.present], 2):
         if first.source is None or second.source is None or first.serial != second.serial:
@@ -151,7 +154,7 @@ def _note_same_devices(views: list[View]) -> None:
             view.notes += [note] * bool(note)
 
 
-def _require_usable(views: list[View], sequence: SequenceEntry) -> None:
+def _require_usable(views: list[ExtractedCamera], sequence: SequenceEntry) -> None:
     reasons = "; ".join(f"{view.name}: {', '.join(view.notes)}" for view in views if view.notes)
     if not any(view.present for view in views):
         raise UserError(
@@ -160,10 +163,10 @@ def _require_usable(views: list[View], sequence: SequenceEntry) -> None:
         )
 
 
-def _straighten_clocks(views: list[View], master: int) -> None:
+def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
     """Where a device's clock was reset, keep the stretch of its images in the others' time."""
     present = [view for view in views if view.present]
-    stretches = {view.name: epochs(view.colour_times) for view in present}
+    stretches = {view.name: split_into_epochs(view.colour_times) for view in present}
     straight = [view for view in present if stretches[view.name].max() == 0]
     if not straight:
         first = views[master] if views[master].present else present[0]
@@ -175,15 +178,15 @@ def _straighten_clocks(views: list[View], master: int) -> None:
         _keep_one_stretch(view, stretches[view.name], reference)
 
 
-def _keep_one_stretch(view: View, stretch: np.ndarray, reference_us: np.ndarray) -> None:
+def _keep_one_stretch(view: ExtractedCamera, stretch: np.ndarray, reference_us: np.ndarray) -> None:
     period_us = 1e6 / view.fps
-    kept = best_epoch(view.colour_times, stretch, np.sort(reference_us), period_us)
+    kept = choose_epoch(view.colour_times, stretch, np.sort(reference_us), period_us)
     resets = int(stretch.max())
-    wrong = int((stretch == WRONG).sum())
+    wrong = int((stretch == OUTLIER).sum())
     if wrong:
         view.notes.append(f"{wrong} images with device times out of order left out")
     if resets:
-        others = int(((stretch != kept) & (stretch != WRONG)).sum())
+        others = int(((stretch != kept) & (stretch != OUTLIER)).sum())
         view.notes.append(
             f"its device times jump back {resets} times: {others} images outside the stretch of "
             f"{int((stretch == kept).sum())} in the other cameras' time left out"
@@ -191,20 +194,20 @@ def _keep_one_stretch(view: View, stretch: np.ndarray, reference_us: np.ndarray)
     view.colour_usable &= stretch == kept
     if not len(view.depth_times):
         return
-    depth = epochs(view.depth_times)
+    depth = split_into_epochs(view.depth_times)
     if depth.max() != resets:
-        kept = best_epoch(view.depth_times, depth, view.usable_times, period_us)
+        kept = choose_epoch(view.depth_times, depth, view.usable_times, period_us)
     view.depth_usable &= depth == kept
 
 
-def _overlap(view: View, other: View) -> bool:
+def _overlap(view: ExtractedCamera, other: ExtractedCamera) -> bool:
     """Whether two cameras recorded at the same time, by their device times."""
     period_us = 1e6 / view.fps
     mine, others = view.usable_times, other.usable_times
     return bool(others.min() <= mine.max() + period_us and others.max() >= mine.min() - period_us)
 
 
-def _clock_of(views: list[View], master: int) -> int:
+def _clock_of(views: list[ExtractedCamera], master: int) -> int:
     """The camera whose images define the sets: the one with which the most overlap in time.
 
     Of equals the master, or the first that is there.
@@ -217,7 +220,7 @@ def _clock_of(views: list[View], master: int) -> int:
     return clock
 
 
-def _set_aside_other_clocks(views: list[View], clock: int) -> None:
+def _set_aside_other_clocks(views: list[ExtractedCamera], clock: int) -> None:
     """A device that ran without the sync cable counts from its own start: of no use here."""
     for view in [view for view in views if view.present]:
         if _overlap(views[clock], view):
@@ -234,7 +237,7 @@ def _set_aside_other_clocks(views: list[View], clock: int) -> None:
 
 
 def _frame_sets(
-    views: list[View], clock: int, settings: FramesSettings
+    views: list[ExtractedCamera], clock: int, settings: FramesSettings
 ) -> tuple[SetTable, np.ndarray]:
     """Return the table of colour images and the index (T, C) of the depth images beside them."""
     max_skew_us = settings.max_skew_ms * 1000
@@ -260,9 +263,9 @@ def _frame_sets(
     return table, depth_index
 
 
-def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
+def _note_shortcomings(views: list[ExtractedCamera], table: SetTable, clock: int) -> None:
     period_us = 1e6 / views[clock].fps
-    sets_per_s = rate_of(table.times_us) or views[clock].fps
+    sets_per_s = frame_rate(table.times_us) or views[clock].fps
     gaps = table.gaps(period_us)
     if gaps:
         lost = sum(length for _, length in gaps)
@@ -274,7 +277,7 @@ def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
         if not view.present:
             continue
         seen = np.flatnonzero(table.index[:, camera] >= 0)
-        own = rate_of(view.usable_times) or sets_per_s
+        own = frame_rate(view.usable_times) or sets_per_s
         ratio = own / sets_per_s
         if not 1 / OTHER_RATE < ratio < OTHER_RATE:
             view.notes.append(_other_rate(own, sets_per_s, int(table.unmatched[camera])))
@@ -289,7 +292,7 @@ def _note_shortcomings(views: list[View], table: SetTable, clock: int) -> None:
             )
         if not len(seen):
             continue
-        drift = drift_us(table.times_us, table.skew_us[:, camera])
+        drift = clock_drift_us(table.times_us, table.skew_us[:, camera])
         if abs(drift) > MIN_DRIFT_US:
             view.notes.append(
                 f"its clock runs away from {views[clock].name}'s by {drift / 1e3:.1f} "
@@ -342,7 +345,9 @@ def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry)
     return dropped
 
 
-def _camera_or_placeholder(view: View, views: list[View], extrinsics: Extrinsics) -> Camera:
+def _camera_or_placeholder(
+    view: ExtractedCamera, views: list[ExtractedCamera], extrinsics: Extrinsics
+) -> Camera:
     """The camera, or for one that is absent a stand-in without depth that keeps the C axis whole.
 
     The stand-in has the image size of a camera that is there and a plain lens; ``present`` says

@@ -11,7 +11,7 @@ import numpy as np
 
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.intercap import ReleaseLayout
+from intercap_core.formats.recordings.intercap import InterCapLayout
 from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -64,7 +64,7 @@ def choose_calibration(sequence: SequenceEntry, calibrations: Mapping[str, Path]
 
 def _cameras(row: SequenceEntry, depths: dict[str, np.ndarray]) -> dict[str, Camera]:
     """The cameras with depth of one calibration; background depth is added to ``depths`` once."""
-    layout = ReleaseLayout(row)
+    layout = InterCapLayout(row)
     cameras = {}
     for name in layout.names:
         if name not in layout.extrinsics.master_from_colour:

@@ -12,12 +12,11 @@ import numpy as np
 
 from intercap_core.config import DetectionsSettings
 from intercap_core.formats.detections import candidate_files, keypoint_files
-from intercap_core.formats.detections.candidate_check import look_at_candidates
-from intercap_core.formats.detections.class_names import COCO_NAMES
-from intercap_core.formats.detections.converters.label_maps import read_label_map
+from intercap_core.formats.detections.candidate_files import look_at_candidates
+from intercap_core.formats.detections.class_names import COCO_NAMES, read_label_map
 from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.detections.instance import Instance
-from intercap_core.formats.detections.keypoint_check import look_at_keypoints
+from intercap_core.formats.detections.keypoint_files import look_at_keypoints
 from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
 from intercap_core.formats.detections.models.onnx_pose import PoseModel
 from intercap_core.formats.detections.models.onnx_segmentation import Segmenter

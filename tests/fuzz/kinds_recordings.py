@@ -12,9 +12,9 @@ import numpy as np
 
 from intercap_core.formats.recordings.encoded import encoded_size
 from intercap_core.formats.recordings.image_files import DamagedImage, read_colour, read_depth
-from intercap_core.formats.recordings.k4a_layout import KinectRecording
+from intercap_core.formats.recordings.k4a import KinectRecording
 from intercap_core.formats.recordings.source import CameraRecording
-from intercap_core.formats.recordings.timestamps import read_timestamps, shots_of
+from intercap_core.formats.recordings.timestamps import pair_images, read_timestamps
 from intercap_core.formats.recordings.video import VideoRecording
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
@@ -34,7 +34,7 @@ def _check(recording: CameraRecording) -> list[str]:
     within(0.01, 1e5, fps=recording.fps)
     within(-2e6, 2e6, delay=recording.depth_delay_us)
     recording.serial.encode("utf-8")
-    seen = recording.glance()
+    seen = recording.preview()
     within(0, 1, share=seen.share)
     finite(seconds=seen.seconds or 0)
     colour = depth = damaged = 0
@@ -134,7 +134,7 @@ def _read_times(folder: Path) -> None:
     within(-1e11, 1e11, times=list(times.values()))
     colour = [Path(f"frame_{n:04d}.jpg") for n in range(20)]
     source = folder / "timestamps.csv"
-    for shot in shots_of(colour, [], fps=30, offset_s=0, times=times, source=source):
+    for shot in pair_images(colour, [], fps=30, offset_s=0, times=times, source=source):
         within(-(2**62), 2**62, time=shot.time_us)
 
 

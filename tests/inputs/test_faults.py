@@ -17,7 +17,7 @@ from intercap_core.commands.check import faults_of_truth
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.encoded import encoded_size
-from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.rigid.mesh import colours_of
 from intercap_core.geometry.rigid.mesh_files import load_mesh
@@ -252,7 +252,7 @@ def test_times_of_recordings_that_no_clock_has(
     ) as writer:
         writer.write_colour(jpeg_at(0, 0), options.get("start_offset_ns", 0) // 1000 + 1000)
     with pytest.raises(UserError, match=rf"k1\.mkv: tag {words} is .*expected nanoseconds"):
-        Recording(path)
+        KinectFile(path)
 
 
 def test_a_jpeg_of_head_and_end_alone_is_no_image(tmp_path: Path) -> None:

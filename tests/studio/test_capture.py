@@ -20,7 +20,7 @@ from intercap_core.config import Annotation, ObjectEntry, StudioCapture, StudioS
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
 from intercap_core.formats.calibration.k4a import read_calibration
-from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.distance import DistanceField
@@ -48,7 +48,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory, object_entry: Entry) -> Pa
 
 
 def claimed_camera(capture: Path, name: str) -> Camera:
-    with Recording(capture / f"{name}.mkv") as recording:
+    with KinectFile(capture / f"{name}.mkv") as recording:
         info = recording.info
     poses = read_extrinsics(capture / "calibration.json").master_from_colour
     return read_calibration(

@@ -12,7 +12,7 @@ from intercap_core import artefacts
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.k4a import DEPTH_MODES
-from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.failures import Failures, check_faults
@@ -123,7 +123,7 @@ def test_faults_are_in_the_recordings_and_in_the_truth(broken_capture: Path) -> 
         assert truth.attributes["room"] == "bare"
         recorded, names = truth["recorded"], list(truth["camera_names"])
     for index, name in enumerate(names):
-        with Recording(broken_capture / f"{name}.mkv") as recording:
+        with KinectFile(broken_capture / f"{name}.mkv") as recording:
             assert recording.info.depth_mode == "WFOV_2X2BINNED"
             assert recording.info.fps == FPS
             packets = list(recording.packets())

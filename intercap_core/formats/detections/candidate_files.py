@@ -17,22 +17,23 @@ from intercap_core.formats.detections.coco import (
     ImageKey,
     UnreadableCandidates,
     candidates_of,
+    read_head,
     read_json,
 )
-from intercap_core.formats.detections.constants import FILES_NAMED
-from intercap_core.formats.detections.converters.data_sets import release_masks
-from intercap_core.formats.detections.converters.mask_files import (
+from intercap_core.formats.detections.image_numbers import CameraImages
+from intercap_core.formats.detections.instance import Instance
+from intercap_core.formats.detections.mask_files import (
     MaskFile,
     UnreadableMask,
     instance_masks,
     read_masks,
+    release_masks,
 )
-from intercap_core.formats.detections.image_numbers import CameraImages
-from intercap_core.formats.detections.instance import Instance
 from intercap_core.inputs.quotes import printable
 
 Result = TypeVar("Result")
 
+FILES_NAMED = 3  # broken files or entries that a note names; more are counted
 ALL_IMAGES = ("coco_instances_results.json", "predictions.json")  # in the camera's own folder
 
 
@@ -278,3 +279,53 @@ def note_broken(notes: list[str], what: str, broken: list[str]) -> None:
     if broken:
         more = f" and {len(broken) - FILES_NAMED} more" if len(broken) > FILES_NAMED else ""
         notes.append(f"{what} not readable: {', '.join(broken[:FILES_NAMED])}{more}")
+
+
+@dataclass
+class Look:
+    """What was seen of one camera: what is wrong, in words, and the labels."""
+
+    notes: list[str] = field(default_factory=list)
+    labels: set[str] = field(default_factory=set)
+
+
+def look_at_candidates(
+    folder: Path, camera: str, *, size: tuple[int, int], names: Mapping[int, str]
+) -> Look:
+    """Read the beginning of one camera's file, or its first file of one image.
+
+    ``size`` (width, height) of the colour images; ``names`` are the classes by number. Masks as
+    images are not looked at.
+    """
+    look = Look()
+    whole = camera_file(folder, camera)
+    path = whole if whole is not None else next(iter(image_files(folder, camera)), None)
+    if path is None:
+        return look
+    try:
+        content = read_head(path)
+        if content is None:
+            return look
+        found = candidates_of(
+            content,
+            width=size[0],
+            height=size[1],
+            min_score=0.0,
+            names=names,
+            one_image=whole is None,
+        )
+    except UnreadableCandidates as error:
+        look.notes.append(f"{path} {error}; the camera will count as without candidates")
+        return look
+    if found.faults:
+        look.notes.append(
+            f"{path}: {len(found.faults)} of its first {found.entries} results cannot be used "
+            f"(first: {found.faults[0]})"
+        )
+    if found.scaled:
+        look.notes.append(
+            f"{path}: masks are of another resolution than the images of {size[0]}x{size[1]} and "
+            "will be scaled"
+        )
+    look.labels = {instance.label for _, instance in found.results}
+    return look

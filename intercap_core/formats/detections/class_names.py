@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from intercap_core.formats.detections.constants import MAX_LABEL
-from intercap_core.inputs.quotes import quoted
+import yaml
 
+from intercap_core.errors import UserError
+from intercap_core.inputs.files import read_text
+from intercap_core.inputs.json_files import parse_json
+from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.yaml_files import parse_yaml
+
+MAX_LABEL = 200  # characters; the artefact stores all labels at the length of the longest
+MAX_LABELS_BYTES = (
+    1 << 26
+)  # a list of classes has some kB; annotations of a data set are not needed
 # COCO's 80 classes, and their published ids, which have gaps.
 _CLASSES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
@@ -71,3 +81,39 @@ def label_text(name: str) -> str:
     if len(name) > MAX_LABEL:
         raise ValueError(f"a category's name has {len(name)} characters, at most {MAX_LABEL}")
     return name
+
+
+BUILT_IN = {"coco": COCO_NAMES, "coco80": COCO_NAMES_FROM_0}
+
+
+def class_names(setting: str | Path) -> dict[int, str]:
+    """Names by number of the setting ``category_names``: a built-in numbering or a file.
+
+    Raises UserError as :func:`read_label_map` does.
+    """
+    if isinstance(setting, str) and setting in BUILT_IN:
+        return BUILT_IN[setting]
+    return read_label_map(Path(setting))
+
+
+def read_label_map(path: Path) -> dict[int, str]:
+    """Read a file of class names. Raises UserError naming what is wrong with it."""
+    text = read_text(
+        path,
+        MAX_LABELS_BYTES,
+        advice="name a list of classes, such as a data set's 'categories' alone, as "
+        "docs/detectors.md shows",
+    )
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".json":
+            return names_of(parse_json(text))
+        if suffix in (".yaml", ".yml"):
+            return names_of(parse_yaml(text))
+        return names_of([line.strip() for line in text.strip().splitlines()])
+    except (ValueError, yaml.YAMLError) as error:
+        words = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path}: is no list of classes ({words}); expected 'categories' as COCO has them, a "
+            "mapping of numbers to names, or names in order"
+        ) from None

@@ -16,18 +16,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from intercap_core.formats.detections.class_names import label_text, names_of
-from intercap_core.formats.detections.constants import (
-    HEAD_BYTES,
-    MAX_JSON_BYTES,
-    MAX_SCORE,
-    MIN_SCORE,
-)
 from intercap_core.formats.detections.instance import Instance, to_rle
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import Unreadable, read_bytes
 from intercap_core.inputs.json_files import decoder, parse_json
 from intercap_core.inputs.quotes import quoted
 
+MAX_JSON_BYTES = 1 << 29  # parsed JSON takes about six times its file size in memory
+HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
+# Scores are probabilities. The overlaps that Segment Anything predicts slightly exceed 1.
+MIN_SCORE, MAX_SCORE = -0.01, 1.2
 _LARGEST_ID = 2**31 - 1
 _NAME_KEYS = ("category_name", "category", "class_name", "class", "label", "name")
 _NUMBER_KEYS = ("category_id", "class", "class_id", "label")

@@ -12,15 +12,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from intercap_core.formats.detections.constants import (
-    MASK_THRESHOLD,
-    MAX_PIXELS,
-    MAX_REDUCED,
-    SAME_SHAPE_PX,
-)
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.quotes import quoted
 
+MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth of this
+MAX_REDUCTION = 32.0  # largest ratio of an image's side to the mask's side
+SAME_SHAPE_PX = 1.0  # rounding error of one side of a reduced image
+MASK_THRESHOLD = 128  # grey level of 8 bits; JPEG blurs the two values of a mask
 PERSON_LABEL = "person"  # what every detector's list of classes calls people
 
 
@@ -56,7 +54,7 @@ def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, floa
     if found == size:
         return 1.0, 1.0
     x, y = size[0] / found[0], size[1] / found[1]
-    if x > MAX_REDUCED or abs(found[1] * x - size[1]) > max(x, 1) * SAME_SHAPE_PX:
+    if x > MAX_REDUCTION or abs(found[1] * x - size[1]) > max(x, 1) * SAME_SHAPE_PX:
         raise ValueError(
             f"the mask has {found[0]}x{found[1]} pixels, the image {size[0]}x{size[1]}; segment "
             "the images as recorded"

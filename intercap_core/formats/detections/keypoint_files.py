@@ -14,21 +14,90 @@ from typing import Any
 
 import numpy as np
 
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
-from intercap_core.formats.detections import openpose
 from intercap_core.formats.detections.candidate_files import (
+    FILES_NAMED,
     note_absent,
     note_broken,
     short,
     sorted_by_image,
 )
-from intercap_core.formats.detections.coco import UnreadableCandidates, read_json
-from intercap_core.formats.detections.constants import FILES_NAMED
-from intercap_core.formats.detections.converters.data_sets import as_openpose
-from intercap_core.formats.detections.converters.wholebody import people_of
+from intercap_core.formats.detections.coco import UnreadableCandidates, read_head, read_json
+from intercap_core.formats.detections.converters import openpose
+from intercap_core.formats.detections.converters.coco_people import people_of
+from intercap_core.formats.detections.converters.openpose import as_openpose
 from intercap_core.formats.detections.image_numbers import CameraImages
-from intercap_core.formats.detections.keypoint_values import NOBODY, Values
 from intercap_core.inputs.quotes import printable
+
+EDGE_PX = 0.5  # the centres of pixels have integer coordinates
+# px. A person whose points all lie below this has normalised coordinates (0 to 1, some beyond the
+# image), not pixels.
+MAX_NORMALISED_PX = 2.0
+NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
+
+
+@dataclass
+class Values:
+    """Cleans the people of one camera's images of ``size`` (width, height), and counts.
+
+    ``full_confidence`` is what counts as 1.
+    """
+
+    size: tuple[int, int]
+    full_confidence: float = 1.0
+    seen: int = 0
+    outside: int = 0
+    beyond: int = 0
+    shares: int = 0
+
+    def clean(self, people: np.ndarray) -> np.ndarray:
+        """People (P, 135, 3) without those of whom nothing is seen, the rest as float32.
+
+        A point that is not finite, lies outside the image or in its very corner (0, 0), or has no
+        confidence becomes zeros; confidence beyond the full one is cut to 1.
+        """
+        x, y, confidence = np.moveaxis(np.asarray(people, np.float64), -1, 0)
+        with np.errstate(invalid="ignore"):
+            seen = np.isfinite(people).all(-1) & (confidence > 0) & ((x != 0) | (y != 0))
+            inside = (np.minimum(x, y) >= -EDGE_PX) & (x < self.size[0] - EDGE_PX)
+            inside &= y < self.size[1] - EDGE_PX
+        beyond = seen & (confidence > self.full_confidence)
+        self.seen += int(seen.sum())
+        self.outside += int((seen & ~inside).sum())
+        self.beyond += int(beyond.sum())
+        known = seen & inside
+        share = np.minimum(np.where(known, confidence, 0) / self.full_confidence, 1)
+        result = np.where(known[..., None], np.stack([x, y, share], -1), 0).astype(np.float32)
+        present = known.any(-1)
+        shares = present & (result[..., :2].max((1, 2), initial=0) <= MAX_NORMALISED_PX)
+        self.shares += int(shares.sum())
+        return result[present & ~shares]
+
+    def notes(self) -> list[str]:
+        """What was changed, in words."""
+        notes = []
+        width, height = self.size
+        if self.outside:
+            wrong = 2 * self.outside > self.seen
+            hint = "; are they of images of another size, or of another camera?" if wrong else ""
+            notes.append(
+                f"{self.outside} of {self.seen} keypoints lie outside the image of "
+                f"{width}x{height} pixels and count as not seen{hint}"
+            )
+        if self.shares:
+            notes.append(
+                f"{self.shares} people left out whose points all lie within {MAX_NORMALISED_PX:g} "
+                "pixels of the upper left corner: coordinates must be pixels, not shares of the "
+                "image"
+            )
+        if self.beyond:
+            notes.append(
+                f"{self.beyond} of {self.seen} confidences are beyond {self.full_confidence:g} and "
+                "count as 1; detections.keypoint_full_confidence says what is full"
+            )
+        return notes
+
 
 RESULTS = "results_"  # what mmpose's demo puts before the name of an image or a video
 ALPHAPOSE = "alphapose-results.json"
@@ -201,3 +270,46 @@ def _people_of_image(reading: _Reading, content: Any, path: Path) -> np.ndarray 
     if found.faults and not found.results:
         return None
     return np.stack([one for _, one in found.results]) if found.results else NOBODY
+
+
+def look_at_keypoints(
+    folder: Path, camera: str, *, size: tuple[int, int], full_confidence: float
+) -> list[str]:
+    """What is wrong with the beginning of one camera's file, or its first file of one image.
+
+    ``size`` (width, height) of the colour images; ``full_confidence`` counts as 1.
+    """
+    whole = camera_file(folder, camera)
+    path = whole if whole is not None else next(iter(image_files(folder / camera)), None)
+    if path is None:
+        return []
+    notes, values = [], Values(size, full_confidence)
+    try:
+        content = read_head(path)
+        if content is None:
+            return []
+        if whole is None:
+            content = as_openpose(content)
+        if whole is None and openpose.is_openpose(content):
+            people = openpose.people_of(content, str(path))
+        else:
+            found = people_of(content, one_image=whole is None)
+            if found.faults:
+                notes.append(
+                    f"{path}: {len(found.faults)} of its first {found.entries} people cannot be "
+                    f"used (first: {found.faults[0]})"
+                )
+            people = np.array([person for _, person in found.results]).reshape(
+                -1, *NOBODY.shape[1:]
+            )
+    except UnreadableCandidates as error:
+        return [f"{path} {error}"]
+    except UserError as error:
+        return [str(error)]
+    values.clean(people)
+    if len(people) and not values.seen:
+        notes.append(
+            f"{path}: none of its first {len(people)} people has a point with numbers and a "
+            "confidence above 0; write the keypoints again"
+        )
+    return notes + [f"{path}: {note}" for note in values.notes()]

@@ -1,4 +1,4 @@
-"""Layout ``behave``: the folders of the BEHAVE data set.
+"""RecordingLayout ``behave``: the folders of the BEHAVE data set.
 
 ``recordings`` is a sequence's folder of frame folders ``t<seconds>`` that hold
 ``k<n>.color.jpg`` and ``k<n>.depth.png`` (16 bits, millimetres, on the colour image's grid) of the
@@ -18,8 +18,8 @@ from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import MAX_DISTANCE_M, Extrinsics, placed
 from intercap_core.formats.calibration.plausible import check_lens
-from intercap_core.formats.recordings.image_files import AlignedRecording, Shot, common_size
-from intercap_core.formats.recordings.source import Layout
+from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
+from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
 from intercap_core.inputs.files import Unreadable
@@ -33,7 +33,7 @@ NOMINAL_FPS = (30.0, 15.0, 5.0)  # of an Azure Kinect; names round the times to 
 FPS_TOLERANCE = 0.05
 
 
-class BehaveLayout(Layout):
+class BehaveLayout(RecordingLayout):
     """One sequence of the data set."""
 
     def __init__(self, sequence: SequenceEntry) -> None:
@@ -54,7 +54,7 @@ class BehaveLayout(Layout):
     def open(self, name: str) -> AlignedRecording:
         """Find the camera's files; raises UserError without colour images or a fitting lens."""
         shots = [
-            Shot(time_us, images.get((name, "color")), images.get((name, "depth")))
+            ImagePair(time_us, images.get((name, "color")), images.get((name, "depth")))
             for time_us, images in self._images.items()
             if (name, "color") in images or (name, "depth") in images
         ]
@@ -151,7 +151,7 @@ def read_poses(folder: Path) -> Extrinsics:
     return Extrinsics(MASTER, placed(folder, MASTER, world_from_colour).master_from_colour)
 
 
-def intrinsics_of(calibration: Path) -> Path | None:
+def find_intrinsics_folder(calibration: Path) -> Path | None:
     """The folder ``intrinsics`` in ``calibration`` (``calibs/<date>/config``), or up to two folders
     above; None where there is none."""
     above = calibration.resolve()
@@ -166,7 +166,7 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
     above. The file's ``color`` states ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
     ``opencv``: those four again, then OpenCV's distortion. Raises UserError naming the file.
     """
-    place = intrinsics_of(calibration)
+    place = find_intrinsics_folder(calibration)
     folders = _kinect_folders(place) if place is not None else {}
     path = folders[number] / "calibration.json" if number in folders else None
     if path is None or not path.is_file():

@@ -69,7 +69,7 @@ def _orientation(tiff: bytes) -> int:
     return 1
 
 
-def jpeg_of(image: np.ndarray) -> bytes:
+def encode_jpeg(image: np.ndarray) -> bytes:
     """Encode (H, W, 3) uint8 BGR, for recordings whose colour cannot be copied."""
     import cv2
 
@@ -79,7 +79,7 @@ def jpeg_of(image: np.ndarray) -> bytes:
     return content.tobytes()
 
 
-def bgr_of_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.ndarray:
+def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.ndarray:
     """Return (H, W, 3) uint8 BGR of a raw image of ``size`` (width, height).
 
     ``pixel_format`` is one of :data:`RAW_FORMATS`; YUV is BT.601 with limited range, as the Azure

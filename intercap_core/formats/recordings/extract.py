@@ -13,7 +13,7 @@ from intercap_core import artefacts
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.encoded import encoded_size
 from intercap_core.formats.recordings.sound import Sound
-from intercap_core.formats.recordings.source import CameraRecording, Image, Layout
+from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.quotes import printable
 from intercap_core.progress import Progress
@@ -25,7 +25,7 @@ FINGERPRINT_BYTES = 256  # of each image's end: entropy-coded, so that no two im
 
 
 @dataclass
-class View:
+class ExtractedCamera:
     """One camera: its lenses, the times of its images, and their defects.
 
     ``colour_times`` and ``depth_times`` are device times, microseconds, in the order of the
@@ -60,12 +60,14 @@ class View:
         return self.colour_times[self.colour_usable]
 
 
-def extract(name: str, layout: Layout, writer: artefacts.Writer, *, depth: bool = True) -> View:
+def extract(
+    name: str, layout: RecordingLayout, writer: artefacts.Writer, *, depth: bool = True
+) -> ExtractedCamera:
     """Copy one camera's images into the artefact; whatever is wrong becomes a note of the view.
 
     Without ``depth`` its colour alone.
     """
-    view = View(name)
+    view = ExtractedCamera(name)
     if name not in layout.extrinsics.master_from_colour:
         calibration = layout.sequence.calibration.name
         view.notes.append(f"no pose in {calibration}; add the camera there")
@@ -87,7 +89,7 @@ def extract(name: str, layout: Layout, writer: artefacts.Writer, *, depth: bool 
     return view
 
 
-def _without_folders(text: str, layout: Layout) -> str:
+def _without_folders(text: str, layout: RecordingLayout) -> str:
     """An artefact holds no path of a machine: files by what is below the sequence's folders."""
     recordings, calibration = layout.sequence.recordings, layout.sequence.calibration
     for folder in (recordings, calibration.parent):
@@ -99,7 +101,12 @@ class _Copy:
     """The copying of one recording."""
 
     def __init__(
-        self, recording: CameraRecording, view: View, writer: artefacts.Writer, *, depth: bool
+        self,
+        recording: CameraRecording,
+        view: ExtractedCamera,
+        writer: artefacts.Writer,
+        *,
+        depth: bool,
     ) -> None:
         self.recording, self.view, self.writer = recording, view, writer
         lens = recording.camera.depth if depth else None

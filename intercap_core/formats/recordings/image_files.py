@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.recordings.containers import RecordingPreview
 from intercap_core.formats.recordings.encoded import PNG_END, PNG_START, encoded_size
-from intercap_core.formats.recordings.glance import Glance
 from intercap_core.formats.recordings.source import CameraRecording, Image
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
 
-LOOKED_AT = 5  # files of each kind that a glance opens, spread over the recording
+LOOKED_AT = 5  # files of each kind that a preview opens, spread over the recording
 GREY_TYPE = 0  # PNG colour type of one channel
 
 
@@ -30,7 +30,7 @@ class DamagedImage(Exception):
     """The file is no image that can be used; says why, in words that fit after its name."""
 
 
-class Shot(NamedTuple):
+class ImagePair(NamedTuple):
     """What one camera recorded at one moment; None = no file."""
 
     time_us: int
@@ -100,7 +100,7 @@ class FilesRecording(CameraRecording):
     Depth images have the size of the camera's depth lens; without one they are not read.
     """
 
-    def __init__(self, source: Path, camera: Camera, shots: list[Shot], fps: float) -> None:
+    def __init__(self, source: Path, camera: Camera, shots: list[ImagePair], fps: float) -> None:
         super().__init__(source, camera, fps=fps)
         self._shots = shots
 
@@ -109,7 +109,7 @@ class FilesRecording(CameraRecording):
         """Device time, microseconds, and path of every colour file, also of damaged ones."""
         return [(shot.time_us, shot.colour) for shot in self._shots if shot.colour is not None]
 
-    def glance(self) -> Glance:
+    def preview(self) -> RecordingPreview:
         """The sizes of all files, and some of the images."""
         files, size = self.colour_files, None
         for _, path in files:
@@ -119,14 +119,14 @@ class FilesRecording(CameraRecording):
         times = [time_us for time_us, _ in files]
         seconds = (times[-1] - times[0]) * 1e-6 if times else None
         faults = faults_of_files(self._shots, self.camera.depth)
-        return Glance(size, len(files), seconds, faults=tuple(faults))
+        return RecordingPreview(size, len(files), seconds, faults=tuple(faults))
 
     def images(self) -> Iterator[Image]:
         """Images in the order of the shots; damaged ones are left out and counted."""
-        return read_shots(self, self._shots)
+        return read_pairs(self, self._shots)
 
 
-def faults_of_files(shots: list[Shot], lens: Intrinsics | None) -> list[str]:
+def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str]:
     """What is wrong with a camera's image files, by their sizes and a look into some of them.
 
     ``lens`` of the depth camera, None = its depth is not used.
@@ -158,7 +158,7 @@ def faults_of_files(shots: list[Shot], lens: Intrinsics | None) -> list[str]:
     return faults
 
 
-def read_shots(recording: CameraRecording, shots: list[Shot]) -> Iterator[Image]:
+def read_pairs(recording: CameraRecording, shots: list[ImagePair]) -> Iterator[Image]:
     """Yield the images of ``shots``; what is damaged is noted at the recording, by first name."""
     lens = recording.camera.depth
     damaged: list[str] = []
@@ -195,7 +195,7 @@ class AlignedRecording(FilesRecording):
         lens: Intrinsics,
         pose: np.ndarray,
         *,
-        shots: list[Shot],
+        shots: list[ImagePair],
         fps: float,
     ) -> None:
         self._shots, self._size = shots, (lens.width, lens.height)

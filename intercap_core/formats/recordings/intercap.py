@@ -1,4 +1,4 @@
-"""Layout ``intercap``: the folders of the InterCap release.
+"""RecordingLayout ``intercap``: the folders of the InterCap release.
 
 ``recordings`` is ``RGBD_Images/<subject>/<object>/Seg_<k>`` with ``Frames_Cam<n>/color/%05d.jpg``
 and a folder of depth beside each ``color``: 16-bit PNG, millimetres, on the colour image's grid.
@@ -18,8 +18,8 @@ from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
 from intercap_core.formats.calibration.plausible import check_lens
-from intercap_core.formats.recordings.image_files import AlignedRecording, Shot, common_size
-from intercap_core.formats.recordings.source import Layout
+from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
+from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.inputs.files import Unreadable
 from intercap_core.inputs.json_files import read_json
@@ -44,7 +44,7 @@ def numbers_of(times_us: np.ndarray) -> np.ndarray:
     return np.rint(np.asarray(times_us) * (FPS / 1e6)).astype(np.int64)
 
 
-class ReleaseLayout(Layout):
+class InterCapLayout(RecordingLayout):
     """One sequence of the release."""
 
     def __init__(self, sequence: SequenceEntry) -> None:
@@ -73,7 +73,8 @@ class ReleaseLayout(Layout):
         lens_file = "Color.json" if number == 1 else f"Color_{number}.json"
         lens = read_lens(self.sequence.calibration / lens_file, size)
         shots = [
-            Shot(time_of(at), colour.get(at), depth.get(at)) for at in sorted({*colour, *depth})
+            ImagePair(time_of(at), colour.get(at), depth.get(at))
+            for at in sorted({*colour, *depth})
         ]
         pose = self.extrinsics.master_from_colour[name]
         fps = frame_rate(sorted(colour))

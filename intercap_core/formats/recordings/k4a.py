@@ -21,17 +21,33 @@ import av
 import numpy as np
 from av.stream import Discard
 
+from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import read_extrinsics
+from intercap_core.formats.calibration.files import read_other_calibration, refuse_scale
 from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
     colour_from_accelerometer,
     read_calibration,
 )
+from intercap_core.formats.calibration.other import Recorded
 from intercap_core.formats.calibration.plausible import check_rate
-from intercap_core.formats.recordings.container import LATEST_US, open_container
-from intercap_core.formats.recordings.encoded import RAW_FORMATS, encoded_size
-from intercap_core.formats.recordings.glance import Glance, glance_at_video, segment_end
+from intercap_core.formats.recordings.containers import (
+    LATEST_US,
+    RecordingPreview,
+    open_container,
+    preview_video,
+    segment_end,
+)
+from intercap_core.formats.recordings.encoded import (
+    JPEG_QUALITY,
+    RAW_FORMATS,
+    decode_raw,
+    encode_jpeg,
+    encoded_size,
+)
+from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import read_bytes
 from intercap_core.inputs.quotes import quoted
@@ -56,7 +72,7 @@ class Packet(NamedTuple):
 
 
 @dataclass(frozen=True)
-class RecordingInfo:
+class KinectFileInfo:
     """What the head of a recording says. ``depth_mode`` is None where no depth was recorded.
 
     ``colour_format`` is MJPG or one of :data:`RAW_FORMATS`.
@@ -75,7 +91,7 @@ class RecordingInfo:
     truncated: bool
 
 
-class Recording:
+class KinectFile:
     """One open recording; use as a context manager.
 
     Raises UserError, naming the file, for a file that is missing, empty or no Matroska file, and
@@ -105,7 +121,7 @@ class Recording:
             if stream.index not in self._streams:
                 stream.discard = Discard.all  # infrared is half of the bytes; never read it
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> KinectFile:
         return self
 
     def __exit__(
@@ -161,10 +177,10 @@ class Recording:
             return len(content) == 2 * width * height
         return kind == "imu"
 
-    def glance(self) -> Glance:
+    def preview(self) -> RecordingPreview:
         """A look at the colour track, without reading the others."""
         index = next(index for index, kind in self._streams.items() if kind == "colour")
-        seen = glance_at_video(self.path, index, self.info.fps)
+        seen = preview_video(self.path, index, self.info.fps)
         if self.info.colour_format != "MJPG":
             return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size)
         return seen
@@ -211,7 +227,7 @@ class Recording:
         index = next((i for i, k in self._streams.items() if k == kind), None)
         return None if index is None else self._container.streams[index]
 
-    def _read_info(self, truncated: bool) -> RecordingInfo:
+    def _read_info(self, truncated: bool) -> KinectFileInfo:
         colour, depth = self._stream("colour"), self._stream("depth")
         if colour is None or colour.type != "video" or colour.codec_context is None:
             raise UserError(
@@ -220,7 +236,7 @@ class Recording:
             )
         fps = float(colour.average_rate or 30)
         check_rate(fps, str(self.path))
-        return RecordingInfo(
+        return KinectFileInfo(
             colour_mode=self._mode("colour", colour, "K4A_COLOR_MODE", COLOUR_MODES),
             colour_format=self._colour_format(colour),
             depth_mode=self._depth_mode(depth),
@@ -312,3 +328,86 @@ def _is_truncated(path: Path) -> bool:
         )
     end = segment_end(head)
     return end is None or size < end
+
+
+class KinectLayout(RecordingLayout):
+    """``<camera>.mkv`` files, and camera poses as :func:`read_extrinsics` reads them, or those of
+    another tool's calibration, whose lenses are left aside."""
+
+    def __init__(self, sequence: SequenceEntry) -> None:
+        super().__init__(sequence)
+        self.names = sorted(path.stem for path in sequence.recordings.glob("[!.]*.mkv"))
+        path, scale = sequence.calibration, sequence.calibration_scale
+        other = read_other_calibration(path, Recorded(self.names), scale)
+        if other is None:
+            refuse_scale(path, scale)
+        self.extrinsics = read_extrinsics(path) if other is None else other.extrinsics
+
+    def open(self, name: str) -> KinectRecording:
+        """Open ``<name>.mkv``; raises UserError as :class:`KinectFile` does."""
+        path = self.sequence.recordings / f"{name}.mkv"
+        return KinectRecording(path, name, self.extrinsics.master_from_colour[name])
+
+
+class KinectRecording(CameraRecording):
+    """One Azure Kinect recording; lenses are those of the calibration that it holds."""
+
+    def __init__(self, path: Path, name: str, pose: np.ndarray) -> None:
+        self._recording = KinectFile(path)
+        info = self._recording.info
+        try:
+            camera = self._recording.camera(name, pose)
+        except BaseException:
+            self._recording.close()
+            raise
+        super().__init__(
+            path, camera, fps=info.fps, serial=info.serial, depth_delay_us=info.depth_delay_us
+        )
+        self.truncated = info.truncated
+
+    def close(self) -> None:
+        """Close the file."""
+        self._recording.close()
+
+    def preview(self) -> RecordingPreview:
+        """The head, the first image and the file's length."""
+        return self._recording.preview()
+
+    def images(self) -> Iterator[Image]:
+        """Colour packets as recorded, depth without loss; gravity from the accelerometer.
+
+        Raw colour is stored as JPEG, with a note: as recorded it would be ten times the bytes.
+        """
+        info = self._recording.info
+        counts = {"colour": 0, "depth": 0}
+        acceleration, samples = np.zeros(3), 0
+        for packet in self._recording.packets():
+            if packet.kind == "imu":
+                values = imu_samples(packet.content)[:, :3]
+                acceleration += values.sum(axis=0)
+                samples += len(values)
+                continue
+            counts[packet.kind] += 1
+            content: bytes | np.ndarray = packet.content
+            if packet.kind == "depth":
+                content = self._recording.depth_image(packet.content)
+            elif info.colour_format != "MJPG":
+                size = COLOUR_MODES[info.colour_mode].size
+                content = encode_jpeg(decode_raw(packet.content, info.colour_format, size))
+            yield Image(packet.kind, packet.device_time_us, content)
+        if info.colour_format != "MJPG":
+            self.notes.append(
+                f"colour was recorded as {info.colour_format} and is stored as JPEG of quality "
+                f"{JPEG_QUALITY}"
+            )
+        if self.truncated:
+            self.notes.append(
+                f"the file is cut off: {counts['colour']} colour and {counts['depth']} depth "
+                "images could be read"
+            )
+        if self._recording.broken_packets:
+            self.notes.append(f"{self._recording.broken_packets} damaged packets left out")
+        rotation = self._recording.colour_from_accelerometer()
+        if samples and rotation is not None and np.linalg.norm(acceleration) > 0:
+            # At rest the sensor feels the floor's push, which is up.
+            self.gravity = rotation @ (-acceleration / np.linalg.norm(acceleration))

@@ -7,7 +7,7 @@ from pathlib import Path
 from intercap_core.config import LayoutName, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import refuse_scale
-from intercap_core.formats.recordings.source import Layout
+from intercap_core.formats.recordings.source import RecordingLayout
 
 # What the workflow watches, below the folder of recordings ("" = the folder itself). Folders stand
 # for what is in them: their times change when an image comes or goes, and watching each of a
@@ -40,7 +40,7 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
     )
 
 
-def open_layout(sequence: SequenceEntry) -> Layout:
+def open_layout(sequence: SequenceEntry) -> RecordingLayout:
     """Open the recordings of one sequence in the layout that its row names.
 
     Raises UserError where there is no such folder, and as the layout does.
@@ -55,13 +55,13 @@ def open_layout(sequence: SequenceEntry) -> Layout:
     # Imports inside, one a layout: the workflow sees what the stage reaches, each loads its own.
     match sequence.layout:
         case "k4a":
-            from intercap_core.formats.recordings.k4a_layout import KinectLayout
+            from intercap_core.formats.recordings.k4a import KinectLayout
 
             return KinectLayout(sequence)
         case "intercap":
-            from intercap_core.formats.recordings.intercap import ReleaseLayout
+            from intercap_core.formats.recordings.intercap import InterCapLayout
 
-            return ReleaseLayout(sequence)
+            return InterCapLayout(sequence)
         case "behave":
             from intercap_core.formats.recordings.behave import BehaveLayout
 

@@ -1,4 +1,4 @@
-"""Layout ``plain``: a folder of images or a video for each camera, and a calibration file.
+"""RecordingLayout ``plain``: a folder of images or a video for each camera, and a calibration file.
 
 ``recordings`` holds ``<camera>/`` with JPEG or PNG files (or ``<camera>/colour/``), or
 ``<camera>.mp4`` and its like; ``<camera>/depth/`` holds 16-bit PNG files, millimetres, where the
@@ -17,12 +17,12 @@ from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import read_calibration
 from intercap_core.formats.calibration.other import Recorded
 from intercap_core.formats.recordings.image_files import FilesRecording, common_size
-from intercap_core.formats.recordings.source import CameraRecording, Layout
+from intercap_core.formats.recordings.source import CameraRecording, RecordingLayout
 from intercap_core.formats.recordings.timestamps import (
     find_timestamps,
-    rate_of,
+    frame_rate,
+    pair_images,
     read_timestamps,
-    shots_of,
 )
 from intercap_core.geometry.camera.rig import Camera
 
@@ -31,7 +31,7 @@ VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpe
 COLOUR_FOLDERS = ("colour", "color", "rgb")
 
 
-class PlainLayout(Layout):
+class PlainLayout(RecordingLayout):
     """Folders and videos named after the cameras."""
 
     def __init__(self, sequence: SequenceEntry) -> None:
@@ -99,7 +99,7 @@ class PlainLayout(Layout):
                 times=times,
             )
         else:
-            shots = shots_of(
+            shots = pair_images(
                 colour,
                 depth if with_depth else [],
                 fps=known.fps,
@@ -108,7 +108,9 @@ class PlainLayout(Layout):
                 source=source,
             )
             stated = np.array([shot.time_us for shot in shots if shot.colour])
-            recording = FilesRecording(source, camera, shots, known.fps or rate_of(stated) or 1.0)
+            recording = FilesRecording(
+                source, camera, shots, known.fps or frame_rate(stated) or 1.0
+            )
         if depth and not with_depth:
             recording.notes.append(
                 "its depth images are not read: the calibration says nothing of depth (aligned, or "

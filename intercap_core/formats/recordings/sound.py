@@ -10,7 +10,7 @@ from typing import Any
 import av
 import numpy as np
 
-from intercap_core.formats.recordings.container import LATEST_US, open_container
+from intercap_core.formats.recordings.containers import LATEST_US, open_container
 from intercap_core.inputs.files import Unreadable
 
 SOUND_RATE = 8000  # samples a second: telephony's, steps and voices are within 4 kHz

@@ -1,6 +1,6 @@
 """What every layout of recordings gives: the cameras, their poses, their images one at a time.
 
-A layout is one class, :class:`Layout`, made for one sequence; it opens one :class:`CameraRecording`
+A layout is one class, :class:`RecordingLayout`, made for one sequence; it opens one :class:`CameraRecording`
 for each camera. The frames stage knows nothing else of where images come from. To add a layout:
 derive from both, name it in ``config.LayoutName`` and in :mod:`intercap_core.formats.recordings.layouts`.
 """
@@ -17,7 +17,7 @@ import numpy as np
 
 from intercap_core.config import SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics
-from intercap_core.formats.recordings.glance import Glance
+from intercap_core.formats.recordings.containers import RecordingPreview
 from intercap_core.formats.recordings.sound import Sound
 from intercap_core.geometry.camera.rig import Camera
 
@@ -81,7 +81,7 @@ class CameraRecording(ABC):
         return None
 
     @abstractmethod
-    def glance(self) -> Glance:
+    def preview(self) -> RecordingPreview:
         """Look at what can be told without reading all images, in milliseconds."""
 
     def close(self) -> None:  # noqa: B027 (a folder has nothing to close)
@@ -99,7 +99,7 @@ class CameraRecording(ABC):
         self.close()
 
 
-class Layout(ABC):
+class RecordingLayout(ABC):
     """The recordings of one sequence.
 
     The constructor finds the cameras and reads their poses; it raises UserError where the folder

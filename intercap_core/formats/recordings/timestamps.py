@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.image_files import Shot
+from intercap_core.formats.recordings.image_files import ImagePair
 from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
 from intercap_core.inputs.quotes import quoted
 
@@ -71,14 +71,14 @@ def read_timestamps(path: Path) -> Timestamps:
     return times
 
 
-def rate_of(times_us: np.ndarray) -> float | None:
+def frame_rate(times_us: np.ndarray) -> float | None:
     """Return images a second by the usual step of device times (N,); None for fewer than 2."""
     steps = np.abs(np.diff(np.asarray(times_us, np.float64)))
     steps = steps[steps > 0]
     return float(1e6 / np.median(steps)) if len(steps) else None
 
 
-def shots_of(
+def pair_images(
     colour: list[Path],
     depth: list[Path],
     *,
@@ -86,7 +86,7 @@ def shots_of(
     offset_s: float,
     times: Timestamps | None,
     source: Path,
-) -> list[Shot]:
+) -> list[ImagePair]:
     """Bring colour and depth files of one camera together, each with its time.
 
     The files' numbers (the last one in each name) say which belong together and, divided by
@@ -113,7 +113,9 @@ def shots_of(
             "likely times, or time_offset is no seconds; write a timestamps.csv in seconds"
         )
     return [
-        Shot(round((seconds[key] + offset_s) * 1e6), *found[key]) for key in keys if key in seconds
+        ImagePair(round((seconds[key] + offset_s) * 1e6), *found[key])
+        for key in keys
+        if key in seconds
     ]
 
 

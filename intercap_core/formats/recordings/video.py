@@ -15,13 +15,18 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.plausible import check_rate
-from intercap_core.formats.recordings.container import LATEST_US, MAX_SIDE, open_container
-from intercap_core.formats.recordings.encoded import JPEG_QUALITY, jpeg_of
-from intercap_core.formats.recordings.glance import Glance, glance_at_video
-from intercap_core.formats.recordings.image_files import faults_of_files, read_shots
+from intercap_core.formats.recordings.containers import (
+    LATEST_US,
+    MAX_SIDE,
+    RecordingPreview,
+    open_container,
+    preview_video,
+)
+from intercap_core.formats.recordings.encoded import JPEG_QUALITY, encode_jpeg
+from intercap_core.formats.recordings.image_files import faults_of_files, read_pairs
 from intercap_core.formats.recordings.sound import Sound, read_sound
 from intercap_core.formats.recordings.source import CameraRecording, Image
-from intercap_core.formats.recordings.timestamps import Timestamps, shots_of
+from intercap_core.formats.recordings.timestamps import Timestamps, pair_images
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import Unreadable
 
@@ -88,7 +93,7 @@ class VideoRecording(CameraRecording):
         super().__init__(path, camera, fps=rate)
         self._offset_s = offset_s
         self._times = None if times is None else list(times.values())
-        self._shots = shots_of(
+        self._shots = pair_images(
             [], depth, fps=rate, offset_s=offset_s, times=times, source=path.with_suffix("")
         )
         self._damaged = 0
@@ -98,9 +103,9 @@ class VideoRecording(CameraRecording):
         """Close the file."""
         self._container.close()
 
-    def glance(self) -> Glance:
+    def preview(self) -> RecordingPreview:
         """The head, the first image, the index or the last image; beside it the depth files."""
-        seen = glance_at_video(self.source, self._stream.index, self.fps)
+        seen = preview_video(self.source, self._stream.index, self.fps)
         faults = faults_of_files(self._shots, self.camera.depth)
         if self._times is not None and seen.images is not None:
             stated = len(self._times)
@@ -138,7 +143,7 @@ class VideoRecording(CameraRecording):
             self.notes.append(f"{self._damaged} damaged packets left out")
         if self.truncated:
             self.notes.append(f"the file is cut off: {count} images could be read")
-        yield from read_shots(self, self._shots)
+        yield from read_pairs(self, self._shots)
 
     def sound(self) -> Sound | None:
         """The file's first sound track."""
@@ -175,4 +180,4 @@ class VideoRecording(CameraRecording):
                 image = frame.to_ndarray(format="bgr24")
                 # A phone held upright records lying images and says so; viewers turn them.
                 image = np.rot90(image, round((getattr(frame, "rotation", 0) or 0) / 90))
-                yield frame.time, jpeg_of(np.ascontiguousarray(image))
+                yield frame.time, encode_jpeg(np.ascontiguousarray(image))

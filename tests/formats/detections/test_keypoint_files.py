@@ -12,10 +12,13 @@ import pytest
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.image_numbers import CameraImages
-from intercap_core.formats.detections.keypoint_check import look_at_keypoints
-from intercap_core.formats.detections.keypoint_files import has_keypoints, read_camera
+from intercap_core.formats.detections.keypoint_files import (
+    Values,
+    has_keypoints,
+    look_at_keypoints,
+    read_camera,
+)
 from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
-from intercap_core.formats.detections.keypoint_values import Values
 
 SIZE = (1920, 1080)
 COUNT = 4

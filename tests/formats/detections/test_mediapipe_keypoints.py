@@ -22,7 +22,7 @@ import mediapipe_keypoints as tool  # noqa: E402
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
 from intercap_core.formats.detections import keypoint_layouts  # noqa: E402
-from intercap_core.formats.detections.converters.wholebody import people_of  # noqa: E402
+from intercap_core.formats.detections.converters.coco_people import people_of  # noqa: E402
 
 AT = KEYPOINT_NAMES.index
 SIZE = (1000, 500)

@@ -199,7 +199,7 @@ def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
     ],
 )
 def test_label_maps(tmp_path, name, text, names):
-    from intercap_core.formats.detections.converters.label_maps import read_label_map
+    from intercap_core.formats.detections.class_names import read_label_map
 
     (tmp_path / name).write_text(text)
     assert read_label_map(tmp_path / name) == names
@@ -220,7 +220,7 @@ def test_label_maps(tmp_path, name, text, names):
     ],
 )
 def test_wrong_label_maps_are_named(tmp_path, name, text):
-    from intercap_core.formats.detections.converters.label_maps import read_label_map
+    from intercap_core.formats.detections.class_names import read_label_map
 
     (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match="is no list of classes"):

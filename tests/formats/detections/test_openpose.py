@@ -10,8 +10,12 @@ import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.converters.data_sets import as_openpose
-from intercap_core.formats.detections.openpose import is_openpose, keypoint_files, people_of
+from intercap_core.formats.detections.converters.openpose import (
+    as_openpose,
+    is_openpose,
+    keypoint_files,
+    people_of,
+)
 
 COUNTS = {
     "pose_keypoints_2d": 25,

@@ -7,7 +7,7 @@ import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.formats.detections.coco import ImageKey, UnreadableCandidates
-from intercap_core.formats.detections.converters.wholebody import people_of
+from intercap_core.formats.detections.converters.coco_people import people_of
 from intercap_core.formats.detections.keypoint_layouts import LAYOUTS, WHOLE_BODY, to_shared
 
 AT = KEYPOINT_NAMES.index

@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from intercap_core.config import SequenceEntry
-from intercap_core.formats.recordings.clocks import WRONG, best_epoch, drift_us, epochs
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.formats.recordings.synchronise import (
+    OUTLIER,
+    choose_epoch,
+    clock_drift_us,
+    split_into_epochs,
+)
 from tests.helpers.kinect_files import PERIOD_US, depth_at, entry_of, jpeg_at, notes_of, record, run
 
 TICKS = 12
@@ -219,28 +224,28 @@ def test_delays_that_jitter_and_unequal_counts_are_normal(capture):
     [
         ([1, 2, 3, 4], [0, 0, 0, 0]),
         ([10, 11, 1, 2, 3], [0, 0, 1, 1, 1]),
-        ([10, 11, 5, 12, 13], [0, 0, WRONG, 0, 0]),
-        ([10, 11, 90, 12, 13], [0, 0, WRONG, 0, 0]),
-        ([10, 10, 11], [0, WRONG, 0]),
+        ([10, 11, 5, 12, 13], [0, 0, OUTLIER, 0, 0]),
+        ([10, 11, 90, 12, 13], [0, 0, OUTLIER, 0, 0]),
+        ([10, 10, 11], [0, OUTLIER, 0]),
         ([10, 11, 1, 2, 0, 1], [0, 0, 1, 1, 2, 2]),
         ([5], [0]),
     ],
 )
 def test_epochs(times, expected):
-    assert epochs(np.array(times)).tolist() == expected
+    assert split_into_epochs(np.array(times)).tolist() == expected
 
 
 def test_the_stretch_in_the_others_time_wins_over_the_longer_one():
     times = np.array([0, 1, 2, 3, 4, -9, -8, -7])
-    stretch = epochs(times)
-    assert best_epoch(times, stretch, np.arange(-12, -6), 0.5) == 1
-    assert best_epoch(times, stretch, np.array([-50, -8, 70]), 0.5) == 1
-    assert best_epoch(times, stretch, np.array([100, 200]), 0.5) == 0
-    assert best_epoch(times, stretch, np.zeros(0), 0.5) == 0
+    stretch = split_into_epochs(times)
+    assert choose_epoch(times, stretch, np.arange(-12, -6), 0.5) == 1
+    assert choose_epoch(times, stretch, np.array([-50, -8, 70]), 0.5) == 1
+    assert choose_epoch(times, stretch, np.array([100, 200]), 0.5) == 0
+    assert choose_epoch(times, stretch, np.zeros(0), 0.5) == 0
     times = np.array([5, 6, 7, 8, 5, 6, 7, 8, 9])  # both among the others': the reset is at fault
-    assert best_epoch(times, epochs(times), np.arange(20), 0.5) == 0
+    assert choose_epoch(times, split_into_epochs(times), np.arange(20), 0.5) == 0
     times = np.array([7, 5, 6, 7, 8, 9])  # an image left from before the common start
-    assert best_epoch(times, epochs(times), np.arange(20), 0.5) == 1
+    assert choose_epoch(times, split_into_epochs(times), np.arange(20), 0.5) == 1
 
 
 def test_drift_ignores_jitter_and_gaps():
@@ -248,5 +253,5 @@ def test_drift_ignores_jitter_and_gaps():
     rng = np.random.default_rng(0)
     skew = 50e-6 * times + rng.normal(0, 300, len(times)) + 160
     skew[rng.random(len(times)) < 0.3] = np.nan
-    assert drift_us(times, skew) == pytest.approx(3000, abs=80)
-    assert drift_us(times[:3], skew[:3]) == 0
+    assert clock_drift_us(times, skew) == pytest.approx(3000, abs=80)
+    assert clock_drift_us(times[:3], skew[:3]) == 0

@@ -8,7 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.formats.recordings.encoded import RAW_FORMATS, bgr_of_raw, encoded_size, jpeg_of
+from intercap_core.formats.recordings.encoded import (
+    RAW_FORMATS,
+    decode_raw,
+    encode_jpeg,
+    encoded_size,
+)
 
 
 def picture(width=50, height=30) -> np.ndarray:
@@ -64,13 +69,15 @@ def test_noise_is_no_image():
 
 
 def test_encoding_changes_little():
-    decoded = cv2.imdecode(np.frombuffer(jpeg_of(picture(640, 480)), np.uint8), cv2.IMREAD_COLOR)
+    decoded = cv2.imdecode(
+        np.frombuffer(encode_jpeg(picture(640, 480)), np.uint8), cv2.IMREAD_COLOR
+    )
     assert np.abs(decoded.astype(int) - picture(640, 480)).mean() < 1
 
 
 @pytest.mark.parametrize("name", RAW_FORMATS)
 def test_raw_images_of_another_size_are_refused(name):
     content = bytes(round(64 * 48 * RAW_FORMATS[name]))
-    assert bgr_of_raw(content, name, (64, 48)).shape == (48, 64, 3)
+    assert decode_raw(content, name, (64, 48)).shape == (48, 64, 3)
     with pytest.raises(ValueError, match="reshape"):
-        bgr_of_raw(content[:-1], name, (64, 48))
+        decode_raw(content[:-1], name, (64, 48))

@@ -13,7 +13,7 @@ import pytest
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.k4a import read_calibration
-from intercap_core.formats.recordings.k4a import Recording, imu_samples
+from intercap_core.formats.recordings.k4a import KinectFile, imu_samples
 from intercap_core.studio.mkv import MkvWriter
 
 MASTERS = {0x18538067, 0x1F43B675, 0xA0, 0x1941A469, 0x61A7}  # elements that hold elements
@@ -50,7 +50,7 @@ def blocks(data: bytes) -> list[tuple[int, int, bytes]]:
 
 def test_real_depth_equals_an_independent_parse_in_every_pixel(real_recording):
     raw = blocks(real_recording.read_bytes())
-    with Recording(real_recording) as recording:
+    with KinectFile(real_recording) as recording:
         packets = list(recording.packets())
         depth = [p for p in packets if p.kind == "depth"]
         images = [recording.depth_image(p.content) for p in depth]
@@ -65,7 +65,7 @@ def test_real_depth_equals_what_ffmpeg_decodes(real_recording):
     with av.open(str(real_recording)) as container:
         stream = next(s for s in container.streams if s.metadata.get("title") == "DEPTH")
         decoded = [f.to_ndarray(format="gray16le") for f in container.decode(stream)]
-    with Recording(real_recording) as recording:
+    with KinectFile(real_recording) as recording:
         images = [
             recording.depth_image(p.content) for p in recording.packets() if p.kind == "depth"
         ]
@@ -75,7 +75,7 @@ def test_real_depth_equals_what_ffmpeg_decodes(real_recording):
 
 def test_real_colour_times_and_head(real_recording):
     raw = blocks(real_recording.read_bytes())
-    with Recording(real_recording) as recording:
+    with KinectFile(real_recording) as recording:
         info = recording.info
         packets = list(recording.packets())
     assert (info.colour_mode, info.depth_mode, info.fps) == ("720P", "NFOV_UNBINNED", 5)
@@ -91,7 +91,7 @@ def test_real_colour_times_and_head(real_recording):
 
 def test_real_calibration_and_gravity(real_recording, real_calibration):
     attached = next(p for n, p in ebml(real_recording.read_bytes()) if n == 0x465C)
-    with Recording(real_recording) as recording:
+    with KinectFile(real_recording) as recording:
         assert recording.info.calibration == attached
         camera = recording.camera("k1")
         samples = [imu_samples(p.content) for p in recording.packets() if p.kind == "imu"]
@@ -124,7 +124,7 @@ def write(path: Path, frames: int = 5, **changes) -> Path:
 
 
 def read(path: Path) -> list:
-    with Recording(path) as recording:
+    with KinectFile(path) as recording:
         return list(recording.packets())
 
 
@@ -142,7 +142,7 @@ def test_a_cut_file_gives_its_whole_images_and_says_so(tmp_path):
     counts = []
     for share in (0.3, 0.5, 0.75, 0.95, 0.99):
         cut.write_bytes(whole[: int(len(whole) * share)])
-        with Recording(cut) as recording:
+        with KinectFile(cut) as recording:
             assert recording.info.truncated
             packets = list(recording.packets())
         assert packets == expected[: len(packets)]
@@ -158,14 +158,14 @@ def test_a_recorder_that_was_killed_leaves_a_readable_file(tmp_path):
     at = data.find(b"\x18\x53\x80\x67") + 4
     data[at : at + 8] = b"\x01" + b"\xff" * 7
     path.write_bytes(data)
-    with Recording(path) as recording:
+    with KinectFile(path) as recording:
         assert recording.info.truncated
         assert list(recording.packets()) == expected
 
 
 def test_a_recording_without_depth_is_colour_alone(tmp_path):
     path = write(tmp_path / "k1.mkv", depth_mode=None)
-    with Recording(path) as recording:
+    with KinectFile(path) as recording:
         assert recording.info.depth_mode is None
         assert {p.kind for p in recording.packets()} == {"colour"}
 
@@ -178,7 +178,7 @@ def test_a_damaged_jpeg_is_left_out_and_counted(tmp_path):
     ) as writer:
         for time_us, content in enumerate([jpeg + b"\0\0", jpeg[:-2], b"noise"]):
             writer.write_colour(content, time_us * 40_000)
-    with Recording(path) as recording:
+    with KinectFile(path) as recording:
         assert [p.device_time_us for p in recording.packets()] == [0]
         assert recording.broken_packets == 2
 
@@ -238,7 +238,7 @@ def test_bad_files_are_told_in_one_sentence(tmp_path, make, words):
     whole = write(tmp_path / "whole.mkv").read_bytes()
     path = tmp_path / "k1.mkv"
     make(path, whole)
-    with pytest.raises(UserError, match=words) as caught, Recording(path) as recording:
+    with pytest.raises(UserError, match=words) as caught, KinectFile(path) as recording:
         list(recording.packets())
     message = str(caught.value)
     assert str(path) in message and "\n" not in message and ";" in message
@@ -250,7 +250,7 @@ def test_memory_does_not_grow_with_length(tmp_path):
     def growth(frames: int) -> int:
         path = write(tmp_path / f"{frames}.mkv", frames)
         peak = before = process.memory_info().rss
-        with Recording(path) as recording:
+        with KinectFile(path) as recording:
             for index, _ in enumerate(recording.packets()):
                 if index % 50 == 0:
                     peak = max(peak, process.memory_info().rss)

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.formats.recordings.k4a import Recording
+from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
 
 
 @pytest.fixture
 def real_frame(real_recording):
     """The recording's camera, calibration, depth (H, W) mm, and grey image (H, W)."""
-    with Recording(real_recording) as recording:
+    with KinectFile(real_recording) as recording:
         packets = {packet.kind: packet for packet in recording.packets()}
         depth = recording.depth_image(packets["depth"].content)
         jpeg = np.frombuffer(packets["colour"].content, np.uint8)

@@ -16,17 +16,17 @@ import cv2
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.constants import (
-    CAFFE_MEAN_BGR,
-    IMAGENET_DEVIATION_RGB,
-    IMAGENET_MEAN_RGB,
-    MAX_BATCH,
-    MAX_INPUT_SIDE,
-    MAX_NETWORK_BYTES,
-)
 from intercap_core.inputs.files import check_file
 from intercap_core.inputs.quotes import printable
 
+MAX_NETWORK_BYTES = 1 << 31  # limit of the ONNX format; larger models store weights in other files
+MAX_INPUT_SIDE = 8192  # px; detectors use 640 to 1333
+MAX_BATCH = 256  # images in one input
+# Mean of ImageNet, blue first, as in Caffe's models; maskrcnn-benchmark subtracts it.
+CAFFE_MEAN_BGR = np.array([102.9801, 115.9465, 122.7717], np.float32)
+# Mean and standard deviation of ImageNet, red first; torchvision and mmpose normalise with them.
+IMAGENET_MEAN_RGB = np.array([123.675, 116.28, 103.53], np.float32)
+IMAGENET_DEVIATION_RGB = np.array([58.395, 57.12, 57.375], np.float32)
 PixelValues = Literal["rgb", "bgr255", "bgr_mean", "imagenet"]
 
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}

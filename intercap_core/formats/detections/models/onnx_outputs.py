@@ -11,15 +11,14 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from intercap_core.formats.detections.constants import (
-    MASK_PROBABILITY,
-    MAX_BOXES,
-    MAX_INSTANCES,
-    NMS_IOU,
-)
 from intercap_core.formats.detections.instance import Instance
 from intercap_core.formats.detections.models.onnx_model import Fit
 from intercap_core.geometry.camera import masks
+
+NMS_IOU = 0.7  # default of ultralytics' predictors
+MAX_BOXES = 3000  # of one image, that enter non-maximum suppression
+MAX_INSTANCES = 100  # of one image, the best; as in COCO's evaluation
+MASK_PROBABILITY = 0.5  # at the edge of a mask
 
 
 def yolo_instances(

@@ -22,20 +22,10 @@ from intercap_core.formats.detections.class_names import (
     COCO_NAMES,
     COCO_NAMES_FROM_0,
     COCO_NAMES_FROM_1,
-)
-from intercap_core.formats.detections.constants import (
-    MAX_GRID_SIDE,
     MAX_LABEL,
-    MAX_SCORE,
-    RCNN_LONG,
-    RCNN_SHORT,
-    RCNN_STRIDE,
-    SEGMENTATION_BATCH,
-    YOLO_GREY,
-    YOLO_SIDE,
-    YOLO_STRIDE,
+    read_label_map,
 )
-from intercap_core.formats.detections.converters.label_maps import read_label_map
+from intercap_core.formats.detections.coco import MAX_SCORE
 from intercap_core.formats.detections.instance import Instance
 from intercap_core.formats.detections.models.onnx_model import (
     Fit,
@@ -49,6 +39,16 @@ from intercap_core.inputs.quotes import quoted
 
 Key = TypeVar("Key", bound=Hashable)
 
+SEGMENTATION_BATCH = 4  # images in one run of a model with a free batch size
+MAX_GRID_SIDE = 32_767  # cells of a mask: limit of OpenCV's warps
+# Input of ultralytics' training.
+YOLO_SIDE = 640  # px
+YOLO_STRIDE = 32  # px
+YOLO_GREY = 114  # grey level of the padding
+# Input of the test configurations of detectron2 and maskrcnn-benchmark, px.
+RCNN_SHORT = 800
+RCNN_LONG = 1333
+RCNN_STRIDE = 32
 _FLOATS = ("tensor(float)", "tensor(float16)")
 
 

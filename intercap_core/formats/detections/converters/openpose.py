@@ -29,6 +29,13 @@ _LISTS = {
     "hand_right_keypoints_2d": 21,
     "face_keypoints_2d": 70,
 }
+# BEHAVE keeps OpenPose's lists of one person at the top of the file, under names of its own.
+_BEHAVE_LISTS = {
+    "pose_keypoints_2d": "body_joints",
+    "hand_left_keypoints_2d": "left_hand_joints",
+    "hand_right_keypoints_2d": "right_hand_joints",
+    "face_keypoints_2d": "face_joints",
+}
 _JAW_LINE, _INNER_FACE = slice(0, 17), slice(17, 68)
 _FILE_NAME = re.compile(r"(?!\.)(?:.*?_)?(\d+)_keypoints\.json")
 
@@ -57,6 +64,13 @@ def named_keypoint_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     """Find the files of one camera that are named after its images, ``<name>_keypoints.json``."""
     paths = {name: folder / f"{name}_keypoints.json" for name in names}
     return {name: path for name, path in paths.items() if path.is_file()}
+
+
+def as_openpose(content: Any) -> Any:
+    """BEHAVE's parsed JSON of one person as OpenPose writes it; any other content as it is."""
+    if not isinstance(content, dict) or "people" in content or "body_joints" not in content:
+        return content
+    return {"people": [{key: content.get(theirs, []) for key, theirs in _BEHAVE_LISTS.items()}]}
 
 
 def is_openpose(content: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -9,17 +10,26 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from intercap_core.formats.detections.constants import (
+from intercap_core.formats.detections.class_names import MAX_LABEL
+from intercap_core.formats.detections.instance import (
     MASK_THRESHOLD,
-    MAX_LABEL,
-    MAX_MASK_VALUES,
     MAX_PIXELS,
+    PERSON_LABEL,
+    Instance,
+    instance_of,
+    resized,
+    scale_to,
 )
-from intercap_core.formats.detections.instance import Instance, instance_of, resized, scale_to
+from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.recordings.encoded import encoded_size
 from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
 from intercap_core.inputs.quotes import printable
 
+BEHAVE_PERSON = ("person_mask",)
+BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second where the first is not there
+SUFFIXES = ("png", "jpg")  # without loss first
+_NUMBERED = re.compile(r"\D*(\d{1,9})\.(?:png|jpe?g)", re.IGNORECASE)
+MAX_MASK_VALUES = 1000  # instances in one mask image; an image with more is not a mask
 WHITE = 255
 BETWEEN = "__"  # an image's name, a label and a number in the name of a mask
 _AROUND_LABEL = "0123456789_-. "
@@ -119,3 +129,56 @@ def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
 
 def _is_png(path: Path) -> bool:
     return path.suffix.lower() == ".png" and not path.name.startswith(".") and path.is_file()
+
+
+def release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
+    """Person masks of one camera as the InterCap release's tools keep them, by image number.
+
+    ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png``, without ``_<n>`` for camera 1,
+    with 0 for the person and 255 for the background; None where there is no such folder.
+    """
+    number = camera[1:]
+    names = [camera, f"BodyIndexColor_{number}", *(["BodyIndexColor"] if number == "1" else [])]
+    for name in names:
+        folder = candidates / name
+        if folder.is_dir():
+            matches = ((path, _NUMBERED.fullmatch(path.name)) for path in sorted(folder.iterdir()))
+            return {int(m.group(1)): MaskFile(path, PERSON_LABEL, True) for path, m in matches if m}
+    return None
+
+
+class BehaveFiles:
+    """Keypoints and masks beside BEHAVE's images, by the time of the image, microseconds.
+
+    The masks are of one person and of the sequence's object, which is given ``object_label``; None
+    leaves them out.
+    """
+
+    def __init__(self, recordings: Path, object_label: str | None) -> None:
+        self._folders = frame_folders(recordings) if recordings.is_dir() else {}
+        self._labels: dict[tuple[str, ...], str] = {BEHAVE_PERSON: PERSON_LABEL}
+        if object_label is not None:
+            self._labels[BEHAVE_OBJECT] = object_label
+
+    def keypoints(self, time_us: int, camera: str) -> Path | None:
+        """The keypoint file of one image, None = there is none."""
+        return self._existing(time_us, f"{camera}.color.json")
+
+    def masks(self, time_us: int, camera: str) -> list[MaskFile]:
+        """The masks of one image."""
+        found = []
+        for kinds, label in self._labels.items():
+            paths = (
+                self._existing(time_us, f"{camera}.{kind}.{suffix}")
+                for kind in kinds
+                for suffix in SUFFIXES
+            )
+            path = next((path for path in paths if path is not None), None)
+            if path is not None:
+                found.append(MaskFile(path, label))
+        return found
+
+    def _existing(self, time_us: int, name: str) -> Path | None:
+        folder = self._folders.get(time_us)
+        path = folder / name if folder is not None else None
+        return path if path is not None and path.is_file() else None

@@ -1,4 +1,4 @@
-"""A glance at a video: its head, first and last image, how much of it is there; not its images.
+"""A preview at a video: its head, first and last image, how much of it is there; not its images.
 
 Takes milliseconds for files with an index (mp4, mov, avi) and for Matroska, which states its own
 length; other files are read from the last image that can be jumped to.
@@ -13,15 +13,32 @@ from typing import Any, NamedTuple
 import av
 import numpy as np
 
-from intercap_core.formats.recordings.container import open_container
 from intercap_core.formats.recordings.encoded import encoded_size
+from intercap_core.inputs.files import check_file
+
+# By content a file may also be a list of other files or addresses, which FFmpeg would follow.
+FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
+LATEST_US = 10**15  # of a device's clock: some thirty years; later ones are damage
+MAX_SIDE = 16_384  # px of an image that is decoded
+
+
+def open_container(path: Path, **options: str) -> Any:
+    """Open a regular file; raises Unreadable where it is none, and what PyAV raises where it is no
+    container of :data:`FORMATS`."""
+    check_file(path, None)
+    return av.open(
+        f"file:{path}",
+        options={"format_whitelist": FORMATS, "protocol_whitelist": "file", **options},
+        metadata_errors="replace",
+    )
+
 
 FIRST_PACKETS = 60  # within these some image must decode: two seconds
 _MATROSKA = "matroska"
 _SEGMENT_ID = b"\x18\x53\x80\x67"
 
 
-class Glance(NamedTuple):
+class RecordingPreview(NamedTuple):
     """What a look at a recording shows without reading all of it.
 
     ``size`` (width, height) of the first colour image, None = none can be read. ``images`` counts
@@ -38,7 +55,7 @@ class Glance(NamedTuple):
     counted: bool = True
 
 
-def glance_at_video(path: Path, stream_index: int, fps: float) -> Glance:
+def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview:
     """Look at one track of a video file that opens."""
     with open_container(path) as container:
         stream: Any = container.streams[stream_index]
@@ -61,10 +78,10 @@ def glance_at_video(path: Path, stream_index: int, fps: float) -> Glance:
     with open_container(path) as container:
         size = _first_size(container, container.streams[stream_index])
     if seconds is None:
-        return Glance(size, None, None, share, counted=False)
+        return RecordingPreview(size, None, None, share, counted=False)
     counted = frames > 0
     images = round(frames * share) if counted else max(1, round(seconds * fps))
-    return Glance(size, images, seconds, share, counted=counted)
+    return RecordingPreview(size, images, seconds, share, counted=counted)
 
 
 def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
