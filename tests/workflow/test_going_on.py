@@ -20,18 +20,18 @@ STAGE_S = 0.5  # a replayed stage waits, so that signals meet it at work
 @pytest.fixture(scope="module")
 def peaceful(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
     """The finished run in another place, of which nothing is out of date."""
-    return _copied(flow, tmp_path_factory.mktemp("peaceful"))
+    return _copied(flow.results, tmp_path_factory.mktemp("peaceful"))
 
 
 @pytest.fixture
-def victim(peaceful: Victim, tmp_path_factory: pytest.TempPathFactory) -> Victim:
-    """A copy of it in another place, without Snakemake's own folder."""
-    return _copied(peaceful.flow, tmp_path_factory.mktemp("victim"))
+def victim(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
+    """Another copy, without Snakemake's own folder."""
+    return _copied(flow.results, tmp_path_factory.mktemp("victim"))
 
 
-def _copied(flow: Flow, folder: Path) -> Victim:
-    other = Victim(Flow.copy(folder, replay=flow.results, pause_s=STAGE_S))
-    shutil.copytree(flow.results, other.flow.results)
+def _copied(results: Path, folder: Path) -> Victim:
+    other = Victim(Flow.copy(folder, replay=results, pause_s=STAGE_S))
+    shutil.copytree(results, other.flow.results)
     other.flow.as_if_made_now()
     return other
 
