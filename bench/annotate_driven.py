@@ -30,11 +30,12 @@ from intercap_core.annotate.rerun import targets
 from intercap_core.commands.bench import put_figures
 from intercap_core.commands.evaluate.objects import measure
 from intercap_core.errors import UserError
-from intercap_core.evaluation import figures, hold_figures
+from intercap_core.evaluation import figures
+from intercap_core.evaluation.contact_figures import stated_contact_figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.flags import ranges
 from intercap_core.evaluation.object_errors import ObjectErrors
-from intercap_core.evaluation.times import match_times
+from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import METRIC_REGIONS, SCENE, TRUTH
@@ -316,7 +317,7 @@ def contact_figures(project: Project, name: str) -> tuple[float, float, dict[str
         part: [(a, b + 1) for a, b, _ in ranges(["x" if one else "" for one in true[:, r]])]
         for r, part in enumerate(METRIC_REGIONS)
     }
-    stated = hold_figures.stated_contact_figures([found])["contact_detected_f1"]
+    stated = stated_contact_figures([found])["contact_detected_f1"]
     meshes = figures.truth_figures([found], "joint")["contact_region_f1"]
     return float(stated), float(meshes), intervals
 

@@ -27,7 +27,7 @@ from intercap_core.config import ObjectPose
 from intercap_core.errors import UserError
 from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
-from intercap_core.evaluation.times import match_times
+from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.pipeline import given
 from intercap_core.project import Project, load_project

@@ -3,7 +3,7 @@
     python -m bench.verdict METRICS [METRICS ...]
 
 METRICS are metrics.h5 of sequences with truth, best of many kinds of rigs and noise: stated errors
-can be trusted as far as those reach. Prints the factors for `intercap_core/evaluation/verdict/constants.py`,
+can be trusted as far as those reach. Prints the factors for `intercap_core/evaluation/verdict/stated.py`,
 and how well errors are told of recordings of a kind (the folder above a sequence's) that was left
 out of the fit: the spread that is stated is of these.
 """
@@ -24,9 +24,9 @@ from scipy.stats import spearmanr
 
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict.constants import Factors
-from intercap_core.evaluation.verdict.part import Part
-from intercap_core.evaluation.verdict_figures import WITHIN, stated_errors
+from intercap_core.evaluation.verdict.figures import WITHIN, stated_errors
+from intercap_core.evaluation.verdict.hold_out import JudgedPart
+from intercap_core.evaluation.verdict.stated import Factors
 
 SPREAD_SHARE = 0.8  # of the true errors that are within a part's spread
 # Of the jackknife's shift: what a single camera changes is an error, though the studio's stated
@@ -48,9 +48,9 @@ class Samples:
         return Samples(self.features[rows], self.true[rows], self.kind[rows])
 
 
-def read(paths: Sequence[Path]) -> dict[Part, Samples]:
+def read(paths: Sequence[Path]) -> dict[JudgedPart, Samples]:
     """The samples of each part; raises UserError where a file has no verdict, or no truth."""
-    rows: dict[Part, list[tuple[np.ndarray, float, str]]] = {part: [] for part in Part}
+    rows: dict[JudgedPart, list[tuple[np.ndarray, float, str]]] = {part: [] for part in JudgedPart}
     for path in paths:
         sequence = SequenceMetrics.read(path)
         if not sequence.has_truth or "verdict/features" not in sequence.values:
@@ -61,7 +61,7 @@ def read(paths: Sequence[Path]) -> dict[Part, Samples]:
         for place, error in enumerate(stated_errors(sequence)):
             if np.isfinite(error.stated) and np.isfinite(error.true):
                 features = sequence.values["verdict/features"][place]
-                rows[Part(error.part)].append(
+                rows[JudgedPart(error.part)].append(
                     (features, 1e-3 * error.true, path.parent.parent.name)
                 )
     return {
@@ -86,7 +86,7 @@ def fit(samples: Samples) -> Factors:
 
 
 def left_out(samples: Samples) -> np.ndarray:
-    """Stated errors (N,), each from factors that were fitted to recordings of other kinds."""
+    """ErrorEstimate errors (N,), each from factors that were fitted to recordings of other kinds."""
     stated = np.empty(len(samples.true))
     for kind in np.unique(samples.kind):
         own = samples.kind == kind
@@ -122,7 +122,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             cells = (rank, (off < WITHIN).mean(), factors.spread)
             table.add_row(str(part), str(len(off)), str(kinds), *(f"{cell:.2f}" for cell in cells))
         of = ", ".join(f"{value:.2f}" for value in factors.of)
-        print(f"    Part.{part.name}: Factors({factors.rest:.4f}, ({of}), {factors.spread:.2f}),")
+        print(
+            f"    JudgedPart.{part.name}: Factors({factors.rest:.4f}, ({of}), {factors.spread:.2f}),"
+        )
     console.print(table)
     return 0
 

@@ -413,7 +413,15 @@ def evaluate(
         bool,
         typer.Option(
             "--quick",
-            help="A fixed small set to the end in ten minutes, beside its recorded figures.",
+            help="Evaluate a fixed small set within ten minutes; exit with an error where a figure "
+            "is worse than bench/reference-quick.json by more than its spread.",
+        ),
+    ] = False,
+    update_reference: Annotated[
+        bool,
+        typer.Option(
+            "--update-reference",
+            help="With --quick: record the figures in bench/reference-quick.json.",
         ),
     ] = False,
     seed: Annotated[
@@ -436,8 +444,11 @@ def evaluate(
     _check_output(output, replace_any=True)
     if quick and seed is not None:
         raise UserError("--quick is a fixed set; leave out --quick or --seed")
+    if update_reference and not quick:
+        raise UserError("--update-reference records the quick set; add --quick")
     if quick:
-        raise typer.Exit(evaluate_quick(output, cores=cores))
+        status = evaluate_quick(output, cores=cores, renew_reference=update_reference)
+        raise typer.Exit(status)
     parts = {
         Part.sequences: settings,
         Part.captures: captures,

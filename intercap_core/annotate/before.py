@@ -20,7 +20,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_figures import stated_errors
+from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.project import Project
 from intercap_core.schemas import JOINT, OBJECT_TRACK
 from intercap_core.stage_list import SEQUENCE_STAGES

@@ -9,7 +9,7 @@ from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_figures import stated_errors
+from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.output.site.tables import sequence_table
 from intercap_core.project import Project
 from intercap_core.schemas import SUMMARY

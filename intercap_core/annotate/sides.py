@@ -15,8 +15,7 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.evaluation.exchanged import exchanged
-from intercap_core.evaluation.flags import ranges
+from intercap_core.evaluation.flags import exchanged, ranges
 from intercap_core.formats.detections.read import Detections
 from intercap_core.output.viewer.package import payload
 from intercap_core.person.facing import against_build

@@ -17,7 +17,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.errors import UserError
 from intercap_core.evaluation.body import BODY_JOINTS, FINGER_JOINTS
 from intercap_core.evaluation.summary import SequenceSummary
-from intercap_core.evaluation.verdict_figures import stated_errors
+from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.schemas import JOINT
 
 TOUCHING = 0.5  # a stated probability of contact from which a region counts as touching

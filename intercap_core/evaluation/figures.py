@@ -11,7 +11,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.evaluation import contact, object_errors, penetration
+from intercap_core.evaluation import contact, object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.schemas import METRICS, PER_VERTEX_METRICS
 from intercap_core.stage_list import ESTIMATES
@@ -85,7 +85,7 @@ def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     depth, touching = pooled(sequences, "penetration_mean"), pooled(sequences, "contact_frame")
     if depth is None or touching is None:
         return {}
-    return penetration.summarise(depth, touching)
+    return contact.penetration_summary(depth, touching)
 
 
 def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:

@@ -7,9 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.evaluation import contact, penetration
-from intercap_core.evaluation.clouds import Cloud, vertex_to_cloud, visible_to_cloud
-from intercap_core.evaluation.proximity import PosedBody, PosedObject, Sight, face_normals
+from intercap_core.evaluation import contact
+from intercap_core.evaluation.proximity import (
+    BodySurface,
+    MeasuredCloud,
+    PosedObject,
+    Sight,
+    face_normals,
+    vertex_to_cloud,
+    visible_to_cloud,
+)
 from intercap_core.evaluation.segmented import SegmentedClouds
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.evaluation.truth import Truth
@@ -31,7 +38,7 @@ CLOUD_POINTS = 3000  # points of the person that are compared with the body's su
 Values = dict[str, Any]
 
 
-class Handled:
+class HandledObject:
     """The object's ``mesh`` and ``track`` with the points of it that are compared."""
 
     def __init__(self, mesh: ObjectMesh, track: ObjectTrack) -> None:
@@ -63,7 +70,7 @@ class Measurement:
 
     def __init__(
         self,
-        handled: Handled | None,
+        handled: HandledObject | None,
         body_track: BodyTrack,
         clouds: SegmentedClouds,
         rig: Rig,
@@ -95,8 +102,8 @@ class Measurement:
         progress = Progress(log, "measured", len(self.body.joints))
         for t, vertices in enumerate(self.body.vertices()):
             vertices = vertices.astype(np.float64)
-            row: Values = {"ground_penetration": penetration.ground_penetration(vertices, *floor)}
-            surface = PosedBody(vertices, self.faces, self.tree)
+            row: Values = {"ground_penetration": contact.ground_penetration(vertices, *floor)}
+            surface = BodySurface(vertices, self.faces, self.tree)
             if handled is not None:
                 between, touched = self._between(handled, t, vertices, surface, floor)
                 row |= between
@@ -131,10 +138,10 @@ class Measurement:
 
     def _between(
         self,
-        handled: Handled,
+        handled: HandledObject,
         t: int,
         vertices: np.ndarray,
-        surface: PosedBody,
+        surface: BodySurface,
         floor: tuple[np.ndarray, np.ndarray],
     ) -> tuple[Values, np.ndarray]:
         """Distances between body and object in frame ``t``, and the object's points (N,) that the
@@ -148,17 +155,17 @@ class Measurement:
         to_object = handled.surface.signed_distance(
             vertices, track.rotation[t], track.translation[t]
         )
-        depth = penetration.depths(to_object)
+        depth = contact.depths(to_object)
         return {
             "body_to_object": to_object,
             "object_to_body": to_body,
             "penetration_mean": depth.mean,
             "penetration_median": depth.median,
             "penetration_max": depth.max,
-            "penetration_object": penetration.depths(point_distance).mean,
+            "penetration_object": contact.depths(point_distance).mean,
             "ground_penetration": np.fmax(
-                penetration.ground_penetration(vertices, *floor),
-                penetration.ground_penetration(object_vertices, *floor),
+                contact.ground_penetration(vertices, *floor),
+                contact.ground_penetration(object_vertices, *floor),
             ),
         }, contact.vertex_contact(point_distance, self.threshold)
 
@@ -166,10 +173,10 @@ class Measurement:
         self,
         t: int,
         vertices: np.ndarray,
-        surface: PosedBody,
+        surface: BodySurface,
         seen_body: np.ndarray | None,
         seen_object: np.ndarray | None,
-    ) -> tuple[Values, tuple[Cloud, Cloud]]:
+    ) -> tuple[Values, tuple[MeasuredCloud, MeasuredCloud]]:
         """Distances to frame ``t``'s clouds; the samples that cameras see are found where not
         given."""
         handled = self.handled
@@ -177,7 +184,9 @@ class Measurement:
         if handled is not None:
             object_vertices = handled.posed(t, handled.mesh.vertices)
             near.append(object_vertices)
-        person, object_ = (Cloud(points) for points in self.clouds.at(t, np.concatenate(near)))
+        person, object_ = (
+            MeasuredCloud(points) for points in self.clouds.at(t, np.concatenate(near))
+        )
         body_points = self.body_samples.of(vertices, self.faces)
         sight = None
         if seen_body is None or (handled is not None and seen_object is None):
@@ -209,7 +218,7 @@ class Measurement:
         return row, (person, object_)
 
     def _true_body(
-        self, t: int, truth: Truth, person: Cloud, seen_body: np.ndarray | None
+        self, t: int, truth: Truth, person: MeasuredCloud, seen_body: np.ndarray | None
     ) -> Values:
         """The same measures with the true body put in."""
         if truth.vertices is None:
@@ -227,7 +236,7 @@ class Measurement:
         truth: Truth,
         surface: PosedObject,
         sample_points: np.ndarray | None,
-        object_: Cloud,
+        object_: MeasuredCloud,
         seen_object: np.ndarray | None,
     ) -> Values:
         """The same measures with the true object put in, and true contact."""
@@ -241,6 +250,6 @@ class Measurement:
             vertices = truth.vertices[t].astype(np.float64)
             distance = surface.signed_distance(vertices, rotation, translation)
             row["true_distance"] = distance.astype(np.float32)
-            row["truth/penetration_mean"] = penetration.depths(distance).mean
+            row["truth/penetration_mean"] = contact.depths(distance).mean
             row["truth/contact_frame"] = contact.vertex_contact(distance, self.threshold).any()
         return row

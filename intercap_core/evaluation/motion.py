@@ -1,6 +1,13 @@
-"""Smoothness and lag of a track over time."""
+"""Motion of a track against the true motion: jitter, acceleration, lag, slip and planted feet.
+
+A foot stands where enough of its true sole rests near the floor, or near the furniture under it. A
+fit that froze all feet would have no error there, so swinging feet are measured too.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -108,3 +115,106 @@ def _leaves(path: np.ndarray, rest: int) -> int | None:
     away = np.linalg.norm(path - path[:rest].mean(0), axis=-1) > ONSET_M
     away[: max(1, rest // 2)] = False  # jitter at the start of the rest is no motion
     return int(np.argmax(away)) if away.any() else None
+
+
+# Between the two moments that a velocity is taken from: noise from frame to frame is no slip.
+SLIP_S = 0.2
+
+
+def slip_speed(
+    local: np.ndarray,
+    true_local: np.ndarray,
+    touching: np.ndarray,
+    normals_at: Callable[[np.ndarray], np.ndarray],
+    fps: float,
+) -> np.ndarray:
+    """Speed (T,) at which fitted skin slides over the fitted object, beyond the true one, m/s.
+
+    Of skin vertices in the object's own frame, fitted ``local`` and ``true_local`` (T, V, 3), over
+    those ``touching`` (T, V) truly both in the frame and :data:`SLIP_S` later: the mean norm of the
+    difference of both velocities along the surface, of which ``normals_at`` gives the unit normals
+    (N, 3) nearest to true points (N, 3). NaN where no vertex touches at both ends.
+    """
+    total = len(local)
+    found = np.full(total, np.nan)
+    window = max(1, round(SLIP_S * fps))
+    for t in range(total - window):
+        held = np.flatnonzero(touching[t] & touching[t + window])
+        if not len(held):
+            continue
+        moved, truly = (
+            points[t + window, held].astype(np.float64) - points[t, held]
+            for points in (local, true_local)
+        )
+        excess = (moved - truly) * (fps / window)
+        normal = normals_at(true_local[t, held].astype(np.float64))
+        along = excess - (excess * normal).sum(1, keepdims=True) * normal
+        found[t] = np.linalg.norm(along, axis=1).mean()
+    return found
+
+
+# Of a sole vertex that carries weight: height above the floor, and speed, of the truth.
+SUPPORT_HEIGHT_M, SUPPORT_SPEED_M_S = 0.015, 0.05
+STANDING_SHARE = 0.1  # of a sole's vertices that rest so: toes or a heel alone are a stand too
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The plane normal . x + offset = 0: ``normal`` (3,) unit and up, ``offset`` metres."""
+
+    normal: np.ndarray
+    offset: float
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Of points (..., 3) above the floor, metres."""
+        return points @ self.normal + self.offset
+
+    def along(self, vectors: np.ndarray) -> np.ndarray:
+        """The part of vectors (..., 3) that lies in the floor."""
+        return vectors - (vectors @ self.normal)[..., None] * self.normal
+
+
+def support(
+    true_sole: np.ndarray, floor: Floor, fps: float, level: np.ndarray | None = None
+) -> np.ndarray:
+    """Vertices of a true sole (T, S, 3) that carry weight from a frame to the next: (T - 1, S).
+
+    ``level`` (T,) is how high above the floor what is under it lies, metres, None = it is the
+    floor. No vertices of a foot that does not stand.
+    """
+    above = floor.height(true_sole) if level is None else floor.height(true_sole) - level[:, None]
+    low = above < SUPPORT_HEIGHT_M
+    speed = np.linalg.norm(np.diff(true_sole, axis=0), axis=-1) * fps
+    carrying = low[1:] & low[:-1] & (speed < SUPPORT_SPEED_M_S)
+    carrying[carrying.mean(1) < STANDING_SHARE] = False
+    return carrying
+
+
+@dataclass(frozen=True)
+class FootErrors:
+    """Of one foot, metres and m/s, NaN where there is nothing to measure. Of what carries it
+    ``speed`` (T - 1,) along the floor and ``height`` (T - 1,), the mean distance from the true
+    height; ``swing`` (T - 1,), the mean distance of all of the sole from the true one where it does
+    not stand."""
+
+    speed: np.ndarray
+    height: np.ndarray
+    swing: np.ndarray
+
+
+def foot_errors(
+    sole: np.ndarray, true_sole: np.ndarray, carrying: np.ndarray, floor: Floor, fps: float
+) -> FootErrors:
+    """Errors of a fitted sole (T, S, 3), ``carrying`` (T - 1, S) as of :func:`support`."""
+    speed = np.linalg.norm(floor.along(np.diff(sole, axis=0)), axis=-1) * fps
+    away = (sole - true_sole)[1:]
+    swing = np.linalg.norm(away, axis=-1).mean(1)
+    swing[carrying.any(1)] = np.nan
+    return FootErrors(_mean(speed, carrying), _mean(np.abs(away @ floor.normal), carrying), swing)
+
+
+def _mean(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Means (T,) of the values (T, S) that are ``counted``; NaN where none is."""
+    number = counted.sum(1)
+    total = np.where(counted, values, 0.0).sum(1)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)

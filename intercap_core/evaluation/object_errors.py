@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.evaluation import motion, object_pose
-from intercap_core.evaluation.times import match_times
 from intercap_core.evaluation.tracks import read_object
+from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, SCENE, TRUTH
 

@@ -1,4 +1,4 @@
-"""Signed distances between a posed body and a posed object, and their visibility to the cameras."""
+"""Distances between body, object and measured points, and visibility of surfaces to the cameras."""
 
 from __future__ import annotations
 
@@ -9,7 +9,35 @@ import numpy as np
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.point_grid import PointGrid
 from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
+
+
+class MeasuredCloud:
+    """Measured points (N, 3), metres, ready for nearest-point queries."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        self.points = np.asarray(points, np.float32)
+        self._tree = PointGrid(self.points) if len(self.points) else None
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (M,) of mesh points (M, 3) to the closest measured point; NaN without any."""
+        if self._tree is None:
+            return np.full(len(points), np.nan)
+        return self._tree.distance(points)
+
+
+def vertex_to_cloud(vertices: np.ndarray, cloud: MeasuredCloud) -> float:
+    """The paper's figure: mean over every vertex (V, 3), occluded ones too, metres."""
+    return float(cloud.distance(vertices).mean())
+
+
+def visible_to_cloud(points: np.ndarray, visible: np.ndarray, cloud: MeasuredCloud) -> float:
+    """Mean over the area samples (N, 3) that cameras can see (N,) bool; NaN with none."""
+    if not visible.any():
+        return float("nan")
+    return float(cloud.distance(points[visible]).mean())
+
 
 REACH_M = 0.10  # distances are capped here: no reported figure needs larger ones
 DEEPEST_M = 0.25  # and depths of what is inside here
@@ -48,7 +76,7 @@ class PosedObject:
         return self._solid.signed_distance((points - translation) @ rotation, reach)
 
 
-class PosedBody:
+class BodySurface:
     """A body in one pose, vertices (V, 3), with the ``tree`` of its faces (F, 3).
 
     ``surface``: its tree, posed.

@@ -10,9 +10,8 @@ import numpy as np
 from intercap_core.evaluation import body, contact, motion, object_pose
 from intercap_core.evaluation import truth as truths
 from intercap_core.evaluation.measurement import Values
-from intercap_core.evaluation.planted import foot_errors, support
+from intercap_core.evaluation.motion import foot_errors, slip_speed, support
 from intercap_core.evaluation.proximity import PosedObject
-from intercap_core.evaluation.slip import slip_speed
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -23,7 +22,7 @@ _FEET = ("left_foot", "right_foot")  # regions of the soles
 
 
 @dataclass(frozen=True, eq=False)
-class _Both:
+class _ObjectSurfaces:
     """The tracked object's ``mesh`` and ``surface``, and the ``true_surface``."""
 
     mesh: ObjectMesh
@@ -54,9 +53,9 @@ class StageErrors:
         self._true_distance = true_distance
         self._threshold = threshold_m
         self._fps = fps
-        self._both: _Both | None = None
+        self._object: _ObjectSurfaces | None = None
         if mesh is not None and truth.has_object:
-            self._both = _Both(
+            self._object = _ObjectSurfaces(
                 mesh,
                 PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight),
                 DistanceField(truth.object_vertices, truth.object_faces),
@@ -71,9 +70,9 @@ class StageErrors:
             )
 
     def of_object(self, stage: str, track: ObjectTrack) -> Values:
-        if self._both is None:
+        if self._object is None:
             return {}
-        errors = truths.object_errors(self._truth, track, self._both.mesh, self._fps)
+        errors = truths.object_errors(self._truth, track, self._object.mesh, self._fps)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
     def of_body(
@@ -103,13 +102,13 @@ class StageErrors:
             held.append(vertices[self._touched])
             soles.append([vertices[regions[foot]] for foot in _FEET])
             pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
-            if self._both is None or self._true_distance is None:
+            if self._object is None or self._true_distance is None:
                 continue
             distance = np.full(len(vertices), np.inf)  # of an object that was not found
             if known is not None:
                 distance = known[t]
             elif track.known:
-                distance = self._both.surface.signed_distance(
+                distance = self._object.surface.signed_distance(
                     vertices.astype(np.float64),
                     track.rotation[t],
                     track.translation[t],
@@ -133,11 +132,11 @@ class StageErrors:
 
     def _slip(self, held: np.ndarray, track: ObjectTrack) -> Values:
         """Of the skin vertices (T, N, 3) that truly touch at some time, on the tracked object."""
-        assert self._true_distance is not None and self._both is not None
+        assert self._true_distance is not None and self._object is not None
         if not track.known:
             return {"slip": np.full(len(held), np.nan)}
         pose, true = (Pose(of.rotation, of.translation).matrix for of in (track, self._truth))
-        symmetry = self._both.mesh.symmetry  # a spin that nothing shows is no slip
+        symmetry = self._object.mesh.symmetry  # a spin that nothing shows is no slip
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
         )
@@ -146,7 +145,7 @@ class StageErrors:
             _local(held, pose[:, :3, :3], pose[:, :3, 3]),
             self._true_local,
             touching,
-            self._both.true_normals,
+            self._object.true_normals,
             self._fps,
         )
         return {"slip": speed}
@@ -180,10 +179,10 @@ class StageErrors:
     def about_truth(self, regions: Mapping[str, np.ndarray]) -> Values:
         """What is true, of a body whose parts have these vertices."""
         truth = self._truth
-        if self._both is None:
+        if self._object is None:
             return self._true_skin(regions)
         centre = object_pose.posed_point(
-            truth.rotation, truth.translation, self._both.mesh.centre_of_mass
+            truth.rotation, truth.translation, self._object.mesh.centre_of_mass
         )
         return {
             "truth/sweep": contact.SWEEP_M,
@@ -201,7 +200,7 @@ class StageErrors:
         soles, carrying = self._true_soles(regions)
         carried = [np.any(vertices, axis=1) for vertices in carrying]
         near = {}
-        if self._both is not None and self._true_distance is not None:
+        if self._object is not None and self._true_distance is not None:
             nearest = [self._true_distance[:, regions[name]].min(1) for name in METRIC_REGIONS]
             near = {"truth/region_distance": np.stack(nearest, 1)}
         return near | {

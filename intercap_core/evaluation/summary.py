@@ -1,9 +1,11 @@
-"""What a sequence adds to the dataset's figures: its metrics without distances by vertex, counts of
-contact, and how its cameras were found."""
+"""What a sequence contributes to the dataset's figures, and contact heatmaps over all sequences.
+
+A summary holds the metrics without distances by vertex, counts of contact, and the calibration.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,15 +14,15 @@ import numpy as np
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
 from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
-from intercap_core.evaluation.extrinsics import displacement
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.schemas import JOINT, METRICS, PER_VERTEX_METRICS, SCENE, SUMMARY
 
 _RIG = "rig/"
 
 
 @dataclass(frozen=True)
-class BodyFile:
+class FittedBody:
     """Which body file a sequence was fitted with, and how many numbers of it."""
 
     gender: str
@@ -41,7 +43,7 @@ class SequenceSummary:
 
     metrics: SequenceMetrics
     intent: str
-    body: BodyFile
+    body: FittedBody
     rig: Mapping[str, np.ndarray] = field(repr=False)
     body_contact: np.ndarray | None = field(repr=False)
     surface: np.ndarray | None = field(repr=False)
@@ -80,7 +82,7 @@ class SequenceSummary:
             return cls(
                 SequenceMetrics.of(artefact),
                 str(artefact.attributes["intent"]),
-                BodyFile(
+                FittedBody(
                     str(artefact.attributes["gender"]),
                     str(artefact.attributes["body_model"]),
                     int(artefact.attributes["num_betas"]),
@@ -167,3 +169,72 @@ def _rig(scene: Artefact) -> dict[str, np.ndarray | list[str]]:
         "pair_residual_before": scene["pair_residual_before"].astype(np.float64),
         "pair_residual_after": scene["pair_residual_after"].astype(np.float64),
     }
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceHeat:
+    """Share of ``frames`` in which each of ``points`` (N, 3), rest pose, is in contact (N,)."""
+
+    points: np.ndarray
+    likelihood: np.ndarray
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class Heatmaps:
+    """``body`` (V,) share of ``body_frames`` in contact; one map an object by name. ``left_out``:
+    sequences that do not count in a map, by name, and why."""
+
+    body: np.ndarray
+    body_frames: int
+    objects: dict[str, SurfaceHeat]
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+
+
+def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
+    """Add up the sequences' counts at 4.5 mm.
+
+    Sequences without an object count in none of the maps. A map lies on one surface: bodies of
+    another vertex count than the first one's, and objects that were measured with another mesh
+    than the first one of their name, are left out and told.
+    """
+    body = np.zeros(0)
+    body_frames = 0
+    left_out: dict[str, list[str]] = {}
+    counts: dict[str, np.ndarray] = {}
+    points: dict[str, np.ndarray] = {}
+    frames: dict[str, int] = {}
+    for summary in summaries:
+        contact, here, found = summary.body_contact, summary.surface, summary.surface_contact
+        if contact is None or here is None or found is None:
+            continue
+        name, count = summary.metrics.object_, len(summary.metrics)
+        if body_frames == 0:
+            body = np.zeros(len(contact))
+        if len(contact) == len(body):
+            body += contact
+            body_frames += count
+        else:
+            left_out.setdefault(summary.name, []).append(
+                f"its body has {len(contact)} vertices where the sequences before have "
+                f"{len(body)}: not in the body's heatmap"
+            )
+        if name not in counts:
+            counts[name], points[name], frames[name] = np.zeros(len(found)), here, 0
+        if not np.array_equal(points[name], here):
+            left_out.setdefault(summary.name, []).append(
+                f"object {name!r} was measured with another mesh than in the sequences before: not "
+                "in its heatmap; re-run stage 'metrics' of those that have the older mesh"
+            )
+            continue
+        counts[name] += found
+        frames[name] += count
+    return Heatmaps(
+        body / max(1, body_frames),
+        body_frames,
+        {
+            name: SurfaceHeat(points[name], counts[name] / frames[name], frames[name])
+            for name in sorted(counts)
+        },
+        left_out,
+    )

@@ -1,4 +1,4 @@
-"""The truth of a virtual recording, brought onto the fitted meshes. Only the metrics read it."""
+"""Truth of a virtual recording, interpolated onto the fitted meshes. Only the metrics read it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,32 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
+from intercap_core.errors import UserError
 from intercap_core.evaluation import body, contact, motion, object_pose
-from intercap_core.evaluation.planted import Floor
-from intercap_core.evaluation.times import match_times
+from intercap_core.evaluation.motion import Floor
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_samples import SurfaceSamples
 from intercap_core.schemas import METRIC_REGIONS, TRUTH
+
+
+def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
+    """The set (T,) of the truth ``path`` nearest to each recorded one; times in seconds, rising.
+
+    Raises UserError where the truth has no set within half a frame of a recorded one.
+    """
+    after = np.clip(np.searchsorted(true_times, times), 0, len(true_times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(times - true_times[before]) < np.abs(true_times[after] - times)
+    nearest = np.where(nearer, before, after)
+    apart = np.abs(true_times[nearest] - times)
+    if apart.max(initial=0) > 0.5 / fps:
+        raise UserError(
+            f"{path}: holds {len(true_times)} frames and the recording {len(times)}; that of "
+            f"{times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the nearest; make the "
+            "truth of this recording again or leave it out"
+        )
+    return nearest
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,18 +94,18 @@ class Truth:
             soles = float(file.attributes.get("sole_m", 0.0))
             offset = float(file.attributes["ground_offset"]) - soles
             columns = [names.index(name) for name in METRIC_REGIONS]
-            thing = _TrueThing.read(file, at)
+            true_object = _TrueObject.read(file, at)
             return cls(
                 vertices=vertices,
                 visible=visible,
                 joints=file["joints"][at],
                 tips=file["fingertips"][at],
-                object_vertices=thing.vertices,
-                object_faces=thing.faces,
-                object_visible=thing.visible,
-                rotation=thing.rotation,
-                translation=thing.translation,
-                object_views=thing.views,
+                object_vertices=true_object.vertices,
+                object_faces=true_object.faces,
+                object_visible=true_object.visible,
+                rotation=true_object.rotation,
+                translation=true_object.translation,
+                object_views=true_object.views,
                 contact_region=file["region_contact"][at][:, columns],
                 floor=Floor(file["ground_normal"], offset),
                 support_height=_support_height(file, at),
@@ -113,7 +132,7 @@ def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class _TrueThing:
+class _TrueObject:
     """The object's part of the file at T moments: an empty mesh without poses where there is
     none."""
 
@@ -125,7 +144,7 @@ class _TrueThing:
     views: np.ndarray
 
     @classmethod
-    def read(cls, file: artefacts.Artefact, at: np.ndarray) -> _TrueThing:
+    def read(cls, file: artefacts.Artefact, at: np.ndarray) -> _TrueObject:
         if not file.attributes["object"]:
             count = len(at)
             return cls(

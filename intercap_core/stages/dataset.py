@@ -19,8 +19,7 @@ from intercap_core.config import BodyModels, CardSettings, ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.contact import CONTACT_M
-from intercap_core.evaluation.heatmaps import Heatmaps, collect
-from intercap_core.evaluation.summary import BodyFile, SequenceSummary
+from intercap_core.evaluation.summary import FittedBody, Heatmaps, SequenceSummary, collect_heatmaps
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.release.card import facts, markdown, split_table
 from intercap_core.output.release.croissant import croissant
@@ -86,7 +85,7 @@ def run(
         **groups,
     }
     tables.write(tables_folder, written)
-    heat = collect(found)
+    heat = collect_heatmaps(found)
     surfaces, doubts = _body_heat(found, heat, body_models)
     doubts |= _unlisted(found, objects)
     remarks = {name: "; ".join(reasons) for name, reasons in heat.left_out.items()} | doubts
@@ -153,7 +152,7 @@ def _body_heat(
     return [], doubts
 
 
-def _model(path: Path, told: BodyFile) -> BodyModel:
+def _model(path: Path, told: FittedBody) -> BodyModel:
     return BodyModel.load(path, num_betas=told.num_betas, num_expression=told.num_expression)
 
 

@@ -21,14 +21,13 @@ from intercap_core.config import (
 )
 from intercap_core.evaluation import body, motion, object_pose
 from intercap_core.evaluation import truth as truths
-from intercap_core.evaluation.exchanged import exchanged
-from intercap_core.evaluation.extrinsics import displacement
-from intercap_core.evaluation.flags import merge_reasons
-from intercap_core.evaluation.measurement import Handled, Measurement, Values
+from intercap_core.evaluation.flags import exchanged, merge_reasons
+from intercap_core.evaluation.measurement import HandledObject, Measurement, Values
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.segmented import read_clouds
 from intercap_core.evaluation.stage_errors import StageErrors
 from intercap_core.evaluation.tracks import BodyTrack, read_body, read_object
-from intercap_core.evaluation.verdict.judge import Verdict
+from intercap_core.evaluation.verdict.judge import SequenceVerdict
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -94,7 +93,7 @@ def run(
             known = truths.Truth.load(truth, images.time_s, images.fps, vertices)
         handled = None
         if mesh is not None and fitted_object.known:
-            handled = Handled(mesh, fitted_object)
+            handled = HandledObject(mesh, fitted_object)
         measured = Measurement(
             handled,
             fitted_body,
@@ -134,7 +133,7 @@ def run(
     # Last, while the rig and the body are held: what they hold, tables of rays and the like, is not
     # made again. The verdict was fitted to errors of this program's results alone.
     if settings.hold_out and not made_by:
-        verdict = Verdict.reach(
+        verdict = SequenceVerdict.reach(
             frames=frames,
             scene=scene,
             detections=detections,
@@ -155,7 +154,7 @@ def run(
             writer.put(f"verdict/{key}", verdict[key])
 
 
-def _motion(body_track: BodyTrack, handled: Handled | None, fps: float) -> Values:
+def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) -> Values:
     joints = body_track.joints[:, body.BODY_JOINTS]
     values: Values = {"acceleration_body": motion.acceleration(joints, fps)}
     if handled is not None:

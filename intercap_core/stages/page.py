@@ -21,8 +21,8 @@ from intercap_core.config import (
     SubjectEntry,
 )
 from intercap_core.errors import UserError
-from intercap_core.evaluation.extrinsics import displacement
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig

@@ -32,7 +32,7 @@ from bench.oracle_inputs import (
 )
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.evaluation.extrinsics import displacement
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.joint.cameras import BIAS

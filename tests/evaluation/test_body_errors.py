@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.body.keypoints import FACE, KEYPOINT_NAMES
 from intercap_core.evaluation import body, body_errors
-from intercap_core.evaluation.body_clouds import CLOUD_KEYS
-from intercap_core.evaluation.body_errors import BodyErrors
+from intercap_core.evaluation.body_errors import CLOUD_KEYS, BodyErrors
 from intercap_core.schemas import FRAMES
 from tests.helpers import fitted_capture as fitted
 

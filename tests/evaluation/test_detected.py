@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from intercap_core.evaluation.detected import calibration_error, reliability
+from intercap_core.evaluation.contact_figures import calibration_error, reliability
 
 
 def test_reliability_by_hand():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.evaluation.exchanged import exchanged
+from intercap_core.evaluation.flags import exchanged
 
 T = 12
 LEGS = [

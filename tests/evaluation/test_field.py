@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.evaluation.extrinsics import displacement
-from intercap_core.evaluation.field import (
+from intercap_core.evaluation.field_errors import (
     FieldScene,
     beam_figures,
     floor_error,
@@ -17,7 +16,8 @@ from intercap_core.evaluation.field import (
     start_figures,
     stated_displacement,
 )
-from intercap_core.evaluation.planted import Floor
+from intercap_core.evaluation.motion import Floor
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.geometry.camera.transforms import rigid
 
 

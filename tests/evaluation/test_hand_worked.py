@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ContinuousSymmetry, Symmetry
-from intercap_core.evaluation import body, contact, flags, motion, object_pose, penetration
-from intercap_core.evaluation.clouds import Cloud, vertex_to_cloud, visible_to_cloud
-from intercap_core.evaluation.extrinsics import displacement, rig_centre
-from intercap_core.evaluation.proximity import PosedBody, PosedObject, Sight, face_normals
+from intercap_core.evaluation import body, contact, flags, motion, object_pose
+from intercap_core.evaluation.proximity import (
+    BodySurface,
+    MeasuredCloud,
+    PosedObject,
+    Sight,
+    face_normals,
+    vertex_to_cloud,
+    visible_to_cloud,
+)
+from intercap_core.evaluation.scene_errors import displacement, rig_centre
 from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
@@ -124,10 +131,10 @@ def test_contact_counts_and_scores() -> None:
 
 
 def test_penetration_of_one_frame_and_over_contact_frames() -> None:
-    depth = penetration.depths(np.array([0.1, -0.001, -0.002, -0.006]))
+    depth = contact.depths(np.array([0.1, -0.001, -0.002, -0.006]))
     assert depth == pytest.approx((0.003, 0.002, 0.006))
-    assert penetration.depths(np.array([0.1])) == (0, 0, 0)
-    figures = penetration.summarise(
+    assert contact.depths(np.array([0.1])) == (0, 0, 0)
+    figures = contact.penetration_summary(
         np.array([0.002, 0.006, 0.030, 0.5]), np.array([True, True, True, False])
     )
     assert figures["mean_mm"] == pytest.approx(38 / 3)
@@ -136,16 +143,16 @@ def test_penetration_of_one_frame_and_over_contact_frames() -> None:
     assert figures["share_le_7mm"] == pytest.approx(2 / 3)
     assert figures["share_le_20mm"] == pytest.approx(2 / 3)
     assert figures["p98_mm"] == pytest.approx(6 + 0.96 * 24)
-    nothing = penetration.summarise(np.array([0.1]), np.array([False]))
+    nothing = contact.penetration_summary(np.array([0.1]), np.array([False]))
     assert all(np.isnan(value) for value in nothing.values())
 
 
 def test_ground_penetration_is_the_deepest_vertex() -> None:
     vertices = np.array([[0, -1.0, 0], [0, 0.02, 0], [0, 0.005, 0]])
     up = np.array([0, -1.0, 0])
-    assert penetration.ground_penetration(vertices, np.zeros(3), up) == pytest.approx(0.02)
-    assert penetration.ground_penetration(vertices[:1], np.zeros(3), up) == 0
-    assert np.isnan(penetration.ground_penetration(vertices, np.full(3, np.nan), up))
+    assert contact.ground_penetration(vertices, np.zeros(3), up) == pytest.approx(0.02)
+    assert contact.ground_penetration(vertices[:1], np.zeros(3), up) == 0
+    assert np.isnan(contact.ground_penetration(vertices, np.full(3, np.nan), up))
 
 
 @pytest.mark.parametrize("fps", [15.0, 30.0])
@@ -205,12 +212,12 @@ def test_turns_are_beyond_the_true_ones_and_over_the_symmetry_group() -> None:
 
 
 def test_cloud_distances_count_all_or_only_visible_points() -> None:
-    cloud = Cloud(np.array([[0.0, 0, 0.1], [1, 0, 0.3]]))
+    cloud = MeasuredCloud(np.array([[0.0, 0, 0.1], [1, 0, 0.3]]))
     assert vertex_to_cloud(SQUARE[:2], cloud) == pytest.approx(0.2)
     visible = np.array([True, False])
     assert visible_to_cloud(SQUARE[:2], visible, cloud) == pytest.approx(0.1)
     assert np.isnan(visible_to_cloud(SQUARE[:2], ~visible & visible, cloud))
-    assert np.isnan(vertex_to_cloud(SQUARE, Cloud(np.empty((0, 3)))))
+    assert np.isnan(vertex_to_cloud(SQUARE, MeasuredCloud(np.empty((0, 3)))))
 
 
 def test_samples_cover_area_not_vertices() -> None:
@@ -235,7 +242,7 @@ def test_distance_to_a_posed_box_both_ways() -> None:
         expected, abs=1e-6
     )
     posed = vertices @ rotation.T + translation
-    body = PosedBody(posed, faces, SurfaceTree(vertices, faces))
+    body = BodySurface(posed, faces, SurfaceTree(vertices, faces))
     assert body.signed_distance(points) == pytest.approx(expected, abs=1e-6)
     assert body.distance(points) == pytest.approx([0.1, 0.03, 0.05, 0.25], abs=1e-6)
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation.detected import detected_figures
-from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.hold_figures import (
+from intercap_core.evaluation.contact_figures import (
+    detected_figures,
     hold_figures,
     slip_by_object,
     stated_contact_figures,
     worse_objects,
 )
-from intercap_core.evaluation.planted import Floor, foot_errors, support
-from intercap_core.evaluation.slip import slip_speed
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.motion import Floor, foot_errors, slip_speed, support
 from intercap_core.schemas import METRIC_REGIONS
 
 FPS = 10.0  # a slip's window of 0.2 s is two frames

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.evaluation.planted import Floor, support
+from intercap_core.evaluation.motion import Floor, support
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.studio.interactions.beam_walk import BEAM_HALF_M, BEAM_HEIGHT_M, BeamWalk
 from intercap_core.studio.stage import Stage

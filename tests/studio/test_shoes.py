@@ -10,7 +10,7 @@ import pytest
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
-from intercap_core.evaluation.planted import support
+from intercap_core.evaluation.motion import support
 from intercap_core.evaluation.truth import Truth
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.shoes import FEET, LEATHER_M, SOLE_M, in_heavy_shoes, shoe_area

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
-from intercap_core.evaluation.slip import SLIP_S, slip_speed
+from intercap_core.evaluation.motion import SLIP_S, slip_speed
 from intercap_core.studio.interactions.slipping import (
     GLIDE_M,
     TURN_DEG,

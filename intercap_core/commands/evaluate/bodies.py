@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from intercap_core.commands.evaluate.part import (
+    EvaluationPart,
     Measured,
-    Part,
     add_rows,
     console_of,
     keyed,
@@ -227,11 +227,10 @@ def _print_worst(console: Console, evaluations: Sequence[Bodies]) -> None:
     console.print(table)
 
 
-PART = Part(
+PART = EvaluationPart(
     "bodies",
     "body_fit",
     ("frames", "scene", "person"),
-    "metrics.body_errors",
     measure,
     flat,
     print_bodies,

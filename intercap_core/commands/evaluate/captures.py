@@ -10,16 +10,16 @@ from rich.table import Table
 
 from intercap_core.commands.evaluate.part import (
     SPREAD,
+    EvaluationPart,
     Figures,
     Measured,
-    Part,
     console_of,
     keyed,
     number,
     spread,
 )
-from intercap_core.evaluation import capture
-from intercap_core.evaluation.capture import CaptureErrors
+from intercap_core.evaluation import scene_errors
+from intercap_core.evaluation.scene_errors import CaptureErrors
 from intercap_core.project import Project
 
 Captures = Measured[CaptureErrors]
@@ -31,14 +31,16 @@ def measure(project: Project, sequence: str) -> CaptureErrors:
     truth = project.sequences[sequence].truth
     assert truth is not None
     frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
-    return capture.measure(frames, scene, truth)
+    return scene_errors.measure(frames, scene, truth)
 
 
 def flat(evaluations: Sequence[Captures]) -> Figures:
     """Keys ``<dataset>.<measure>``."""
     found: Figures = {}
     for captured in evaluations:
-        figures = capture.figures(captured.errors) | spread(capture.figures, captured.errors)
+        figures = scene_errors.figures(captured.errors) | spread(
+            scene_errors.figures, captured.errors
+        )
         found |= keyed(f"{captured.dataset}.", figures)
     return found
 
@@ -67,7 +69,7 @@ def print_captures(evaluations: Sequence[Captures]) -> None:
             table.add_row(name, "no scene")
     console.print(table)
     columns = [
-        capture.figures(found.errors) | spread(capture.figures, found.errors)
+        scene_errors.figures(found.errors) | spread(scene_errors.figures, found.errors)
         for found in evaluations
     ]
     names = [name for column in columns for name in column if not name.endswith(SPREAD)]
@@ -87,11 +89,10 @@ def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
     return number(1e3 * float(values.mean()), digits) if len(values) else ""
 
 
-PART = Part(
+PART = EvaluationPart(
     "captures",
     "scene",
     ("frames",),
-    "metrics.capture",
     measure,
     flat,
     print_captures,

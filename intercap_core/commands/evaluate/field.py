@@ -20,10 +20,17 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.commands.bench import judgement
-from intercap_core.commands.evaluate.part import Figures, Measured, Part, console_of, keyed, number
-from intercap_core.evaluation import figures, subject_right
+from intercap_core.commands.evaluate.part import (
+    EvaluationPart,
+    Figures,
+    Measured,
+    console_of,
+    keyed,
+    number,
+)
+from intercap_core.evaluation import field_errors, figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_figures import TRUE, stated_errors, verdict_figures
+from intercap_core.evaluation.verdict.figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES, JOINT, TRUTH
 from intercap_core.stages.export import MARKER
@@ -72,7 +79,7 @@ def measure(project: Project, sequence: str) -> FieldSequence:
     height = float(np.ptp(vertices[:, 1])) - float(np.ptp(person.rest[:, 1]))
     metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
     chosen, scene = (project.artefact(sequence, stage) for stage in ("person", "scene"))
-    right = subject_right.measure(chosen, scene, row.truth)
+    right = field_errors.measure_subject_share(chosen, scene, row.truth)
     alone = exported_alone(project.artefact(sequence, "export"))
     return FieldSequence(metrics, own / known - 1, height, right, alone)
 
@@ -195,11 +202,10 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
         console.print(f"{key}: {value:.3g}", highlight=False)
 
 
-PART = Part(
+PART = EvaluationPart(
     "field",
     "metrics",
     ("joint",),
-    "metrics.figures",
     measure,
     flat,
     print_field,

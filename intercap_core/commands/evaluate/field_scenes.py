@@ -11,9 +11,16 @@ from collections.abc import Sequence
 import numpy as np
 from rich.table import Table
 
-from intercap_core.commands.evaluate.part import Figures, Measured, Part, console_of, keyed, number
-from intercap_core.evaluation import field
-from intercap_core.evaluation.field import FieldScene
+from intercap_core.commands.evaluate.part import (
+    EvaluationPart,
+    Figures,
+    Measured,
+    console_of,
+    keyed,
+    number,
+)
+from intercap_core.evaluation import field_errors
+from intercap_core.evaluation.field_errors import FieldScene
 from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]
@@ -27,19 +34,19 @@ def measure(project: Project, sequence: str) -> FieldScene:
     truth = project.sequences[sequence].truth
     assert truth is not None
     frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
-    return field.measure(frames, scene, truth)
+    return field_errors.measure(frames, scene, truth)
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     """Keys ``field.<measure>``; those of starts also by dataset, of unequal rates apart."""
-    found = keyed("field.", field.floor_figures(_of(evaluations, FLOOR)))
-    found |= keyed("field.", field.start_figures(_of(evaluations, STARTS)))
-    found |= keyed("field.rates_", field.start_figures(_of(evaluations, RATES)))
-    found |= keyed("field.", field.beam_figures(_of(evaluations, BEAM)))
+    found = keyed("field.", field_errors.floor_figures(_of(evaluations, FLOOR)))
+    found |= keyed("field.", field_errors.start_figures(_of(evaluations, STARTS)))
+    found |= keyed("field.rates_", field_errors.start_figures(_of(evaluations, RATES)))
+    found |= keyed("field.", field_errors.beam_figures(_of(evaluations, BEAM)))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):
             rate = measured.dataset.removeprefix(STARTS)
-            figures = field.start_figures(measured.errors)
+            figures = field_errors.start_figures(measured.errors)
             found |= {f"field.{key}{rate}": value for key, value in figures.items()}
     return found
 
@@ -65,7 +72,7 @@ def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
                 number(1e3 * float(e.before.mean()), 1),
                 number(1e3 * float(e.after.mean()), 1),
                 number(1e3 * float(np.median(e.stated)), 1),
-                str(int((e.after > e.before + field.WORSE_M).sum())),
+                str(int((e.after > e.before + field_errors.WORSE_M).sum())),
                 number(1e3 * e.floor_m, 1) or "-",
                 number(e.tilt_deg, 2) or "-",
             )
@@ -80,11 +87,10 @@ def _list(values: np.ndarray, digits: int) -> str:
     return " ".join(number(float(value), digits) or "-" for value in values)
 
 
-PART = Part(
+PART = EvaluationPart(
     "field_scenes",
     "scene",
     ("frames",),
-    "metrics.field",
     measure,
     flat,
     print_scenes,

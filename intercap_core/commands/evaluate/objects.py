@@ -9,9 +9,9 @@ import numpy as np
 from rich.table import Table
 
 from intercap_core.commands.evaluate.part import (
+    EvaluationPart,
     Figures,
     Measured,
-    Part,
     add_rows,
     console_of,
     keyed,
@@ -124,11 +124,10 @@ def has_object(project: Project, sequence: str) -> bool:
     return project.object_of(sequence) is not None
 
 
-PART = Part(
+PART = EvaluationPart(
     "objects",
     "object_track",
     ("scene",),
-    "metrics.object_errors",
     measure,
     flat,
     print_objects,

@@ -49,7 +49,7 @@ class Measured(Generic[Errors]):
 
 
 @dataclass(frozen=True)
-class Part(Generic[Errors]):
+class EvaluationPart(Generic[Errors]):
     """One part of the evaluation.
 
     ``measure`` (project, sequence) compares the artefact of ``stage`` with the truth; it reads the
@@ -65,7 +65,6 @@ class Part(Generic[Errors]):
     name: str
     stage: str
     reads: tuple[str, ...]
-    code: str
     measure: Callable[[Project, str], Errors]
     flat: Callable[[Sequence[Measured[Errors]]], Figures]
     print_tables: Callable[[Sequence[Measured[Errors]]], None]
@@ -126,11 +125,11 @@ class Part(Generic[Errors]):
 
 
 def _measure_one(module: str, settings: Path, sequence: str) -> object:
-    part: Part[object] = import_module(module).PART
+    part: EvaluationPart[object] = import_module(module).PART
     return measured_once(part, load_project(settings), sequence)
 
 
-def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors:
+def measured_once(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
     """Measure one recording, or take its errors from the last time that all inputs were the same.
 
     The errors lie beside the artefacts, named by the digest of what they were computed from: the
@@ -145,8 +144,7 @@ def measured_once(part: Part[Errors], project: Project, sequence: str) -> Errors
         )
     if part.kept is None:
         return part.measure(project, sequence)
-    state = hashlib.sha256(code_digest(part.code).encode())
-    state.update(code_digest(f"evaluation.{part.name}").encode())
+    state = hashlib.sha256(code_digest(f"commands.evaluate.{part.name}").encode())
     row = project.sequences[sequence]
     entry, subject = project.object_of(sequence), project.subjects[row.subject]
     for told in (*filter(None, [entry]), subject, project.config.body_models):

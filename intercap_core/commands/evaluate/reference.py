@@ -1,71 +1,147 @@
-"""Figures beside those that were recorded before: what got worse by more than the spread."""
+"""Regression gate of the quick evaluation: figures compared with a recorded reference.
+
+The reference file lists the gated figures. Each entry states the recorded value, the spread within
+which the figure may vary, and which direction is better. On one machine a run is deterministic, but
+processors round differently and the fits amplify the difference; the spread covers that variation.
+Times and memory are not gated. docs/evaluation.md states how the spreads were measured.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from intercap_core.commands.evaluate.part import SPREAD
+from intercap_core.errors import UserError
 
 REFERENCE = Path("bench/reference-quick.json")
-TIMES_SPREAD = 2.0  # standard errors
-SAME = 0.02  # of the figure: the same for all who read it
-NEGLIGIBLE = 5e-4  # of any unit: no digit of a table shows it
-# Words of keys that say which way is better; others are printed but not judged
-_MORE_IS_BETTER = ("recall", "precision", "_f1", "success", "improved")
-_LESS_IS_BETTER = ("_mm", "_deg", "lost_", "bad_frames", "acceleration", "missing")
-_MAIN = (
-    "translation_median_mm", "translation_p95_mm", "rotation_median_deg", "rotation_p95_deg",
-    "lost_share", "body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "contact_region_f1",
-    "object_translation_mm", "object_rotation_deg", "slip_mm_s", "planted_mm_s",
-    "contact_detected_f1", "hand_grasp_mpjpe_mm",
-)  # fmt: skip
 
 
-def worse(key: str, value: float, before: float, error: float) -> bool:
-    """Whether a figure is worse than before by more than its spread and a little."""
-    gain = value - before
-    if any(word in key for word in _MORE_IS_BETTER):
-        gain = -gain
-    elif not any(word in key for word in _LESS_IS_BETTER):
-        return False
-    return gain > max(TIMES_SPREAD * error, SAME * abs(before), NEGLIGIBLE)
+class GateResult(StrEnum):
+    """Result of comparing one figure with its reference."""
+
+    SAME = "same"  # within the spread
+    BETTER = "better"  # improved by more than the spread
+    WORSE = "worse"  # degraded by more than the spread
+    MISSING = "missing"  # the run has no such figure, or it is not finite
 
 
-def compare(figures: Mapping[str, float], reference: Path = REFERENCE) -> list[str]:
-    """Print the main figures beside the recorded ones and all that got worse; the latter's keys.
+FAILING = (GateResult.WORSE, GateResult.MISSING)
 
-    The spread is the recorded one. The recordings are the same, so that most of a change is not
-    chance even within it.
+
+@dataclass(frozen=True)
+class GatedFigure:
+    """One entry of the reference file."""
+
+    key: str  # key of the evaluation's JSON, "area.measure"
+    value: float  # the recorded figure, in the unit that ends its key
+    spread: float  # variation that is tolerated, same unit
+    higher_is_better: bool
+
+    def judge(self, now: float | None) -> GateResult:
+        """Compare the figure of a run (None = not measured) with the recorded value."""
+        if now is None or not math.isfinite(now):
+            return GateResult.MISSING
+        loss = self.value - now if self.higher_is_better else now - self.value
+        if loss > self.spread:
+            return GateResult.WORSE
+        return GateResult.BETTER if loss < -self.spread else GateResult.SAME
+
+
+def read_reference(path: Path = REFERENCE) -> list[GatedFigure]:
+    """Gated figures of a reference file, in the file's order.
+
+    Raises UserError where the file is missing or an entry is malformed.
     """
-    console = Console()
-    if not reference.is_file():
-        console.print(f"{reference} is not there: nothing to compare with", highlight=False)
-        return []
-    before = json.loads(reference.read_text(encoding="utf-8"))
-    judged = [key for key in figures if key in before and not key.endswith(SPREAD)]
-    found = [
-        key
-        for key in judged
-        if worse(key, figures[key], before[key], before.get(f"{key}{SPREAD}", 0.0))
-    ]
-    gone = [key for key in before if key not in figures and not key.startswith("time.")]
-    table = Table("figure", "recorded", "now", "+-", "", box=None)
-    table.title = f"beside {reference}"
-    for key in judged:
-        main = key.split(".")[-1] in _MAIN
-        if main or key in found:
-            error = before.get(f"{key}{SPREAD}")
-            cells = [f"{before[key]:.3f}", f"{figures[key]:.3f}"]
-            cells += ["" if error is None else f"{error:.3f}", "worse" if key in found else ""]
-            table.add_row(key, *cells)
-    console.print(table)
-    if gone:
-        console.print(f"no longer there: {', '.join(gone)}", highlight=False, soft_wrap=True)
-    words = f"{len(found)} figures are worse than recorded by more than their spread"
-    console.print(words if found else "nothing is worse than recorded", highlight=False)
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        found = [
+            GatedFigure(
+                key,
+                float(entry["value"]),
+                float(entry["spread"]),
+                {"higher": True, "lower": False}[entry["better"]],
+            )
+            for key, entry in entries.items()
+        ]
+    except FileNotFoundError:
+        raise UserError(
+            f"{path}: no such file; the quick evaluation is compared with it, restore it with "
+            f"`git checkout {path}`"
+        ) from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path}: cannot be read as a reference ({error!r}); expected for each figure "
+            '{"value": number, "spread": number, "better": "lower" or "higher"}'
+        ) from None
+    invalid = [figure.key for figure in found if not figure.spread >= 0]
+    if invalid:
+        raise UserError(f"{path}: the spread of {invalid[0]} is not a number of at least 0")
     return found
+
+
+def passes_gate(figures: Mapping[str, float], reference: Sequence[GatedFigure]) -> bool:
+    """Print every gated figure with its verdict; return whether none is worse or missing."""
+    console = Console()
+    table = Table("figure", "reference", "now", "spread", "verdict", box=None)
+    table.columns[0].no_wrap = True
+    table.title = "regression gate"
+    failing = []
+    for figure in reference:
+        now = figures.get(figure.key)
+        result = figure.judge(now)
+        if result in FAILING:
+            failing.append(figure.key)
+        table.add_row(
+            figure.key,
+            f"{figure.value:.3f}",
+            "" if now is None else f"{now:.3f}",
+            f"{figure.spread:.3f}",
+            result.value,
+        )
+    console.width = max(console.width, 110)
+    console.print(table)
+    if failing:
+        console.print(
+            f"regression gate failed: {len(failing)} of {len(reference)} figures are worse than "
+            f"their reference by more than the spread, or missing: {', '.join(failing)}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    else:
+        console.print(f"regression gate passed: {len(reference)} figures", highlight=False)
+    return not failing
+
+
+def update_reference(figures: Mapping[str, float], path: Path = REFERENCE) -> None:
+    """Record the figures of a run as the new values of a reference file; spreads stay.
+
+    Raises UserError where the file is malformed or the run lacks one of its figures.
+    """
+    reference = read_reference(path)
+    missing = [
+        figure.key
+        for figure in reference
+        if figure.judge(figures.get(figure.key)) == GateResult.MISSING
+    ]
+    if missing:
+        raise UserError(
+            f"{path}: not updated, the run has no figure {', '.join(missing)}; remove the entries "
+            "from the file if they are no longer measured"
+        )
+    entries = {
+        figure.key: {
+            "value": figures[figure.key],
+            "spread": figure.spread,
+            "better": "higher" if figure.higher_is_better else "lower",
+        }
+        for figure in reference
+    }
+    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(entry)}" for key, entry in entries.items())
+    path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")

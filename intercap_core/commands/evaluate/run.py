@@ -19,13 +19,19 @@ from intercap_core.commands.evaluate import (
     objects,
     sequences,
 )
-from intercap_core.commands.evaluate.part import Figures, Part, require_truth
-from intercap_core.commands.evaluate.reference import REFERENCE, compare
+from intercap_core.commands.evaluate.part import EvaluationPart, Figures, require_truth
+from intercap_core.commands.evaluate.reference import (
+    REFERENCE,
+    passes_gate,
+    read_reference,
+    update_reference,
+)
 from intercap_core.commands.evaluate.seeds import drawn_anew
 from intercap_core.commands.evaluate.workflows import bring_up_to_date
+from intercap_core.errors import UserError
 from intercap_core.project import load_project
 
-PARTS: dict[str, Part[Any]] = {
+PARTS: dict[str, EvaluationPart[Any]] = {
     part.name: part
     for part in (
         sequences.PART,
@@ -45,7 +51,6 @@ def evaluate(
     output: Path,
     *,
     cores: int = 0,
-    reference: Path | None = None,
     seed: int | None = None,
 ) -> int:
     """Bring the evaluation's recordings up to date, print the tables and write ``output``.
@@ -89,16 +94,28 @@ def evaluate(
     flat = {key: _rounded(value) for key, value in found.items() if math.isfinite(value)}
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    if reference is not None:
-        compare(flat, reference)
     print(output)
     return status
 
 
-def evaluate_quick(output: Path, *, cores: int = 0) -> int:
-    """The fixed small set, beside the figures recorded last; see :func:`evaluate`."""
+def evaluate_quick(output: Path, *, cores: int = 0, renew_reference: bool = False) -> int:
+    """Evaluate the quick set and apply the regression gate; see :func:`evaluate`.
+
+    ``renew_reference``: record the figures as the new reference instead of comparing them.
+    Returns 1 where a stage failed or a gated figure is worse than its reference by more than its
+    spread. Raises UserError where the reference file cannot be used.
+    """
+    reference = read_reference(REFERENCE)  # before the run: a malformed file costs no time
     settings = {part: [QUICK_SETTINGS] for part in QUICK_PARTS}
-    return evaluate(settings, output, cores=cores, reference=REFERENCE)
+    status = evaluate(settings, output, cores=cores)
+    figures = json.loads(output.read_text(encoding="utf-8"))
+    if renew_reference:
+        if status:
+            raise UserError(f"{REFERENCE}: not updated, as a stage failed")
+        update_reference(figures, REFERENCE)
+        print(f"{REFERENCE}: recorded")
+        return 0
+    return status if passes_gate(figures, reference) else 1
 
 
 def _rounded(value: float) -> float:

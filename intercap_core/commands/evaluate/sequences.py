@@ -11,16 +11,16 @@ from rich.table import Table
 
 from intercap_core.commands.evaluate.part import (
     SPREAD,
+    EvaluationPart,
     Figures,
     Measured,
-    Part,
     keyed,
     number,
     spread,
 )
-from intercap_core.evaluation import figures, hold_figures
+from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_figures import verdict_figures
+from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
 
@@ -90,13 +90,15 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
     """Every figure of a group of sequences by area: the stages, and what is not one stage's."""
     known = [s for s in sequences if s.has_truth]
     found = {
-        stage: figures.truth_figures(sequences, stage) | hold_figures.hold_figures(known, stage)
+        stage: figures.truth_figures(sequences, stage) | contact_figures.hold_figures(known, stage)
         for stage in ESTIMATES
     }
     for stage in ESTIMATES:
         sweep = figures.contact_sweep(sequences, stage)
         found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
-    found["joint"] |= hold_figures.stated_contact_figures(known) | _beside_sequential(known, found)
+    found["joint"] |= contact_figures.stated_contact_figures(known) | _beside_sequential(
+        known, found
+    )
     penetration = figures.penetration_figures(sequences)
     for name, (area, measure) in ALSO.items():
         figure = {**found, "penetration": penetration}[area].get(measure)
@@ -118,14 +120,14 @@ def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Fi
     first = found["body_fit"]
     beside = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
     if any(s.object_ for s in sequences):
-        worse = hold_figures.worse_objects(sequences)
+        worse = contact_figures.worse_objects(sequences)
         beside |= {"object_worse_count": float(len(worse))}
     cameras = figures.extrinsics_figures(sequences)
     if "joint_mean_mm" in cameras:
         beside["extrinsics_mm"] = cameras["joint_mean_mm"]
         beside["extrinsics_scene_mm"] = cameras["after_mean_mm"]
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
-        slips = hold_figures.slip_by_object(sequences, stage)
+        slips = contact_figures.slip_by_object(sequences, stage)
         beside |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
     for name, some in _by_object(sequences).items():
         turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")
@@ -211,4 +213,4 @@ def _cell(column: Figures, name: str) -> str:
     return number(column.get(name), 3) + (f" +- {error}" if error else "")
 
 
-PART = Part("sequences", "metrics", (), "metrics.figures", measure, flat, print_sequences)
+PART = EvaluationPart("sequences", "metrics", (), measure, flat, print_sequences)

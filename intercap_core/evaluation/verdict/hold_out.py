@@ -1,26 +1,85 @@
-"""A result judged by what was kept from it: one camera at a time, every other frame."""
+"""Held-out evaluation of a joint fit: one camera at a time, and every other frame.
+
+The joint fit's energy at its minimum x is a sum of image terms of each camera and of terms without
+images. Leaving out the rows of camera c and solving the normal equations once gives the fit without
+this camera to first order:
+
+    x_c = x - (H - H_c)^-1 (g - g_c) + H^-1 g
+
+The last term removes the remaining descent of the full problem. Correspondences, robust weights and
+contact stay as they are at x, so that a refit costs one linear solve. A refit iterated to
+convergence with new correspondences moves the body 4 to 10 % further.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 import torch
 
 from intercap_core.config import JointSettings
-from intercap_core.evaluation.verdict.constants import HELD_S
-from intercap_core.evaluation.verdict.part import Part
-from intercap_core.evaluation.verdict.refits import Refits
+from intercap_core.joint.constants import MIN_DAMPING
+from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
+from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import JointResult
-from intercap_core.joint.state import State
+from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.body_data import BodyData
+from intercap_core.joint.terms.no_object import NoObject
+from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.object_track.view_report import ViewReport
 
-JOINTS = {Part.BODY: slice(0, 22), Part.HANDS: slice(25, 55)}
+# A camera judges the frames of this many seconds, then the next camera does. Longer than the window
+# of velocities, short enough that every camera judges a recording of two seconds.
+HELD_S = 0.2
+
+
+class JudgedPart(StrEnum):
+    """What is judged."""
+
+    BODY = "body"
+    HANDS = "hands"
+    OBJECT = "object"
+
+
+class Refits:
+    """Refits around one ``state``, at which the ``assembly``'s terms were refreshed."""
+
+    def __init__(self, assembly: Assembly, state: State) -> None:
+        self.state = state
+        self._seen: list[tuple[slice, BodyData | ObjectData | ObjectImagesData]] = [
+            (BODY, assembly.body)
+        ]
+        if not isinstance(assembly.object_, NoObject):
+            self._seen.append((OBJECT, assembly.object_))
+        self._rest = NormalEquations(len(state), assembly.problem.threads)
+        for term in assembly.problem.terms:
+            if not any(term is seen for _, seen in self._seen):
+                term.add(state, self._rest)
+        self._bands = np.empty_like(self._rest.bands)
+        every = np.ones((len(state), len(assembly.body.time_offset)), bool)
+        self._descent = self._step(every)
+
+    def with_views(self, used: np.ndarray) -> State:
+        """The state that the views ``used`` (T, C) alone lead to."""
+        return self.state.moved(limited(self._step(used) - self._descent))
+
+    def _step(self, used: np.ndarray) -> np.ndarray:
+        equations = self._rest.copy(self._bands)
+        for columns, term in self._seen:
+            equations.add_blocks(term.name, columns, *term.of_views(used, self.state))
+        step = equations.step(np.full(len(self.state), MIN_DAMPING))
+        if step is None:  # nothing holds some parameter: no step tells anything
+            return np.full(self._rest.gradient.shape, np.nan)
+        return step
+
+
+JOINTS = {JudgedPart.BODY: slice(0, 22), JudgedPart.HANDS: slice(25, 55)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +113,8 @@ class HeldOut:
     within: ViewErrors
     without: ViewErrors
     keypoint_m: np.ndarray
-    shift: dict[Part, np.ndarray]
-    repeated: dict[Part, np.ndarray]
+    shift: dict[JudgedPart, np.ndarray]
+    repeated: dict[JudgedPart, np.ndarray]
 
 
 def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
@@ -97,7 +156,7 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
         held,
         within,
         judged,
-        _at_person(judged.keypoint_px, result, points[Part.BODY]),
+        _at_person(judged.keypoint_px, result, points[JudgedPart.BODY]),
         {
             part: np.stack([_rms(other[part] - at) for other in moved])
             for part, at in points.items()
@@ -165,7 +224,7 @@ def _taken(states: list[State], which: np.ndarray) -> State:
     return State(body, one.betas, one.expression, rotation, translation)
 
 
-def _points(inputs: JointInputs, state: State) -> dict[Part, np.ndarray]:
+def _points(inputs: JointInputs, state: State) -> dict[JudgedPart, np.ndarray]:
     """What is compared of each part (T, K, 3): joints and, where there is one, the object's centre
     of mass."""
     with torch.no_grad():
@@ -174,7 +233,7 @@ def _points(inputs: JointInputs, state: State) -> dict[Part, np.ndarray]:
     found = {part: joints[:, at] for part, at in JOINTS.items()}
     if inputs.geometry.has_object:
         centre = state.rotation @ inputs.geometry.mesh.centre_of_mass + state.translation
-        found[Part.OBJECT] = centre[:, None]
+        found[JudgedPart.OBJECT] = centre[:, None]
     return found
 
 

@@ -16,9 +16,8 @@ from intercap_core.config import (
     ObjectEntry,
     ObjectTrackSettings,
 )
-from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, hold_out
-from intercap_core.evaluation.verdict.part import Part
-from intercap_core.evaluation.verdict.stated import FEATURES, Stated, state
+from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
+from intercap_core.evaluation.verdict.stated import FEATURES, ErrorEstimate, estimate_error
 from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.sequential import SequentialFits
@@ -30,14 +29,14 @@ Values = dict[str, np.ndarray | list[str]]
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class SequenceVerdict:
     """Of T frames and C cameras: what was held out, None where nothing could be, and what is stated
     of each part: not of an object where there is none."""
 
     cameras: tuple[str, ...]
     frames: int
     held: HeldOut | None
-    stated: dict[Part, Stated]
+    stated: dict[JudgedPart, ErrorEstimate]
 
     @classmethod
     def reach(
@@ -55,7 +54,7 @@ class Verdict:
         settings: JointSettings,
         body_settings: BodyFitSettings,
         track_settings: ObjectTrackSettings,
-    ) -> Verdict:
+    ) -> SequenceVerdict:
         """Judge joint.h5 by what the stages before it had; no truth is read.
 
         Raises UserError where an artefact or the mesh cannot be used.
@@ -78,10 +77,14 @@ class Verdict:
         ) as inputs:
             held = hold_out(inputs, settings, result)
             sequential = inputs.sequential
-            parts = [part for part in Part if part != Part.OBJECT or inputs.geometry.has_object]
+            parts = [
+                part
+                for part in JudgedPart
+                if part != JudgedPart.OBJECT or inputs.geometry.has_object
+            ]
             moved = _moved(inputs, result, body_fit, joint)
         stated = {
-            part: state(
+            part: estimate_error(
                 held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)
             )
             for part in parts
@@ -128,16 +131,16 @@ class Verdict:
         return values
 
 
-def _sigma(fits: SequentialFits, part: Part) -> np.ndarray:
+def _sigma(fits: SequentialFits, part: JudgedPart) -> np.ndarray:
     """What the sequential fits state of a part (T,), metres."""
-    if part == Part.OBJECT:
+    if part == JudgedPart.OBJECT:
         return fits.object_sigma
     return np.sqrt((fits.joint_sigma[:, JOINTS[part]] ** 2).mean(axis=1))
 
 
 def _moved(
     inputs: JointInputs, result: JointResult, body_fit: Path, joint: Path
-) -> dict[Part, np.ndarray]:
+) -> dict[JudgedPart, np.ndarray]:
     """By how much the joint fit is elsewhere than the sequential ones (T,), metres, RMS over a
     part's joints; of the object at its centre of mass."""
     with artefacts.read(body_fit, BODY_FIT) as before, artefacts.read(joint, JOINT) as after:
@@ -148,13 +151,13 @@ def _moved(
         old, new = inputs.sequential.state, result.state
         turned = (new.rotation - old.rotation) @ middle
         shift = turned + new.translation - old.translation
-        found[Part.OBJECT] = np.linalg.norm(shift, axis=1)
+        found[JudgedPart.OBJECT] = np.linalg.norm(shift, axis=1)
     return found
 
 
-def _known(fits: SequentialFits, result: JointResult, part: Part) -> np.ndarray:
+def _known(fits: SequentialFits, result: JointResult, part: JudgedPart) -> np.ndarray:
     """Frames (T,) in which the part was measured, and is where it was measured."""
     flags = fits.flags
-    if part == Part.OBJECT:
+    if part == JudgedPart.OBJECT:
         return ~(flags.lost | flags.carried) & ~result.contradicted
     return ~flags.filled

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from intercap_core.body.maps import maps_path
 from intercap_core.evaluation.contact import CONTACT_M
-from intercap_core.evaluation.verdict_figures import StatedError
+from intercap_core.evaluation.verdict.figures import StatedError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
 from intercap_core.output.export.body_files import Written

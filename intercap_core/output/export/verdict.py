@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_cameras import VIEWS, CameraVerdict, camera_verdicts
-from intercap_core.evaluation.verdict_figures import StatedError, stated_errors
+from intercap_core.evaluation.verdict.figures import (
+    IMAGE_MEASURES,
+    HeldOutCamera,
+    StatedError,
+    held_out_cameras,
+    stated_errors,
+)
 from intercap_core.output.export.numbers import listed
 
 MEANING = (
@@ -27,7 +32,7 @@ class Verdict:
 
     stated: Sequence[StatedError]
     by_frame: np.ndarray
-    cameras: Sequence[CameraVerdict]
+    cameras: Sequence[HeldOutCamera]
 
     @classmethod
     def of(cls, metrics: SequenceMetrics) -> Verdict:
@@ -35,7 +40,7 @@ class Verdict:
         by_frame = (
             1e3 * metrics.values["verdict/error_frame"] if stated else np.zeros((0, len(metrics)))
         )
-        return cls(stated, by_frame, camera_verdicts(metrics))
+        return cls(stated, by_frame, held_out_cameras(metrics))
 
     @property
     def said(self) -> list[int]:
@@ -85,7 +90,7 @@ class Verdict:
             parts = list(self.cameras[0].shift_mm)
             found |= {
                 "verdict_camera": np.array([one.camera for one in self.cameras]),
-                "verdict_of": np.array([f"{view.of}, {view.unit}" for view in VIEWS]),
+                "verdict_of": np.array([f"{view.of}, {view.unit}" for view in IMAGE_MEASURES]),
                 "verdict_held_in": np.array([one.held_in for one in self.cameras]),
                 "verdict_held_out": np.array([one.held_out for one in self.cameras]),
                 "verdict_part": np.array(parts),
@@ -96,7 +101,7 @@ class Verdict:
         return found
 
     @staticmethod
-    def _camera(one: CameraVerdict) -> dict[str, Any]:
+    def _camera(one: HeldOutCamera) -> dict[str, Any]:
         return {
             "camera": one.camera,
             **{
@@ -106,7 +111,9 @@ class Verdict:
                     "held_in": listed(np.array(held_in), 3),
                     "held_out": listed(np.array(held_out), 3),
                 }
-                for view, held_in, held_out in zip(VIEWS, one.held_in, one.held_out, strict=True)
+                for view, held_in, held_out in zip(
+                    IMAGE_MEASURES, one.held_in, one.held_out, strict=True
+                )
             },
             "shift_mm": {p: listed(np.array(mm), 2) for p, mm in one.shift_mm.items()},
         }

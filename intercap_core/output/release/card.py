@@ -22,7 +22,7 @@ from intercap_core.config import CardSettings
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
-from intercap_core.evaluation.verdict_figures import mean_stated, stated_errors
+from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
 from intercap_core.output.release.splits import Split, split
 from intercap_core.versions import versions
 

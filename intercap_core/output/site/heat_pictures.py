@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.evaluation.heatmaps import SurfaceHeat
+from intercap_core.evaluation.summary import SurfaceHeat
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.output.site.shading import Painted, Picture, draw

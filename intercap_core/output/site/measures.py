@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.evaluation import figures, hold_figures
+from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.output.site import charts
 from intercap_core.stage_list import ESTIMATES
@@ -111,7 +111,7 @@ def _sweep(known: Sequence[SequenceMetrics]) -> str:
 
 def _reliability(known: Sequence[SequenceMetrics]) -> str:
     """Share of true contact over the stated probability of contact, in bins."""
-    table = hold_figures.contact_reliability(known)
+    table = contact_figures.contact_reliability(known)
     if table is None or len(table.count) < 2:
         return ""
     return charts.line_chart(

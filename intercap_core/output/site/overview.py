@@ -12,7 +12,7 @@ import pandas as pd
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
-from intercap_core.evaluation.verdict_figures import mean_stated
+from intercap_core.evaluation.verdict.figures import mean_stated
 from intercap_core.output.site import measures, verdict
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.heat_pictures import COLOUR_STOPS, HeatPicture

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from intercap_core.config import ContactInterval
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_figures import stated_errors
+from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.output.site import body, capture, charts, measures, track, verdict
 from intercap_core.output.site.body import BodyFacts
 from intercap_core.output.site.capture import CaptureFacts

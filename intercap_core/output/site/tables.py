@@ -13,7 +13,7 @@ from pyarrow import csv
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
-from intercap_core.evaluation.verdict_figures import TRUE, mean_stated, stated_errors
+from intercap_core.evaluation.verdict.figures import TRUE, mean_stated, stated_errors
 from intercap_core.stage_list import ESTIMATES
 
 _MILLIMETRES = {

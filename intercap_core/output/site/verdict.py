@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict_figures import StatedError, stated_errors, verdict_figures
+from intercap_core.evaluation.verdict.figures import StatedError, stated_errors, verdict_figures
 
 # dataset, what it is, scale to the unit that is printed, digits
 _VIEWS: tuple[tuple[str, str, str, float, int], ...] = (

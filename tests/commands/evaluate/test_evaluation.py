@@ -19,10 +19,9 @@ from intercap_core.commands.evaluate.objects import lost_by_draw, print_objects
 from intercap_core.commands.evaluate.part import Measured, require_truth
 from intercap_core.commands.evaluate.run import QUICK_SETTINGS
 from intercap_core.errors import UserError
-from intercap_core.evaluation.body_clouds import CLOUD_KEYS
-from intercap_core.evaluation.body_errors import BodyErrors
-from intercap_core.evaluation.capture import CaptureErrors, SlipCounts
+from intercap_core.evaluation.body_errors import CLOUD_KEYS, BodyErrors
 from intercap_core.evaluation.object_errors import ObjectErrors
+from intercap_core.evaluation.scene_errors import CaptureErrors, SlipCounts
 from intercap_core.project import load_project
 
 CONFIGS = sorted(Path("config/capture").glob("*.yaml"))

@@ -12,7 +12,7 @@ from intercap_core.commands.evaluate.captures import PART
 from intercap_core.commands.evaluate.part import measured_once, spread
 from intercap_core.config import Config, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
-from intercap_core.evaluation.capture import CaptureErrors, SlipCounts
+from intercap_core.evaluation.scene_errors import CaptureErrors, SlipCounts
 from intercap_core.project import Project
 from tests.helpers.kinect_files import entry_of
 

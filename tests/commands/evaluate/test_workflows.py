@@ -16,7 +16,6 @@ from intercap_core.cli import (
 )
 from intercap_core.commands.evaluate import budget
 from intercap_core.commands.evaluate.part import Targets
-from intercap_core.commands.evaluate.reference import worse
 from intercap_core.commands.evaluate.run import PARTS
 from intercap_core.commands.evaluate.workflows import Order, orders_of, progress
 from intercap_core.project import load_project
@@ -113,13 +112,3 @@ def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
     assert progress([order], 2, 0.0) == "0 of 1 projects done after 0 minutes, at most 1 left"
     order.status = 0
     assert order.left() == (0.0, 140.0)
-
-
-def test_worse_goes_beyond_the_spread_in_the_bad_direction() -> None:
-    assert worse("joint.body_pve_mm", 8.0, 7.0, 0.3)
-    assert not worse("joint.body_pve_mm", 8.0, 7.0, 0.6)
-    assert not worse("joint.body_pve_mm", 6.0, 7.0, 0.1)
-    assert worse("joint.contact_region_f1", 0.8, 0.95, 0.02)
-    assert worse("object.cup.lost_share", 0.3, 0.0, 0.0)
-    assert not worse("object.recordings", 3, 5, 0.0)
-    assert not worse("joint.rest_jitter_mm", 3e-4, 2e-4, 0.0)  # nothing rests more still

@@ -13,9 +13,8 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
-from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, hold_out
-from intercap_core.evaluation.verdict.judge import Verdict
-from intercap_core.evaluation.verdict.part import Part
+from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
+from intercap_core.evaluation.verdict.judge import SequenceVerdict
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.fit import assemble
 from intercap_core.joint.inputs import JointInputs, open_inputs
@@ -67,7 +66,7 @@ def held(capture: fitted.Capture) -> HeldOut:
 def test_every_camera_is_held_out_in_turn(held: HeldOut) -> None:
     np.testing.assert_array_equal(held.cameras, [0, 1, 2])
     np.testing.assert_array_equal(held.held, [0, 0, 0, 1, 1, 1])  # 0.2 s at 15 frames a second
-    for part in Part:
+    for part in JudgedPart:
         assert held.shift[part].shape == (3, 6)
         assert np.isfinite(held.shift[part]).all()
         assert np.isfinite(held.repeated[part]).all()
@@ -101,7 +100,7 @@ def _lying(capture: fitted.Capture, folder: Path, camera: int, pixels: float) ->
 
 def test_a_camera_that_lies_is_told(capture: fitted.Capture, held: HeldOut, tmp_path: Path) -> None:
     lie = _held(capture, person=_lying(capture, tmp_path, camera=1, pixels=3.0))
-    before, after = (np.mean(h.shift[Part.BODY], axis=1) for h in (held, lie))
+    before, after = (np.mean(h.shift[JudgedPart.BODY], axis=1) for h in (held, lie))
     # of what the lie is worth at the person's distance
     assert ((after - before) > 0.05 * 3.0 * 2.4 / 230).all()
     mine = lie.held == 1
@@ -136,13 +135,13 @@ def test_one_step_goes_where_many_do(capture: fitted.Capture, held: HeldOut) -> 
         without = descended(used)
         joints = [_joints(inputs, state) for state in (every, without)]
     moved = np.sqrt(((joints[1] - joints[0]) ** 2).sum(axis=2).mean())
-    found = np.sqrt((held.shift[Part.BODY][1] ** 2).mean())
+    found = np.sqrt((held.shift[JudgedPart.BODY][1] ** 2).mean())
     assert found == pytest.approx(moved, rel=0.35, abs=2e-4)
 
 
 def _joints(inputs: JointInputs, state: State) -> np.ndarray:
     body = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
-    return body.joints.detach().numpy()[:, JOINTS[Part.BODY]]
+    return body.joints.detach().numpy()[:, JOINTS[JudgedPart.BODY]]
 
 
 def test_one_camera_alone_judges_nothing(capture: fitted.Capture, tmp_path: Path) -> None:
@@ -153,7 +152,7 @@ def test_one_camera_alone_judges_nothing(capture: fitted.Capture, tmp_path: Path
         values[:, 1:, :, 2] = 0  # no other camera sees a keypoint
         file["keypoints"][...] = values
     paths = {stage: capture.paths[stage] for stage in (*STAGES, "joint")} | {"person": path}
-    verdict = Verdict.reach(
+    verdict = SequenceVerdict.reach(
         **paths,
         object_=capture.object_,
         body_models=fitted.BODY_MODELS,

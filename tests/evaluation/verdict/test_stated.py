@@ -1,4 +1,4 @@
-"""Stated errors: worked out by hand, and where nothing is said."""
+"""ErrorEstimate errors: worked out by hand, and where nothing is said."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import pytest
 
 from bench import verdict as bench
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict.constants import FACTORS
-from intercap_core.evaluation.verdict.hold_out import HeldOut, ViewErrors
-from intercap_core.evaluation.verdict.part import Part
-from intercap_core.evaluation.verdict.stated import state
-from intercap_core.evaluation.verdict_figures import stated_errors, verdict_figures
+from intercap_core.evaluation.verdict.figures import stated_errors, verdict_figures
+from intercap_core.evaluation.verdict.hold_out import HeldOut, JudgedPart, ViewErrors
+from intercap_core.evaluation.verdict.stated import FACTORS, estimate_error
 
 T = 4
 
@@ -22,16 +20,16 @@ T = 4
 def _held(shift: float, keypoint: float) -> HeldOut:
     none = np.full((T, 3), np.nan)
     empty = ViewErrors(none, none, none, none)
-    every = {part: np.full((3, T), shift) for part in Part}
-    still = {part: np.zeros(T) for part in Part}
+    every = {part: np.full((3, T), shift) for part in JudgedPart}
+    still = {part: np.zeros(T) for part in JudgedPart}
     return HeldOut(np.arange(3), np.zeros(T, int), empty, empty, np.full(T, keypoint), every, still)
 
 
 def test_features_add_up_as_squares() -> None:
-    said = state(
-        _held(0.003, 0.02), Part.BODY, np.full(T, 0.005), np.full(T, 0.004), np.ones(T, bool)
+    said = estimate_error(
+        _held(0.003, 0.02), JudgedPart.BODY, np.full(T, 0.005), np.full(T, 0.004), np.ones(T, bool)
     )
-    rest, (shift, keypoint, sigma, moved), spread = FACTORS[Part.BODY]
+    rest, (shift, keypoint, sigma, moved), spread = FACTORS[JudgedPart.BODY]
     jackknife = np.sqrt(2 / 3 * 3 * 0.003**2)
     expected = np.sqrt(
         rest**2
@@ -47,7 +45,9 @@ def test_features_add_up_as_squares() -> None:
 
 def test_frames_that_were_filled_in_say_nothing() -> None:
     known = np.array([True, True, True, False])
-    said = state(_held(0.003, 0.02), Part.OBJECT, np.full(T, 0.005), np.zeros(T), known)
+    said = estimate_error(
+        _held(0.003, 0.02), JudgedPart.OBJECT, np.full(T, 0.005), np.zeros(T), known
+    )
     assert np.isfinite(said.error)
     np.testing.assert_array_equal(np.isfinite(said.by_frame), known)
 
@@ -62,7 +62,9 @@ def test_frames_that_were_filled_in_say_nothing() -> None:
     ],
 )
 def test_nothing_is_said_without_evidence(held: HeldOut | None, known: int, reason: str) -> None:
-    said = state(held, Part.BODY, np.full(T, 0.005), np.zeros(T), np.arange(T) < known)
+    said = estimate_error(
+        held, JudgedPart.BODY, np.full(T, 0.005), np.zeros(T), np.arange(T) < known
+    )
     assert np.isnan(said.error) and np.isnan(said.by_frame).all()
     assert reason in said.silent
 

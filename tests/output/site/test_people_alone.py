@@ -13,8 +13,7 @@ import pytest
 from intercap_core.commands.evaluate.sequences import areas
 from intercap_core.config import MetricsSettings, PageSettings
 from intercap_core.evaluation.figures import SequenceMetrics, flag_figures, truth_figures
-from intercap_core.evaluation.heatmaps import collect
-from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.evaluation.summary import SequenceSummary, collect_heatmaps
 from intercap_core.object_track.absent import SOURCE, absent_track
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stages import metrics
@@ -114,7 +113,7 @@ def test_heatmaps_count_those_who_could_touch(out: Path) -> None:
     summaries = [
         SequenceSummary.read(out / "summaries" / f"{name}.h5") for name in (ALONE, HELD, MISSED)
     ]
-    found, held = collect(summaries), collect(summaries[1:2])
+    found, held = collect_heatmaps(summaries), collect_heatmaps(summaries[1:2])
     assert found.body_frames == TOTAL and list(found.objects) == ["football"]
     np.testing.assert_array_equal(found.body, held.body)
     assert found.objects["football"].frames == TOTAL

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.evaluation.heatmaps import SurfaceHeat
+from intercap_core.evaluation.summary import SurfaceHeat
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.output.site import charts, heat_pictures, overlays, shading
 

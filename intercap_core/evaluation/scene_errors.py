@@ -1,4 +1,4 @@
-"""Errors of the scene artefact against truth: poses, time, slips, floor, depth."""
+"""Errors of the scene artefact against truth: camera poses, time offsets, slips, floor, depth."""
 
 from __future__ import annotations
 
@@ -10,9 +10,44 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.evaluation.extrinsics import displacement, rig_centre
-from intercap_core.evaluation.times import match_times
+from intercap_core.evaluation.truth import match_times
+from intercap_core.geometry.camera.transforms import invert
 from intercap_core.schemas import FRAMES, SCENE, TRUTH
+
+CUBE_SIDE_M = 2.0
+
+
+def rig_centre(master_from_camera: np.ndarray) -> np.ndarray:
+    """The point (3,) nearest to all optical axes of cameras (C, 4, 4), least squares.
+
+    A little ridge towards the mean camera position keeps parallel axes solvable.
+    """
+    position = master_from_camera[:, :3, 3]
+    axis = master_from_camera[:, :3, 2]
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    ridge = 1e-6 * np.eye(3)
+    right = np.einsum("cij,cj->i", across, position) + ridge @ position.mean(0)
+    return np.linalg.solve(across.sum(0) + ridge, right)
+
+
+def displacement(
+    master_from_camera: np.ndarray,
+    true_master_from_camera: np.ndarray,
+    master: int,
+) -> np.ndarray:
+    """RMS displacement (C,) of the points of a 2 m cube at the rig's true centre, metres.
+
+    Both rigs (C, 4, 4) are first expressed in their own ``master`` camera. The mean over the cube
+    of |A x + b|^2 is exact: |A centre + b|^2 + side^2 / 12 |A|^2.
+    """
+    estimated = invert(master_from_camera[master]) @ master_from_camera
+    true = invert(true_master_from_camera[master]) @ true_master_from_camera
+    moved = estimated @ invert(true)
+    linear = moved[:, :3, :3] - np.eye(3)
+    at_centre = linear @ rig_centre(true) + moved[:, :3, 3]
+    spread = CUBE_SIDE_M**2 / 12 * (linear**2).sum((1, 2))
+    return np.sqrt((at_centre**2).sum(1) + spread)
+
 
 CAPTURE_RADIUS_M = 1.5  # around the rig's centre, on the floor
 _RINGS, _SPOKES = 40, 90  # of the places on the floor where heights are compared

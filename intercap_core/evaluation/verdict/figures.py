@@ -1,4 +1,4 @@
-"""The errors that the verdict states without truth, and how they compare with the true ones."""
+"""Figures of the held-out verdict from the metrics artefact: stated errors, true errors, cameras."""
 
 from __future__ import annotations
 
@@ -11,6 +11,72 @@ from scipy.stats import spearmanr
 
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import Figures, SequenceMetrics
+
+
+@dataclass(frozen=True)
+class ImageMeasure:
+    """A measure of how well an image agrees: the dataset's name within verdict/, what it is, the
+    unit that it is told in, and how many of them the dataset's unit has."""
+
+    key: str
+    of: str
+    unit: str
+    scale: float
+
+
+IMAGE_MEASURES = (
+    ImageMeasure("keypoint_px", "keypoints of the body", "px", 1.0),
+    ImageMeasure("person_m", "the person's points from the skin", "mm", 1e3),
+    ImageMeasure("overlap", "the object's mask, intersection over union", "1", 1.0),
+    ImageMeasure("object_depth_m", "the object's depth", "mm", 1e3),
+)
+
+
+@dataclass(frozen=True)
+class HeldOutCamera:
+    """Medians over the frames that the ``camera`` judges, in the order of ``IMAGE_MEASURES``: errors of the
+    result (``held_in``) and of a fit without the camera (``held_out``); ``shift_mm`` by part, how
+    far it is elsewhere without the camera (root mean square over frames). NaN = not known."""
+
+    camera: str
+    held_in: tuple[float, ...]
+    held_out: tuple[float, ...]
+    shift_mm: dict[str, float]
+
+
+def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
+    """Of every camera that was held out; empty where none was."""
+    values = sequence.values
+    if "verdict/held_camera" not in values:
+        return ()
+    parts = [str(part) for part in values["verdict/part_names"]]
+    found = []
+    for c, camera in enumerate(values["verdict/camera_names"]):
+        shift = values["verdict/shift"][:, c]
+        if not np.isfinite(shift).any():
+            continue
+        judged = values["verdict/held_camera"] == c
+        held_in, held_out = (
+            tuple(
+                view.scale * _median(values[f"verdict/{view.key}{end}"][judged, c])
+                for view in IMAGE_MEASURES
+            )
+            for end in ("", "_held_out")
+        )
+        moved = {part: 1e3 * _rms(shift[place]) for place, part in enumerate(parts)}
+        found.append(HeldOutCamera(str(camera), held_in, held_out, moved))
+    return tuple(found)
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _rms(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+
 
 BAD_MM = 20.0  # a part of a sequence whose error is larger should not go unnoticed
 WITHIN = 1.5  # a stated error within this factor of the true one tells it

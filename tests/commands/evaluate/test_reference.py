@@ -1,0 +1,87 @@
+"""The regression gate of the quick evaluation."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from intercap_core.commands.evaluate.reference import (
+    REFERENCE,
+    GatedFigure,
+    GateResult,
+    passes_gate,
+    read_reference,
+    update_reference,
+)
+from intercap_core.errors import UserError
+
+ERROR = GatedFigure("joint.body_pve_mm", 7.0, 0.5, higher_is_better=False)
+SCORE = GatedFigure("joint.contact_f1", 0.9, 0.05, higher_is_better=True)
+
+
+@pytest.mark.parametrize(
+    ("figure", "now", "expected"),
+    [
+        (ERROR, 7.5, GateResult.SAME),
+        (ERROR, 7.6, GateResult.WORSE),
+        (ERROR, 6.4, GateResult.BETTER),
+        (SCORE, 0.86, GateResult.SAME),
+        (SCORE, 0.84, GateResult.WORSE),
+        (SCORE, 0.96, GateResult.BETTER),
+        (ERROR, None, GateResult.MISSING),
+        (ERROR, float("nan"), GateResult.MISSING),
+    ],
+)
+def test_figure_is_worse_beyond_its_spread_in_its_bad_direction(
+    figure: GatedFigure, now: float | None, expected: GateResult
+) -> None:
+    assert figure.judge(now) == expected
+
+
+def test_gate_prints_all_figures_and_fails_on_worse_or_missing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    gate = [ERROR, SCORE]
+    assert passes_gate({ERROR.key: 7.2, SCORE.key: 0.95}, gate)
+    assert not passes_gate({ERROR.key: 8.0, SCORE.key: 0.95}, gate)
+    printed = capsys.readouterr().out.splitlines()
+    (row,) = [line.split() for line in printed if ERROR.key in line and "worse" in line.split()]
+    assert row == [ERROR.key, "7.000", "8.000", "0.500", "worse"]
+    assert not passes_gate({ERROR.key: 7.2}, gate)
+    assert "missing: joint.contact_f1" in capsys.readouterr().out.replace("or missing", "")
+
+
+def test_recorded_reference_states_a_spread_and_no_times() -> None:
+    reference = read_reference(Path(__file__).parents[3] / REFERENCE)
+    assert len(reference) > 30
+    assert not [f.key for f in reference if f.key.startswith("time.") or "memory" in f.key]
+
+
+def test_update_replaces_values_and_keeps_spreads(tmp_path: Path) -> None:
+    path = tmp_path / "reference.json"
+    entry = {"value": 7.0, "spread": 0.5, "better": "lower"}
+    path.write_text(json.dumps({ERROR.key: entry}))
+    update_reference({ERROR.key: 6.0, "not.gated": 1.0}, path)
+    assert read_reference(path) == [GatedFigure(ERROR.key, 6.0, 0.5, higher_is_better=False)]
+    with pytest.raises(UserError, match=r"not updated.*joint\.body_pve_mm"):
+        update_reference({}, path)
+    assert read_reference(path)[0].value == 6.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", '{"a_mm": 3}', '{"a_mm": {"value": 1, "spread": 1, "better": "up"}}',
+     '{"a_mm": {"value": 1, "spread": -1, "better": "lower"}}'],
+)  # fmt: skip
+def test_malformed_reference_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "reference.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"reference\.json"):
+        read_reference(path)
+
+
+def test_missing_reference_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file"):
+        read_reference(tmp_path / "reference.json")
