@@ -76,9 +76,11 @@ RISKIEST = (
     Probe("person.MUCH_BETTER", "when a limb's sides are exchanged"),
     Probe("person.EXCHANGED_VIEW_COST", "what each exchanged view costs"),
     Probe("person.SAME_PERSON_GAP_M", "which people of two views are one"),
-    Probe("segmentation.PERSON_MARGINS", "what is the person, and no object"),
-    Probe("segmentation.GONE_SHARE", "what gives way and is no background"),
-    Probe("segmentation.FLOOR_M", "what is the floor"),
+    Probe(
+        "person.segmentation.depth_candidates:PERSON_MARGINS", "what is the person, and no object"
+    ),
+    Probe("person.segmentation.foreground:GONE_SHARE", "what gives way and is no background"),
+    Probe("person.segmentation.depth_candidates:FLOOR_M", "what is the floor"),
     Probe("scene.MIN_SLIP_GAIN", "when a camera slipped, beyond doubt"),
     Probe("scene.CLEAR_SLIP_GAIN", "slipped, rather than late throughout"),
     Probe("scene.SURFACE_SIGMA_FLOOR_M", "trust in surfaces between cameras"),

@@ -18,9 +18,8 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import exchanged, ranges
 from intercap_core.formats.detections.read import Detections
 from intercap_core.output.viewer.package import payload
-from intercap_core.person.facing import against_build
-from intercap_core.person.sides import ARMS, LEGS, swapped
-from intercap_core.person.stated_sides import stated_images
+from intercap_core.person.left_right import excess_build_cost
+from intercap_core.person.sides import ARMS, LEGS, images_with_stated_sides, swap_sides
 from intercap_core.schemas import BODY_FIT, JOINT, PERSON, SCENE
 from intercap_core.stages.person import subject_keypoints
 
@@ -100,7 +99,9 @@ def doubts(opened: Opened) -> list[Doubt]:
     stated = np.zeros(found.image_of.shape, bool)
     with contextlib.suppress(UserError):  # an annotation that is none is told elsewhere
         annotation = opened.project.annotation(opened.name, look_at_frames=False)
-        stated = stated_images(annotation.left_right, found.cameras, found.image_of, opened.name)
+        stated = images_with_stated_sides(
+            annotation.left_right, found.cameras, found.image_of, opened.name
+        )
     limbs = np.where(found.exchanged < 0, -1, found.exchanged ^ stated[..., None])
     return _runs(limbs, found)
 
@@ -128,7 +129,7 @@ def _sides(opened: Opened) -> Sides:
     source, result, jumped = _result(opened, joints)
     return Sides(
         cameras, np.clip(pixels, _NOWHERE, 32767).astype(np.int16), limbs, result, source,
-        against_build(joints.astype(np.float64)), jumped, image_of,
+        excess_build_cost(joints.astype(np.float64)), jumped, image_of,
     )  # fmt: skip
 
 
@@ -136,7 +137,7 @@ def _exchanged(
     given: np.ndarray, used: np.ndarray, limb: np.ndarray, confident: float
 ) -> np.ndarray:
     """Whether a limb (T, C) was exchanged: 1 yes, 0 no, -1 it is not seen."""
-    own, as_found, other = used[:, :, limb], given[:, :, limb], swapped(given)[:, :, limb]
+    own, as_found, other = used[:, :, limb], given[:, :, limb], swap_sides(given)[:, :, limb]
     seen = (as_found[..., 2] >= confident).any(2)
     exchanged = (own == other).all((2, 3)) & (own != as_found).any((2, 3))
     return np.where(seen, exchanged.astype(int), -1)

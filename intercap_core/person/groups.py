@@ -19,14 +19,16 @@ from intercap_core.geometry.camera.triangulation import (
     reproject,
     view_pairs,
 )
-from intercap_core.person.constants import (
-    LIFTED_SUPPORT,
-    MIN_COMMON_POINTS,
-    SAME_PERSON_GAP_M,
-    SAME_PERSON_M,
-    SAME_PERSON_PX_AT_1080P,
-)
 from intercap_core.person.sides import BODY_POINTS, PARTNER
+
+MIN_COMMON_POINTS = 5  # body points; fewer do not tell two people apart; tuned on the studio
+# Median distance within which a view shows the same person, px: detectors' biases and calibration
+# stay well under it, another person half a metre away (160 px at 2.6 m) is well over it.
+SAME_PERSON_PX_AT_1080P = 60.0
+SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the studio
+SAME_PERSON_M = 0.3  # between centres, of people who share a detection; nobody stands nearer
+LIFTED_SUPPORT = 0.5  # of a point that one view lifts by depth; triangulated, it counts about two
+
 
 NOBODY = -1
 
@@ -38,7 +40,7 @@ set t, by its depth alone: called with t, c and the people."""
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class PersonGroup:
     """One person in one frame set: ``members`` (C,) index of the view's person or -1, ``points``
     (25, 3) metres, NaN = not known, ``support``, the number of points seen, over views, and
     ``errors`` (C,), how far the points are from each member's, share of what is allowed."""
@@ -58,12 +60,12 @@ class Group:
         """Median of the known points (3,)."""
         return np.nanmedian(self.points, 0)
 
-    def without(self, views: np.ndarray) -> Group:
+    def without(self, views: np.ndarray) -> PersonGroup:
         """The same person, not seen by some ``views`` (C,) bool."""
         return replace(self, members=np.where(views, NOBODY, self.members))
 
 
-def groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[Group]:
+def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[PersonGroup]:
     """Group one set's people (P, 25, 3) of each view; best supported first."""
     rays, seen = [], []
     for c, found in enumerate(people):
@@ -72,7 +74,7 @@ def groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> 
         seen.append(found[..., 2] >= min_confidence)
     pairs, rest = view_pairs(rig)
     proposals = _pair_proposals(pairs, rays, seen, rig) or _pair_proposals(rest, rays, seen, rig)
-    grown: list[Group] = []
+    grown: list[PersonGroup] = []
     for _, points, first, second in sorted(proposals, key=lambda p: p[0]):
         if any(
             g.members[first[0]] == first[1] and g.members[second[0]] == second[1] for g in grown
@@ -82,13 +84,13 @@ def groups_of_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> 
         if group is not None:
             grown.append(group)
     grown.sort(key=lambda group: -group.support)
-    result: list[Group] = []
+    result: list[PersonGroup] = []
     for group in grown:
         result = _with_another(result, group)
     return result
 
 
-def _with_another(groups: list[Group], group: Group) -> list[Group]:
+def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonGroup]:
     """Add a person whom two views or more see as nobody else; a detection that two people could be
     is that one's whom it fits better."""
     shared = [(group.members == g.members) & (group.members != NOBODY) for g in groups]
@@ -104,7 +106,7 @@ def _with_another(groups: list[Group], group: Group) -> list[Group]:
     return [*result, group] if all(g.views > 1 for g in result) else groups
 
 
-def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[Group]:
+def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[PersonGroup]:
     """Every person (P, 25, 3) of each view as a group of its own; best supported first."""
     result = []
     for c, found in enumerate(people):
@@ -113,7 +115,9 @@ def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[Group]:
             if count >= MIN_COMMON_POINTS:
                 members = np.full(len(people), NOBODY, np.int32)
                 members[c] = i
-                result.append(Group(members, points, LIFTED_SUPPORT * count, np.zeros(len(people))))
+                result.append(
+                    PersonGroup(members, points, LIFTED_SUPPORT * count, np.zeros(len(people)))
+                )
     return sorted(result, key=lambda group: -group.support)
 
 
@@ -156,7 +160,7 @@ def _grow(
     people: list[np.ndarray],
     seen: list[np.ndarray],
     rig: Rig,
-) -> Group | None:
+) -> PersonGroup | None:
     """Add to a proposal the person of every view that it reprojects onto."""
     members = np.full(len(rig), NOBODY, np.int32)
     members[first[0]], members[second[0]] = first[1], second[1]
@@ -174,7 +178,7 @@ def _grow(
         if members[c] != NOBODY and best < limits[c]:
             errors[c] = best / limits[c]
             support += float((known & seen[c][members[c]]).sum()) * (1 - errors[c])
-    return Group(members, points, support, errors) if support > 0 else None
+    return PersonGroup(members, points, support, errors) if support > 0 else None
 
 
 def distance_to(

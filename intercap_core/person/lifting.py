@@ -21,22 +21,37 @@ from intercap_core.geometry.camera.clouds import depth_points
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import Triangulation
-from intercap_core.person.constants import (
-    AT_BACKGROUND_MM,
-    BODY_DEPTH_M,
-    DEPTH_STRIDE,
-    ENOUGH_TRIANGULATED,
-    HAND_INSET_M,
-    INSET_M,
-    KEYPOINT_REACH_M,
-    MIN_DEPTH_SAMPLES,
-    MIN_MOVING_POINTS,
-    NEAREST_QUANTILE,
-    OCCLUDED_BREADTH_M,
-    SURFACE_M,
-)
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
+
+KEYPOINT_REACH_M = 0.03  # half side, across the ray, of where depth is read; tuned
+MIN_DEPTH_SAMPLES = 4  # depth pixels; tuned on the studio
+# Quantile of the samples that counts as nearest: nearer ones may float between body and background.
+NEAREST_QUANTILE = 0.2  # tuned on the studio
+SURFACE_M = 0.05  # samples this far behind the nearest are another surface; tuned on the studio
+AT_BACKGROUND_MM = 40  # within this of the scene's background a pixel shows it; tuned on the studio
+DEPTH_STRIDE = 2  # pixels and rows; a quarter of the depth image is enough around a joint
+# How deep a keypoint lies under the skin, metres: measured on the open body (`body.loading`),
+# standing, the median over all horizontal directions. What is not named lies on the skin.
+INSET_M = {
+    "neck": 0.065,
+    "shoulder": 0.060,
+    "elbow": 0.046,
+    "wrist": 0.026,
+    "mid_hip": 0.13,
+    "hip": 0.106,
+    "knee": 0.059,
+    "ankle": 0.040,
+}
+HAND_INSET_M = 0.008  # half a finger's thickness
+# Between shoulders, between hips, metres, half of an adult's breadth: nearer, one occludes the
+# other.
+OCCLUDED_BREADTH_M = (0.18, 0.09)
+BODY_DEPTH_M = 0.25  # from the body's middle, along the ray, an unmoving part may lie; tuned
+ENOUGH_TRIANGULATED = 8  # body points; a set with so many needs no lifting; tuned on the studio
+MIN_MOVING_POINTS = (
+    6  # points before the background; with fewer, the person is taken for part of it
+)
 
 
 def _insets() -> np.ndarray:
@@ -51,7 +66,7 @@ INSETS_M = _insets()
 
 
 @dataclass(frozen=True, eq=False)
-class Relief:
+class DepthRelief:
     """What a depth image shows, as the colour camera sees it.
 
     ``pixels`` (N, 2) of the colour image and ``distance`` (N,) along the ray, metres; ``room`` (N,)
@@ -66,7 +81,7 @@ class Relief:
     @classmethod
     def of(
         cls, depth: np.ndarray, camera: Camera, bias_m: float, background: np.ndarray | None
-    ) -> Relief:
+    ) -> DepthRelief:
         """Every second pixel of every second row of ``depth`` (H, W) uint16 mm.
 
         ``bias_m`` is subtracted from the depth. ``background`` (H, W) of the scene, None = unknown.
@@ -141,12 +156,12 @@ class Lifter:
         self._background = [scene[key] if key in known else None for key in keys]
         self._relief = lru_cache(maxsize=len(self._rig))(self._load)
 
-    def _load(self, t: int, c: int) -> Relief | None:
+    def _load(self, t: int, c: int) -> DepthRelief | None:
         camera = self._rig[c]
         depth = self._frames.depth(t, c) if camera.depth is not None else None
         if depth is None:
             return None
-        return Relief.of(depth, camera, float(self._bias[c]), self._background[c])
+        return DepthRelief.of(depth, camera, float(self._bias[c]), self._background[c])
 
     def people(self, t: int, c: int, people: np.ndarray) -> np.ndarray:
         """Points (P, 25, 3) of body keypoints (P, 25, 3) in view ``c`` of set ``t``; see

@@ -10,15 +10,15 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Candidate
 from intercap_core.geometry.camera.masks import Runs
-from intercap_core.person.constants import (
-    BOX_MARGIN,
-    LABEL_BONUS,
-    MIN_INSIDE_SHARE,
-    MIN_MASK_POINTS,
-    OUTSIDE_COST,
-    OUTSIDE_GRID,
-    SAME_PERSON_SHARE,
-)
+
+SAME_PERSON_SHARE = 0.5  # of a candidate's mask within the subject's: the same person; judged
+OUTSIDE_GRID = 64  # steps along the longer side of a mask on whose grid its outside is counted
+MIN_INSIDE_SHARE = 0.5  # of the subject's points inside the mask
+LABEL_BONUS = 0.15  # share of points; labels are mostly right, one that fits much better still wins
+OUTSIDE_COST = 0.5  # share of points, for a mask that lies wholly outside the subject's box
+BOX_MARGIN = 0.25  # share of the box of the points, for what has none: hair, soles, clothes
+MIN_MASK_POINTS = 4  # points and middles of bones
+
 
 # Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
 BONES = keypoint_pairs(SKELETON)  # (14, 2) of the 25 body points
@@ -55,7 +55,7 @@ def choose_mask(
     return best
 
 
-def others_beside(candidates: list[Candidate], person: bytes) -> bytes:
+def merge_other_candidates(candidates: list[Candidate], person: bytes) -> bytes:
     """The RLE of all other candidates together, those left out that lie mostly within the
     ``person``'s mask: the same person again, or a part; empty where there are none. Their RLEs
     have been parsed, as :func:`choose_mask` does."""

@@ -1,10 +1,19 @@
-"""Keypoints that are left and right of each other, and limbs a detector confuses as a whole."""
+"""Left and right keypoints: index tables, exchange of sides, and sides stated by the user.
+
+The annotation ``left_right`` lists images in which a detector exchanged the sides. They are
+exchanged back before any other step, and decide in the end which side of their set is left.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
+from intercap_core.config import ExchangedSides
+from intercap_core.errors import UserError
+from intercap_core.geometry.camera.triangulation import Triangulation
 
 _INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 
@@ -33,7 +42,7 @@ LIMBS: tuple[np.ndarray, ...] = (ARMS, LEGS, HEAD, HANDS)
 BODY_POINTS = np.arange(BODY.start, BODY.stop)
 
 
-def swapped(keypoints: np.ndarray, limb: np.ndarray | None = None) -> np.ndarray:
+def swap_sides(keypoints: np.ndarray, limb: np.ndarray | None = None) -> np.ndarray:
     """Keypoints (..., 135, n) with left and right of ``limb`` (or of everything) exchanged."""
     order = np.arange(len(PARTNER))
     chosen = order if limb is None else limb
@@ -54,3 +63,56 @@ def exchange_limb(keypoints: np.ndarray, t: np.ndarray, c: np.ndarray, limb: np.
     """Exchange in place left and right of ``limb`` in images (t, c) (N,) of ``keypoints``
     (T, C, 135, n)."""
     keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], PARTNER[limb]]
+
+
+def images_with_stated_sides(
+    stated: Sequence[ExchangedSides], names: Sequence[str], image_of: np.ndarray, sequence: str
+) -> np.ndarray:
+    """The moments' images (T, C) bool in which left and right are stated to be exchanged.
+
+    ``names`` of the cameras, ``image_of`` (T, C) of the scene artefact: the frame whose image shows
+    each moment. Raises UserError, naming the entry, for an unknown camera.
+    """
+    found = np.zeros(image_of.shape, bool)
+    for number, sides in enumerate(stated):
+        if sides.camera is not None and sides.camera not in names:
+            raise UserError(
+                f"sequence {sequence}: the annotation's left_right[{number}] names camera "
+                f"{sides.camera!r}; the recording has {', '.join(names)}"
+            )
+        cameras = [sides.camera is None or name == sides.camera for name in names]
+        found |= (image_of >= sides.start) & (image_of < sides.end) & np.array(cameras)
+    return found
+
+
+def exchange_stated(keypoints: np.ndarray, stated: np.ndarray) -> np.ndarray:
+    """Keypoints (T, C, 135, n) with left and right exchanged in the images ``stated`` (T, C)."""
+    return np.where(stated[..., None, None], swap_sides(keypoints), keypoints)
+
+
+def hold_sides(
+    keypoints: np.ndarray, points: Triangulation, given: np.ndarray, stated: np.ndarray
+) -> tuple[np.ndarray, Triangulation]:
+    """The subject with the sides of the images ``stated`` (T, C): in sets in which most of these
+    had a limb exchanged, it is exchanged again in all views.
+
+    ``keypoints`` (T, C, 135, 3) and the triangulation of T * 135 ``points`` as they were found from
+    the keypoints ``given`` (T, C, 135, 3).
+    """
+    count = len(keypoints)
+    wrong = np.zeros((count, len(LIMBS)), bool)
+    for number, limb in enumerate(LIMBS):
+        own, other = keypoints[:, :, limb], swap_sides(given)[:, :, limb]
+        same = (own == given[:, :, limb]).all((2, 3))
+        exchanged = (own == other).all((2, 3))
+        wrong[:, number] = (stated & exchanged & ~same).sum(1) > (stated & same & ~exchanged).sum(1)
+    if not wrong.any():
+        return keypoints, points
+    keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), wrong), 1, 2)
+    parts = (points.points, points.inlier, points.error, points.view_error)
+    return keypoints, Triangulation(
+        *(
+            exchange_points(part.reshape(count, -1, *part.shape[1:]), wrong).reshape(part.shape)
+            for part in parts
+        )
+    )

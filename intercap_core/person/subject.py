@@ -16,26 +16,33 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
-from intercap_core.person.constants import (
-    CENTRE_RANGE_M,
-    HANDLING_WEIGHT,
-    LEAST_HANDLING,
-    MAX_LINK_GAP_S,
-    MOVED_PX_FACTOR,
-    RIVAL_SHARE,
-    SAME_PERSON_PX_AT_1080P,
-)
 from intercap_core.person.groups import (
     NOBODY,
-    Group,
+    SAME_PERSON_PX_AT_1080P,
     Lift,
+    PersonGroup,
     distance_to,
-    groups_of_set,
+    group_set,
     lifted_groups,
 )
-from intercap_core.person.people import Person, people_of
 from intercap_core.person.sides import BODY_POINTS
-from intercap_core.person.tracks import Track, link
+from intercap_core.person.tracks import (
+    MAX_LINK_GAP_S,
+    Person,
+    PersonTrack,
+    join_tracks,
+    link_groups,
+)
+
+MOVED_PX_FACTOR = 2.0  # that limit is this much wider where the subject has moved since
+CENTRE_RANGE_M = 1.5  # support counts half so far from the ring's middle; tuned on the studio
+# Support of who touches the object most counts so much more, others' by how much they touch it;
+# where nobody touches it in this share of the images that show both, nothing is said; judged.
+HANDLING_WEIGHT, LEAST_HANDLING = 4.0, 0.05
+# Support of another person, seen at the same time, over the subject's, from which it is said that
+# it might be the one; judged.
+RIVAL_SHARE = 0.5
+
 
 Touches = Callable[[int, int, int], bool | None]
 """Whether person i of the image of view c in set t touches the object there, None = the object is
@@ -43,7 +50,7 @@ not seen: called with t, c and i."""
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedDetection:
     """A detection that the user says is the subject: person ``index`` of camera ``c`` in set ``t``;
     ``words`` name the entry that says so."""
 
@@ -54,7 +61,7 @@ class Named:
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class SubjectDetections:
     """``people`` (T, C) int32: index of the subject's detection in every image, -1 = not seen;
     ``others`` (T,) int32: how many more people were placed; ``chosen_by``: "alone", "named",
     "handling" or "middle"; ``doubts``: what speaks against the choice, in words."""
@@ -73,8 +80,8 @@ def find_subject(
     min_confidence: float,
     lift: Lift | None = None,
     touches: Touches | None = None,
-    named: Sequence[Named] = (),
-) -> Subject:
+    named: Sequence[NamedDetection] = (),
+) -> SubjectDetections:
     """Find the subject in every image; nobody where nobody can be placed in any set.
 
     ``times`` (T,) seconds. ``lift`` places the people of single views in sets where no two views
@@ -83,11 +90,11 @@ def find_subject(
     groups = []
     for t in range(detections.num_sets):
         seen = [detections.people(t, c)[:, BODY_POINTS] for c in range(len(rig))]
-        found = groups_of_set(seen, rig, min_confidence)
+        found = group_set(seen, rig, min_confidence)
         if not found and lift is not None:
             found = lifted_groups(t, seen, lift)
         groups.append(found)
-    tracks = link(groups, times)
+    tracks = link_groups(groups, times)
     people = np.full((detections.num_sets, len(rig)), NOBODY, np.int32)
     chosen, by, doubts = _chosen(tracks, times, ring_centre(rig), touches, named)
     for t, group in zip(chosen.sets, chosen.groups, strict=True):
@@ -96,23 +103,23 @@ def find_subject(
     _add_named(people, named)
     counts = np.array([len(found) for found in groups], np.int32)
     others = counts - np.isin(np.arange(len(counts)), chosen.sets)
-    return Subject(people, others, by, tuple(doubts))
+    return SubjectDetections(people, others, by, tuple(doubts))
 
 
 def _chosen(
-    tracks: list[Track],
+    tracks: list[PersonTrack],
     times: np.ndarray,
     middle: np.ndarray,
     touches: Touches | None,
-    named: Sequence[Named],
-) -> tuple[Track, str, list[str]]:
+    named: Sequence[NamedDetection],
+) -> tuple[PersonTrack, str, list[str]]:
     """The subject's groups as one track, how it was chosen, and doubts."""
     first, doubts = _of_named(tracks, named, times)
-    people = people_of(tracks, times, first)
+    people = join_tracks(tracks, times, first)
     if first:
         return people[0].whole, "named", [*doubts, *people[0].doubts]
     if not people:
-        return Track(), "alone", doubts
+        return PersonTrack(), "alone", doubts
     scores = [_score(person.whole, middle) for person in people]
     order = np.argsort(scores)[::-1].tolist()
     least = RIVAL_SHARE / (1 + HANDLING_WEIGHT) * scores[order[0]]
@@ -134,13 +141,13 @@ def _chosen(
 
 
 def _of_named(
-    tracks: list[Track], named: Sequence[Named], times: np.ndarray
-) -> tuple[list[Track], list[str]]:
+    tracks: list[PersonTrack], named: Sequence[NamedDetection], times: np.ndarray
+) -> tuple[list[PersonTrack], list[str]]:
     """The tracks that hold the named detections, and what was not found.
 
     Raises UserError where two of them are seen at once.
     """
-    found: dict[int, tuple[Track, Named]] = {}
+    found: dict[int, tuple[PersonTrack, NamedDetection]] = {}
     lost = []
     for one in named:
         track = next((k for k in tracks if _holds(k, one)), None)
@@ -158,7 +165,7 @@ def _of_named(
     return [track for track, _ in found.values()], [_not_followed(lost)] if lost else []
 
 
-def _not_followed(named: Sequence[Named]) -> str:
+def _not_followed(named: Sequence[NamedDetection]) -> str:
     words = ", ".join(one.words for one in named)
     return (
         f"who is named by {words} is placed by no two views there and could not be followed; name "
@@ -166,14 +173,14 @@ def _not_followed(named: Sequence[Named]) -> str:
     )
 
 
-def _holds(track: Track, named: Named) -> bool:
+def _holds(track: PersonTrack, named: NamedDetection) -> bool:
     place = np.searchsorted(track.sets, named.t)
     if place == len(track.sets) or track.sets[place] != named.t:
         return False
     return bool(track.groups[place].members[named.c] == named.index)
 
 
-def _score(track: Track, middle: np.ndarray) -> float:
+def _score(track: PersonTrack, middle: np.ndarray) -> float:
     away = [float(np.linalg.norm(group.centre - middle)) for group in track.groups]
     return sum(
         group.support / (1 + (d / CENTRE_RANGE_M) ** 2)
@@ -181,7 +188,7 @@ def _score(track: Track, middle: np.ndarray) -> float:
     )
 
 
-def _handling(track: Track, touches: Touches) -> float:
+def _handling(track: PersonTrack, touches: Touches) -> float:
     """Share of the images of somebody in which they touch the object, of those that show it."""
     told = [
         touches(t, c, int(group.members[c]))
@@ -203,8 +210,8 @@ def _rival(rival: Person, times: np.ndarray, by: str) -> str:
 
 def _add_single_views(
     people: np.ndarray,
-    chosen: Track,
-    groups: Sequence[Sequence[Group]],
+    chosen: PersonTrack,
+    groups: Sequence[Sequence[PersonGroup]],
     detections: PeopleOfImages,
     rig: Rig,
     times: np.ndarray,
@@ -235,7 +242,7 @@ def _add_single_views(
                     best, people[t, c] = error, i
 
 
-def _add_named(people: np.ndarray, named: Sequence[Named]) -> None:
+def _add_named(people: np.ndarray, named: Sequence[NamedDetection]) -> None:
     """What the user says of an image holds, whatever the views agree on."""
     for one in named:
         people[one.t, one.c] = one.index

@@ -1,8 +1,8 @@
-"""People followed over time in space, and whether two tracks are of one person.
+"""People followed over time, and tracks of one person joined across gaps.
 
-Who cannot be followed (hidden, out of view, missed by a detector for long) is known again by build:
-the lengths of limbs, shoulders and trunk, which differ between people by more than a track's median
-errs by.
+A person who cannot be followed (occluded, out of view, missed by the detector) is recognised again
+by place and build: lengths of limbs, shoulders and trunk, which differ between people by more than
+the error of a track's median. The most likely pair is joined first.
 """
 
 from __future__ import annotations
@@ -10,19 +10,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.person.constants import (
-    BUILD_FLOOR_M,
-    BUILD_SPREADS_M,
-    FOLLOWED_GAP_S,
-    LINK_SLACK_M,
-    MAX_BODY_SPEED_M_S,
-    MIN_BUILD_SETS,
-)
-from intercap_core.person.groups import Group
+from intercap_core.person.groups import PersonGroup
+
+# How far adults' thighs, shanks, upper arms, forearms, shoulders (from joint to joint) and trunks
+# are spread, metres: standard deviations over the open body's shapes.
+BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
+# A median length errs by as much however many sets tell: detectors' biases by pose; tuned
+BUILD_FLOOR_M = 0.012
+MIN_BUILD_SETS = 5  # that know a bone; also so many neighbouring sets err alike; tuned
+MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
+# Over at most this a person is followed by place alone; longer gaps are a matter of build, too.
+FOLLOWED_GAP_S = 0.4  # tuned on the studio
+# Over at most this a single view takes somebody for who was last known there, and a joined track
+# is not in doubt; tuned on the studio.
+MAX_LINK_GAP_S = 2.0
+WALKING_SPEED_M_S = 1.2  # of who is not seen for a while
+LINK_SLACK_M = 0.25  # scatter of a person's centre between sets; tuned on the studio
+# Logarithms of how much more likely two tracks are of one person than of two, by build: below the
+# first they are not joined, below the second, after a gap, it is said.
+OTHER_BUILD, SURE_BUILD = -3.0, 1.0
+
 
 _PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 
@@ -43,11 +55,11 @@ _BONES: tuple[tuple[tuple[int, int], ...], ...] = (
 
 
 @dataclass(eq=False)
-class Track:
+class PersonTrack:
     """One person from set to set: ``sets`` (N,), rising, and the ``groups`` of them."""
 
     sets: list[int] = field(default_factory=list)
-    groups: list[Group] = field(default_factory=list)
+    groups: list[PersonGroup] = field(default_factory=list)
 
     @cached_property
     def build(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,9 +87,9 @@ def _lengths(points: np.ndarray, bone: tuple[tuple[int, int], ...]) -> np.ndarra
     return np.where(known.any(0), total / np.maximum(known.sum(0), 1), np.nan)
 
 
-def link(groups: Sequence[Sequence[Group]], times: np.ndarray) -> list[Track]:
+def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> list[PersonTrack]:
     """Follow the people of each set (T lists) over short gaps, nearest first; ``times`` (T,) s."""
-    tracks: list[Track] = []
+    tracks: list[PersonTrack] = []
     for t, in_set in enumerate(groups):
         free = [k for k in tracks if times[t] - times[k.sets[-1]] <= FOLLOWED_GAP_S]
         pairs = sorted(
@@ -96,11 +108,13 @@ def link(groups: Sequence[Sequence[Group]], times: np.ndarray) -> list[Track]:
             used_tracks.add(k)
             free[k].sets.append(t)
             free[k].groups.append(in_set[g])
-        tracks += [Track([t], [group]) for g, group in enumerate(in_set) if g not in used_groups]
+        tracks += [
+            PersonTrack([t], [group]) for g, group in enumerate(in_set) if g not in used_groups
+        ]
     return tracks
 
 
-def same_build(one: Track, other: Track) -> float:
+def same_build(one: PersonTrack, other: PersonTrack) -> float:
     """How much more likely the two tracks' bones are of one person than of two: the logarithm of
     the ratio, 0 = nothing is known. Normal errors of the tracks, normal spreads among people."""
     (a, own), (b, theirs) = one.build, other.build
@@ -109,3 +123,98 @@ def same_build(one: Track, other: Track) -> float:
     same = (own + theirs)[known]
     two = same + 2 * np.array(BUILD_SPREADS_M)[known] ** 2
     return float(0.5 * (np.log(two / same) + apart / two - apart / same).sum())
+
+
+NEVER = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """``parts``: tracks that do not overlap, in order of time; ``doubts``: what speaks against that
+    they are of one person, in words."""
+
+    parts: tuple[PersonTrack, ...]
+    doubts: tuple[str, ...] = field(default=())
+
+    @cached_property
+    def whole(self) -> PersonTrack:
+        """All parts as one track."""
+        whole = PersonTrack()
+        for part in self.parts:
+            whole.sets += part.sets
+            whole.groups += part.groups
+        return whole
+
+    def meets(self, other: Person) -> bool:
+        """Whether two people are surely two: parts of them overlap in time."""
+        return any(
+            a.sets[0] <= b.sets[-1] and b.sets[0] <= a.sets[-1]
+            for a in self.parts
+            for b in other.parts
+        )
+
+
+def join_tracks(
+    tracks: Sequence[PersonTrack], times: np.ndarray, together: Sequence[PersonTrack] = ()
+) -> list[Person]:
+    """The people of a recording; ``times`` (T,) s. Those ``together``, some of the ``tracks`` that
+    do not overlap, are one person whatever speaks against it, and that person is the first."""
+    rest = [track for track in tracks if track not in together]
+    people = [Person(_ordered(together))] if together else []
+    people += [Person((track,)) for track in rest]
+    pairs = {(id(a), id(b)): (_likelihood(a, b, times), a, b) for a, b in combinations(people, 2)}
+    while pairs:
+        likelihood, a, b = max(pairs.values(), key=lambda pair: pair[0])
+        if likelihood == NEVER:
+            break
+        joined = Person(
+            _ordered((*a.parts, *b.parts)), (*a.doubts, *b.doubts, *_doubt(a, b, times))
+        )
+        people = [joined if k is a else k for k in people if k is not b]
+        gone = {id(a), id(b)}
+        pairs = {ids: pair for ids, pair in pairs.items() if not gone & set(ids)}
+        for k in people:
+            if k is not joined:
+                pairs[id(joined), id(k)] = (_likelihood(joined, k, times), joined, k)
+    return people
+
+
+def _ordered(parts: Sequence[PersonTrack]) -> tuple[PersonTrack, ...]:
+    return tuple(sorted(parts, key=lambda track: track.sets[0]))
+
+
+def _likelihood(one: Person, other: Person, times: np.ndarray) -> float:
+    """Logarithm of how much more likely one person than two are, by build and by the ways between;
+    :data:`NEVER` where it cannot be one."""
+    if one.meets(other):
+        return NEVER
+    found = 0.0
+    for before, after in _seams(one, other):
+        apart = float(np.linalg.norm(after.groups[0].centre - before.groups[-1].centre))
+        gap = float(times[after.sets[0]] - times[before.sets[-1]])
+        if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
+            return NEVER
+        found -= 0.5 * (apart / (LINK_SLACK_M + WALKING_SPEED_M_S * gap)) ** 2
+    alike = same_build(one.whole, other.whole)
+    return found + alike if alike > OTHER_BUILD else NEVER
+
+
+def _seams(one: Person, other: Person) -> list[tuple[PersonTrack, PersonTrack]]:
+    """Where, in order of time, a part of one person follows a part of the other."""
+    own = set(map(id, one.parts))
+    parts = _ordered((*one.parts, *other.parts))
+    return [(a, b) for a, b in pairwise(parts) if (id(a) in own) != (id(b) in own)]
+
+
+def _doubt(one: Person, other: Person, times: np.ndarray) -> tuple[str, ...]:
+    """What is said of joining two after a gap over which nobody can be followed."""
+    gap, start = min(
+        (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(one, other)
+    )
+    if gap <= MAX_LINK_GAP_S or same_build(one.whole, other.whole) >= SURE_BUILD:
+        return ()
+    return (
+        f"the subject was not seen for {gap:.1f} s, and the build does not tell whether who is "
+        f"seen from frame {start} on is the same person; if not, name the subject in both parts "
+        "(annotation 'subject')",
+    )

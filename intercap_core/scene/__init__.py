@@ -1,26 +1,17 @@
-"""What stands still and when each camera exposes: the room of the stage ``scene``.
+"""Camera poses, exposure times, static background and floor of one recording (stage ``scene``).
 
 In the order of a run (:mod:`intercap_core.stages.scene`):
 
-0. ``moments`` puts the first steps together. ``start_times``: cameras that started apart, before
-   anything compares views.
-1. ``subject_views``: the subject in every view at the given poses; ``late_views`` adds images that
-   are frames late.
-2. ``slips``: images that are whole frames late, found by the body's motion. It rests on
-   ``keypoint_motion`` (keypoints against one moving body), ``smooth_paths`` (Whittaker's smoother)
-   and ``keypoint_noise`` (covariance of a detector's errors over time).
-3. ``keypoint_timing``: each camera's time offset, by generalised least squares on the same motion.
-4. ``background``: the static depth of each camera; ``person_space`` leaves the subject out.
-5. ``lens_exchange``: cameras that were given each other's lenses, by the background, or by the
-   keypoints (``lenses``) where there is no depth.
-6. ``surface`` and ``moving``: background and foreground as thinned points with normals, the latter
-   with their speed.
-7. ``extrinsics``: refines the poses, depth biases and time offsets and decides whether the result
-   is better than the start, ``camera_verdicts`` of each camera by itself. The problem is in
-   ``registration`` (point-to-plane residuals of all pairs of cameras, ``balance`` weighs them by
-   direction), ``body_constraints`` (reprojection of keypoints, points eliminated) and
-   ``floor_constraint`` (one floor under all cameras).
-8. ``ground``: the floor's plane and the z-up frame.
-
-``constants`` holds the room's numbers.
+1. ``moments`` assigns each image to the set whose moment it shows. It calls ``start_times``
+   (cameras that were started separately; ``starts`` has the types, ``start_costs`` the epipolar
+   costs), ``subject_views`` (the subject's detections and triangulated joints), ``slips`` (images
+   that are whole frames late) and ``keypoint_timing`` (sub-frame time offsets). The last two share
+   ``keypoint_motion``: smooth paths of the keypoints and their residuals.
+2. ``background`` estimates the static depth of each camera, ``surfaces`` turns background and
+   foreground into thinned points with normals.
+3. ``lens_exchange`` corrects cameras that were given each other's intrinsics.
+4. ``extrinsics`` refines the poses. It builds the problem of ``registration`` (point-to-plane
+   residuals of all pairs of cameras), adds the terms of ``constraints`` (keypoints, common floor)
+   and keeps only results that ``camera_verdicts`` finds better on held-out data.
+5. ``ground`` fits the floor and the z-up frame, ``up`` the rough up direction it starts from.
 """

@@ -1,28 +1,87 @@
-"""The static scene as each depth camera sees it.
+"""Static background depth of each depth camera.
 
-What moves in front of the scene is nearer than it, so a pixel's background is the *farthest* depth
-that it holds steadily, not the median: someone who stands still for most of a recording does not
-become background. Someone who never leaves does not either, as long as the keypoints tell where
-(:mod:`.person_space`); a thing that never moves does: it cannot be told from furniture.
+Moving things are nearer than the static scene, so the background of a pixel is the *farthest* depth
+that it measures repeatedly, not the median: a person who stands still for most of the recording
+does not become background. Pixels near the triangulated keypoints are ignored, so a person who
+never leaves does not become background either. An object that never moves cannot be told from
+furniture and is part of the background.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
+from intercap_core.body.keypoints import LIMB_BONES, keypoint_pairs, of_side
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.scene.constants import (
-    BACKGROUND_AGREE_MM,
-    BACKGROUND_AGREE_PER_DEPTH,
-    MAX_SAMPLES,
-    OFTEN_VALID,
-    STATIC_SHARE,
-    STEADY_SHARE,
-    VALID_AGREE,
-)
-from intercap_core.scene.person_space import person_pixels
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import apply
+
+# Samples of one pixel agree within this: three standard deviations of the sensor's random error,
+# about 1 mm + 0.1 % of depth, more at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, NFOV).
+BACKGROUND_AGREE_MM = 8.0
+BACKGROUND_AGREE_PER_DEPTH = 0.004  # of depth
+MAX_SAMPLES = 25  # sets of the background; bounds memory: this many depth images of one camera
+PERSON_MASK_REDUCTION = 8  # the person's mask is worked out on every eighth pixel
+STEADY_SHARE = 0.2  # of a pixel's samples that must agree; tuned on the studio
+# A pixel that often measures nothing looks past the scene: what it holds now and then, however
+# steadily, may have come by. There nearly all of it must agree. Tuned on the studio.
+OFTEN_VALID = 0.75
+VALID_AGREE = 0.8  # of such a pixel's valid samples
+STATIC_SHARE = 0.5  # above this the pixel shows background most of the time
+# How far from a bone skin, clothing and hair reach, metres: wider than the body's own radii
+# (`segmentation.constants`), since what is left out of the background only has to hold the person.
+# Of the limbs, in the order of LIMB_BONES; tuned on the studio.
+LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
+# Of trunk and head, which have no bones of their own in the skeleton; hands reach past the wrist.
+TRUNK_REACH_M: dict[tuple[str, str], float] = {
+    ("neck", "mid_hip"): 0.26,
+    ("right_shoulder", "right_hip"): 0.20,
+    ("left_shoulder", "left_hip"): 0.20,
+    ("nose", "neck"): 0.22,
+    ("left_ear", "right_ear"): 0.20,
+    ("right_wrist", "right_wrist"): 0.24,
+    ("left_wrist", "left_wrist"): 0.24,
+}
+
+
+_BONES = (*TRUNK_REACH_M, *of_side("right", LIMB_BONES), *of_side("left", LIMB_BONES))
+_FIRST, _SECOND = keypoint_pairs(_BONES).T
+_REACH = np.array([*TRUNK_REACH_M.values(), *LIMB_REACH_M, *LIMB_REACH_M])
+
+
+def mask_person(
+    depth: np.ndarray, lens: Intrinsics, depth_from_master: np.ndarray, joints: np.ndarray
+) -> np.ndarray:
+    """Tell for a depth image (H, W) uint16 mm which pixels (H, W) lie within a bone's reach.
+
+    ``joints`` (K, 3): the keypoints of the 135-point order, at least the body's 25, master frame,
+    metres, NaN = not known.
+    """
+    ends = [apply(depth_from_master, joints[index]) for index in (_FIRST, _SECOND)]
+    known = np.isfinite(ends[0]).all(1) & np.isfinite(ends[1]).all(1)
+    result = np.zeros(depth.shape, bool)
+    if not known.any():
+        return result
+    start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
+    small = np.s_[
+        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
+        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
+    ]
+    z = depth[small].astype(np.float64) * 1e-3
+    points = np.dstack([lens.rays[small] * z[..., None], z])
+    low = np.minimum(start, start + along).min(0) - reach.max()
+    high = np.maximum(start, start + along).max(0) + reach.max()
+    near = (z > 0) & ((points >= low) & (points <= high)).all(-1)
+    chosen = points[near][:, None]
+    length = np.maximum((along**2).sum(1), 1e-9)
+    share = np.clip(((chosen - start) * along).sum(-1) / length, 0, 1)
+    away = ((chosen - start - share[..., None] * along) ** 2).sum(-1)
+    near[near] = (away < reach**2).any(1)
+    size = (depth.shape[1], depth.shape[0])
+    return cv2.resize(near.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +100,9 @@ def sample_sets(available: np.ndarray) -> np.ndarray:
     return sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
 
 
-def background_of(frames: Frames, c: int, joints: np.ndarray | None = None) -> Background | None:
+def camera_background(
+    frames: Frames, c: int, joints: np.ndarray | None = None
+) -> Background | None:
     """The background of camera ``c``; None where it has no depth image.
 
     ``joints`` (T, 135, 3): the subject's keypoints at the moment that the camera's image of each
@@ -55,7 +116,7 @@ def background_of(frames: Frames, c: int, joints: np.ndarray | None = None) -> B
     somebody = np.zeros(images.shape, bool)
     if joints is not None:
         for image, near, t in zip(images, somebody, sets, strict=True):
-            near[:] = person_pixels(image, camera.depth, camera.depth_from_master, joints[t])
+            near[:] = mask_person(image, camera.depth, camera.depth_from_master, joints[t])
     return steady_background(images, somebody)
 
 

@@ -13,15 +13,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.scene.body_constraints import BodyConstraint, BodyViews
-from intercap_core.scene.constants import (
-    CHANCE_SIGMA,
-    DOUBTFUL_RATIO,
-    LEAST_UNIT_SPREAD,
-    MIN_BODY_POINTS,
-    MUST_IMPROVE,
+from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, BodyViews
+from intercap_core.scene.registration import (
+    MOVING,
+    STATIC,
+    PairResiduals,
+    Registration,
+    RigEstimate,
 )
-from intercap_core.scene.registration import MOVING, STATIC, Estimate, PairResiduals, Registration
+
+MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
+# By how many standard deviations a camera's refined pose has to be better than its given one; the
+# least spread, of log ratios, that errors of units are taken to have. Tuned on the studio.
+CHANCE_SIGMA, LEAST_UNIT_SPREAD = 2.0, 0.25
+DOUBTFUL_RATIO = 0.5  # of refined over given errors: above it a camera gets a second look
+WEAK_CAMERA_M = 0.010  # a camera that may slide by more is told
+
 
 _KINDS = (("background", STATIC), ("moving surfaces", MOVING))
 _LEAST = 1e-6  # of an error
@@ -29,7 +36,7 @@ _LEVEL, _STEEP, _ALONG = 0.5, 0.8, 0.8  # cosines by which a direction is named
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseEvidence:
     """Of one ``kind`` for one camera: log ratios (N,) of errors, refined over given, of units that
     err independently: pairs of cameras, or a joint for half a second."""
 
@@ -39,7 +46,7 @@ class Evidence:
     @classmethod
     def of(
         cls, kind: str, given: Mapping[Hashable, float], refined: Mapping[Hashable, float]
-    ) -> Evidence:
+    ) -> PoseEvidence:
         """Of errors by unit, those units that both have."""
         both = [
             np.log(max(error, _LEAST) / max(given[unit], _LEAST))
@@ -65,11 +72,11 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class CameraVerdict:
+class PoseVerdict:
     """Whether a camera's refined pose is better beyond chance, and what says so."""
 
     refined: bool
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[PoseEvidence, ...]
 
     @property
     def in_doubt(self) -> bool:
@@ -80,7 +87,7 @@ class CameraVerdict:
         return not self.refined or bool(mean > np.log(DOUBTFUL_RATIO))
 
     @classmethod
-    def of(cls, evidence: Sequence[Evidence]) -> CameraVerdict:
+    def of(cls, evidence: Sequence[PoseEvidence]) -> PoseVerdict:
         """Every kind counts the same, however many units it has."""
         if not evidence:  # the rig as a whole is better refined
             return cls(True, ())
@@ -96,17 +103,17 @@ class CameraVerdict:
         return f"{said} (held-out errors, {', '.join(map(str, self.evidence))})"
 
 
-class Judge:
+class PoseJudge:
     """Judges single cameras of a rig that was ``refined`` as a whole from ``held``, the given poses
     with the biases and offsets that suit them."""
 
     def __init__(
         self,
         registration: Registration,
-        refine: Callable[[BodyViews | None, np.ndarray], Estimate],
+        refine: Callable[[BodyViews | None, np.ndarray], RigEstimate],
         views: BodyViews | None,
-        held: Estimate,
-        refined: Estimate,
+        held: RigEstimate,
+        refined: RigEstimate,
     ) -> None:
         """``refine`` (keypoints, None = all; which cameras (C,) may move) gives an estimate."""
         self._registration, self._refine = registration, refine
@@ -119,7 +126,7 @@ class Judge:
                 self._halved = refine(seen, np.ones(len(held.poses), bool))
                 self._held_out = BodyConstraint(unseen, registration.rig)
 
-    def verdicts(self, cameras: Sequence[int]) -> dict[int, CameraVerdict]:
+    def verdicts(self, cameras: Sequence[int]) -> dict[int, PoseVerdict]:
         """Of each of the ``cameras``; those in doubt get a second look, the others of the rig
         refined to suit their given poses."""
         found = {}
@@ -136,7 +143,7 @@ class Judge:
             found |= {c: self._compare(c, apart, halved) for c in doubtful}
         return found
 
-    def _compare(self, camera: int, apart: Estimate, halved: Estimate | None) -> CameraVerdict:
+    def _compare(self, camera: int, apart: RigEstimate, halved: RigEstimate | None) -> PoseVerdict:
         """``apart`` and ``halved``: the estimate with this camera as given, and that without the
         held-out keypoints."""
         evidence = []
@@ -145,14 +152,14 @@ class Judge:
                 _by_pair(self._registration.residuals(at, kind, camera))
                 for at in (apart, self._refined)
             )
-            evidence.append(Evidence.of(name, *medians))
+            evidence.append(PoseEvidence.of(name, *medians))
         if halved is not None and self._halved is not None and self._held_out is not None:
             held_out = self._held_out
             errors = (
                 held_out.unit_errors(at.poses, at.offset, camera) for at in (halved, self._halved)
             )
-            evidence.append(Evidence.of("keypoints", *errors))
-        return CameraVerdict.of([e for e in evidence if len(e.log_ratio)])
+            evidence.append(PoseEvidence.of("keypoints", *errors))
+        return PoseVerdict.of([e for e in evidence if len(e.log_ratio)])
 
 
 def _by_pair(residuals: PairResiduals) -> dict[Hashable, float]:
@@ -160,9 +167,9 @@ def _by_pair(residuals: PairResiduals) -> dict[Hashable, float]:
     return dict(zip(pairs, residuals.median.tolist(), strict=True))
 
 
-def _with_camera_of(at: Estimate, other: Estimate, camera: int) -> Estimate:
+def _with_camera_of(at: RigEstimate, other: RigEstimate, camera: int) -> RigEstimate:
     """``at`` with one camera's pose, depth bias and time offset of ``other``."""
-    mixed = Estimate(at.poses.copy(), at.bias.copy(), at.offset.copy())
+    mixed = RigEstimate(at.poses.copy(), at.bias.copy(), at.offset.copy())
     mixed.poses[camera] = other.poses[camera]
     mixed.bias[camera], mixed.offset[camera] = other.bias[camera], other.offset[camera]
     return mixed
@@ -179,7 +186,7 @@ def weakest_motion(
     return float(np.sqrt(max(values[-1], 0.0))), vectors[:, -1]
 
 
-def direction_in_words(direction: np.ndarray, pose: np.ndarray, up: np.ndarray) -> str:
+def describe_direction(direction: np.ndarray, pose: np.ndarray, up: np.ndarray) -> str:
     """Name a unit ``direction`` (3,) as seen by a camera at ``pose`` (4, 4), ``up`` (3,) unit."""
     steep = abs(float(direction @ up))
     if steep > _STEEP:

@@ -8,38 +8,41 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.body_constraints import BodyConstraint, BodyViews, body_views
-from intercap_core.scene.camera_verdicts import CameraVerdict, Judge
-from intercap_core.scene.constants import (
-    CONVERGED_M,
-    COVARIANCE_INFLATION,
-    KNOWN_OFFSET_SIGMA_S,
-    MAY_WORSEN,
+from intercap_core.scene.camera_verdicts import MUST_IMPROVE, PoseJudge, PoseVerdict
+from intercap_core.scene.constraints import (
     MIN_BODY_POINTS,
-    MUST_IMPROVE,
-    PRIOR_ROTATION_RAD,
-    PRIOR_TRANSLATION_M,
-    TIMING_INFLATION,
-    WEAK_POINTS,
-    WEAK_RESIDUAL,
+    BodyConstraint,
+    BodyViews,
+    FloorConstraint,
+    body_views,
 )
-from intercap_core.scene.floor_constraint import FloorConstraint
-from intercap_core.scene.keypoint_timing import Offsets
+from intercap_core.scene.keypoint_timing import TIMING_INFLATION, TimeOffsets
 from intercap_core.scene.registration import (
     MOVING,
     OFFSET,
+    PRIOR_ROTATION_RAD,
+    PRIOR_TRANSLATION_M,
     STATIC,
     Constraint,
-    Estimate,
-    Layer,
     OffsetInformation,
     PairResiduals,
     Registration,
-    Solution,
+    RigEstimate,
+    RigSolution,
+    SurfaceLayer,
 )
-from intercap_core.scene.start_times import Starts
+from intercap_core.scene.starts import StartTimes
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.scene.surface import Surface
+from intercap_core.scene.surfaces import DepthSurface
+
+# Variance of refined poses and biases over that of the normal equations: the points of a surface
+# share errors of its lens and its material. Tuned on the studio.
+COVARIANCE_INFLATION = 3.0
+CONVERGED_M = 0.001  # the last step's motion of what a camera looks at
+MAY_WORSEN = 1.02  # in any group
+WEAK_POINTS = 120  # held-out correspondences of a pair, background and moving together
+WEAK_RESIDUAL = 2.0  # times the median pair's
+KNOWN_OFFSET_SIGMA_S = 0.008  # less certain than what devices are off by: not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +83,12 @@ class Refinement:
 def refine(
     rig: Rig,
     master: int,
-    static: dict[int, Surface],
-    moving: Sequence[dict[int, Surface]],
+    static: dict[int, DepthSurface],
+    moving: Sequence[dict[int, DepthSurface]],
     subject: SubjectViews,
     times: np.ndarray,
-    timing: Offsets,
-    starts: Starts,
+    timing: TimeOffsets,
+    starts: StartTimes,
     *,
     floor: FloorConstraint | None,
     free_poses: bool,
@@ -98,9 +101,9 @@ def refine(
     with the others. The start's poses are kept where held-out points and keypoints together do not
     get better, and where not ``free_poses``.
     """
-    layers = [Layer(static, STATIC), *(Layer(at_once, MOVING) for at_once in moving)]
+    layers = [SurfaceLayer(static, STATIC), *(SurfaceLayer(at_once, MOVING) for at_once in moving)]
     registration = Registration(rig, layers, master, starts.offset_sigma)
-    given = Estimate.start(rig, starts.offset)
+    given = RigEstimate.start(rig, starts.offset)
     views = body_views(subject, times)
     body = BodyConstraint(views, rig) if len(views.points) >= MIN_BODY_POINTS else None
     known = OffsetInformation(
@@ -113,11 +116,11 @@ def refine(
         constraints.append(floor)  # where cameras overlap, their surfaces tell more
     held = registration.solve(given, (), known, free_poses=False)
     found, improved, ratios = held, False, []
-    verdicts: dict[int, CameraVerdict] = {}
+    verdicts: dict[int, PoseVerdict] = {}
     covariance = held.covariance
     if free_poses and len(rig) > 1:
 
-        def solve(some: BodyViews | None, free: np.ndarray) -> Solution:
+        def solve(some: BodyViews | None, free: np.ndarray) -> RigSolution:
             own = constraints
             if some is not None:
                 own = [BodyConstraint(some, rig), *(one for one in constraints if one is not body)]
@@ -126,7 +129,7 @@ def refine(
         freed = solve(None, np.ones(len(rig), bool))
         ratios = _ratios(registration, body, held.estimate, freed.estimate)
         if _better(ratios, freed.estimate):
-            judge = Judge(
+            judge = PoseJudge(
                 registration,
                 lambda some, free: solve(some, free).estimate,
                 views if body else None,
@@ -174,7 +177,7 @@ def refine(
 
 
 def _verdicts(
-    rig: Rig, master: int, own: dict[int, CameraVerdict], said: str
+    rig: Rig, master: int, own: dict[int, PoseVerdict], said: str
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Which cameras (C,) were refined, and why, in words; of the rig as a whole where no camera was
     judged by itself."""
@@ -198,7 +201,7 @@ def _stated_covariance(found: np.ndarray, master: int) -> np.ndarray:
 
 
 def _ratios(
-    registration: Registration, body: BodyConstraint | None, start: Estimate, found: Estimate
+    registration: Registration, body: BodyConstraint | None, start: RigEstimate, found: RigEstimate
 ) -> list[float]:
     """Held-out costs over the start's: background, what moves, and keypoints, where there are any.
 
@@ -220,13 +223,13 @@ def _cost(residuals: PairResiduals) -> float:
     return float(residuals.median.mean())
 
 
-def _better(ratios: list[float], found: Estimate) -> bool:
+def _better(ratios: list[float], found: RigEstimate) -> bool:
     if not ratios or not np.isfinite(found.poses).all():
         return False
     return min(ratios) <= MUST_IMPROVE and max(ratios) <= MAY_WORSEN
 
 
-def _pair_table(registration: Registration, start: Estimate, found: Estimate) -> PairTable:
+def _pair_table(registration: Registration, start: RigEstimate, found: RigEstimate) -> PairTable:
     kinds = [
         [registration.residuals(at, kind) for at in (start, found)] for kind in (STATIC, MOVING)
     ]

@@ -1,4 +1,4 @@
-"""The floor: a plane through what all cameras see, or through annotated points."""
+"""The floor plane: fitted to depth, annotated, stated by the user, or derived from standing feet."""
 
 from __future__ import annotations
 
@@ -9,25 +9,33 @@ import numpy as np
 from intercap_core.config import MIN_FLOOR_SPREAD_M, floor_spread
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig, ring_centre
-from intercap_core.scene.constants import (
-    BELOW_FLOOR_COST,
-    BELOW_FLOOR_M,
-    COVER_CELL_M,
-    FLOOR_COSINE,
-    FLOOR_FIRST_GATE_M,
-    FLOOR_HYPOTHESES,
-    FLOOR_HYPOTHESIS_POINTS,
-    FLOOR_HYPOTHESIS_TOLERANCE_M,
-    FLOOR_REFINE_STEPS,
-    LOWER_FLOOR_DEG,
-    MAX_COVERED_SHARE,
-    MIN_FLOOR_AREA_M2,
+from intercap_core.scene.up import UpDirection, degrees_between
+
+FOOT_HEIGHT_M = 0.014  # of the lowest of heel and toe keypoints: the open body's, standing
+FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor; tuned on the studio
+MIN_FOOT_SPREAD_M = 0.15  # standard deviation, of feet that show a tilt; tuned on the studio
+FLOOR_HYPOTHESES = 400
+FLOOR_HYPOTHESIS_POINTS = 6000  # on which they are judged
+FLOOR_REFINE_STEPS = 8
+FLOOR_COSINE = 0.94  # 20 degrees: of a floor point's normal with the plane's; tuned on the studio
+FLOOR_FIRST_GATE_M = 0.06  # of the plane's refinement, closing to the setting's tolerance
+FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
+BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
+BELOW_FLOOR_COST = 3.0  # how many inliers such a point outweighs; tuned on the studio
+MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
+LOWER_FLOOR_DEG = 3.0  # of a lower floor from a platform: both are level
+COVER_CELL_M = 0.15  # in which a surface above another one hides it
+MAX_COVERED_SHARE = (
+    0.5  # of a lower floor: with more it is the upper one, seen by a misplaced camera
 )
-from intercap_core.scene.up import Up, degrees_between
+LEVEL_SHARE = 0.15  # of the sets: feet that make a level of their own; a bound, not tuned
+MAX_SLOPE_DEG = 15.0  # of one tilted plane under all feet; treads of 12 by 40 cm climb by 17
+FEET_TILT_DEG = 6.0  # twice what feet that have been apart tell a tilt to
+MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundPlane:
     """``point`` (3,) and unit ``normal`` (3,), up, master frame; ``rms`` metres over the
     ``inliers`` points, or sets in which someone stands, within the tolerance; NaN and 0 where
     there is no floor. ``note``: what is odd about it, in words, "" = nothing."""
@@ -45,18 +53,18 @@ class Ground:
         return self.source != "none"
 
 
-NO_GROUND = Ground(np.full(3, np.nan), np.full(3, np.nan), float("nan"), 0, "none")
+NO_GROUND = GroundPlane(np.full(3, np.nan), np.full(3, np.nan), float("nan"), 0, "none")
 
 
 def fit_ground(
     points: np.ndarray,
     normals: np.ndarray,
     rig: Rig,
-    up: Up,
+    up: UpDirection,
     *,
     tolerance_m: float,
     cell_m: float,
-) -> Ground:
+) -> GroundPlane:
     """Fit the floor to background points (N, 3) with normals (N, 3), master frame, spaced by
     ``cell_m``: the lowest large plane that faces up, below the cameras, with little under it.
 
@@ -91,8 +99,8 @@ def fit_ground(
 
 
 def _lowest(
-    points: np.ndarray, normals: np.ndarray, ground: Ground, tolerance_m: float, cell_m: float
-) -> Ground:
+    points: np.ndarray, normals: np.ndarray, ground: GroundPlane, tolerance_m: float, cell_m: float
+) -> GroundPlane:
     """The lowest large plane parallel to ``ground`` among points (N, 3) that face up, or itself."""
     upper = ground
     while True:
@@ -121,12 +129,14 @@ def _lowest(
     return replace(ground, note=note)
 
 
-def _covered(points: np.ndarray, lower: Ground, upper: Ground, tolerance_m: float) -> float:
+def _covered(
+    points: np.ndarray, lower: GroundPlane, upper: GroundPlane, tolerance_m: float
+) -> float:
     """Share of the lower plane, by cells, over which the upper one was seen: no camera looks
     through a platform, but one that is misplaced shows the same floor a second time."""
     across = np.linalg.svd(upper.normal[None])[2][1:]
 
-    def cells(plane: Ground) -> set[tuple[int, ...]]:
+    def cells(plane: GroundPlane) -> set[tuple[int, ...]]:
         on = np.abs((points - plane.point) @ plane.normal) < tolerance_m
         flat = np.floor(points[on] @ across.T / COVER_CELL_M).astype(int)
         return set(map(tuple, flat.tolist()))
@@ -141,7 +151,7 @@ def _refined(
     point: np.ndarray,
     normal: np.ndarray,
     tolerance_m: float,
-) -> Ground:
+) -> GroundPlane:
     """Weighted total least squares, the gate closing from 6 cm to the tolerance."""
     gates = np.geomspace(max(FLOOR_FIRST_GATE_M, tolerance_m), tolerance_m, FLOOR_REFINE_STEPS)
     for gate in gates:
@@ -157,12 +167,12 @@ def _refined(
     distance = (points - point) @ normal
     inlier = (np.abs(distance) < tolerance_m) & (normals @ normal >= FLOOR_COSINE)
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2))) if inlier.any() else float("nan")
-    return Ground(point, normal, rms, int(inlier.sum()), "fitted")
+    return GroundPlane(point, normal, rms, int(inlier.sum()), "fitted")
 
 
 def annotated_ground(
-    floor: np.ndarray, points: np.ndarray, up: Up, *, tolerance_m: float
-) -> Ground:
+    floor: np.ndarray, points: np.ndarray, up: UpDirection, *, tolerance_m: float
+) -> GroundPlane:
     """The plane through annotated floor points (M, 3), M >= 3, master frame; ``points`` (N, 3) of
     the background are only counted.
 
@@ -179,15 +189,15 @@ def annotated_ground(
     distance = (points - point) @ normal
     inlier = np.abs(distance) < tolerance_m
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2))) if inlier.any() else float("nan")
-    return Ground(point, normal, rms, int(inlier.sum()), "annotated")
+    return GroundPlane(point, normal, rms, int(inlier.sum()), "annotated")
 
 
-def stated_ground(up: np.ndarray, floor: np.ndarray) -> Ground:
+def stated_ground(up: np.ndarray, floor: np.ndarray) -> GroundPlane:
     """The floor as the user states it: ``up`` (3,) unit, and a point of it, master frame."""
-    return Ground(floor, up, float("nan"), 0, "stated")
+    return GroundPlane(floor, up, float("nan"), 0, "stated")
 
 
-def zup_from_master(ground: Ground, rig: Rig, up_hint: Up) -> np.ndarray:
+def zup_from_master(ground: GroundPlane, rig: Rig, up_hint: UpDirection) -> np.ndarray:
     """Transform (4, 4) to z up with the floor at z = 0 under the ring's middle; y is where the
     master looks. Without a floor: up by ``up_hint``, and z = 0 at the master camera."""
     up, point = ground.normal, ground.point
@@ -203,3 +213,131 @@ def zup_from_master(ground: Ground, rig: Rig, up_hint: Up) -> np.ndarray:
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, -rotation @ origin
     return result
+
+
+def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
+    """The floor that someone stands on: from heels and toes (T, F, 3), NaN = not known.
+
+    In each set the lowest of the feet stands, in most of them on the floor; where they stand on
+    several levels (a beam, stairs) the lowest that is well supported is the floor. Measured gravity
+    or a stated up gives the normal; without them the feet do, as far as they have been apart: who
+    walks along a line shows the tilt along it, and across it the cameras' own up stands. For
+    scenes whose floor no camera measures; its height is as good as the keypoints, a centimetre or
+    two.
+    """
+    standing = _standing(feet, up.direction)
+    if len(standing) < MIN_FOOT_SETS:
+        return NO_GROUND
+    slope = _one_slope(standing, up.direction)
+    inlier, note = _one_level(standing, up.direction, sloping=slope is not None)
+    standing = standing[inlier]
+    if len(standing) < MIN_FOOT_SETS:
+        return NO_GROUND
+    point, normal = np.median(standing, 0), up.direction
+    if up.source == "cameras":
+        own = _normal_of(standing, up.direction)
+        if own is None:
+            return NO_GROUND
+        point, normal = standing.mean(0), own
+    elif up.source == "stated" and slope is not None:
+        off = degrees_between(slope, normal)
+        if off > FEET_TILT_DEG:
+            odd = f"the plane of the standing feet is {off:.0f} degrees from the stated up"
+            note = f"{note}; {odd}" if note else odd
+    distance = (standing - point) @ normal
+    point = point + (np.median(distance) - FOOT_HEIGHT_M) * normal
+    rms = float(np.sqrt(np.mean((distance - np.median(distance)) ** 2)))
+    return GroundPlane(point, normal, rms, len(standing), "feet", note)
+
+
+def describe_raised_feet(feet: np.ndarray, ground: GroundPlane) -> str:
+    """Say, "" = nothing, where the lower of the feet (T, F, 3) often stands above ``ground``, or
+    below it."""
+    standing = _standing(feet, ground.normal)
+    if len(standing) < MIN_FOOT_SETS:
+        return ""
+    height = (standing - ground.point) @ ground.normal - FOOT_HEIGHT_M
+    for off, side in (
+        (height > 2 * FOOT_TOLERANCE_M, "above"), (height < -2 * FOOT_TOLERANCE_M, "below"),
+    ):  # fmt: skip
+        if off.sum() >= _supporting(len(standing)):
+            return _levels(off, np.abs(height), side)
+    return ""
+
+
+def _standing(feet: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(S, 3): the lowest foot point of each set in which three or more are known."""
+    known = np.isfinite(feet[..., 0]).sum(1) >= 3
+    height = np.where(np.isfinite(feet[..., 0]), feet @ up, np.inf)[known]
+    return feet[known][np.arange(known.sum()), height.argmin(1)]
+
+
+def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[np.ndarray, str]:
+    """Which of the standing feet (S, 3) are on one level, the floor: (S,) bool, and a note.
+
+    ``sloping``: one plane holds them all, be ``up`` tilted or the floor.
+    """
+    height = standing @ up
+    middle = np.median(height)
+    inlier = np.abs(height - middle) < FOOT_TOLERANCE_M
+    need = _supporting(len(standing))
+    above, below = height > middle + FOOT_TOLERANCE_M, height < middle - FOOT_TOLERANCE_M
+    if max(above.sum(), below.sum()) < need or sloping:
+        return inlier, ""
+    if below.sum() >= need:
+        middle = _lowest_level(height, need)
+        inlier = np.abs(height - middle) < FOOT_TOLERANCE_M
+        above = height > middle + FOOT_TOLERANCE_M
+    return inlier, _levels(above, height - middle, "above") if above.sum() >= need else ""
+
+
+def _lowest_level(height: np.ndarray, need: int) -> float:
+    """The lowest of the heights (S,) about which ``need`` of them lie and above which few do; their
+    median where there is none such: noise about one level has no gap below it."""
+    order, middle = np.sort(height), float(np.median(height))
+    ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
+    first = int(np.argmax(ends - np.arange(len(order)) >= need))
+    level = float(np.median(order[first : ends[first]]))
+    between = np.arange(level, middle, 0.2 * FOOT_TOLERANCE_M)
+    near = np.abs(height[:, None] - between) < 0.5 * FOOT_TOLERANCE_M
+    count = near.sum(0)
+    return level if len(count) and count.min() < 0.5 * count[0] else middle
+
+
+def _levels(off: np.ndarray, height: np.ndarray, side: str) -> str:
+    return (
+        f"feet do not stand on one plane: in {100 * off.mean():.0f} % of the sets the lower one is "
+        f"{np.median(height[off]):.2f} m {side} the floor (a beam, stairs, jumps)"
+    )
+
+
+def _supporting(count: int) -> int:
+    return max(MIN_FOOT_SETS, int(np.ceil(LEVEL_SHARE * count)))
+
+
+def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
+    """Normal (3,) of the one plane, little tilted, that explains nearly all of the standing feet
+    (S, 3); None where there is no such plane."""
+    kept = np.ones(len(standing), bool)
+    for _ in range(5):
+        normal = _normal_of(standing[kept], up)
+        if normal is None or degrees_between(normal, up) > MAX_SLOPE_DEG:
+            return None
+        distance = (standing - standing[kept].mean(0)) @ normal
+        kept = np.abs(distance - np.median(distance[kept])) < FOOT_TOLERANCE_M
+        if kept.sum() < MIN_FOOT_SETS:
+            return None
+    return normal if (~kept).sum() < _supporting(len(standing)) else None
+
+
+def _normal_of(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
+    """Unit normal (3,) of the plane through points (S, 3), across a line that of ``up``; None
+    where they are all in one place."""
+    _, spread, axes = np.linalg.svd(standing - standing.mean(0), full_matrices=False)
+    along, across = spread[:2] / np.sqrt(len(standing))
+    if along < MIN_FOOT_SPREAD_M:
+        return None
+    if across < MIN_FOOT_SPREAD_M:
+        normal = up - (up @ axes[0]) * axes[0]
+        return normal / np.linalg.norm(normal)
+    return axes[2] * np.sign(axes[2] @ up)

@@ -1,7 +1,13 @@
-"""The subject's keypoints of all views against one moving body: residuals and their derivatives.
+"""Keypoints of all views compared with one moving body: smooth 3D paths, residuals, Jacobians.
 
-Detectors err by a constant for each joint and view, and the cameras' poses are still off, so the
-median residual of each keypoint in each view is taken off: what is left are changes over time.
+Paths are smoothed by Whittaker's smoother (Eilers, Analytical Chemistry 75, 2003) with third
+differences. The stiffness of each path is chosen by restricted maximum likelihood: a path that is
+too stiff underestimates speeds, a path that follows the noise overestimates them, and both would
+bias time offsets.
+
+Detectors err by a constant for each joint and view, and the camera poses are not yet refined.
+The median residual of each keypoint in each view is therefore subtracted: what remains are changes
+over time.
 """
 
 from __future__ import annotations
@@ -10,20 +16,124 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
-from intercap_core.scene.constants import (
-    MIN_CONFIDENCE,
-    MOTION_ROUNDS,
-    MOTION_SIGMA_FLOOR_PX,
-    OUTLIER_SIGMA,
-    SLIPPED_PX_AT_1080P,
-)
-from intercap_core.scene.smooth_paths import Paths, smooth_paths
+
+MAX_PATH_GAP_S = 0.35  # over which a path is carried on without sight; tuned on the studio
+MIN_CONFIDENCE = 0.3  # below, keypoints are left out; tuned on the studio
+SLIPPED_PX_AT_1080P = 60.0  # as above, of slipped views of moving limbs; tuned on the studio
+MOTION_SIGMA_FLOOR_PX = 1.0  # at 1080p, with the bias taken off; tuned on the studio
+OUTLIER_SIGMA = 4.0  # beyond, a residual is an outlier; tuned on the studio
+MOTION_ROUNDS = 3  # of smoothing and refitting the keypoints' paths
+STIFFNESS = 10.0 ** np.arange(-3, 4)  # of third differences between sets, tried by likelihood
+# Likelihood takes errors that last for motion; this much more stiffness is closest to no bias of
+# the speeds, to either side. Tuned on the studio.
+STIFFER = 4.0
+MIN_PATH_SAMPLES = 6  # of a path through third differences, and a few to spare
+
+
+ORDER = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothPaths:
+    """K smooth paths through T sets at ``times`` (T,) s: ``points`` (T, K, 3) m and ``velocity``
+    (T, K, 3) m/s, NaN = not known."""
+
+    times: np.ndarray
+    points: np.ndarray
+    velocity: np.ndarray
+
+    def at(self, wanted: np.ndarray) -> np.ndarray:
+        """Points (N, K, 3) at times ``wanted`` (N,): cubic between neighbours, NaN outside the
+        paths and over long gaps."""
+        times, last = self.times, len(self.times) - 1
+        left = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, max(last - 1, 0))
+        right = np.minimum(left + 1, last)
+        length = np.maximum(times[right] - times[left], 1e-9)[:, None, None]
+        u = (wanted - times[left])[:, None, None] / length
+        from_left = (1 + u * u * (2 * u - 3)) * self.points[left]
+        from_left += u * (1 - u) ** 2 * length * self.velocity[left]
+        from_right = u * u * (3 - 2 * u) * self.points[right]
+        from_right -= u * u * (1 - u) * length * self.velocity[right]
+        inside = (u >= -1e-6) & (u <= 1 + 1e-6) & (length <= MAX_PATH_GAP_S)
+        return np.where(inside, from_left + from_right, np.nan)
+
+
+def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
+    """Smooth ``points`` (T, K, 3), NaN = not known, at increasing ``times`` (T,) s."""
+    sets = len(points)
+    known = np.isfinite(points[..., 0])
+    smooth = np.full(points.shape, np.nan)
+    velocity = np.full(points.shape, np.nan)
+    if sets >= MIN_PATH_SAMPLES:
+        penalty = _penalty(times)
+        usable = np.flatnonzero(known.sum(0) >= MIN_PATH_SAMPLES)
+        for k in usable:
+            smooth[:, k] = _smoothed(np.nan_to_num(points[:, k]), known[:, k], penalty)
+        velocity[:, usable] = CubicSpline(times, smooth[:, usable])(times, 1)
+    bridged = _near_known(times, known)[..., None]
+    return SmoothPaths(
+        times, np.where(bridged, smooth, np.nan), np.where(bridged, velocity, np.nan)
+    )
+
+
+def _penalty(times: np.ndarray) -> np.ndarray:
+    """D'D in upper banded form (4, T), D third divided differences in units of the usual gap."""
+    gap = float(np.median(np.diff(times)))
+    scaled = (times - times[0]) / gap
+    rows = len(times) - ORDER
+    weights = np.ones((rows, ORDER + 1))
+    for i in range(ORDER + 1):
+        for j in range(ORDER + 1):
+            if i != j:
+                weights[:, i] /= scaled[i : i + rows] - scaled[j : j + rows]
+    weights *= 6.0  # third derivative = 3! times the divided difference
+    banded = np.zeros((ORDER + 1, len(times)))
+    for i in range(ORDER + 1):
+        for j in range(i, ORDER + 1):
+            banded[ORDER - (j - i), j : j + rows] += weights[:, i] * weights[:, j]
+    return banded
+
+
+def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+    """One path (T, 3), :data:`STIFFER` than the one of greatest restricted likelihood."""
+    right = points * known[:, None]
+    samples, sets = int(known.sum()), len(points)
+    costs = []
+    for stiffness in STIFFNESS:
+        factor = _factor(stiffness, known, penalty)
+        path = cho_solve_banded((factor, False), right)
+        energy = max(float((right * (points - path)).sum()), 1e-12)
+        cost = 3 * (samples - ORDER) * np.log(energy)
+        cost += 3 * (2 * np.log(factor[-1]).sum() - (sets - ORDER) * np.log(stiffness))
+        costs.append(cost)
+    likely = STIFFNESS[int(np.argmin(costs))]
+    return cho_solve_banded((_factor(STIFFER * likely, known, penalty), False), right)
+
+
+def _factor(stiffness: float, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+    matrix = stiffness * penalty
+    matrix[-1] += known + 1e-9
+    return cholesky_banded(matrix)
+
+
+def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Whether (T, K) a path is known at a set, or was shortly before and is shortly after."""
+    before = np.full(known.shape, -np.inf)
+    after = np.full(known.shape, np.inf)
+    before[known] = np.broadcast_to(times[:, None], known.shape)[known]
+    after[known] = np.broadcast_to(times[:, None], known.shape)[known]
+    before = np.maximum.accumulate(before, 0)
+    after = np.minimum.accumulate(after[::-1], 0)[::-1]
+    return after - before <= MAX_PATH_GAP_S
+
 
 # Body; of each hand the wrist, knuckles and finger tips; corners of brows, eyes, nose and mouth.
 # Points beyond these move with them and cost as much again.
@@ -38,7 +148,7 @@ POINTS = np.r_[
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class KeypointMotion:
     """K keypoints in T sets of C views.
 
     ``paths`` in the master frame; ``residual`` (T, C, K, 2) px, found less expected, 0 where not
@@ -48,7 +158,7 @@ class Motion:
 
     rig: Rig
     times: np.ndarray
-    paths: Paths
+    paths: SmoothPaths
     residual: np.ndarray
     seen: np.ndarray
     valid: np.ndarray
@@ -70,7 +180,7 @@ class Motion:
         """Pixel velocities (T, C, K, 2), px/s, 0 where not known."""
         return np.nan_to_num(np.einsum("tckij,tkj->tcki", self.by_point, self.paths.velocity))
 
-    def at_offsets(self, offset: np.ndarray) -> Motion:
+    def at_offsets(self, offset: np.ndarray) -> KeypointMotion:
         """The motion as seen by cameras that expose ``offset`` (C,) s late."""
         along = np.where(self.seen[..., None], self.speed_px * offset[:, None, None], 0.0)
         return replace(self, residual=self.residual - along)
@@ -111,7 +221,7 @@ class Motion:
 
 def build_motion(
     keypoints: np.ndarray, rig: Rig, times: np.ndarray, start: np.ndarray | None = None
-) -> Motion:
+) -> KeypointMotion:
     """Fit moving points to ``keypoints`` (T, C, 135, 3) x, y, confidence, 0 = not seen.
 
     ``start`` (T, K, 3): points of nearly the same keypoints, NaN = not known.
@@ -139,7 +249,7 @@ def build_motion(
     return _seeing(pixels, seen, rig, paths, sigma, bias)
 
 
-def seeing(motion: Motion, keypoints: np.ndarray) -> Motion:
+def with_keypoints(motion: KeypointMotion, keypoints: np.ndarray) -> KeypointMotion:
     """Other ``keypoints`` (T, C, 135, 3) of the same motion."""
     pixels, seen = _chosen(keypoints)
     return _seeing(pixels, seen, motion.rig, motion.paths, motion.sigma, motion.bias)
@@ -149,15 +259,15 @@ def _seeing(
     pixels: np.ndarray,
     seen: np.ndarray,
     rig: Rig,
-    paths: Paths,
+    paths: SmoothPaths,
     sigma: np.ndarray,
     bias: np.ndarray,
-) -> Motion:
+) -> KeypointMotion:
     expected, _ = _project(paths.points, rig)
     seen = seen & np.isfinite(expected[..., 0])
     residual = np.where(seen[..., None], pixels - expected - bias, 0.0)
     valid = seen & (np.linalg.norm(residual, axis=-1) < OUTLIER_SIGMA * sigma)
-    return Motion(rig, paths.times, paths, residual, seen, valid, sigma, bias)
+    return KeypointMotion(rig, paths.times, paths, residual, seen, valid, sigma, bias)
 
 
 def _chosen(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,13 @@
-"""Each camera's constant time offset from the motion of the subject's keypoints.
+"""Constant time offset of each camera, estimated from the motion of the subject's keypoints.
 
-An image that is late shows every keypoint further along its path: a residual along the pixel
-velocity, which no wrong place of the joint, no constant error of the detector and, over time, no
-wrong pose of the camera explains. All offsets are found together by generalised least squares;
-where the joints are and how the cameras' poses err are unknowns of the same problem.
+An image exposed late shows every keypoint further along its path. The residual is parallel to the
+pixel velocity, which neither a wrong joint position, a constant detector error nor, over time, a
+wrong camera pose explains. All offsets are estimated jointly by generalised least squares, with
+joint positions and pose errors as further unknowns.
+
+The covariance of a residual series is the sum of a constant of any size, a process correlated over
+time, and white noise. Kind and length of the correlated part are chosen by likelihood from a short
+list, for all keypoints and views together.
 """
 
 from __future__ import annotations
@@ -15,25 +19,86 @@ import numpy as np
 
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.constants import (
-    CONSTANT_VARIANCE,
-    KEYPOINT_OFFSET_KNOWN_S,
-    MIN_TIMING_SETS,
-    MISSING_VARIANCE,
-    OFFSET_SIGMA_S,
-    POSE_SIGMA,
-    SPEED_ERROR,
-    WINDOW_SETS,
-)
-from intercap_core.scene.keypoint_motion import Motion, build_motion
-from intercap_core.scene.keypoint_noise import TimeNoise, fit_noise
+from intercap_core.geometry.solve.gaps import filled_linearly
+from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
+
+# Of the poses as they are given, beside the offsets in the keypoints' equations: rotation, rad, and
+# translation, m. Tuned on the studio.
+POSE_SIGMA = np.r_[np.full(3, np.radians(1.0)), np.full(3, 0.02)]
+OFFSET_SIGMA_S = 0.05  # prior of an offset, told by keypoints alone; tuned on the studio
+# The noise over time is chosen from these by likelihood; a short list tuned on the studio.
+ERROR_LENGTHS_S = {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}
+FAST_SHARES = (0.03, 0.1, 0.25, 0.6)  # of the variance that is new in each image
+CONSTANT_VARIANCE = 100.0  # of a series' constant part, of its own scatter: free in effect
+MISSING_VARIANCE = 1e6  # of a sample that is not there: no weight in effect
+TIMING_INFLATION = 2.0  # of sigmas: keypoints of one person err together; tuned on the studio
+SPEED_ERROR = 0.08  # of an offset: paths are smoothed too much or too little; tuned on the studio
+WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
+MIN_TIMING_SETS = 8  # fewer tell no time
+KEYPOINT_OFFSET_KNOWN_S = 0.02  # sigma, from keypoints alone: less certain is not known
+MIN_VALID_SHARE = 0.9  # of a series that helps to choose the noise
+
+
+@dataclass(frozen=True)
+class TimeNoise:
+    """``kind`` "rough" exp(-|d| / length) or "smooth" exp(-d^2 / (2 length^2)); ``length`` s;
+    ``fast`` share of the variance that is new in each image; ``scale``: standard deviation;
+    ``constant``: variance of what never changes, of the rest's."""
+
+    kind: str
+    length: float
+    fast: float
+    scale: float
+    constant: float = CONSTANT_VARIANCE
+
+    def covariance(self, times: np.ndarray) -> np.ndarray:
+        """(T, T), of unit ``scale``, with the constant part."""
+        return _covariance(times, self.kind, self.length, self.fast) + self.constant
+
+    def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """Inverse covariances (N, T, T) of N series, in units of ``scale``; ``variance`` (N, T) is
+        added to each sample: :data:`MISSING_VARIANCE` where there is none."""
+        whole = np.broadcast_to(self.covariance(times), (*variance.shape, len(times))).copy()
+        rows = np.arange(len(times))
+        whole[:, rows, rows] += variance
+        return np.linalg.inv(whole) / self.scale**2
+
+
+def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeNoise:
+    """Choose the noise model for ``series`` (N, T) of unit variance, from those with few gaps."""
+    whole = np.flatnonzero(valid.mean(1) >= MIN_VALID_SHARE)
+    if len(whole) < 10 or len(times) < 8:
+        return TimeNoise("rough", 0.5, 0.25, 1.0)
+    rows = np.where(valid[whole], series[whole], np.nan)
+    steps = np.arange(rows.shape[1])
+    rows = np.stack([filled_linearly(row[:, None], steps, np.isfinite(row))[:, 0] for row in rows])
+    best, chosen = -np.inf, TimeNoise("rough", 0.5, 0.25, 1.0)
+    for kind, lengths in ERROR_LENGTHS_S.items():
+        for length in lengths:
+            for fast in FAST_SHARES:
+                covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
+                low = np.linalg.cholesky(covariance)
+                energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
+                # Median over series: some are of occluded joints, some of an unsynchronised camera.
+                scale = max(float(np.median(energy)) / max(len(times) - 1.7, 1), 1e-6)
+                found = -np.log(np.diag(low)).sum() - len(times) / 2 * np.log(scale)
+                if found > best:
+                    best, chosen = found, TimeNoise(kind, length, fast, float(np.sqrt(scale)))
+    return chosen
+
+
+def _covariance(times: np.ndarray, kind: str, length: float, fast: float) -> np.ndarray:
+    apart = np.abs(times[:, None] - times) / length
+    lasting = np.exp(-apart) if kind == "rough" else np.exp(-(apart**2) / 2)
+    return (1 - fast) * lasting + fast * np.eye(len(times))
+
 
 # Groups of POINTS with correlated errors: each body point on its own, each hand, the face.
 CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
 
 @dataclass(frozen=True, eq=False)
-class Offsets:
+class TimeOffsets:
     """``offset`` (C,) s and ``sigma`` (C,) s, NaN = too little evidence; ``information`` (C, C)
     1/s^2 and ``vector`` (C,) 1/s: the normal equations ``information @ offset = vector`` of all
     cameras' offsets, before the master's is set to 0 and without any prior on them."""
@@ -44,7 +109,7 @@ class Offsets:
     vector: np.ndarray
 
 
-def keypoint_offsets(
+def find_offsets(
     keypoints: np.ndarray,
     slip: np.ndarray,
     rig: Rig,
@@ -52,22 +117,22 @@ def keypoint_offsets(
     *,
     master: int = 0,
     start: np.ndarray | None = None,
-) -> Offsets:
+) -> TimeOffsets:
     """Estimate when each camera exposes, seconds after the master.
 
     ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``slip``
     (T, C) whole sets by which an image is older than its set; ``times`` (T,) s; ``start`` (C,) s,
     about when they do, where that is not nearly together.
     """
-    shown = by_moment(keypoints, slip)
+    shown = keypoints_by_moment(keypoints, slip)
     views = len(rig)
     if len(times) < MIN_TIMING_SETS or views < 2:
         unknown = np.where(np.arange(views) == master, 0.0, np.nan)
-        return Offsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
+        return TimeOffsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
     motion = build_motion(shown, rig, times)
     if start is None or not start.any():
-        return offsets_of(motion, master)
-    found = offsets_of(motion.at_offsets(start), master)
+        return estimate_offsets(motion, master)
+    found = estimate_offsets(motion.at_offsets(start), master)
     return replace(
         found,
         offset=found.offset + start,
@@ -75,7 +140,7 @@ def keypoint_offsets(
     )
 
 
-def offsets_of(motion: Motion, master: int) -> Offsets:
+def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     """The time offsets that explain a motion's residuals."""
     views = len(motion.rig)
     matrices, vectors = keypoint_equations(motion, motion.residual, _columns(motion))
@@ -96,7 +161,7 @@ def offsets_of(motion: Motion, master: int) -> Offsets:
     sigma[free[own]] = np.sqrt(random + (SPEED_ERROR * offset[free[own]]) ** 2)
     unknown = sigma > KEYPOINT_OFFSET_KNOWN_S
     offset[unknown], sigma[unknown] = 0.0, np.nan
-    return Offsets(
+    return TimeOffsets(
         offset,
         sigma,
         (information + information.T) / 2 / inflation,
@@ -128,7 +193,7 @@ def _inflation(
     return max(1.0, float(ratio.mean()))
 
 
-def by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
+def keypoints_by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
     """Keypoints (T, C, 135, 3) of the images that show each set's moment; 0 where none does."""
     image_of = images_of_moments(slip, np.asarray(keypoints[..., 2].any(-1)))
     shown = keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
@@ -142,21 +207,21 @@ def windows(sets: int) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(edges.tolist())]
 
 
-def series_of(values: np.ndarray) -> np.ndarray:
+def as_series(values: np.ndarray) -> np.ndarray:
     """(T, K, 2C) to (K, 2C, T)."""
     return np.moveaxis(values, 0, 2)
 
 
-def noise_of(motion: Motion) -> TimeNoise:
+def estimate_noise(motion: KeypointMotion) -> TimeNoise:
     """The detector's noise over time, from the first window."""
     part = windows(len(motion.times))[0]
-    series = series_of(motion.projected(motion.residual))[..., part]
+    series = as_series(motion.projected(motion.residual))[..., part]
     valid = np.repeat(np.moveaxis(motion.valid, (0, 1, 2), (2, 1, 0)), 2, axis=1)[..., part]
     size = series.shape[2]
     return fit_noise(motion.times[part], series.reshape(-1, size), valid.reshape(-1, size))
 
 
-def precisions(motion: Motion, noise: TimeNoise, part: slice) -> np.ndarray:
+def precisions(motion: KeypointMotion, noise: TimeNoise, part: slice) -> np.ndarray:
     """Inverse covariances (K, C, W, W) over time of one window, the same for x and y."""
     valid = np.moveaxis(motion.valid[part], 0, 2)  # (C, K, W)
     variance = np.where(valid, 0.0, MISSING_VARIANCE)
@@ -166,15 +231,18 @@ def precisions(motion: Motion, noise: TimeNoise, part: slice) -> np.ndarray:
 
 
 def keypoint_equations(
-    motion: Motion, residual: np.ndarray, columns: np.ndarray, constant: float = CONSTANT_VARIANCE
+    motion: KeypointMotion,
+    residual: np.ndarray,
+    columns: np.ndarray,
+    constant: float = CONSTANT_VARIANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Each keypoint's normal matrix (K, n, n) and vector (K, n).
 
     ``columns`` (n, T, K, 2C) are projected residuals' derivatives by the unknowns, ``residual`` (T,
     C, K, 2) px; ``constant``: see :class:`TimeNoise`.
     """
-    noise = replace(noise_of(motion), constant=constant)
-    series = series_of(motion.projected(residual))
+    noise = replace(estimate_noise(motion), constant=constant)
+    series = as_series(motion.projected(residual))
     size, _, count, _ = columns.shape
     matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
     parts = windows(len(motion.times))
@@ -192,14 +260,14 @@ def keypoint_equations(
     return matrices, vectors
 
 
-def _columns(motion: Motion) -> np.ndarray:
+def _columns(motion: KeypointMotion) -> np.ndarray:
     """How the projected residuals (T, K, 2C) change with each camera's offset, then with each
     camera's six pose errors: (7C, T, K, 2C)."""
     offsets = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(len(motion.rig))]
     return np.concatenate([np.stack(offsets), pose_columns(motion)])
 
 
-def pose_columns(motion: Motion) -> np.ndarray:
+def pose_columns(motion: KeypointMotion) -> np.ndarray:
     """How the projected residuals change with each camera's turn about its centre, rad, and its
     move, m, in the master's axes: (6C, T, K, 2C)."""
     poses = []

@@ -1,10 +1,10 @@
-"""Registration of all cameras of a rig on the surfaces that several of them see.
+"""Joint registration of all cameras of a rig on the surfaces that several of them see.
 
-One robust Gauss-Newton problem (point-to-plane ICP over all pairs at once): residuals of every
-overlapping pair; unknowns are each camera's rotation, translation, depth bias and time offset, with
-the master's pose and time fixed and a weak prior on the start. Further constraints on the poses
-come from body keypoints (:mod:`.body_constraints`) and the floor (:mod:`.floor_constraint`): a bare
-floor alone leaves three motions free. Moving surfaces observe the exposure times as well.
+One robust Gauss-Newton problem (point-to-plane ICP over all pairs at once). Residuals: distances
+between the surfaces of every overlapping pair. Unknowns of each camera: rotation, translation,
+depth bias and time offset; pose and time of the master are fixed, and a weak prior holds the start.
+Further terms on the poses (:mod:`.constraints`) are passed in: a bare floor alone leaves three
+degrees of freedom undetermined. Moving surfaces also observe the exposure times.
 """
 
 from __future__ import annotations
@@ -20,26 +20,54 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.scene.balance import balanced
-from intercap_core.scene.constants import (
-    GATES_M,
-    HELD_GATES_M,
-    HELD_OUT_EVERY,
-    LEVER_M,
-    MIN_NORMALS_COSINE,
-    MIN_PAIR_POINTS,
-    MOMENTS_APART_M,
-    MOVING_EFFECTIVE_POINTS,
-    PAIR_QUERIES,
-    PRIOR_BIAS_M,
-    PRIOR_OFFSET_S,
-    PRIOR_ROTATION_RAD,
-    PRIOR_TRANSLATION_M,
-    STATIC_EFFECTIVE_POINTS,
-    SURFACE_SEARCH_M,
-    SURFACE_SIGMA_FLOOR_M,
-)
-from intercap_core.scene.surface import Surface
+from intercap_core.scene.starts import PRIOR_OFFSET_S
+from intercap_core.scene.surfaces import DepthSurface
+
+SURFACE_SIGMA_FLOOR_M = 0.003  # of point-to-plane residuals; tuned on the studio
+# Prior on the start of the registration: errors of a careful calibration; tuned on the studio.
+PRIOR_TRANSLATION_M = 0.01
+PRIOR_ROTATION_RAD = np.radians(0.5)
+PRIOR_BIAS_M = 0.003  # systematic depth error is at most 11 mm + 0.1 % (Azure Kinect DK data sheet)
+LEVER_M = 2.5  # from a camera to what it looks at, in a ring: turns a rotation into metres
+PAIR_QUERIES = 2500  # points of one camera that are sought in another, over all moments
+HELD_OUT_EVERY = 4  # of each surface's cells, one judges instead of taking part
+MOMENTS_APART_M = 10.0  # in the search tree's fourth axis: farther than any search
+SURFACE_SEARCH_M = 0.12  # distance to the nearest cell, beyond the widest gate
+# Gates on the distance to the plane, one an iteration, annealed; tuned on the studio.
+GATES_M = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)
+HELD_GATES_M = (0.08, 0.04, 0.04)  # where the poses are held
+MIN_NORMALS_COSINE = 0.85  # 32 degrees: one surface's normals in two views; tuned on the studio
+# Of the weight that two cameras' background has in the registration, one direction of normals has
+# at most this share; others gain at most this factor. Normals within 20 degrees are one direction.
+# Tuned on the studio.
+MAX_DIRECTION_SHARE, MAX_DIRECTION_GAIN, DIRECTION_COSINE = 0.8, 3.0, 0.94
+MIN_PAIR_POINTS = 60  # fewer correspondences are chance; tuned on the studio
+# Neighbouring residuals err together (lens, multipath, bias): a pair of cameras counts as at most
+# this many independent measurements each way. Tuned on the studio.
+STATIC_EFFECTIVE_POINTS = 10.0
+MOVING_EFFECTIVE_POINTS = 50.0  # over many moments and places
+
+
+_STEPS = 3  # until the mean of a direction that holds most of the weight stays
+
+
+def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Weights (N,) of points with unit normals (N, 3), their sum unchanged, in which one direction
+    has at most ``MAX_DIRECTION_SHARE`` of it.
+
+    The others gain at most ``MAX_DIRECTION_GAIN`` times: specks of a bare floor's edge are no wall.
+    """
+    total = weight.sum()
+    inside = np.ones(len(weight), bool)
+    for _ in range(_STEPS):
+        mean = weight[inside] @ normals[inside]
+        inside = normals @ mean >= DIRECTION_COSINE * np.linalg.norm(mean)
+    share = weight[inside].sum() / max(total, 1e-9)
+    if share <= MAX_DIRECTION_SHARE or share >= 1:
+        return weight
+    gain = min(MAX_DIRECTION_GAIN, (1 - MAX_DIRECTION_SHARE) / (1 - share))
+    return weight * np.where(inside, (1 - (1 - share) * gain) / share, gain)
+
 
 ROTATION, TRANSLATION, BIAS, OFFSET = slice(0, 3), slice(3, 6), 6, 7
 FREEDOMS = 8  # of a camera
@@ -71,15 +99,15 @@ MOVING = SurfaceKind(MOVING_EFFECTIVE_POINTS, PAIR_QUERIES, rounded=True)
 
 
 @dataclass(frozen=True)
-class Layer:
+class SurfaceLayer:
     """Surfaces seen at one moment: surfaces by camera index, depth camera's frame."""
 
-    surfaces: dict[int, Surface]
+    surfaces: dict[int, DepthSurface]
     kind: SurfaceKind
 
 
 @dataclass
-class Estimate:
+class RigEstimate:
     """Poses ``master_from_colour`` (C, 4, 4), depth bias (C,), metres to subtract, and time offset
     (C,), seconds by which each camera exposes after the set's time."""
 
@@ -88,7 +116,7 @@ class Estimate:
     offset: np.ndarray
 
     @classmethod
-    def start(cls, rig: Rig, offset: np.ndarray | None = None) -> Estimate:
+    def start(cls, rig: Rig, offset: np.ndarray | None = None) -> RigEstimate:
         """The rig as given, exposing ``offset`` (C,) s late."""
         none = np.zeros(len(rig))
         late = none.copy() if offset is None else offset.copy()
@@ -96,11 +124,11 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Solution:
+class RigSolution:
     """An estimate, its covariance (C, 8, C, 8) of rotation about the camera's centre, translation,
     bias and offset (0 for what was held), and how far the last step moved a point, metres."""
 
-    estimate: Estimate
+    estimate: RigEstimate
     covariance: np.ndarray
     last_step_m: float
 
@@ -127,15 +155,15 @@ class _Seen:
     """All of one kind that one camera sees, of all moments: ``moment`` (N,) sets moments apart in
     the search tree; ``queries`` and ``held_out`` are the rows that are sought in other cameras."""
 
-    surface: Surface
+    surface: DepthSurface
     moment: np.ndarray
     tree: cKDTree
     queries: np.ndarray
     held_out: np.ndarray
 
     @classmethod
-    def of(cls, surfaces: Sequence[tuple[int, Surface]], queries: int) -> _Seen:
-        surface = Surface.joined([surface for _, surface in surfaces])
+    def of(cls, surfaces: Sequence[tuple[int, DepthSurface]], queries: int) -> _Seen:
+        surface = DepthSurface.joined([surface for _, surface in surfaces])
         moment = np.repeat(
             [MOMENTS_APART_M * at for at, _ in surfaces], [len(s) for _, s in surfaces]
         )
@@ -172,7 +200,7 @@ class Registration:
     def __init__(
         self,
         rig: Rig,
-        layers: Sequence[Layer],
+        layers: Sequence[SurfaceLayer],
         master: int,
         offset_sigma: np.ndarray | None = None,
     ) -> None:
@@ -185,7 +213,7 @@ class Registration:
         self._master = master
         self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
         for kind in dict.fromkeys(layer.kind for layer in layers):
-            by_camera: dict[int, list[tuple[int, Surface]]] = {}
+            by_camera: dict[int, list[tuple[int, DepthSurface]]] = {}
             for moment, layer in enumerate(layers):
                 for camera, surface in layer.surfaces.items():
                     if layer.kind == kind and len(surface):
@@ -196,19 +224,19 @@ class Registration:
 
     def solve(
         self,
-        start: Estimate,
+        start: RigEstimate,
         constraints: Sequence[Constraint] = (),
         timing: OffsetInformation | None = None,
         *,
         free_poses: bool | np.ndarray = True,
-    ) -> Solution:
+    ) -> RigSolution:
         """Refine ``start``; ``constraints`` add normal equations of the poses, ``timing`` those of
         the offsets.
 
         Without ``free_poses``, of all or by camera (C,), the bias and the offsets alone are
         estimated.
         """
-        current = Estimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
+        current = RigEstimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
         rows = self._free_rows(free_poses)
         for gate in GATES_M if np.any(free_poses) else HELD_GATES_M:
@@ -231,12 +259,12 @@ class Registration:
         covariance[np.ix_(rows, rows)] = np.linalg.inv(system)
         last = np.abs(step.reshape(count, FREEDOMS))
         moved = LEVER_M * last[:, ROTATION].max(1) + last[:, TRANSLATION].max(1)
-        return Solution(
+        return RigSolution(
             current, covariance.reshape(count, FREEDOMS, count, FREEDOMS), float(moved.max())
         )
 
     def residuals(
-        self, at: Estimate, kind: SurfaceKind, camera: int | None = None
+        self, at: RigEstimate, kind: SurfaceKind, camera: int | None = None
     ) -> PairResiduals:
         """Median |point to plane| of every pair of cameras, or those of one ``camera``, over the
         held-out points."""
@@ -262,7 +290,7 @@ class Registration:
         kind: SurfaceKind,
         a: int,
         b: int,
-        at: Estimate,
+        at: RigEstimate,
         gate: float,
         *,
         held_out: bool = False,
@@ -307,7 +335,7 @@ class Registration:
         return between
 
     def _add_surfaces(
-        self, matrix: np.ndarray, gradient: np.ndarray, at: Estimate, gate: float
+        self, matrix: np.ndarray, gradient: np.ndarray, at: RigEstimate, gate: float
     ) -> None:
         pairs = [
             (kind, *pair) for kind, seen in self._seen.items() for pair in combinations(seen, 2)
@@ -328,7 +356,9 @@ class Registration:
                 residual = residual - share @ residual
                 rows = rows - np.einsum("n,knf->kf", share, rows)[:, None]
             else:
-                weight = balanced(weight, np.concatenate([match.normals for match in found]))
+                weight = balance_directions(
+                    weight, np.concatenate([match.normals for match in found])
+                )
             sigma = max(SURFACE_SIGMA_FLOOR_M, SIGMA_PER_MAD * float(np.median(np.abs(residual))))
             weight /= sigma**2 * max(1.0, len(residual) / (2 * kind.effective_points))
             weighted = rows * weight[:, None]
@@ -338,7 +368,7 @@ class Registration:
             )
 
     def _add_prior(
-        self, matrix: np.ndarray, gradient: np.ndarray, at: Estimate, start: Estimate
+        self, matrix: np.ndarray, gradient: np.ndarray, at: RigEstimate, start: RigEstimate
     ) -> None:
         precision = np.r_[
             np.full(3, PRIOR_ROTATION_RAD**-2.0),
@@ -366,7 +396,7 @@ class Registration:
         return np.flatnonzero(free.ravel())
 
 
-def _derivatives(m: _Match, at: Estimate, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
+def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (n, 8) of r = n . (p - q) - (offset_a - offset_b) speed by the cameras' freedoms.
 
     Turning the target about its centre moves n and q: together that is minus the source's
@@ -381,8 +411,8 @@ def _derivatives(m: _Match, at: Estimate, a: int, b: int) -> tuple[np.ndarray, n
     return rows(centres[a], m.own_ray), -rows(centres[b], m.other_ray)
 
 
-def _stepped(at: Estimate, step: np.ndarray) -> Estimate:
+def _stepped(at: RigEstimate, step: np.ndarray) -> RigEstimate:
     poses = at.poses.copy()
     poses[:, :3, :3] = Rotation.from_rotvec(step[:, ROTATION]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += step[:, TRANSLATION]
-    return Estimate(poses, at.bias + step[:, BIAS], at.offset + step[:, OFFSET])
+    return RigEstimate(poses, at.bias + step[:, BIAS], at.offset + step[:, OFFSET])

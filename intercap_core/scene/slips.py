@@ -16,27 +16,41 @@ import numpy as np
 
 from intercap_core.formats.recordings.synchronise import usual_steps
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.constants import (
-    CLEAR_SLIP_GAIN,
-    MANY_VIEWS,
-    MAX_SLIP_FRAMES,
-    MAX_SLIP_S,
-    MIN_SLIP_GAIN,
-    MIN_SLIP_GAIN_OF_SET,
-    MIN_TIMING_SETS,
+from intercap_core.scene.keypoint_motion import (
     OUTLIER_SIGMA,
-    SLIP_GAIN_PER_SET,
-    SLIP_LEFT_OUT,
-    SLIP_ROUNDS,
-    SLIP_WORTH,
-    SLIPS_APART_S,
+    KeypointMotion,
+    build_motion,
+    with_keypoints,
 )
-from intercap_core.scene.keypoint_motion import Motion, build_motion, seeing
-from intercap_core.scene.keypoint_timing import by_moment, noise_of, offsets_of, precisions, windows
+from intercap_core.scene.keypoint_timing import (
+    MIN_TIMING_SETS,
+    estimate_noise,
+    estimate_offsets,
+    keypoints_by_moment,
+    precisions,
+    windows,
+)
+
+# By how much an image is late. What holds it back is a queue, of some images, or a computer that is
+# busy, for some time: slips of 1 to 4 images at 30 a second occur in InterCap's recordings, and the
+# greater of the two counts at other rates.
+MAX_SLIP_FRAMES, MAX_SLIP_S = 4, 4 / 30
+SLIP_ROUNDS = 12  # at most: each takes the best intervals and looks again
+# Log likelihood without the keypoints that gain most: limbs that a detector confuses fit a slip by
+# chance, but never all over the body. Chance finds are short: what is beyond doubt depends on how
+# many sets say it. Tuned on the studio.
+MIN_SLIP_GAIN = 15.0
+MIN_SLIP_GAIN_OF_SET = 60.0  # over the number of sets
+SLIP_LEFT_OUT = 4  # keypoints
+SLIP_GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
+CLEAR_SLIP_GAIN = 10.0  # of an interval over the whole recording's being late
+SLIP_WORTH = 0.2  # of the best interval's gain makes another worth taking at once
+SLIPS_APART_S = 1.0  # nearer in time, one slip may have brought about another
+MANY_VIEWS = 4  # suffice for the body's motion without those that slip
 
 
 @dataclass(frozen=True)
-class Interval:
+class SlipInterval:
     """Camera ``camera`` shows in sets ``first`` to ``last``, inclusive, what was to be seen
     ``slip`` frames before; ``gain`` in log likelihood, ``sure`` without the best keypoints."""
 
@@ -59,7 +73,7 @@ class Slips:
     intervals that were found, in the order of their gain."""
 
     slip: np.ndarray
-    intervals: tuple[Interval, ...]
+    intervals: tuple[SlipInterval, ...]
 
 
 def longest_slip(fps: float) -> int:
@@ -87,7 +101,7 @@ def find_slips(
     steps = [s for s in range(-longest, longest + 1) if s]
     motion = build_motion(keypoints, rig, times)
     offset: np.ndarray | None = None
-    always: list[Interval] = []
+    always: list[SlipInterval] = []
     for _ in range(SLIP_ROUNDS):
         seen = motion if offset is None else motion.at_offsets(offset)
         evidence = _Evidence(seen, steps, fps)
@@ -97,17 +111,21 @@ def find_slips(
                 _apply(slip, interval)
                 if _whole(interval, len(times)):
                     always.append(interval)
-            motion = build_motion(by_moment(keypoints, slip), rig, times, motion.paths.points)
+            motion = build_motion(
+                keypoints_by_moment(keypoints, slip), rig, times, motion.paths.points
+            )
         elif offset is None:
             # Slips are large against offsets, but weak ones hide behind them: look once more.
-            offset = offsets_of(motion, master).offset
+            offset = estimate_offsets(motion, master).offset
         else:
             break
     if slip.any():
         undisturbed = keypoints.copy()
         if len(rig) >= MANY_VIEWS:
             undisturbed[slip != constant_slip(slip)] = 0
-        motion = build_motion(by_moment(undisturbed, slip), rig, times, motion.paths.points)
+        motion = build_motion(
+            keypoints_by_moment(undisturbed, slip), rig, times, motion.paths.points
+        )
     offset = np.zeros(len(rig)) if offset is None else offset
     slip, intervals = _polished(slip, keypoints, motion, offset, steps, fps)
     intervals = sorted([*always, *intervals], key=lambda i: -i.gain)
@@ -115,7 +133,7 @@ def find_slips(
     return Slips(slip - np.int32(of_master), tuple(intervals))
 
 
-def _whole(interval: Interval, sets: int) -> bool:
+def _whole(interval: SlipInterval, sets: int) -> bool:
     return interval.last - interval.first + 1 == sets
 
 
@@ -124,21 +142,21 @@ def constant_slip(slip: np.ndarray) -> np.ndarray:
     return np.where((slip != 0).all(0), np.median(slip, 0), 0).astype(np.int32)
 
 
-def _apply(slip: np.ndarray, interval: Interval) -> None:
+def _apply(slip: np.ndarray, interval: SlipInterval) -> None:
     """Add to ``slip`` (T, C), in place, for the images that so far show the interval's moments."""
     moment = np.arange(len(slip)) - slip[:, interval.camera]
     late = (moment >= interval.first) & (moment <= interval.last)
     slip[late | _whole(interval, len(slip)), interval.camera] += interval.slip
 
 
-def _apart(intervals: list[Interval], times: np.ndarray) -> list[Interval]:
+def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterval]:
     """The best interval and those that it cannot have caused.
 
     An unsynchronised camera makes others look so: much weaker intervals, and those near it in time,
     are left to the next round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
-    taken: list[Interval] = []
+    taken: list[SlipInterval] = []
     for interval in ordered:
         early, late = times[interval.first] - SLIPS_APART_S, times[interval.last] + SLIPS_APART_S
         if interval.gain >= SLIP_WORTH * ordered[0].gain and all(
@@ -157,11 +175,11 @@ def _runs(chosen: np.ndarray) -> list[np.ndarray]:
 def _polished(
     slip: np.ndarray,
     keypoints: np.ndarray,
-    motion: Motion,
+    motion: KeypointMotion,
     offset: np.ndarray,
     steps: list[int],
     fps: float,
-) -> tuple[np.ndarray, list[Interval]]:
+) -> tuple[np.ndarray, list[SlipInterval]]:
     """Find each interval once more, against the motion that no slip disturbs any longer."""
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
@@ -169,7 +187,7 @@ def _polished(
         for run in _runs(slip[:, c] != constant):
             before = slip.copy()
             before[run, c] = constant
-            shown = seeing(motion, by_moment(keypoints, before))
+            shown = with_keypoints(motion, keypoints_by_moment(keypoints, before))
             found = _Evidence(shown.at_offsets(offset), steps, fps).best(c)
             result[run, c] = constant
             if found is not None and not _whole(found, len(slip)):
@@ -178,7 +196,7 @@ def _polished(
     return result, intervals
 
 
-def _tolerant(motion: Motion, moved: np.ndarray) -> Motion:
+def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
     """The motion, where residuals that a slip would explain count as valid, too; ``moved`` (S, T,
     C, K, 2) px."""
     size = np.linalg.norm(motion.residual, axis=-1)
@@ -195,13 +213,13 @@ def _sure(gains: np.ndarray) -> float:
 class _Evidence:
     """Evidence of the residuals for slips of ``steps`` frames."""
 
-    def __init__(self, motion: Motion, steps: list[int], fps: float) -> None:
+    def __init__(self, motion: KeypointMotion, steps: list[int], fps: float) -> None:
         self._steps = steps
         self._late = np.stack([np.nan_to_num(motion.shifted(s / fps)) for s in steps])
         self._motion = _tolerant(motion, self._late)
         # a camera of half the rate slips by two sets at a time
         self._own_steps = np.rint(usual_steps(np.any(motion.seen, -1))).astype(int)
-        noise = noise_of(self._motion)
+        noise = estimate_noise(self._motion)
         whole = windows(len(motion.times))
         between = [
             slice((a.start + a.stop) // 2, (b.start + b.stop) // 2) for a, b in pairwise(whole)
@@ -209,7 +227,7 @@ class _Evidence:
         self._parts = [(part, False) for part in whole] + [(part, True) for part in between]
         self._precisions = [precisions(self._motion, noise, part) for part, _ in self._parts]
 
-    def best(self, camera: int) -> Interval | None:
+    def best(self, camera: int) -> SlipInterval | None:
         """The interval of one camera with the greatest gain, if significant."""
         sets, own_step = len(self._motion.times), self._own_steps[camera]
         root, series = _own_series(self._motion, camera)
@@ -235,13 +253,15 @@ class _Evidence:
                     last=part.start + found.last,
                 )
         step = max(self._steps, key=lambda s: _sure(always[s]))
-        whole = Interval(camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step]))
+        whole = SlipInterval(
+            camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step])
+        )
         if whole.beyond_doubt and (top is None or whole.gain > top.gain - CLEAR_SLIP_GAIN):
             return whole
         return top
 
 
-def _best_of_window(cases: dict[int, _Slipped]) -> Interval | None:
+def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
     """The interval, by place in the window, with the greatest gain, if significant."""
     found = [case.best(step) for step, case in cases.items()]
     found = [interval for interval in found if interval.beyond_doubt]
@@ -252,7 +272,7 @@ def _best_of_window(cases: dict[int, _Slipped]) -> Interval | None:
     return min(found, key=lambda i: cases[i.slip].misfit(most.first, most.last + 1))
 
 
-def _own_series(motion: Motion, camera: int) -> tuple[np.ndarray, np.ndarray]:
+def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.ndarray]:
     """One camera's residuals given all other views': ``root`` (T, K, 2, 2) makes its pixels of unit
     variance, ``series`` (T, K, 2) are the residuals so.
 
@@ -311,13 +331,13 @@ class _Slipped:
         left = self.series[:, first:end] - self.change[:, first:end]
         return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMA**2).sum())
 
-    def best(self, step: int) -> Interval:
+    def best(self, step: int) -> SlipInterval:
         """The interval of greatest gain, by place in the window, of camera 0."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
         gain = interval_gains(self.linear.sum(0) - SLIP_GAIN_PER_SET, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         gains = self.gains(first, end)
-        return Interval(0, first, end - 1, step, float(gains.sum()), _sure(gains))
+        return SlipInterval(0, first, end - 1, step, float(gains.sum()), _sure(gains))
 
 
 def interval_gains(linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:

@@ -1,26 +1,125 @@
-"""How badly two cameras agree if one is so many sets late: epipolar distances along moving people.
+"""Epipolar cost of a time lag between two cameras, along the people that both follow.
 
-What is used of the body's middles, and why, :mod:`intercap_core.scene.start_times` says.
+People are followed in the images of each camera separately, so no two views have to be in step.
+Only body points are used that do not depend on left and right (nose, neck, middle of the hips,
+middle between both knees, ...), because a detector may exchange the sides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.formats.recordings.synchronise import usual_steps
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.geometry.camera.triangulation import pixel_scale
-from intercap_core.scene.constants import EPIPOLAR_PX_AT_1080P
+from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
+from intercap_core.person.tracks import MAX_LINK_GAP_S
+from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
+
+MAX_PEOPLE = 3  # of an image, the surest
+LINK_SLACK_RAD = 0.05  # scatter of a person's middles between images; a detector's few pixels
+EPIPOLAR_PX_AT_1080P = (
+    6.0  # what two views of one moment disagree by, over time; tuned on the studio
+)
+SLOWER_SETS = 1.5  # usual sets from one of a camera's images to the next: half way to half the rate
+
+
+_PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
+_SIDES = [
+    (_PLACE[f"left_{name}"], _PLACE[f"right_{name}"])
+    for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+]
+_ALONE = [_PLACE[name] for name in ("nose", "neck", "mid_hip")]
+MIDDLES = len(_ALONE) + len(_SIDES)
+
+
+def body_middles(person: np.ndarray) -> np.ndarray:
+    """Pixels (K, 2) that do not depend on which side is called left, of keypoints (135, 3); NaN
+    where one of the two is not seen."""
+    known = np.where(person[:, 2:] >= MIN_CONFIDENCE, person[:, :2], np.nan)
+    between = [(known[left] + known[right]) / 2 for left, right in _SIDES]
+    return np.concatenate([known[_ALONE], between])
+
+
+def follow_rays(
+    detections: PeopleOfImages, rig: Rig, times: np.ndarray, available: np.ndarray
+) -> np.ndarray:
+    """Rays (T, C, P, K, 2), x and y at z = 1, of the middles of people; NaN = not seen.
+
+    Each of the P places holds one person of a camera's images for as long as it can be followed;
+    places of two cameras have nothing to do with each other. ``times`` (T,) s of the sets,
+    ``available`` (T, C): the set has an image of the camera.
+    """
+    rays = np.full((*available.shape, MAX_PEOPLE, MIDDLES, 2), np.nan)
+    for c, usual in enumerate(usual_steps(available)):
+        images = np.flatnonzero(available[:, c])
+        for t in images.tolist():
+            people = detections.people(t, c)
+            surest = np.argsort(-people[..., 2].sum(1), kind="stable")[:MAX_PEOPLE]
+            if not len(surest):
+                continue
+            pixels = np.stack([body_middles(people[i]) for i in surest])
+            _place(rays[:, c], t, rig[c].colour.unproject(pixels)[..., :2], times)
+        if usual >= SLOWER_SETS:
+            _carry_on(rays[:, c], images, usual)
+    return rays
+
+
+def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> None:
+    """Put an image's ``people`` (N, K, 2) into the places of ``rays`` (T, P, K, 2), in place: each
+    where somebody was last seen near by, else into one that was free for longest."""
+    count = rays.shape[1]
+    last = [_last_seen(rays[:t, place]) for place in range(count)]
+    options = sorted(
+        (float(np.nanmedian(np.linalg.norm(person - rays[seen, place], axis=1))), i, place)
+        for i, person in enumerate(people)
+        for place, seen in enumerate(last)
+        if seen >= 0 and np.isfinite(person[:, 0] + rays[seen, place, :, 0]).any()
+    )
+    free, waiting = set(range(count)), set(range(len(people)))
+    for apart, i, place in options:
+        gap = float(times[t] - times[last[place]])
+        reach = LINK_SLACK_RAD + MAX_IMAGE_SPEED_RAD_S * gap
+        if i in waiting and place in free and gap <= MAX_LINK_GAP_S and apart <= reach:
+            rays[t, place] = people[i]
+            waiting.remove(i)
+            free.remove(place)
+    for i in sorted(waiting):
+        place = min(free, key=lambda k: last[k])
+        rays[t, place] = people[i]
+        free.remove(place)
+
+
+def _last_seen(rays: np.ndarray) -> int:
+    """The last set of rays (T, K, 2) that has any, -1 = none."""
+    seen = np.flatnonzero(np.isfinite(rays[..., 0]).any(1))
+    return int(seen[-1]) if len(seen) else -1
+
+
+def _carry_on(rays: np.ndarray, images: np.ndarray, usual: float) -> None:
+    """Fill the ``rays`` (T, P, K, 2) of a camera of fewer images a second than sets, in place, in
+    the sets between two of its ``images`` (N,), usually ``usual`` sets apart: people move evenly
+    over so short a time. Else one lag is judged by other pairs and moments than the next."""
+    for first, last in pairwise(images.tolist()):
+        if last - first > 2 * usual:
+            continue  # lost images: nothing is made up
+        for t in range(first + 1, last):
+            share = (t - first) / (last - first)
+            rays[t] = (1 - share) * rays[first] + share * rays[last]
+
 
 _NO_MOTION_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class PairCosts:
     """How badly two cameras a < b agree, 0 to 1, if b's image of set t + lag shows what a's of set
     t does: ``cost[a, b]`` (4 reach + 1, T), lags from - 2 reach, NaN = not known."""
 
@@ -29,7 +128,7 @@ class Pairs:
     reach: int
 
     @classmethod
-    def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> Pairs:
+    def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> PairCosts:
         """From ``rays`` (T, C, P, K, 2); lags at which fewer than ``fewest`` sets tell stay NaN."""
         lags = range(-2 * reach, 2 * reach + 1)
         cost = {
@@ -51,7 +150,7 @@ class Pairs:
             start = self.reach - (theirs if a == other else own)  # a's set t shows moment t - late
             series[start : start + len(row)] = row
             found.append(series)
-        return mean(np.array(found))
+        return known_mean(np.array(found))
 
     def profile(
         self, camera: int, others: Sequence[int], sets: np.ndarray, bound: int | None = None
@@ -59,14 +158,14 @@ class Pairs:
         """Mean cost (2 reach + 1,) by how late a camera is, NaN where no pair tells, and beyond
         ``bound`` sets."""
         tried = range(-self.reach, self.reach + 1)
-        cost = mean(np.array([self.series(camera, k, others, sets) for k in tried]).T)
+        cost = known_mean(np.array([self.series(camera, k, others, sets) for k in tried]).T)
         if bound is not None:
             cost[np.abs(np.array(tried)) > bound] = np.nan
         return cost
 
 
 def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -> np.ndarray:
-    """One lag's costs (T,) of :class:`Pairs`: of each person whom camera a follows, and the one of
+    """One lag's costs (T,) of :class:`PairCosts`: of each person whom camera a follows, and the one of
     camera b who agrees best all along, how far the distances to each other's epipolar lines are
     from their medians over time; the mean over people by how much they move."""
     sets = len(rays)
@@ -79,16 +178,16 @@ def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -
     seen = np.isfinite(distance).sum(0, keepdims=True)
     distance = np.where(seen >= fewest, distance, np.nan)  # of people who are seen for long enough
     known = np.isfinite(distance).any(-1)  # (T, P, Q)
-    size = mean(mean(np.moveaxis(np.abs(distance), -1, 0)))
+    size = known_mean(known_mean(np.moveaxis(np.abs(distance), -1, 0)))
     size[known.sum(0) < fewest] = np.nan
     cost, weight = np.full((2, first.shape[1], len(first)), np.nan)
     for p in np.flatnonzero(np.isfinite(size).any(1)):
         own = distance[:, p, np.nanargmin(size[p])]
         own = own[:, np.isfinite(own).any(0)]
         change = (own - np.nanmedian(own, axis=0)) / EPIPOLAR_PX_AT_1080P
-        cost[p] = mean((change**2 / (1 + change**2)).T)
+        cost[p] = known_mean((change**2 / (1 + change**2)).T)
         weight[p] = np.where(np.isfinite(cost[p]), _moves(first[:, p]), np.nan)
-    found[at] = mean(weight * cost) / mean(weight)
+    found[at] = known_mean(weight * cost) / known_mean(weight)
     return found
 
 
@@ -112,7 +211,7 @@ def _epipolar(first: np.ndarray, second: np.ndarray, rig: Rig, a: int, b: int) -
     return focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
 
 
-def mean(values: np.ndarray) -> np.ndarray:
+def known_mean(values: np.ndarray) -> np.ndarray:
     """Mean over the first axis of what is known; NaN where nothing is."""
     known = np.isfinite(values)
     count = known.sum(0)

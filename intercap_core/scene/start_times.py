@@ -1,15 +1,14 @@
-"""Cameras that started apart: whole recordings that are late by up to seconds.
+"""Start times of cameras that were not started together: recordings late by up to seconds.
 
-Nothing that compares the views of a frame set holds for them, so they are sought first, with what
-needs no view to be in step: along a moving person, the rays of two cameras meet (epipolar distance)
-only where both show the same moment. The body's middles are looked at (nose, neck, hips, half way
-between the knees, ...), which stay where they are when a detector exchanges left and right. For
-each pair of cameras and each lag the distances are summed robustly, each middle's median taken off,
-which is the calibration's error and not the time's; the lags of all pairs together give the
-cameras' times. Where the person hardly moves, or a motion repeats itself, nothing is said.
+The method needs no synchronised views. The rays of two cameras to a moving person meet only where
+both show the same moment, so the epipolar distance is low at the right lag. For each pair of
+cameras and each lag the truncated distances are summed (:mod:`.start_costs`); the median of each
+body point is subtracted, since it stems from the calibration. The lags of all pairs together give
+the start times. If the person hardly moves, or the motion repeats itself, no start is returned.
 
-What is stated of a start is where the search begins, as the images' own times are where nothing is:
-a camera leaves it where the views surely agree better elsewhere, and denies it if that is far away.
+The search begins at a stated start if there is one, else at the device times. A camera leaves this
+point only if the views clearly agree better elsewhere; if that is far away, the stated start is
+rejected.
 """
 
 from __future__ import annotations
@@ -18,112 +17,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.constants import (
-    CLEAR_SIGMAS,
-    FEWEST_BLOCKS,
+from intercap_core.scene.start_costs import PairCosts, follow_rays, known_mean
+from intercap_core.scene.starts import (
     FEWEST_SETS_APART,
-    MAX_START_S,
-    MAX_START_SHARE,
     MIN_SHARED_S,
-    PRIOR_OFFSET_S,
-    START_BLOCK_S,
-    START_BLOCKS_SHARE,
-    START_PEAK_S,
-    START_ROUNDS,
-    START_SIGMAS,
-    START_WORSE,
+    StartTimes,
+    StatedStarts,
+    combine_estimates,
+    shift_images,
 )
-from intercap_core.scene.people_in_view import followed
-from intercap_core.scene.start_costs import Pairs, mean
-from intercap_core.scene.stated_starts import StatedStarts, combined
 
-
-@dataclass(frozen=True, eq=False)
-class Starts:
-    """By how much each camera's images are older than their sets say, all along: ``late`` (C,) s,
-    the master's 0, and the nearest whole number of ``sets`` (C,). ``apart``: the cameras were not
-    started together. ``in_doubt`` (C,): then this camera's time could not be told. ``sigma`` (C,) s
-    that ``late`` is off by where it rests on what was stated, else NaN; ``denied`` (C,): something
-    was stated, and the keypoints say otherwise."""
-
-    late: np.ndarray
-    sets: np.ndarray
-    in_doubt: np.ndarray
-    apart: bool
-    step_s: float
-    sigma: np.ndarray
-    denied: np.ndarray
-
-    @classmethod
-    def as_stated(cls, stated: StatedStarts, step_s: float) -> Starts:
-        """What is stated, and of other cameras what their images' times say."""
-        none = np.zeros(len(stated.late), bool)
-        late = np.nan_to_num(stated.late)
-        return cls(late, stated.sets(step_s), none, False, step_s, stated.sigma.copy(), none.copy())
-
-    @property
-    def offset(self) -> np.ndarray:
-        """(C,) s after which cameras expose, once images are moved by whole numbers of sets."""
-        return self.sets * self.step_s - self.late
-
-    @property
-    def offset_sigma(self) -> np.ndarray | None:
-        """(C,) s that these offsets are off by: what was stated, else half a set of cameras that
-        started apart; None where nothing is stated and nothing started apart."""
-        stated = np.isfinite(self.sigma)
-        if not self.apart and not stated.any():
-            return None
-        return np.where(stated, self.sigma, self.step_s / 2 if self.apart else PRIOR_OFFSET_S)
-
-    def in_step(self, values: np.ndarray) -> np.ndarray:
-        """Values (T, C, ...) of images, with each camera's moved to the sets of its moments; 0
-        where there is no image."""
-        return moved(values, self.sets)
-
-    def of_images(self, values: np.ndarray) -> np.ndarray:
-        """Values (T, C, ...) of moments, as :meth:`in_step` gives them, moved back."""
-        return moved(values, -self.sets)
-
-    def with_slips(self, slip: np.ndarray) -> np.ndarray:
-        """By how many sets (T, C) images are late in all, from slips (T, C) that were found in
-        step."""
-        last = len(slip) - 1
-        place = np.clip(np.arange(len(slip))[:, None] - self.sets, 0, last)
-        return np.take_along_axis(slip, place, 0) + self.sets.astype(slip.dtype)
-
-
-def moved(values: np.ndarray, by: np.ndarray, fill: float = 0) -> np.ndarray:
-    """Values (T, C, ...) of images with each camera's ``by`` (C,) sets earlier; ``fill`` where
-    there are none."""
-    sets = len(values)
-    result = np.full_like(values, fill)
-    for c, shift in enumerate(by.tolist()):
-        there = slice(max(0, -shift), max(0, min(sets, sets - shift)))
-        result[there, c] = values[max(0, shift) : max(0, sets + min(0, shift)), c]
-    return result
-
-
-@dataclass(frozen=True)
-class InStep:
-    """The people of the images that show each set's moment."""
-
-    detections: PeopleOfImages
-    starts: Starts
-
-    @property
-    def num_sets(self) -> int:
-        """How many sets there are."""
-        return self.detections.num_sets
-
-    def people(self, t: int, c: int) -> np.ndarray:
-        """Keypoints (P, 135, 3) of the people whom camera c sees at set t's moment."""
-        image = t + int(self.starts.sets[c])
-        if 0 <= image < self.num_sets and not self.starts.in_doubt[c]:
-            return self.detections.people(image, c)
-        return np.zeros((0, NUM_KEYPOINTS, 3))
+MAX_START_S = 1.5  # cameras are started by hand or by one command that reaches them in turn
+MAX_START_SHARE = 0.4  # of the recording: less in common tells little; tuned on the studio
+# A camera started apart if views agree better so than as they are, and than at any time that is not
+# near: in most blocks of time, by so many standard errors of their mean, and by a share of how much
+# they disagree anyway. Tuned on the studio.
+START_BLOCK_S, START_BLOCKS_SHARE, START_SIGMAS, START_WORSE = 0.3, 0.7, 3.0, 0.2
+CLEAR_SIGMAS, START_PEAK_S, FEWEST_BLOCKS = 1.0, 0.15, 4
+START_ROUNDS = 5
 
 
 def find_starts(
@@ -134,7 +47,7 @@ def find_starts(
     *,
     master: int = 0,
     stated: StatedStarts | None = None,
-) -> Starts:
+) -> StartTimes:
     """When the cameras started, from all people that they show, and from what is ``stated``.
 
     ``times`` (T,) s of the sets; ``available`` (T, C): the set has an image of the camera.
@@ -142,16 +55,16 @@ def find_starts(
     views, sets = len(rig), len(times)
     step = float(np.median(np.diff(times))) if sets > 1 else 0.0
     told = stated or StatedStarts.nothing(views)
-    as_stated = Starts.as_stated(told, step)
+    as_stated = StartTimes.as_stated(told, step)
     if sets < 2 or views < 2:
         return as_stated
     reach = min(round(MAX_START_S / step), int(MAX_START_SHARE * sets))
     fewest = max(MIN_SHARED_S / step, 1)
     if reach < 1 or sets - reach < fewest:
         return as_stated
-    rays = moved(followed(detections, rig, times, available), as_stated.sets, np.nan)
+    rays = shift_images(follow_rays(detections, rig, times, available), as_stated.sets, np.nan)
     search = _Search(
-        Pairs.of(rays, rig, reach, fewest), master, step, told.bounds(step, reach), told.known
+        PairCosts.of(rays, rig, reach, fewest), master, step, told.bounds(step, reach), told.known
     )
     late, denied = search.agreed()
     others = [c for c in range(views) if c != master]
@@ -177,7 +90,7 @@ def find_starts(
         elif told.known[c] and told.sigma[c] > step / 2:
             found.sigma[c] = step / 2  # the views tell more; slips are sought from the best place
         elif told.known[c]:
-            found.late[c], found.sigma[c] = combined(
+            found.late[c], found.sigma[c] = combine_estimates(
                 (found.late[c], step / 2), (told.late[c], told.sigma[c])
             )
             found.sets[c] = round(found.late[c] / step)
@@ -189,7 +102,7 @@ class _Search:
     """How late cameras are beside what is stated, whole sets: ``bounds`` (C,) within which they do
     not deny it, of cameras of which something is ``stated`` (C,)."""
 
-    pairs: Pairs
+    pairs: PairCosts
     master: int
     step: float
     bounds: np.ndarray
@@ -325,7 +238,7 @@ class _Search:
         change = self.pairs.series(camera, late, others, sets) - own
         size = max(1, round(START_BLOCK_S / self.step))
         whole = change[: len(change) // size * size].reshape(-1, size)
-        return mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
+        return known_mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
 
     def between(self, sets: np.ndarray, camera: int) -> float:
         """How far from its whole number of sets, in sets, a parabola of a camera's cost is

@@ -1,4 +1,9 @@
-"""The subject as all views see it, at poses that are not yet refined."""
+"""Detections of the subject in all views, and its joints triangulated at the poses as given.
+
+The search for the subject requires that views agree within a set. In an image that is some frames
+late a walking person is a step behind, so the search rejects it. :func:`add_late_views` adds such
+images by the position in which the other views saw the subject shortly before.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +14,73 @@ import numpy as np
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.person.groups import NOBODY
-from intercap_core.person.middles import fill_middles
-from intercap_core.person.sides import BODY_POINTS
+from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
+from intercap_core.person.groups import MIN_COMMON_POINTS, NOBODY
+from intercap_core.person.sides import BODY_POINTS, swap_sides
 from intercap_core.person.subject import find_subject
-from intercap_core.person.swaps import triangulate_people
-from intercap_core.scene.constants import LOOSE_PX_AT_1080P, MIN_CONFIDENCE
-from intercap_core.scene.late_views import with_late_views
+from intercap_core.person.subject_joints import fill_middles, triangulate_people
+from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
+from intercap_core.scene.slips import longest_slip
+
+LOOSE_PX_AT_1080P = 40.0  # agreement of views whose poses are a centimetre off; tuned on the studio
+# Median over the body of somebody seen a while ago: biases of joints, poses not yet refined, half
+# a frame of motion; tuned on the studio.
+SAME_PERSON_PX_AT_1080P = 45.0
+
+
+def add_late_views(
+    index: np.ndarray,
+    detections: PeopleOfImages,
+    joints: np.ndarray,
+    rig: Rig,
+    times: np.ndarray,
+    *,
+    fps: float,
+    min_confidence: float,
+) -> np.ndarray:
+    """Add to the subject's ``index`` (T, C), -1 = not seen, people who are where it was shortly
+    before.
+
+    ``joints`` (T, 135, 3) m, triangulated from the views that do see it, NaN = not known; ``times``
+    (T,) s. Looks back as far as slips are sought.
+    """
+    reach_s = longest_slip(fps) / fps
+    result = index.copy()
+    body = joints[:, BODY_POINTS]
+    limit = SAME_PERSON_PX_AT_1080P * pixel_scale(rig)
+    for t, c in np.argwhere(index == NOBODY):
+        found = detections.people(int(t), int(c))
+        if not len(found):
+            continue
+        before = _sets_before(times, int(t), reach_s)
+        expected = reproject(np.nan_to_num(body[before].reshape(-1, 3), nan=1.0), rig)[:, c]
+        expected = expected.reshape(len(before), -1, 2)
+        known = np.isfinite(body[before, :, 0])
+        errors = [_distance(person, expected, known, min_confidence) for person in found]
+        if min(errors, default=np.inf) < limit[c]:
+            result[t, c] = int(np.argmin(errors))
+    return result
+
+
+def _sets_before(times: np.ndarray, t: int, reach_s: float) -> np.ndarray:
+    """Sets up to ``reach_s`` before set ``t``, itself included."""
+    first = np.searchsorted(times, times[t] - reach_s - 1e-3)
+    return np.arange(first, t + 1)
+
+
+def _distance(
+    person: np.ndarray, expected: np.ndarray, known: np.ndarray, min_confidence: float
+) -> float:
+    """The least median distance, px, of a person (135, 3) to any of N bodies (N, 25, 2); either as
+    found or with the sides exchanged."""
+    best = np.inf
+    for body in (person[BODY_POINTS], swap_sides(person)[BODY_POINTS]):
+        common = known & (body[:, 2] >= min_confidence)
+        away = np.linalg.norm(expected - body[:, :2], axis=-1)
+        for row, both in zip(away, common, strict=True):
+            if both.sum() >= MIN_COMMON_POINTS:
+                best = min(best, float(np.median(row[both])))
+    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,16 +99,16 @@ class SubjectViews:
         """The same by moment: set t holds the image of camera c that ``image_of`` (T, C) says."""
         shown = self.keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
         shown[image_of < 0] = 0
-        return triangulated(shown, rig)
+        return triangulate_views(shown, rig)
 
 
-def subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
+def find_subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
     """Find the subject at the start's poses; all 0 and NaN where no two views agree on anybody."""
     index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE).people
-    found = triangulated(_keypoints_of(detections, index), rig)
+    found = triangulate_views(_keypoints_of(detections, index), rig)
     if len(times) < 2:
         return found
-    late = with_late_views(
+    late = add_late_views(
         index,
         detections,
         found.joints,
@@ -54,7 +119,7 @@ def subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> Su
     )
     if np.array_equal(late, index):
         return found
-    return triangulated(_keypoints_of(detections, late), rig)
+    return triangulate_views(_keypoints_of(detections, late), rig)
 
 
 def _keypoints_of(detections: PeopleOfImages, index: np.ndarray) -> np.ndarray:
@@ -64,7 +129,7 @@ def _keypoints_of(detections: PeopleOfImages, index: np.ndarray) -> np.ndarray:
     return keypoints
 
 
-def triangulated(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
+def triangulate_views(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
     """Triangulate the body of ``keypoints`` (T, C, 135, 3), sides exchanged where views say so."""
     sets, views = keypoints.shape[:2]
     body = np.zeros_like(keypoints)

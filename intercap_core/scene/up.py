@@ -9,21 +9,23 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.constants import (
-    CAMERA_UP_CONE_DEG,
-    GRAVITY_CONE_DEG,
-    MIN_TRUNK_SETS,
-    STATED_FLOOR_M,
-    STATED_UP_CONE_DEG,
-    STATED_UP_DEG,
-    WRONG_UP_DEG,
-)
+
+GRAVITY_CONE_DEG = 10.0  # of an accelerometer and its mounting, on a tripod; a bound, no data sheet
+STATED_UP_CONE_DEG = 10.0  # of a calibration's axis from the floor's normal: a board laid on it
+CAMERA_UP_CONE_DEG = 40.0  # of the mean of the cameras' own up directions; tuned on the studio
+# How far a measured floor may be from what is stated of the calibration's world before it is said:
+# a board is laid by hand and is a few centimetres thick, feet tell a tilt to about 3 degrees.
+STATED_UP_DEG = 4.0
+STATED_FLOOR_M = 0.06
+WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; who bends for long leans by less
+MIN_TRUNK_SETS = 5  # that show neck and hips
+
 
 NECK, MID_HIP = 1, 8  # among the body's keypoints
 
 
 @dataclass(frozen=True, eq=False)
-class Up:
+class UpDirection:
     """``direction`` (3,), unit, master frame; up is within ``cone_deg`` of it."""
 
     direction: np.ndarray
@@ -31,7 +33,7 @@ class Up:
     source: Literal["gravity", "stated", "cameras"]
 
 
-def up_hint(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) -> Up:
+def rough_up(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) -> UpDirection:
     """Roughly up.
 
     ``gravity`` (C, 3) points down in each colour camera, NaN where not known; where no sensor
@@ -43,11 +45,11 @@ def up_hint(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) -> 
     if measured.any():
         down = np.einsum("cij,cj->ci", rotations[measured], gravity[measured])
         up = -np.median(down, axis=0)
-        return Up(up / np.linalg.norm(up), GRAVITY_CONE_DEG, "gravity")
+        return UpDirection(up / np.linalg.norm(up), GRAVITY_CONE_DEG, "gravity")
     if stated is not None and np.isfinite(stated).all():
-        return Up(stated, STATED_UP_CONE_DEG, "stated")
+        return UpDirection(stated, STATED_UP_CONE_DEG, "stated")
     up = -rotations[:, :, 1].mean(0)
-    return Up(up / np.linalg.norm(up), CAMERA_UP_CONE_DEG, "cameras")
+    return UpDirection(up / np.linalg.norm(up), CAMERA_UP_CONE_DEG, "cameras")
 
 
 def trunk_direction(joints: np.ndarray) -> np.ndarray:
@@ -74,7 +76,7 @@ def check_stated_up(
     """
     if not np.isfinite(stated).all():
         return []
-    without = up_hint(rig, gravity)
+    without = rough_up(rig, gravity)
     off = degrees_between(stated, without.direction)
     if without.source == "gravity":
         said = f"the stated up (calibration_up) is {off:.0f} degrees from the gravity sensors'"

@@ -20,18 +20,24 @@ from intercap_core.formats.detections.read import (
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import Triangulation, reproject, spread
-from intercap_core.person.exposure import at_set_times
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.lifting import Lifter
-from intercap_core.person.masks import choose_mask, others_beside
-from intercap_core.person.middles import fill_middles
-from intercap_core.person.named import named_people
-from intercap_core.person.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.person.sides import BODY_POINTS
-from intercap_core.person.stated_sides import exchanged_back, hold_sides, stated_images
-from intercap_core.person.subject import Subject, find_subject
-from intercap_core.person.swaps import steady_sides, triangulate_people
-from intercap_core.person.touching import touches_of
+from intercap_core.person.masks import choose_mask, merge_other_candidates
+from intercap_core.person.segmentation.candidate_masks import ImageCandidate, ViewSegments
+from intercap_core.person.sides import (
+    BODY_POINTS,
+    exchange_stated,
+    hold_sides,
+    images_with_stated_sides,
+)
+from intercap_core.person.subject import SubjectDetections, find_subject
+from intercap_core.person.subject_hints import named_people, touch_test
+from intercap_core.person.subject_joints import (
+    at_set_times,
+    fill_middles,
+    steady_sides,
+    triangulate_people,
+)
 from intercap_core.schemas import PERSON, SCENE
 
 
@@ -76,13 +82,13 @@ def run(
             times,
             min_confidence=confident,
             lift=lifter.people,
-            touches=None if labels is None else touches_of(found, labels, min_confidence=confident),
+            touches=None if labels is None else touch_test(found, labels, min_confidence=confident),
             named=named_people(subject_points, found, image_of, min_confidence=confident),
         )
         person = subject.people
         keypoints = subject_keypoints(found, person)
-        stated = stated_images(left_right, rig.names, image_of, found.sequence)
-        keypoints = given = exchanged_back(keypoints, stated)
+        stated = images_with_stated_sides(left_right, rig.names, image_of, found.sequence)
+        keypoints = given = exchange_stated(keypoints, stated)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
         # rays of one moment meet; what is written down is where each camera saw the points
         moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
@@ -104,7 +110,7 @@ def run(
             )
         masks = _masks(found, keypoints, points, rig, settings.min_confidence)
         beside = [
-            others_beside(found.candidates(t, c), masks[t * len(rig) + c])
+            merge_other_candidates(found.candidates(t, c), masks[t * len(rig) + c])
             for t, c in np.ndindex(found.num_sets, len(rig))
         ]
         segmented = _from_images(images.showing(image_of), source, found, points, rig, settings)
@@ -194,7 +200,7 @@ def _from_images(
 def _write(
     output: Path,
     detections: Detections,
-    subject: Subject,
+    subject: SubjectDetections,
     keypoints: np.ndarray,
     points: Triangulation,
     missing: np.ndarray,

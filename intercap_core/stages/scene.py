@@ -14,32 +14,35 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.scene.background import Background, background_of
-from intercap_core.scene.camera_verdicts import direction_in_words, weakest_motion
-from intercap_core.scene.constants import BACKGROUND_CELL_M, WEAK_CAMERA_M
+from intercap_core.scene.background import Background, camera_background
+from intercap_core.scene.camera_verdicts import WEAK_CAMERA_M, describe_direction, weakest_motion
+from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.extrinsics import Refinement, refine
-from intercap_core.scene.feet import feet_off_the_floor, ground_of_feet
-from intercap_core.scene.floor_constraint import FloorConstraint
 from intercap_core.scene.ground import (
-    Ground,
+    GroundPlane,
     annotated_ground,
+    describe_raised_feet,
     fit_ground,
+    fit_ground_to_feet,
     stated_ground,
     zup_from_master,
 )
-from intercap_core.scene.lens_exchange import Exchange, exchange_lenses
-from intercap_core.scene.moments import Moments, find_moments
-from intercap_core.scene.moving import moving_surfaces
-from intercap_core.scene.start_verdicts import note_of_stated
-from intercap_core.scene.stated_starts import StatedStarts, when
-from intercap_core.scene.subject_views import SubjectViews, triangulated
-from intercap_core.scene.surface import Surface, background_surfaces
+from intercap_core.scene.lens_exchange import LensExchange, exchange_lenses
+from intercap_core.scene.moments import Moments, describe_stated_start, find_moments
+from intercap_core.scene.starts import StatedStarts, describe_start
+from intercap_core.scene.subject_views import SubjectViews, triangulate_views
+from intercap_core.scene.surfaces import (
+    BACKGROUND_CELL_M,
+    DepthSurface,
+    background_surfaces,
+    moving_surfaces,
+)
 from intercap_core.scene.up import (
-    Up,
+    UpDirection,
     check_stated_up,
     compare_with_stated,
+    rough_up,
     trunk_direction,
-    up_hint,
 )
 from intercap_core.schemas import SCENE
 
@@ -152,11 +155,13 @@ def _backgrounds(
     """Each camera's background; the person is sought where it was when the image was taken."""
     last = source.num_sets - 1
     moment = np.clip(np.arange(source.num_sets)[:, None] - slip, 0, last)
-    return [background_of(source, c, subject.joints[moment[:, c]]) for c in range(len(source.rig))]
+    return [
+        camera_background(source, c, subject.joints[moment[:, c]]) for c in range(len(source.rig))
+    ]
 
 
-def _up(source: Frames, rig: Rig) -> Up:
-    return up_hint(rig, source.gravity, source.stated_up)
+def _up(source: Frames, rig: Rig) -> UpDirection:
+    return rough_up(rig, source.gravity, source.stated_up)
 
 
 def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
@@ -169,8 +174,8 @@ def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
 
 
 def _with_feet(
-    source: Frames, rig: Rig, ground: Ground, subject: SubjectViews
-) -> tuple[Ground, list[str]]:
+    source: Frames, rig: Rig, ground: GroundPlane, subject: SubjectViews
+) -> tuple[GroundPlane, list[str]]:
     """The floor, and what is odd about it, in words.
 
     Without a measured one it is that which is stated where feet do not deny it, else that of feet.
@@ -178,8 +183,8 @@ def _with_feet(
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)
     if not ground.found:
-        feet = triangulated(subject.keypoints, rig).joints[:, FEET]
-        ground = ground_of_feet(feet, _up(source, rig))
+        feet = triangulate_views(subject.keypoints, rig).joints[:, FEET]
+        ground = fit_ground_to_feet(feet, _up(source, rig))
         if np.isfinite(stated[1]).all():
             denied = ground.found and compare_with_stated(
                 ground.point, ground.normal, *stated, middle
@@ -187,7 +192,7 @@ def _with_feet(
             ground = ground if denied else stated_ground(*stated)
     odd = [ground.note] if ground.note else []
     if ground.found and ground.source != "feet":
-        above = feet_off_the_floor(subject.joints[:, FEET], ground)
+        above = describe_raised_feet(subject.joints[:, FEET], ground)
         odd += [above] if above else []
     if ground.found:
         odd += compare_with_stated(ground.point, ground.normal, *stated, middle)
@@ -197,11 +202,11 @@ def _with_feet(
 def _ground(
     source: Frames,
     rig: Rig,
-    surfaces: dict[int, Surface],
+    surfaces: dict[int, DepthSurface],
     bias: np.ndarray,
     settings: SceneSettings,
     floor: Floor | None,
-) -> Ground:
+) -> GroundPlane:
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for c, surface in surfaces.items():
         pose = rig[c].master_from_depth
@@ -235,7 +240,7 @@ def _write(
     slip: np.ndarray,
     image_of: np.ndarray,
     refined: Refinement,
-    ground: Ground,
+    ground: GroundPlane,
     oddities: list[str],
     notes: list[str],
     slides: np.ndarray,
@@ -299,7 +304,7 @@ def _notes(
     refined: Refinement,
     moments: Moments,
     stated: StatedStarts,
-    exchanges: Sequence[Exchange],
+    exchanges: Sequence[LensExchange],
 ) -> list[list[str]]:
     """What each camera's lens, pose and time rest on, and where it slips."""
     notes = [[note] if note else [] for note in refined.notes]
@@ -315,10 +320,10 @@ def _notes(
             )
     starts = moments.starts
     for c in np.flatnonzero(source.present & ~stated.known & (starts.sets != 0)).tolist():
-        notes[c].append(f"it started {when(starts.late[c])}, and was brought into step")
+        notes[c].append(f"it started {describe_start(starts.late[c])}, and was brought into step")
     for c in np.flatnonzero(source.present).tolist():
         left, sigma = float(refined.offset[c]), float(refined.offset_sigma[c])
-        note = note_of_stated(stated, starts, moments.slips, c, left, sigma)
+        note = describe_stated_start(stated, starts, moments.slips, c, left, sigma)
         notes[c] += [note] if note else []
     for c in np.flatnonzero(starts.in_doubt).tolist():
         notes[c].append(
@@ -338,7 +343,7 @@ def _notes(
 
 
 def _slides(
-    source: Frames, rig: Rig, refined: Refinement, ground: Ground
+    source: Frames, rig: Rig, refined: Refinement, ground: GroundPlane
 ) -> tuple[np.ndarray, list[str]]:
     """By which each camera may let the rig's middle slide (C, 3), one standard deviation, metres,
     and the same in words, "" = not at all."""
@@ -348,6 +353,6 @@ def _slides(
         sigma, way = weakest_motion(refined.covariance[c, :, c], pose, ring_centre(rig))
         if sigma > 0:
             slides[c] = sigma * way
-            least = direction_in_words(way, pose, up)
+            least = describe_direction(way, pose, up)
             words[c] = f"its pose is known to {1e3 * sigma:.1f} mm, least {least}"
     return slides, words

@@ -21,7 +21,7 @@ import uvicorn
 from intercap_core.annotate.annotator import Annotator
 from intercap_core.annotate.guard import TOKEN_HEADER
 from intercap_core.annotate.server import application
-from intercap_core.person.sides import swapped
+from intercap_core.person.sides import swap_sides
 from tests.helpers import fitted_capture as fitted
 
 NAME = "s01_o03"
@@ -61,7 +61,7 @@ def detect(settings: Path, exchanged: Mapping[str, Sequence[int]]) -> None:
         for c, name in enumerate(person["camera_names"].asstr()):
             people = person["keypoints"][:, c]
             at = list(exchanged.get(name, ()))
-            people[at] = swapped(people[at])
+            people[at] = swap_sides(people[at])
             detections[f"cameras/{name}/people"][...] = people
 
 

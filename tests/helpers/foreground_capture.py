@@ -15,7 +15,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.scene.background import background_of
+from intercap_core.scene.background import camera_background
 from intercap_core.schemas import SCENE
 from tests.helpers.synthetic_capture import (
     FURNITURE,
@@ -147,7 +147,7 @@ class Carrying:
         from intercap_core.formats.recordings.frames import Frames
 
         with Frames.open(frames) as images:
-            found = [background_of(images, c, self.joints) for c in range(self.views)]
+            found = [camera_background(images, c, self.joints) for c in range(self.views)]
         count = self.views
         slip = np.zeros((self.sets, count), int)
         attributes = {

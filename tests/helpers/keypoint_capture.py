@@ -17,9 +17,8 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.subject import find_subject
-from intercap_core.scene.constants import MIN_CONFIDENCE
-from intercap_core.scene.late_views import with_late_views
-from intercap_core.scene.subject_views import triangulated
+from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
+from intercap_core.scene.subject_views import add_late_views, triangulate_views
 from intercap_core.studio.hands import part_of
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.keypoints import Detector
@@ -162,8 +161,8 @@ def subject_keypoints(capture: KeypointCapture) -> np.ndarray:
         capture.times,
         min_confidence=MIN_CONFIDENCE,
     ).people
-    first = triangulated(_keypoints(people, index), capture.rig)
-    index = with_late_views(
+    first = triangulate_views(_keypoints(people, index), capture.rig)
+    index = add_late_views(
         index,
         people,
         first.joints,
@@ -172,7 +171,7 @@ def subject_keypoints(capture: KeypointCapture) -> np.ndarray:
         fps=capture.fps,
         min_confidence=MIN_CONFIDENCE,
     )
-    return triangulated(_keypoints(people, index), capture.rig).keypoints
+    return triangulate_views(_keypoints(people, index), capture.rig).keypoints
 
 
 def _keypoints(people: _People, index: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from intercap_core.formats.detections.read import Candidate
 from intercap_core.geometry.camera import masks
-from intercap_core.person.masks import others_beside
+from intercap_core.person.masks import merge_other_candidates
 
 HEIGHT, WIDTH = 120, 160
 
@@ -30,16 +30,16 @@ AGAIN = _box(slice(52, 88), slice(20, 70))  # the same person's trunk
 
 
 def test_all_else_is_one_mask() -> None:
-    found = others_beside(_candidates(PERSON, CUP, CHAIR), masks.encode(PERSON))
+    found = merge_other_candidates(_candidates(PERSON, CUP, CHAIR), masks.encode(PERSON))
     np.testing.assert_array_equal(masks.decode(found, HEIGHT, WIDTH), CUP | CHAIR)
 
 
 def test_the_person_again_is_not_beside() -> None:
-    found = others_beside(_candidates(PERSON, AGAIN, CUP), masks.encode(PERSON))
+    found = merge_other_candidates(_candidates(PERSON, AGAIN, CUP), masks.encode(PERSON))
     np.testing.assert_array_equal(masks.decode(found, HEIGHT, WIDTH), CUP)
 
 
 def test_nothing_is_beside_nobody_or_somebody_alone() -> None:
-    assert others_beside(_candidates(CUP), b"") == b""
-    assert others_beside(_candidates(PERSON, AGAIN), masks.encode(PERSON)) == b""
-    assert others_beside([], masks.encode(PERSON)) == b""
+    assert merge_other_candidates(_candidates(CUP), b"") == b""
+    assert merge_other_candidates(_candidates(PERSON, AGAIN), masks.encode(PERSON)) == b""
+    assert merge_other_candidates([], masks.encode(PERSON)) == b""

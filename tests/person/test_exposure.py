@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.exposure import at_set_times
-from intercap_core.person.swaps import triangulate_people
+from intercap_core.person.subject_joints import at_set_times, triangulate_people
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, stick_person
 

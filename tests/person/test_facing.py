@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.agreement import agree
-from intercap_core.person.facing import mirrored
-from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swapped
-from intercap_core.person.swaps import triangulate_people
+from intercap_core.person.left_right import find_mirrored, make_views_agree
+from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swap_sides
+from intercap_core.person.subject_joints import triangulate_people
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, stick_person, walking
 
@@ -48,7 +47,7 @@ def put_right(damaged: np.ndarray, rig=RIG) -> tuple[np.ndarray, np.ndarray]:
 def test_people_taken_for_their_mirror_image_are_turned_back(clean, sets, views):
     damaged = clean.copy()
     for c in views:
-        damaged[sets, c] = swapped(damaged[sets, c])
+        damaged[sets, c] = swap_sides(damaged[sets, c])
     fixed, error = put_right(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
     assert error.max() < 0.03
@@ -57,7 +56,7 @@ def test_people_taken_for_their_mirror_image_are_turned_back(clean, sets, views)
 @pytest.mark.parametrize("limb", [LEGS, HANDS], ids=["legs", "hands"])
 def test_a_limb_that_all_views_exchange_is_put_back(clean, limb):
     damaged = clean.copy()
-    damaged[4:10] = swapped(damaged[4:10], limb)
+    damaged[4:10] = swap_sides(damaged[4:10], limb)
     fixed, _ = put_right(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
 
@@ -65,7 +64,7 @@ def test_a_limb_that_all_views_exchange_is_put_back(clean, limb):
 def test_two_views_that_contradict_each_other(clean):
     damaged = np.zeros_like(clean)
     damaged[:, :2] = clean[:, :2]
-    damaged[4:10, 1] = swapped(damaged[4:10, 1])
+    damaged[4:10, 1] = swap_sides(damaged[4:10, 1])
     fixed, _ = put_right(damaged)
     limbs = np.r_[ARMS, LEGS, HANDS]  # two views cannot tell four points of a head apart
     np.testing.assert_array_equal(fixed[:, :2][:, :, limbs], clean[:, :2][:, :, limbs])
@@ -73,10 +72,10 @@ def test_two_views_that_contradict_each_other(clean):
 
 def test_views_that_agree_stay(clean):
     keypoints = clean.copy()
-    assert not agree(keypoints, RIG, min_confidence=0.3).any()
+    assert not make_views_agree(keypoints, RIG, min_confidence=0.3).any()
     np.testing.assert_array_equal(keypoints, clean)
     unseen = np.zeros_like(clean)
-    assert not agree(unseen, RIG, min_confidence=0.3).any()
+    assert not make_views_agree(unseen, RIG, min_confidence=0.3).any()
 
 
 def test_a_kneeling_person_does_not_face_backwards():
@@ -90,11 +89,11 @@ def test_a_kneeling_person_does_not_face_backwards():
         body[[big, small]] = knee[k] - 0.6 * ahead - [0, 0, 0.08]
     still = np.repeat(body[None], 3, 0)
     share = np.zeros((3, 3))
-    assert not mirrored(still, share, np.arange(3) / 15).any()
+    assert not find_mirrored(still, share, np.arange(3) / 15).any()
     turned = still[:, PARTNER]
-    assert mirrored(turned, share, None).all()
+    assert find_mirrored(turned, share, None).all()
 
 
 def test_nothing_known_is_nothing_decided():
-    assert not mirrored(np.full((4, 135, 3), np.nan), np.zeros((4, 3)), TIMES[:4]).any()
-    assert mirrored(np.zeros((0, 135, 3)), np.zeros((0, 3)), TIMES[:0]).shape == (0, 4)
+    assert not find_mirrored(np.full((4, 135, 3), np.nan), np.zeros((4, 3)), TIMES[:4]).any()
+    assert find_mirrored(np.zeros((0, 135, 3)), np.zeros((0, 3)), TIMES[:0]).shape == (0, 4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.person.lifting import Relief
+from intercap_core.person.lifting import DepthRelief
 from tests.helpers.synthetic_capture import ring
 
 RIG, _ = ring()
@@ -24,7 +24,7 @@ def _pixels() -> np.ndarray:
     return middle + np.stack([np.zeros(10), np.linspace(-200, 200, 10)], 1)
 
 
-def _depths(relief: Relief) -> np.ndarray:
+def _depths(relief: DepthRelief) -> np.ndarray:
     points = relief.lift(_pixels(), np.ones(10, bool), NO_INSET)
     return apply(CAMERA.colour_from_master, points)[:, 2]
 
@@ -34,16 +34,16 @@ def test_a_person_is_lifted_past_the_furniture_before_him():
     room, seen = _wall(4000), _wall(2400)
     table = slice(room.shape[0] * 11 // 20, None)
     room[table] = seen[table] = 1300
-    z = _depths(Relief.of(seen, CAMERA, 0.0, room))
+    z = _depths(DepthRelief.of(seen, CAMERA, 0.0, room))
     known = np.isfinite(z)
     assert 6 <= known.sum() < 10 and z[known].min() > 2.2
-    naive = _depths(Relief.of(seen, CAMERA, 0.0, None))
+    naive = _depths(DepthRelief.of(seen, CAMERA, 0.0, None))
     assert np.nanmin(naive) < 1.5, "nothing tells the table from the person"
 
 
 def test_who_stands_still_for_long_is_part_of_the_room_and_still_lifted():
     still = _wall(2400)
-    z = _depths(Relief.of(still, CAMERA, 0.0, still))
+    z = _depths(DepthRelief.of(still, CAMERA, 0.0, still))
     assert np.isfinite(z).sum() >= 8 and np.nanmax(np.abs(z - 2.4)) < 0.2
 
 
@@ -53,7 +53,7 @@ def test_a_trunk_that_stands_still_behind_a_table_is_lifted_beside_moving_arms()
     table, still = slice(room.shape[0] * 13 // 20, None), slice(0, room.shape[0] * 7 // 20)
     room[still] = 2400
     room[table] = seen[table] = 1300
-    z = _depths(Relief.of(seen, CAMERA, 0.0, room))
+    z = _depths(DepthRelief.of(seen, CAMERA, 0.0, room))
     assert np.isnan(z[-1]) and np.nanmin(z) > 2.2
     assert np.isfinite(z[:7]).all(), "the trunk that never moved too"
 
@@ -61,5 +61,5 @@ def test_a_trunk_that_stands_still_behind_a_table_is_lifted_beside_moving_arms()
 def test_keypoints_where_nothing_at_all_is_measured_are_not_lifted():
     half = _wall(2400)
     half[half.shape[0] // 2 - 20 :] = 0
-    z = _depths(Relief.of(half, CAMERA, 0.0, None))
+    z = _depths(DepthRelief.of(half, CAMERA, 0.0, None))
     assert 2 <= np.isfinite(z).sum() <= 6 and np.nanmax(np.abs(z - 2.4)) < 0.2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.person.middles import fill_middles
+from intercap_core.person.subject_joints import fill_middles
 from tests.helpers.synthetic_people import stick_person
 
 NECK, MID_HIP = KEYPOINT_NAMES.index("neck"), KEYPOINT_NAMES.index("mid_hip")

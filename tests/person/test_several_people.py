@@ -11,11 +11,10 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.masks import encode
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import reproject
-from intercap_core.person.groups import Group
-from intercap_core.person.named import named_people
-from intercap_core.person.subject import Subject, find_subject
-from intercap_core.person.touching import touches_of
-from intercap_core.person.tracks import Track, same_build
+from intercap_core.person.groups import PersonGroup
+from intercap_core.person.subject import SubjectDetections, find_subject
+from intercap_core.person.subject_hints import named_people, touch_test
+from intercap_core.person.tracks import PersonTrack, same_build
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking, write_detections
 
@@ -49,7 +48,7 @@ def detections_of(tmp_path, people, candidates=None) -> Detections:
     return Detections.load(path)
 
 
-def subject_of(detections: Detections, **given) -> Subject:
+def subject_of(detections: Detections, **given) -> SubjectDetections:
     times = np.arange(detections.num_sets) / FPS
     return find_subject(detections, RIG, times, min_confidence=0.3, **given)
 
@@ -81,10 +80,10 @@ def test_who_touches_the_object_is_the_subject_wherever_they_stand(tmp_path):
     plain = subject_of(detections)
     assert (plain.people == 0).all() and plain.chosen_by == "middle"
     assert len(plain.doubts) == 1 and "another person" in plain.doubts[0]
-    found = subject_of(detections, touches=touches_of(detections, ("ball",), min_confidence=0.3))
+    found = subject_of(detections, touches=touch_test(detections, ("ball",), min_confidence=0.3))
     assert (found.people == 1).all() and found.chosen_by == "handling"
     assert not found.doubts and (found.others == 1).all()
-    of_another = touches_of(detections, ("cup",), min_confidence=0.3)
+    of_another = touch_test(detections, ("cup",), min_confidence=0.3)
     assert of_another(0, 0, 1) is None  # no candidate has the object's label
     assert subject_of(detections, touches=of_another).chosen_by == "middle"
 
@@ -221,13 +220,13 @@ def test_a_return_that_build_does_not_tell_is_said(tmp_path):
     assert not subject_of(detections, named=named).doubts
 
 
-def track_of(size: float, sets: int, noise_m: float, seed: int) -> Track:
+def track_of(size: float, sets: int, noise_m: float, seed: int) -> PersonTrack:
     rng = np.random.default_rng(seed)
     points = walking(sets, MIDDLE, np.zeros(2), size=size)[:, :25]
     points = points + rng.normal(0, noise_m, points.shape)
     members = np.zeros(VIEWS, np.int32)
-    groups = [Group(members, one, 1.0, np.zeros(VIEWS)) for one in points]
-    return Track(list(range(sets)), groups)
+    groups = [PersonGroup(members, one, 1.0, np.zeros(VIEWS)) for one in points]
+    return PersonTrack(list(range(sets)), groups)
 
 
 def test_build_tells_people_apart_the_better_the_longer_they_are_seen():

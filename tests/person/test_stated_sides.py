@@ -11,8 +11,14 @@ from intercap_core.config import ExchangedSides, PersonSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import Triangulation
-from intercap_core.person.sides import LEGS, exchange_points, swapped
-from intercap_core.person.stated_sides import exchanged_back, hold_sides, stated_images
+from intercap_core.person.sides import (
+    LEGS,
+    exchange_points,
+    exchange_stated,
+    hold_sides,
+    images_with_stated_sides,
+    swap_sides,
+)
 from intercap_core.schemas import PERSON
 from intercap_core.stages import person
 from tests.helpers.synthetic_capture import ring, write_frames
@@ -45,20 +51,22 @@ def joints(tmp_path, keypoints, *stated: ExchangedSides) -> np.ndarray:
 def test_images_are_those_of_the_stated_frames_and_cameras():
     image_of = np.array([[0, 0, -1], [1, 0, 1], [2, 1, 2], [3, 2, 3]])  # k2 slips by one
     stated = [ExchangedSides(start=1, end=3, camera="k2"), ExchangedSides(start=3, end=4)]
-    found = stated_images(stated, NAMES, image_of, "one")
+    found = images_with_stated_sides(stated, NAMES, image_of, "one")
     np.testing.assert_array_equal(
         found, [[0, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 1]]
     )  # fmt: skip
-    assert not stated_images([], NAMES, image_of, "one").any()
+    assert not images_with_stated_sides([], NAMES, image_of, "one").any()
     with pytest.raises(UserError, match=r"left_right\[0\] names camera 'k9'; .* k1, k2, k3"):
-        stated_images([ExchangedSides(start=0, end=1, camera="k9")], NAMES, image_of, "one")
+        images_with_stated_sides(
+            [ExchangedSides(start=0, end=1, camera="k9")], NAMES, image_of, "one"
+        )
 
 
 def test_exchanging_back_undoes_the_exchange():
     keypoints = np.random.default_rng(0).normal(size=(2, 3, 135, 3))
     stated = np.array([[True, False, True], [False, False, True]])
-    wrong = np.where(stated[..., None, None], swapped(keypoints), keypoints)
-    np.testing.assert_array_equal(exchanged_back(wrong, stated), keypoints)
+    wrong = np.where(stated[..., None, None], swap_sides(keypoints), keypoints)
+    np.testing.assert_array_equal(exchange_stated(wrong, stated), keypoints)
 
 
 def test_what_is_stated_decides_the_sides_of_its_set():
@@ -88,8 +96,8 @@ def test_where_nothing_else_tells_the_statement_does(tmp_path):
     shown += [_INDEX["neck"], _INDEX["mid_hip"]]
     hidden = np.setdiff1d(np.arange(135), shown)
     keypoints[:, :, hidden, 2] = 0
-    wrong = joints(tmp_path, swapped(keypoints))
-    found = joints(tmp_path, swapped(keypoints), ExchangedSides(start=0, end=T))
+    wrong = joints(tmp_path, swap_sides(keypoints))
+    found = joints(tmp_path, swap_sides(keypoints), ExchangedSides(start=0, end=T))
     assert np.linalg.norm(wrong[:, shown[:4]] - TRUE[:, shown[:4]], axis=-1).min() > 0.2
     assert np.linalg.norm(found[:, shown] - TRUE[:, shown], axis=-1).max() < 0.01
 
@@ -98,7 +106,7 @@ def test_where_nothing_else_tells_the_statement_does(tmp_path):
 def test_some_cameras_are_exchanged_back(tmp_path, cameras):
     keypoints = seen_by(BODY, RIG, UP)
     for c in cameras:
-        keypoints[2:6, c] = swapped(keypoints[2:6, c])
+        keypoints[2:6, c] = swap_sides(keypoints[2:6, c])
     stated = [ExchangedSides(start=2, end=6, camera=RIG.names[c]) for c in cameras]
     found = joints(tmp_path, keypoints, *stated)
     assert np.linalg.norm(found[:, :25] - TRUE[:, :25], axis=-1).max() < 0.01

@@ -8,7 +8,7 @@ import pytest
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.rig import ring_centre
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.person.sides import swapped
+from intercap_core.person.sides import swap_sides
 from intercap_core.person.subject import find_subject
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking, write_detections
@@ -57,7 +57,7 @@ def test_the_one_in_the_middle_is_found_whatever_the_order(tmp_path, subject, by
 def test_a_view_that_takes_back_for_front_is_still_the_subject(tmp_path, subject):
     people = [[[subject[t, c]] for c in range(6)] for t in range(T)]
     for t in range(T):
-        people[t][2] = [swapped(subject[t, 2])]
+        people[t][2] = [swap_sides(subject[t, 2])]
     assert (subject_of(tmp_path, people) == 0).all()
 
 

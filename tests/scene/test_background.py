@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.scene.background import sample_sets, steady_background
-from intercap_core.scene.constants import MAX_SAMPLES
+from intercap_core.scene.background import MAX_SAMPLES, sample_sets, steady_background
 
 
 def test_someone_who_stands_still_most_of_the_time_is_not_background():

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.scene.camera_verdicts import (
-    CameraVerdict,
-    Evidence,
-    direction_in_words,
+    PoseEvidence,
+    PoseVerdict,
+    describe_direction,
     weakest_motion,
 )
 
@@ -18,22 +18,22 @@ UP = np.array([0.0, 0.0, 1.0])
 LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along +x, its image is upright
 
 
-def _evidence(*ratios: float) -> Evidence:
-    return Evidence("background", np.log(ratios))
+def _evidence(*ratios: float) -> PoseEvidence:
+    return PoseEvidence("background", np.log(ratios))
 
 
 def test_a_camera_is_refined_only_beyond_chance() -> None:
-    assert CameraVerdict.of([_evidence(0.1, 0.2, 0.15)]).refined
-    assert not CameraVerdict.of([_evidence(0.9, 1.1, 0.95, 1.0)]).refined
+    assert PoseVerdict.of([_evidence(0.1, 0.2, 0.15)]).refined
+    assert not PoseVerdict.of([_evidence(0.9, 1.1, 0.95, 1.0)]).refined
     # better on one kind, undecided on the other: both count the same, however many units one has
-    assert CameraVerdict.of([_evidence(0.1, 0.1), _evidence(*[1.02] * 100)]).refined
-    assert not CameraVerdict.of([_evidence(0.9, 0.9), _evidence(*[1.02] * 100)]).refined
-    nothing = CameraVerdict.of([])
+    assert PoseVerdict.of([_evidence(0.1, 0.1), _evidence(*[1.02] * 100)]).refined
+    assert not PoseVerdict.of([_evidence(0.9, 0.9), _evidence(*[1.02] * 100)]).refined
+    nothing = PoseVerdict.of([])
     assert nothing.refined and not nothing.in_doubt and "nothing" in str(nothing)
 
 
 def test_evidence_pairs_units_that_both_have() -> None:
-    found = Evidence.of("keypoints", {1: 2.0, 2: 4.0, 3: 1.0}, {1: 1.0, 2: 2.0, 4: 9.0})
+    found = PoseEvidence.of("keypoints", {1: 2.0, 2: 4.0, 3: 1.0}, {1: 1.0, 2: 2.0, 4: 9.0})
     np.testing.assert_allclose(found.log_ratio, np.log([0.5, 0.5]))
     assert str(found) == "keypoints -50 %" and found.sigma > 0
 
@@ -68,4 +68,4 @@ def test_directions_are_named_as_the_camera_sees_them(
 ) -> None:
     unit = np.array(direction) / np.linalg.norm(direction)
     pose = rigid(Rotation.from_euler("y", 0.3).as_matrix() @ LEVEL, np.zeros(3))  # looks down a bit
-    assert direction_in_words(unit, pose, UP) == words
+    assert describe_direction(unit, pose, UP) == words

@@ -8,15 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.scene.constants import FOOT_HEIGHT_M
-from intercap_core.scene.feet import feet_off_the_floor, ground_of_feet
-from intercap_core.scene.ground import stated_ground
-from intercap_core.scene.up import (
-    check_stated_up,
-    compare_with_stated,
-    trunk_direction,
-    up_hint,
+from intercap_core.scene.ground import (
+    FOOT_HEIGHT_M,
+    describe_raised_feet,
+    fit_ground_to_feet,
+    stated_ground,
 )
+from intercap_core.scene.up import check_stated_up, compare_with_stated, rough_up, trunk_direction
 from tests.helpers.synthetic_capture import ring
 
 RIG, UP = ring()
@@ -24,7 +22,7 @@ MASTER_UP = UP[2, :3]
 ORIGIN = apply(invert(UP), np.zeros((1, 3)))[0]
 NO_GRAVITY = np.full((6, 3), np.nan)
 GRAVITY = np.einsum("cji,j->ci", RIG.master_from_colour[:, :3, :3], -MASTER_UP)
-BY_CAMERAS, BY_GRAVITY = up_hint(RIG, NO_GRAVITY), up_hint(RIG, GRAVITY)
+BY_CAMERAS, BY_GRAVITY = rough_up(RIG, NO_GRAVITY), rough_up(RIG, GRAVITY)
 
 
 def feet_at(places: np.ndarray) -> np.ndarray:
@@ -50,7 +48,7 @@ def walk(height: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("beam_m", [0.12, 0.3])
 def test_the_floor_is_the_lowest_level_also_where_most_steps_are_on_a_beam(up, share, beam_m):
     height = np.where(np.arange(80) % 20 < 20 * share, beam_m, 0.0)
-    ground = ground_of_feet(feet_at(walk(height)), up)
+    ground = fit_ground_to_feet(feet_at(walk(height)), up)
     assert ground.source == "feet" and abs(ground_height(ground)) < 0.02
     assert np.degrees(np.arccos(min(1, ground.normal @ MASTER_UP))) < 1
     assert "do not stand on one plane" in ground.note and f"{beam_m:.2f} m above" in ground.note
@@ -63,7 +61,7 @@ def test_stairs_do_not_tilt_the_floor(up):
     places = np.column_stack(
         [0.3 * step + rng.uniform(-0.12, 0.12, 90), rng.uniform(-0.4, 0.4, 90), 0.17 * step]
     )
-    ground = ground_of_feet(feet_at(places), up)
+    ground = fit_ground_to_feet(feet_at(places), up)
     assert abs(ground_height(ground)) < 0.03 and "one plane" in ground.note
     assert np.degrees(np.arccos(min(1, ground.normal @ MASTER_UP))) < 6
 
@@ -72,37 +70,37 @@ def test_a_hint_that_is_tilted_is_no_staircase():
     feet = feet_at(walk(np.zeros(80)))
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.radians(6) * UP[1, :3]).as_matrix()
-    ground = ground_of_feet(apply(turn, feet.reshape(-1, 3)).reshape(feet.shape), BY_CAMERAS)
+    ground = fit_ground_to_feet(apply(turn, feet.reshape(-1, 3)).reshape(feet.shape), BY_CAMERAS)
     assert ground.found and ground.note == ""
 
 
 def test_noise_about_one_level_does_not_lower_the_floor():
     height = np.random.default_rng(5).normal(0, 0.06, 120)
-    ground = ground_of_feet(feet_at(walk(height)), BY_GRAVITY)
+    ground = fit_ground_to_feet(feet_at(walk(height)), BY_GRAVITY)
     assert abs(ground_height(ground)) < 0.02
 
 
 def test_who_stands_off_a_measured_floor_is_told():
     floor = stated_ground(MASTER_UP, ORIGIN)
-    assert feet_off_the_floor(feet_at(walk(np.zeros(60))), floor) == ""
+    assert describe_raised_feet(feet_at(walk(np.zeros(60))), floor) == ""
     on_beam = np.where(np.arange(60) < 20, 0.3, 0.0)
-    said = feet_off_the_floor(feet_at(walk(on_beam)), floor)
+    said = describe_raised_feet(feet_at(walk(on_beam)), floor)
     assert "33 % of the sets" in said and "0.30 m above" in said
-    assert "0.50 m below" in feet_off_the_floor(feet_at(walk(np.full(60, -0.5))), floor)
-    assert feet_off_the_floor(np.full((60, 6, 3), np.nan), floor) == ""
+    assert "0.50 m below" in describe_raised_feet(feet_at(walk(np.full(60, -0.5))), floor)
+    assert describe_raised_feet(np.full((60, 6, 3), np.nan), floor) == ""
 
 
 def test_a_stated_up_is_the_hint_where_no_sensor_measured_it():
     leaning = Rotation.from_rotvec(np.radians(8) * UP[0, :3]).apply(MASTER_UP)
-    hint = up_hint(RIG, NO_GRAVITY, leaning)
+    hint = rough_up(RIG, NO_GRAVITY, leaning)
     assert hint.source == "stated" and np.array_equal(hint.direction, leaning)
-    assert up_hint(RIG, GRAVITY, leaning).source == "gravity"
-    assert up_hint(RIG, NO_GRAVITY, np.full(3, np.nan)).source == "cameras"
+    assert rough_up(RIG, GRAVITY, leaning).source == "gravity"
+    assert rough_up(RIG, NO_GRAVITY, np.full(3, np.nan)).source == "cameras"
     still = np.repeat(feet_at(np.zeros((1, 3))), 30, 0)  # feet in one place tell no tilt
-    assert not ground_of_feet(still, BY_CAMERAS).found
-    ground = ground_of_feet(still, up_hint(RIG, NO_GRAVITY, MASTER_UP))
+    assert not fit_ground_to_feet(still, BY_CAMERAS).found
+    ground = fit_ground_to_feet(still, rough_up(RIG, NO_GRAVITY, MASTER_UP))
     assert ground.found and np.array_equal(ground.normal, MASTER_UP)
-    tilted = ground_of_feet(feet_at(walk(np.zeros(80))), hint)
+    tilted = fit_ground_to_feet(feet_at(walk(np.zeros(80))), hint)
     assert "8 degrees from the stated up" in tilted.note
 
 

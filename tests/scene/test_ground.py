@@ -8,21 +8,21 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.scene.constants import FOOT_HEIGHT_M
-from intercap_core.scene.feet import ground_of_feet
 from intercap_core.scene.ground import (
+    FOOT_HEIGHT_M,
     NO_GROUND,
     annotated_ground,
     fit_ground,
+    fit_ground_to_feet,
     zup_from_master,
 )
-from intercap_core.scene.up import up_hint
+from intercap_core.scene.up import rough_up
 from tests.helpers.synthetic_capture import ring
 
 RIG, UP = ring()
 NO_GRAVITY = np.full((6, 3), np.nan)
 GRAVITY = np.einsum("cji,j->ci", RIG.master_from_colour[:, :3, :3], -UP[2, :3])
-BY_GRAVITY, BY_CAMERAS = up_hint(RIG, GRAVITY), up_hint(RIG, NO_GRAVITY)
+BY_GRAVITY, BY_CAMERAS = rough_up(RIG, GRAVITY), rough_up(RIG, NO_GRAVITY)
 CELL_M = 0.03
 
 
@@ -82,10 +82,10 @@ def test_a_room_without_a_floor_in_sight_has_none():
 
 def test_up_is_measured_or_guessed_from_the_ring():
     for gravity in (GRAVITY, NO_GRAVITY):
-        np.testing.assert_allclose(up_hint(RIG, gravity).direction, UP[2, :3], atol=1e-6)
+        np.testing.assert_allclose(rough_up(RIG, gravity).direction, UP[2, :3], atol=1e-6)
     one_wild = GRAVITY.copy()
     one_wild[2] = -one_wild[2]
-    assert up_hint(RIG, one_wild).direction @ UP[2, :3] > 0.97
+    assert rough_up(RIG, one_wild).direction @ UP[2, :3] > 0.97
 
 
 def test_annotated_points_override_and_must_span_a_plane():
@@ -138,7 +138,9 @@ def test_who_walks_along_a_line_shows_the_tilt_along_it():
         turn = Rotation.from_rotvec(np.radians(2) * UP[axis, :3]).as_matrix()
         about = np.eye(4)
         about[:3, :3] = turn
-        ground = ground_of_feet(apply(about, feet.reshape(-1, 3)).reshape(feet.shape), BY_CAMERAS)
+        ground = fit_ground_to_feet(
+            apply(about, feet.reshape(-1, 3)).reshape(feet.shape), BY_CAMERAS
+        )
         off = np.degrees(np.arccos(min(1, ground.normal @ turn @ UP[2, :3])))
         assert ground.source == "feet"
         # turned about the line the hint stays; about what is across it, the feet tell
@@ -148,15 +150,15 @@ def test_who_walks_along_a_line_shows_the_tilt_along_it():
 def test_a_floor_that_nobody_measures_is_where_the_feet_stand():
     feet = walking_feet()
     for up in (BY_GRAVITY, BY_CAMERAS):
-        ground = ground_of_feet(feet, up)
+        ground = fit_ground_to_feet(feet, up)
         assert ground.note == ""
         assert ground.source == "feet" and ground.found and ground.inliers > 25
         assert np.degrees(np.arccos(min(1, ground.normal @ UP[2, :3]))) < 0.5
         assert abs(apply(UP, ground.point[None])[0, 2]) < 0.01
     still = np.repeat(feet[1:2], 40, 0)  # without gravity one place shows no tilt
-    assert ground_of_feet(still, BY_GRAVITY).found
-    assert not ground_of_feet(still, BY_CAMERAS).found
-    assert not ground_of_feet(np.full_like(feet, np.nan), BY_GRAVITY).found
+    assert fit_ground_to_feet(still, BY_GRAVITY).found
+    assert not fit_ground_to_feet(still, BY_CAMERAS).found
+    assert not fit_ground_to_feet(np.full_like(feet, np.nan), BY_GRAVITY).found
 
 
 def platform(height_m: float, half_m: float) -> tuple[np.ndarray, np.ndarray]:

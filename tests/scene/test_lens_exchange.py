@@ -9,8 +9,8 @@ import pytest
 
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.scene.background import steady_background
-from intercap_core.scene.lens_exchange import exchange_lenses, exchanged
-from intercap_core.scene.subject_views import triangulated
+from intercap_core.scene.lens_exchange import exchange_lenses, swap_lenses
+from intercap_core.scene.subject_views import triangulate_views
 from tests.helpers.synthetic_capture import (
     DEPTH,
     FURNITURE,
@@ -44,7 +44,7 @@ def seen():
         steady_background(to_millimetres(room_depth(c, UP, FURNITURE), rng, noise=0.3)[None])
         for c in rig
     ]
-    nobody = triangulated(np.zeros((1, 6, 135, 3)), rig)
+    nobody = triangulate_views(np.zeros((1, 6, 135, 3)), rig)
     return perturbed(rig, rng, 0.005, 0.2), backgrounds, nobody
 
 
@@ -57,7 +57,7 @@ def test_right_lenses_are_left_alone(seen):
 @pytest.mark.parametrize("whole", [True, False])
 def test_exchanged_lenses_are_put_right(seen, whole):
     rig, backgrounds, nobody = seen
-    given = exchanged(rig, 3, 4, whole=whole)
+    given = swap_lenses(rig, 3, 4, whole=whole)
     result, found = exchange_lenses(given, backgrounds, nobody, TIMES, 0)
     assert [(one.first, one.second) for one in found] == [(3, 4)]
     assert found[0].after < 0.5 * found[0].before
@@ -68,6 +68,6 @@ def test_exchanged_lenses_are_put_right(seen, whole):
 
 def test_devices_with_lenses_of_their_own_are_not_asked(seen):
     rig, backgrounds, nobody = seen
-    given = exchanged(rig, 3, 4, whole=True)
+    given = swap_lenses(rig, 3, 4, whole=True)
     apart = Rig(tuple(replace(c, colour_from_depth=RING[0].colour_from_depth) for c in given))
     assert exchange_lenses(apart, backgrounds, nobody, TIMES, 0) == (apart, [])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.lenses import lens_gains, swapped_lenses
+from intercap_core.scene.lens_exchange import lens_gains, lenses_by_keypoints
 from tests.helpers.synthetic_capture import perturbed, ring
 from tests.helpers.synthetic_people import seen_by, walking
 
@@ -53,8 +53,8 @@ def test_exchanged_lenses_are_found_and_only_they():
         rig = unlike(rng)
         keypoints = observed(rig, rng)
         claimed = perturbed(rig, rng, 0.003, 0.1)
-        assert swapped_lenses(keypoints, claimed, TIMES, **SIGMA) == []
-        found = swapped_lenses(keypoints, exchanged(claimed, 3, 4), TIMES, **SIGMA)
+        assert lenses_by_keypoints(keypoints, claimed, TIMES, **SIGMA) == []
+        found = lenses_by_keypoints(keypoints, exchanged(claimed, 3, 4), TIMES, **SIGMA)
         assert [(pair.first, pair.second) for pair in found] == [(3, 4)]
 
 

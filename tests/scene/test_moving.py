@@ -7,9 +7,9 @@ import pytest
 
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.scene.background import background_of
-from intercap_core.scene.moving import moving_surfaces
-from intercap_core.scene.registration import MOVING, Estimate, Layer, Registration
+from intercap_core.scene.background import camera_background
+from intercap_core.scene.registration import MOVING, Registration, RigEstimate, SurfaceLayer
+from intercap_core.scene.surfaces import moving_surfaces
 from tests.helpers.synthetic_capture import (
     FURNITURE,
     ring,
@@ -45,7 +45,7 @@ def layers(tmp_path_factory):
     write_frames(path, TRUTH, num_sets=T, depths=depths)
     image_of = np.tile(np.arange(T)[:, None], len(TRUTH))
     with Frames.open(path) as frames:
-        backgrounds = [background_of(frames, c) for c in range(len(TRUTH))]
+        backgrounds = [camera_background(frames, c) for c in range(len(TRUTH))]
         return moving_surfaces(frames, TRUTH, image_of, backgrounds)
 
 
@@ -62,8 +62,8 @@ def test_speed_is_that_of_the_crate_along_its_faces(layers):
 
 
 def test_offsets_come_out_of_the_motion(layers):
-    registration = Registration(TRUTH, [Layer(at_once, MOVING) for at_once in layers], 0)
-    solved = registration.solve(Estimate.start(TRUTH), free_poses=False)
+    registration = Registration(TRUTH, [SurfaceLayer(at_once, MOVING) for at_once in layers], 0)
+    solved = registration.solve(RigEstimate.start(TRUTH), free_poses=False)
     error = np.abs(solved.estimate.offset - OFFSET)
     assert error.max() < 0.002 and error.mean() < 0.001
     sigma = np.sqrt(np.diagonal(solved.covariance[:, 7, :, 7]))

@@ -10,10 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import triangulate
-from intercap_core.scene.body_constraints import BodyConstraint, BodyViews, body_views
-from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
+from intercap_core.scene.constraints import BodyConstraint, BodyViews, body_views
+from intercap_core.scene.registration import (
+    MAX_DIRECTION_GAIN,
+    MAX_DIRECTION_SHARE,
+    STATIC,
+    Registration,
+    RigEstimate,
+    SurfaceLayer,
+    balance_directions,
+)
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.scene.surface import surface_of
+from intercap_core.scene.surfaces import surface_from_depth
 from tests.helpers.synthetic_capture import (
     FURNITURE,
     extrinsics_error,
@@ -35,12 +43,12 @@ def surfaces(seed: int, bias_m: float = 0.0, boxes=FURNITURE, walls=3.6):
     for c, camera in enumerate(TRUTH):
         depth = room_depth(camera, UP, boxes, walls)
         image = to_millimetres(np.where(depth > 0, depth + bias[c], 0), rng, noise=0.3)
-        found[c] = surface_of(image, camera.depth, cell_m=0.03, max_depth_m=5.0)
+        found[c] = surface_from_depth(image, camera.depth, cell_m=0.03, max_depth_m=5.0)
     return found, bias
 
 
 def registration_of(rig, found) -> Registration:
-    return Registration(rig, [Layer(found, STATIC)], 0)
+    return Registration(rig, [SurfaceLayer(found, STATIC)], 0)
 
 
 def none() -> np.ndarray:
@@ -76,13 +84,13 @@ def test_a_furnished_room_brings_perturbed_cameras_back(seed):
     found, _ = surfaces(seed, bias_m=0.002)
     start = perturbed(TRUTH, np.random.default_rng(seed), 0.01, 0.3)
     registration = registration_of(start, found)
-    refined = registration.solve(Estimate.start(start)).estimate
+    refined = registration.solve(RigEstimate.start(start)).estimate
     before = extrinsics_error(start, TRUTH, MIDDLE)
     after = extrinsics_error(start.moved(refined.poses), TRUTH, MIDDLE)
     assert after[1:].mean() < 0.006 < 0.01 < before[1:].mean()
     assert after.max() < 0.012
     np.testing.assert_array_equal(refined.poses[0], start.master_from_colour[0])
-    residuals = [registration.residuals(at, STATIC) for at in (Estimate.start(start), refined)]
+    residuals = [registration.residuals(at, STATIC) for at in (RigEstimate.start(start), refined)]
     assert residuals[1].median.mean() < 0.5 * residuals[0].median.mean()
 
 
@@ -91,7 +99,7 @@ def test_depth_bias_of_one_camera_is_found():
     biased = found[2]
     shifted = replace(biased, points=biased.points + 0.006 * biased.rays)
     registration = registration_of(TRUTH, {**found, 2: shifted})
-    refined = registration.solve(Estimate.start(TRUTH)).estimate
+    refined = registration.solve(RigEstimate.start(TRUTH)).estimate
     others = np.delete(refined.bias, 2)
     assert refined.bias[2] - others.mean() > 0.003
     error = extrinsics_error(TRUTH.moved(refined.poses), TRUTH, MIDDLE)
@@ -102,9 +110,9 @@ def test_the_body_ties_down_what_a_bare_floor_leaves_free():
     found, _ = surfaces(1, boxes=np.zeros((0, 2, 3)), walls=None)
     start = perturbed(TRUTH, np.random.default_rng(3), 0.01, 0.3)
     registration = registration_of(start, found)
-    alone = registration.solve(Estimate.start(start)).estimate
+    alone = registration.solve(RigEstimate.start(start)).estimate
     body = BodyConstraint(views_of(0, 3.0), TRUTH)
-    together = registration.solve(Estimate.start(start), [body]).estimate
+    together = registration.solve(RigEstimate.start(start), [body]).estimate
     errors = [
         extrinsics_error(start.moved(e.poses), TRUTH, MIDDLE)[1:].mean() for e in (alone, together)
     ]
@@ -155,14 +163,14 @@ def test_cameras_that_share_nothing_stay_where_they_were():
     found, _ = surfaces(0)
     start = perturbed(TRUTH, np.random.default_rng(1), 0.01, 0.3)
     only = registration_of(start, {3: found[3]})
-    refined = only.solve(Estimate.start(start)).estimate
+    refined = only.solve(RigEstimate.start(start)).estimate
     np.testing.assert_array_equal(refined.poses, start.master_from_colour)
     assert len(only.residuals(refined, STATIC).pairs) == 0
 
 
 def test_poses_can_be_held_while_bias_is_found():
     found, bias = surfaces(0, bias_m=0.004)
-    held = registration_of(TRUTH, found).solve(Estimate.start(TRUTH), free_poses=False)
+    held = registration_of(TRUTH, found).solve(RigEstimate.start(TRUTH), free_poses=False)
     np.testing.assert_array_equal(held.estimate.poses, TRUTH.master_from_colour)
     assert held.last_step_m == 0
     left = held.estimate.bias - bias
@@ -187,3 +195,37 @@ def test_two_views_count_only_where_the_rig_has_no_more():
     seen, unseen = pair.halves()
     assert len(seen.points) + len(unseen.points) == len(pair.points)
     assert not set(seen.unit) & set(unseen.unit)
+
+
+UP, ACROSS, AHEAD = np.eye(3)[[2, 0, 1]]
+
+
+def _normals(counts: dict[tuple[float, ...], int]) -> np.ndarray:
+    normals = np.repeat([np.array(n) for n in counts], list(counts.values()), axis=0)
+    normals = normals + np.random.default_rng(1).normal(0, 0.03, normals.shape)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def test_a_floor_has_at_most_its_share_and_the_sum_stays() -> None:
+    normals = _normals({tuple(UP): 900, tuple(ACROSS): 60, tuple(AHEAD): 40})
+    weight = np.random.default_rng(2).uniform(0.5, 1, 1000)
+    found = balance_directions(weight, normals)
+    assert found.sum() == pytest.approx(weight.sum())
+    assert found[:900].sum() / found.sum() == pytest.approx(MAX_DIRECTION_SHARE)
+    # what lies one way keeps its own proportions
+    assert np.ptp(found[:900] / weight[:900]) < 1e-12 and np.ptp(found[900:] / weight[900:]) < 1e-12
+
+
+def test_specks_gain_no_more_than_the_limit() -> None:
+    normals = _normals({tuple(UP): 995, tuple(ACROSS): 5})
+    found = balance_directions(np.ones(1000), normals)
+    np.testing.assert_allclose(found[995:], MAX_DIRECTION_GAIN)
+    assert found.sum() == pytest.approx(1000)
+
+
+def test_what_is_balanced_or_of_one_direction_stays_to_the_byte() -> None:
+    weight = np.random.default_rng(3).uniform(0, 1, 300)
+    mixed = _normals({tuple(UP): 100, tuple(ACROSS): 100, tuple(AHEAD): 100})
+    np.testing.assert_array_equal(balance_directions(weight, mixed), weight)
+    np.testing.assert_array_equal(balance_directions(weight, _normals({tuple(UP): 300})), weight)
+    np.testing.assert_array_equal(balance_directions(np.zeros(300), mixed), np.zeros(300))

@@ -9,8 +9,7 @@ import pytest
 
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import reproject
-from intercap_core.scene.constants import WINDOW_SETS
-from intercap_core.scene.keypoint_timing import keypoint_offsets
+from intercap_core.scene.keypoint_timing import WINDOW_SETS, find_offsets
 from intercap_core.scene.slips import find_slips, interval_gains, longest_slip
 from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
 from tests.helpers.synthetic_capture import ring
@@ -70,9 +69,7 @@ def test_all_slips_of_studio_captures_are_found_and_no_others(captures):
 def test_offsets_of_studio_captures(captures):
     errors, normalised = [], []
     for capture in captures:
-        found = keypoint_offsets(
-            subject_keypoints(capture), capture.slip, capture.rig, capture.times
-        )
+        found = find_offsets(subject_keypoints(capture), capture.slip, capture.rig, capture.times)
         assert found.offset[0] == 0 and np.isfinite(found.sigma).all()
         errors.append((found.offset - capture.offset)[1:])
         normalised.append(errors[-1] / found.sigma[1:])
@@ -127,13 +124,13 @@ def test_a_slip_while_nobody_moves_is_not_reported():
     slip = np.zeros((40, 6), np.int32)
     slip[10:20, 1] = 2
     assert not find_slips(seen(exposures(slip), moving=False), RIG, TIMES, FPS).intervals
-    found = keypoint_offsets(seen(exposures(slip), moving=False), slip, RIG, TIMES)
+    found = find_offsets(seen(exposures(slip), moving=False), slip, RIG, TIMES)
     assert np.isnan(found.sigma[1:]).all() and not found.offset.any()
 
 
 def test_offsets_are_seconds_after_the_master():
     true = np.array([0.003, -0.004, 0.008, 0.0, -0.002, 0.006])
-    found = keypoint_offsets(seen(exposures(np.zeros((40, 6)), true)), np.zeros((40, 6), int),
+    found = find_offsets(seen(exposures(np.zeros((40, 6)), true)), np.zeros((40, 6), int),
                              RIG, TIMES, master=1)  # fmt: skip
     np.testing.assert_allclose(found.offset, true - true[1], atol=0.0015)
     free = np.delete(np.arange(6), 1)
@@ -149,7 +146,7 @@ def test_three_cameras_with_unequal_frame_counts_suffice():
     keypoints[36:, 1] = 0
     keypoints[:3, 0] = 0
     np.testing.assert_array_equal(find_slips(keypoints, rig, TIMES, FPS).slip, slip)
-    offsets = keypoint_offsets(keypoints, slip, rig, TIMES)
+    offsets = find_offsets(keypoints, slip, rig, TIMES)
     assert np.abs(offsets.offset).max() < 0.004
 
 

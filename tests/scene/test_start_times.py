@@ -10,12 +10,11 @@ import pytest
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import reproject
-from intercap_core.person.sides import swapped
-from intercap_core.scene.moments import find_moments
-from intercap_core.scene.people_in_view import middles
-from intercap_core.scene.start_times import InStep, Starts, find_starts
-from intercap_core.scene.start_verdicts import note_of_stated
-from intercap_core.scene.stated_starts import StatedStarts, when
+from intercap_core.person.sides import swap_sides
+from intercap_core.scene.moments import describe_stated_start, find_moments
+from intercap_core.scene.start_costs import body_middles
+from intercap_core.scene.start_times import find_starts
+from intercap_core.scene.starts import AlignedPeople, StartTimes, StatedStarts, describe_start
 from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking
@@ -57,7 +56,7 @@ def walk(late_s: np.ndarray, fps: float, seconds: float, *, moving: bool = True)
         pixels = reproject(apply(invert(UP), points.reshape(-1, 3)), RIG)[:, c]
         pixels = pixels.reshape(len(times), 135, 2) + rng.normal(0, 2, (len(times), 135, 2))
         for t, person in enumerate(np.dstack([pixels, np.full(pixels.shape[:2], 0.9)])):
-            images[t][c] = [swapped(person) if rng.uniform() < 0.2 else person]
+            images[t][c] = [swap_sides(person) if rng.uniform() < 0.2 else person]
     return Late(images, np.zeros(len(RIG), int))
 
 
@@ -190,14 +189,14 @@ def test_studio_captures_are_brought_into_step(captures):
 
 def test_middles_do_not_depend_on_sides():
     person = np.random.default_rng(2).uniform(0.4, 1, (135, 3))
-    np.testing.assert_allclose(middles(swapped(person)), middles(person))
+    np.testing.assert_allclose(body_middles(swap_sides(person)), body_middles(person))
     person[2, 2] = 0  # a shoulder that is not seen has no middle
-    assert np.isnan(middles(person)).any(axis=1).sum() == 1
+    assert np.isnan(body_middles(person)).any(axis=1).sum() == 1
 
 
-def brought(late: np.ndarray, sets: np.ndarray) -> Starts:
+def brought(late: np.ndarray, sets: np.ndarray) -> StartTimes:
     none = np.zeros(len(late), bool)
-    return Starts(late, sets, none, True, 0.1, np.full(len(late), np.nan), none)
+    return StartTimes(late, sets, none, True, 0.1, np.full(len(late), np.nan), none)
 
 
 def test_images_move_to_their_moments_and_back():
@@ -220,7 +219,7 @@ def test_images_move_to_their_moments_and_back():
 def test_people_follow_the_images():
     late = Late([[[np.full((135, 3), t)] for _ in range(2)] for t in range(4)], np.zeros(2, int))
     starts = brought(np.zeros(2), np.array([0, 1]))
-    seen = InStep(late, starts)
+    seen = AlignedPeople(late, starts)
     assert seen.num_sets == 4
     assert seen.people(1, 1)[0, 0, 0] == 2 and not len(seen.people(3, 1))
 
@@ -281,11 +280,13 @@ def test_a_wrong_start_is_denied_by_who_walks(fps, wrong):
     starts = moments.starts
     assert np.flatnonzero(starts.denied).tolist() == [2] and np.isnan(starts.sigma[2])
     assert np.abs(starts.late - late).max() < 0.5 / fps + 0.02
-    note = note_of_stated(told, starts, moments.slips, 2, moments.timing.offset[2], 0.002)
+    note = describe_stated_start(told, starts, moments.slips, 2, moments.timing.offset[2], 0.002)
     assert note.startswith("the annotation has it start") and "deny" in note
     assert f"{abs(late[2] + wrong):.3f} s" in note
     for c in (1, 3, 4, 5):
-        kept = note_of_stated(told, starts, moments.slips, c, moments.timing.offset[c], 0.002)
+        kept = describe_stated_start(
+            told, starts, moments.slips, c, moments.timing.offset[c], 0.002
+        )
         assert "and was brought into step: so say the annotation and the keypoints" in kept
 
 
@@ -328,7 +329,7 @@ def test_starts_are_told_beside_the_times_of_the_files():
     np.testing.assert_allclose(told.late, [np.nan, -1.5, np.nan])
     np.testing.assert_allclose(told.sigma, [np.nan, 0.05, np.nan])
     assert told.sets(0.1).tolist() == [0, -15, 0] and told.says_apart(0.1)
-    assert when(told.late[1]) == "1.500 s later than its times say"
+    assert describe_start(told.late[1]) == "1.500 s later than its times say"
     with pytest.raises(UserError, match=r"annotation has camera k2 start 1\.500 s later"):
         told.check_common(np.array([0, 1.6]), ["k1", "k2", "k3"])
     told.check_common(np.array([0, 3.0]), ["k1", "k2", "k3"])

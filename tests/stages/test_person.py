@@ -14,8 +14,8 @@ from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.sides import LEGS, swapped
-from intercap_core.person.swaps import steady_sides
+from intercap_core.person.sides import LEGS, swap_sides
+from intercap_core.person.subject_joints import steady_sides
 from intercap_core.schemas import PERSON, SCENE
 from intercap_core.stages import person
 from tests.helpers.synthetic_capture import ring, write_frames
@@ -208,10 +208,10 @@ def test_nobody_and_other_captures_are_named(tmp_path, detected):
 def test_two_views_do_not_take_a_passing_exchange_of_sides(detected):
     views = Rig(RIG.cameras[:2])
     exchanged = detected[:, :2].copy()
-    exchanged[3:6, 0] = swapped(exchanged[3:6, 0], LEGS)
+    exchanged[3:6, 0] = swap_sides(exchanged[3:6, 0], LEGS)
     found = steady_sides(exchanged, views, min_confidence=0.3)
     np.testing.assert_array_equal(found, detected[:, :2])
     # with more views their vote decides
     six = detected.copy()
-    six[3:6, 0] = swapped(six[3:6, 0], LEGS)
+    six[3:6, 0] = swap_sides(six[3:6, 0], LEGS)
     np.testing.assert_array_equal(steady_sides(six, RIG, min_confidence=0.3), six)

@@ -16,28 +16,31 @@ from intercap_core.artefacts import Artefact
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.person.segmentation.constants import (
-    COLOUR_SCALE,
-    COLOUR_SCORE,
-    DARK,
-    DARK_CHANGE,
-    GAIN_STRIDE,
-    HIGHLIGHT,
-    MASK_MARGINS,
-    MAX_COLOUR_CANDIDATES,
-    MAX_COLOUR_SAMPLES,
-    MIN_COLOUR_CELLS,
-    MIN_COLOUR_SAMPLES,
-    OFF_COLOUR,
-    SAMPLE_MARGINS,
-    SATURATED,
-    SHADOW,
-    THING_MARGINS,
-    UNSURE_CELLS,
+from intercap_core.person.segmentation.candidate_masks import (
+    ImageCandidate,
+    ViewSegments,
+    encode_window,
 )
-from intercap_core.person.segmentation.depth_masks import encode_window
-from intercap_core.person.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.person.segmentation.moving_person import MovingPerson
+from intercap_core.person.segmentation.person_volume import MovingPerson
+
+# Horprasert, Harwood and Davis (1999): a pixel is split into brightness along the background's
+# colour and what is off it. A shadow is darker, of the same colour. Grey levels, share, share; the
+# values are tuned on the studio.
+OFF_COLOUR, SHADOW, HIGHLIGHT = 14.0, 0.5, 1.4
+DARK = 40.0  # grey levels; darker colours of the background have no direction; tuned on the studio
+DARK_CHANGE = 30.0  # grey levels by which a pixel of such a background differs; tuned on the studio
+SATURATED = 250  # grey level from which a pixel tells nothing of the exposure
+# The person's volume, this many margins larger, in the colour image: left out of the background,
+# holds the mask, holds no thing. Tuned on the studio.
+SAMPLE_MARGINS, MASK_MARGINS, THING_MARGINS = 5.0, 2.0, 1.0
+COLOUR_SCALE = 2  # images are decoded at half their size, which JPEG does in a quarter of the time
+UNSURE_CELLS = 4  # around the volume where nothing moved, in which a border is the volume's; judged
+MAX_COLOUR_SAMPLES = 15  # images of which the background is the median
+MIN_COLOUR_SAMPLES = 3  # of a pixel without the person: fewer tell no background
+GAIN_STRIDE = 16  # pixels; exposures are compared at every so many
+MAX_COLOUR_CANDIDATES = 5  # of one image
+MIN_COLOUR_CELLS = 60  # of a candidate in colour, at the reduced size; tuned on the studio
+COLOUR_SCORE = 0.5
 
 
 class ColourSegmenter:
@@ -66,16 +69,16 @@ class ColourSegmenter:
         if image is None or background is None:
             return None
         camera = self._rig[c]
-        moved = before(image, *background)
+        moved = find_foreground(image, *background)
         # clothes of the wall's colour, or a place that the person never left: take the body's
         # volume
-        body = drawn(bones, camera, moved.shape, 0)
-        person = body | (moved & drawn(bones, camera, moved.shape, MASK_MARGINS))
+        body = draw_volume(bones, camera, moved.shape, 0)
+        person = body | (moved & draw_volume(bones, camera, moved.shape, MASK_MARGINS))
         # the volume's own border, what was cut off, and what has no background are no outline
         block = np.ones((2 * UNSURE_CELLS + 1,) * 2, np.uint8)
         assumed = cv2.dilate((body & ~moved).view(np.uint8), block) > 0
         unsure = assumed | (moved & ~person) | ~background[1]
-        things = moved & ~drawn(bones, camera, moved.shape, THING_MARGINS)
+        things = moved & ~draw_volume(bones, camera, moved.shape, THING_MARGINS)
         block = np.ones((3, 3), np.uint8)
         rest = cv2.morphologyEx(things.view(np.uint8), cv2.MORPH_OPEN, block)
         _, label, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=8)
@@ -108,10 +111,10 @@ class ColourSegmenter:
             image, bones = self._image(int(t), c), self._person.bones(int(t), c)
             if image is not None:
                 images.append(image)
-                people.append(drawn(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))
+                people.append(draw_volume(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))
         if len(images) < MIN_COLOUR_SAMPLES:
             return None
-        return median_without(np.stack(images), np.stack(people))
+        return median_background(np.stack(images), np.stack(people))
 
     def _rle(self, mask: np.ndarray, camera: Camera) -> bytes:
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
@@ -121,7 +124,7 @@ class ColourSegmenter:
         return encode_window(window, left, top, COLOUR_SCALE, lens.width, lens.height)
 
 
-def median_without(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median colour (H, W, 3) float32 of images (S, H, W, 3) uint8 where nobody is, and whether it
     is known (H, W) bool; ``people`` (S, H, W) bool.
 
@@ -156,7 +159,7 @@ def _median(images: np.ndarray, people: np.ndarray, gains: np.ndarray) -> np.nda
     return median
 
 
-def before(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
+def find_foreground(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Pixels (H, W) bool of an image (H, W, 3) uint8 that differ from the ``background`` (H, W, 3)
     float32 by more than a shadow does, holes closed; False where that is not ``known`` (H, W)."""
     changed = _changed(image, background, _gain(image, background)) & known
@@ -203,7 +206,9 @@ def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return gains
 
 
-def drawn(bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: float) -> np.ndarray:
+def draw_volume(
+    bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: float
+) -> np.ndarray:
     """Where the person's volume, ``margins`` larger, is in the reduced colour image: (H, W) bool.
 
     ``bones`` (B, 9), master frame, of :func:`.person_volume.bones_of`.

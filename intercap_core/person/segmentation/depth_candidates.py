@@ -24,35 +24,45 @@ import numpy as np
 from intercap_core.artefacts import Artefact
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.person.segmentation.constants import (
-    ABOVE_HEAD_M,
-    AROUND_PATH_M,
-    CELL_M,
-    CLOTHING_MARGINS,
-    FAR,
-    FAR_CUT,
-    FLOOR_M,
-    MAX_COMPONENTS,
-    MIN_POINTS,
-    MIN_VIEW_POINTS,
-    NEAR_CUT,
-    NEARBY_CELL_M,
-    ON_TOP_SCORE,
-    PARTLY_MOVED_SCORE,
-    PERSON_MARGINS,
-    PERSON_SAMPLES,
-    SAME_SHARE,
-    STATIC_SCORE,
-    TWO_ENDS_SCORE,
+from intercap_core.person.segmentation.candidate_masks import (
+    ColourCells,
+    ImageCandidate,
+    ProjectedCells,
+    ViewSegments,
 )
-from intercap_core.person.segmentation.depth_masks import Cells, Projected
-from intercap_core.person.segmentation.foreground import DepthBackground, DepthView, sampled_images
-from intercap_core.person.segmentation.free_space import without_free_space, without_person_traces
-from intercap_core.person.segmentation.image_segments import ImageCandidate, ViewSegments
-from intercap_core.person.segmentation.moving_person import MovingPerson
-from intercap_core.person.segmentation.person_volume import outside
-from intercap_core.person.segmentation.static_things import extent, find_static_things
-from intercap_core.person.segmentation.voxels import components
+from intercap_core.person.segmentation.foreground import (
+    DepthBackground,
+    DepthView,
+    sampled_images,
+    without_free_space,
+    without_person_traces,
+)
+from intercap_core.person.segmentation.person_volume import FAR, MovingPerson, distance_outside
+from intercap_core.person.segmentation.static_objects import (
+    box_diagonal,
+    components,
+    find_static_objects,
+)
+
+PERSON_MARGINS = 1.5  # outside the usual build by less is the person; tuned on the studio
+# Margins outside the person at which a thing may begin, both are tried; tuned on the studio.
+NEAR_CUT, FAR_CUT = 1.0, 2.5
+CLOTHING_MARGINS = 2.2  # a component that reaches no farther is clothing; tuned on the studio
+# Around the person's path, above the highest keypoint: where things are looked for, metres; tuned
+# on the studio.
+AROUND_PATH_M, ABOVE_HEAD_M = 1.5, 0.7
+PERSON_SAMPLES = 12  # moments at which the person's own traces in the background are sought
+MAX_COMPONENTS = 6  # of one kind
+CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
+NEARBY_CELL_M = 0.07  # components with less between them may be one held thing: a hand's breadth
+FLOOR_M = 0.025  # what is lower may be the floor; tuned on the studio
+MIN_POINTS = 40  # of a component, over all views; tuned on the studio
+MIN_VIEW_POINTS = 12  # of it in a view that has it as a candidate; tuned on the studio
+SAME_SHARE = 0.9  # of a component's points: the farther cut shows nothing new; tuned
+# Prior that a component is a handled thing, whatever its size: of moving components, by how far
+# they reach from the person; low for all of the static scene. The scores are shaped by the studio:
+# no recording was annotated to calibrate them.
+ON_TOP_SCORE, STATIC_SCORE, PARTLY_MOVED_SCORE, TWO_ENDS_SCORE = 0.3, 0.2, 0.4, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +74,7 @@ class _ViewPoints:
     """
 
     points: np.ndarray
-    cells: Cells
+    cells: ColourCells
     outside: np.ndarray
     moving: np.ndarray
     of_thing: list[np.ndarray]
@@ -138,16 +148,18 @@ class DepthSegmenter:
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
         # without the floor removed, the whole scene is one component
         bottom = self._low if grounded else self._high
-        self._static = find_static_things(views, backgrounds, bottom, self._high, everywhere)
+        self._static = find_static_objects(views, backgrounds, bottom, self._high, everywhere)
         self._fixed = {c: self._static_points(number, c) for number, c in enumerate(self.cameras)}
 
-    def _static_points(self, number: int, c: int) -> list[tuple[np.ndarray, np.ndarray, Cells]]:
+    def _static_points(
+        self, number: int, c: int
+    ) -> list[tuple[np.ndarray, np.ndarray, ColourCells]]:
         """Flat pixels, points and cells of every static thing in one camera."""
         view, found = self._views[c], []
         for thing in self._static.things:
             pixels = thing.pixels[number]
             points, local = view.points(self._background[c].depth, pixels)
-            found.append((pixels, points, Cells.of(local, view.camera)))
+            found.append((pixels, points, ColourCells.of(local, view.camera)))
         return found
 
     def segment(self, t: int, wanted: list[int]) -> dict[int, ViewSegments]:
@@ -179,14 +191,14 @@ class DepthSegmenter:
         inside = ((points > self._low) & (points < self._high)).all(1)
         points, local, index = points[inside], local[inside], index[inside]
         bones = self._person.bones(t, c)
-        away = outside(points, bones)
+        away = distance_outside(points, bones)
         # background unknown to this view may be known to another one
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._static.surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
         moving[scene] = False
         shown = background.shows(image).ravel()
-        parts, cells, of_thing = [points], [Cells.of(local, view.camera)], []
+        parts, cells, of_thing = [points], [ColourCells.of(local, view.camera)], []
         count = len(points)
         for thing, (pixels, fixed, fixed_cells) in zip(
             self._static.things, self._fixed[c], strict=True
@@ -200,7 +212,7 @@ class DepthSegmenter:
         more = count - len(points)
         return _ViewPoints(
             np.concatenate(parts),
-            Cells.joined(cells),
+            ColourCells.joined(cells),
             np.concatenate([away, np.full(more, FAR, np.float32)]),
             np.concatenate([moving, np.zeros(more, bool)]),
             of_thing,
@@ -238,7 +250,7 @@ class DepthSegmenter:
         for members, points in _connected(seen, chosen):
             moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
             if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
-                found.append(_Component(members, PARTLY_MOVED_SCORE, extent(points)))
+                found.append(_Component(members, PARTLY_MOVED_SCORE, box_diagonal(points)))
         return found[:MAX_COMPONENTS]
 
 
@@ -268,7 +280,7 @@ def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
             ):
                 continue
             proposed.append(
-                _Component(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), extent(points))
+                _Component(members, 1 - 0.5 ** (reach / CLOTHING_MARGINS), box_diagonal(points))
             )
             kept += 1
             if kept == MAX_COMPONENTS:
@@ -290,7 +302,7 @@ def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> l
     for members, points in _connected(seen, chosen, NEARBY_CELL_M):
         parts = components(points, CELL_M, MIN_POINTS)
         if len(parts) > 1 and len(found) < MAX_COMPONENTS:
-            found.append(_Component(members, TWO_ENDS_SCORE, extent(points)))
+            found.append(_Component(members, TWO_ENDS_SCORE, box_diagonal(points)))
     return found
 
 
@@ -303,7 +315,7 @@ def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
 
 
 def _masks(seen: _ViewPoints, proposed: list[tuple[_Component, np.ndarray]]) -> ViewSegments:
-    projected = Projected.of(seen.cells)
+    projected = ProjectedCells.of(seen.cells)
     person = seen.moving & (seen.outside < PERSON_MARGINS)
     things = ~person
     candidates = []

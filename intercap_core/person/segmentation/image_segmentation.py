@@ -8,9 +8,9 @@ import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.person.segmentation.candidate_masks import ViewSegments
 from intercap_core.person.segmentation.colour_candidates import ColourSegmenter
 from intercap_core.person.segmentation.depth_candidates import DepthSegmenter
-from intercap_core.person.segmentation.image_segments import ViewSegments
 from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)

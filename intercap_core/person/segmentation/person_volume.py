@@ -1,8 +1,10 @@
 """Signed distance of points from a person of average build around the triangulated keypoints.
 
-The person is a union of capsules with two radii, one a bone. Where its surface lies is uncertain by
-centimetres at the trunk (clothing, build), by millimetres at the fingers. The distance is given in
-units of that uncertainty, one margin, bone by bone.
+The person is a union of capsules with two radii, one per bone. The position of its surface is
+uncertain by centimetres at the trunk (clothing, build) and by millimetres at the fingers. Distances
+are in units of this uncertainty ("margins"), bone by bone. :class:`MovingPerson` evaluates the
+bones at the exposure of each camera: a fast forearm moves by centimetres between the time of a set
+and the exposure.
 """
 
 from __future__ import annotations
@@ -10,30 +12,57 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from intercap_core.artefacts import Artefact
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LIMB_BONES, of_side
-from intercap_core.person.segmentation.constants import (
-    BLIND_HAND_LENGTH_M,
-    BLIND_HAND_MARGIN_M,
-    BLIND_HAND_RADIUS_M,
-    BONES_PER_GROUP,
-    FAR,
-    FINGER_RADII_M,
-    HAND_MARGIN_M,
-    LARGEST_BUILD,
-    LIMB_RADII_M,
-    MIN_FINGERS,
-    PALM_RADII_M,
-    SMALLEST_BUILD,
-    SOLE_RADII_M,
-    TRUNK_RADII_M,
-    USUAL_TRUNK_M,
-)
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve.velocity import limited_velocity
+
+# Half breadths and girths over 2 pi of NASA-STD-3000, section 3.3; the last of each row, how
+# uncertain the surface is (one margin: clothing and build), is tuned on the studio. Radii at the
+# first and at the second keypoint. "middle_ear" is half way between the ears.
+TRUNK_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
+    ("neck", "mid_hip"): (0.130, 0.130, 0.035),
+    ("left_shoulder", "left_hip"): (0.100, 0.110, 0.035),
+    ("right_shoulder", "right_hip"): (0.100, 0.110, 0.035),
+    ("left_hip", "right_hip"): (0.115, 0.115, 0.035),
+    ("left_shoulder", "right_shoulder"): (0.075, 0.075, 0.035),
+    ("neck", "middle_ear"): (0.075, 0.080, 0.030),
+    ("middle_ear", "middle_ear"): (0.125, 0.125, 0.025),
+    ("nose", "middle_ear"): (0.045, 0.105, 0.025),
+}
+# Of the bones of `body.keypoints.LIMB_BONES`, and of the soles.
+LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
+    ("shoulder", "elbow"): (0.065, 0.048, 0.025),
+    ("elbow", "wrist"): (0.048, 0.034, 0.018),
+    ("hip", "knee"): (0.105, 0.070, 0.030),
+    ("knee", "ankle"): (0.068, 0.045, 0.022),
+    ("ankle", "heel"): (0.050, 0.045, 0.022),
+    ("ankle", "big_toe"): (0.048, 0.035, 0.022),
+}
+SOLE_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
+    ("heel", "small_toe"): (0.040, 0.035, 0.022),
+    ("heel", "big_toe"): (0.040, 0.035, 0.022),
+}
+FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip
+PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles
+HAND_MARGIN_M = 0.012  # fingers are told within millimetres; tuned on the studio
+# A hand whose fingers nobody saw goes on from the wrist along the forearm: length, radius, margin.
+BLIND_HAND_LENGTH_M, BLIND_HAND_RADIUS_M, BLIND_HAND_MARGIN_M = 0.15, 0.045, 0.02
+MIN_FINGERS = 3  # whose roots must be known for the hand's own bones; tuned on the studio
+USUAL_TRUNK_M = 0.50  # neck to middle of the hips, of the people whose radii these are
+SMALLEST_BUILD, LARGEST_BUILD = 0.6, 1.25  # of that: children to the tallest
+MAX_HAND_SPEED_M_S = 8.0  # above what hands reach in everyday tasks (some 5 m/s)
+UNTOLD_OFFSET_S = 0.01  # a camera's time offset that could not be told is off by; as scenes spread
+MAX_KEYPOINT_GAP_S = 0.5  # a keypoint lost for less is where it lies between; tuned on the studio
+BONES_PER_GROUP = 5  # bones that are passed over together where a point is far from all of them
+FAR = 20.0  # margins: the distance that is given to whatever is farther than this
+
 
 # Name -> radii at both ends and margin, metres: trunk and head, limbs and soles of either side.
 _SIDE_RADII_M = {bone: LIMB_RADII_M[bone] for bone in LIMB_BONES} | SOLE_RADII_M
 
 
-def bones_of(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
+def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
     """Bones (B, 9) float32 of one moment: both ends, both radii, margin; metres; hands last.
 
     ``joints`` (135, 3), NaN = not known; a bone without one of its ends is left out. A margin is
@@ -90,10 +119,10 @@ def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a if not np.isfinite(b).all() else (a + b) / 2
 
 
-def outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
+def distance_outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
     """How far points (N, 3) float32 lie outside the person, in margins, (N,) float32.
 
-    Negative inside, at most ``FAR``; ``bones`` (B, 9) of :func:`bones_of`.
+    Negative inside, at most ``FAR``; ``bones`` (B, 9) of :func:`build_bones`.
     """
     groups = range(0, len(bones), BONES_PER_GROUP)
     balls = np.zeros((len(groups), 5), np.float32)  # around every group of bones, largest margin
@@ -137,3 +166,62 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.nda
                 nearest = (np.sqrt(away) - radius) / bones[b, 8]
         found[i] = nearest
     return found
+
+
+class MovingPerson:
+    """Keypoints over time; ``joints`` (T, K, 3), metres, short gaps filled, NaN = not known."""
+
+    def __init__(
+        self,
+        joints: np.ndarray,
+        sigma: np.ndarray,
+        scene: Artefact,
+        frame_from_master: np.ndarray | None = None,
+    ) -> None:
+        """Of ``joints`` (T, K, 3), master frame, at the times of the ``scene`` artefact.
+
+        ``sigma`` (T, K) metres, what each is off by; in another frame where ``frame_from_master``
+        (4, 4) is given.
+        """
+        times = scene["times"]
+        if frame_from_master is not None:
+            joints = apply(frame_from_master, joints.reshape(-1, 3)).reshape(joints.shape)
+        self.joints = fill_short_gaps(joints, times, max_gap_s=MAX_KEYPOINT_GAP_S)
+        self._sigma = np.nan_to_num(sigma)
+        self._velocity = np.nan_to_num(
+            limited_velocity(self.joints, times, max_speed=MAX_HAND_SPEED_M_S)
+        )
+        self._late = scene["time_offset"]
+        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=UNTOLD_OFFSET_S)
+
+    def bones(self, t: int, c: int) -> np.ndarray:
+        """Bones (B, 9) of :func:`build_bones` when camera c exposes the image of moment t."""
+        off = self._late_sigma[c] * np.linalg.norm(self._velocity[t], axis=-1)
+        joints = self.joints[t] + self._late[c] * self._velocity[t]
+        return build_bones(joints, np.hypot(self._sigma[t], off))
+
+    def bones_at(self, t: int) -> np.ndarray:
+        """The same at the moment itself."""
+        return build_bones(self.joints[t], self._sigma[t])
+
+
+def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
+    """Keypoints (T, K, 3), NaN = not known, with short gaps filled by linear interpolation.
+
+    A gap is filled up to ``max_gap_s`` from its nearest known time of ``times`` (T,) seconds; at
+    the beginning and the end the nearest known place is held.
+    """
+    result = joints.copy()
+    for k in range(joints.shape[1]):
+        known = np.flatnonzero(np.isfinite(joints[:, k]).all(1))
+        if not len(known):
+            continue
+        for t in np.flatnonzero(~np.isfinite(joints[:, k]).all(1)):
+            after = int(np.searchsorted(known, t))
+            around = known[max(after - 1, 0) : after + 1]
+            if np.abs(times[around] - times[t]).min() > max_gap_s:
+                continue
+            result[t, k] = [
+                np.interp(times[t], times[around], joints[around, k, i]) for i in range(3)
+            ]
+    return result

@@ -8,8 +8,8 @@ import pytest
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import midpoints, reproject, triangulate
-from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swapped
-from intercap_core.person.swaps import triangulate_people
+from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swap_sides
+from intercap_core.person.subject_joints import triangulate_people
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking
 
@@ -110,9 +110,9 @@ def test_exchanged_limbs_are_found_and_put_back():
     clean = seen_by(truth, RIG, UP)
     clean[..., :2] += np.random.default_rng(0).normal(0, 2, clean[..., :2].shape)
     damaged = clean.copy()
-    damaged[5:15, 2] = swapped(damaged[5:15, 2], np.r_[ARMS, LEGS])
-    damaged[3:9, 4] = swapped(damaged[3:9, 4], LEGS)
-    damaged[8:12, 0] = swapped(damaged[8:12, 0], HANDS)
+    damaged[5:15, 2] = swap_sides(damaged[5:15, 2], np.r_[ARMS, LEGS])
+    damaged[3:9, 4] = swap_sides(damaged[3:9, 4], LEGS)
+    damaged[8:12, 0] = swap_sides(damaged[8:12, 0], HANDS)
     fixed, found = triangulate_people(damaged, RIG, min_confidence=0.3, max_error_px=20)
     limbs = np.r_[ARMS, LEGS, HANDS]
     np.testing.assert_array_equal(fixed[:, :, limbs], clean[:, :, limbs])

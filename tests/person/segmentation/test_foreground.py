@@ -8,13 +8,28 @@ from scipy import ndimage
 
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.segmentation.colour_candidates import before, drawn, median_without
-from intercap_core.person.segmentation.depth_masks import Cells, Projected, encode_window
-from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
-from intercap_core.person.segmentation.free_space import without_free_space
-from intercap_core.person.segmentation.person_volume import FAR, bones_of, outside
-from intercap_core.person.segmentation.static_things import find_static_things
-from intercap_core.person.segmentation.voxels import Occupied, components, connected
+from intercap_core.person.segmentation.candidate_masks import (
+    ColourCells,
+    ProjectedCells,
+    encode_window,
+)
+from intercap_core.person.segmentation.colour_candidates import (
+    draw_volume,
+    find_foreground,
+    median_background,
+)
+from intercap_core.person.segmentation.foreground import (
+    DepthBackground,
+    DepthView,
+    without_free_space,
+)
+from intercap_core.person.segmentation.person_volume import FAR, build_bones, distance_outside
+from intercap_core.person.segmentation.static_objects import (
+    OccupiedCells,
+    components,
+    find_static_objects,
+    label_components,
+)
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
 from tests.helpers.synthetic_people import stick_person
 
@@ -33,7 +48,7 @@ def test_components_are_those_of_a_dense_grid():
     at = tuple((cells - cells.min(0)).T)
     grid[at] = True
     dense, count = ndimage.label(grid, np.ones((3, 3, 3)))
-    label, found = connected(points, 0.06)
+    label, found = label_components(points, 0.06)
     assert found == count
     pairs = np.unique(np.column_stack([dense[at], label]), axis=0)
     assert len(pairs) == count  # one to one
@@ -45,13 +60,13 @@ def test_components_are_those_of_a_dense_grid():
 
 
 def test_no_points_are_no_component():
-    assert connected(np.zeros((0, 3), np.float32), 0.1)[1] == 0
+    assert label_components(np.zeros((0, 3), np.float32), 0.1)[1] == 0
     assert components(np.zeros((0, 3), np.float32), 0.1, 1) == []
-    assert not Occupied(np.zeros((0, 3), np.float32), 0.1, 1).holds(np.zeros((2, 3))).any()
+    assert not OccupiedCells(np.zeros((0, 3), np.float32), 0.1, 1).holds(np.zeros((2, 3))).any()
 
 
 def test_occupied_holds_cells_and_those_beside_them():
-    known = Occupied(np.array([[0.05, 0.05, 0.05], [-0.95, 0.05, 0.05]]), 0.1, 1)
+    known = OccupiedCells(np.array([[0.05, 0.05, 0.05], [-0.95, 0.05, 0.05]]), 0.1, 1)
     asked = np.array([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [0.05, -0.05, 0.05],
                       [0.15, 0.15, 0.05], [0.25, 0.05, 0.05], [-0.85, 0.05, 0.05]])  # fmt: skip
     np.testing.assert_array_equal(known.holds(asked), [1, 1, 1, 0, 0, 1])
@@ -64,12 +79,12 @@ def test_outside_is_the_distance_to_a_cone_in_margins():
     bone = np.array([[0, 0, 0, 0, 0, 1, 0.1, 0.2, 0.05]], np.float32)
     points = np.array([[0.3, 0, 0.5], [0, 0.1, 0], [0, 0, 1.4], [0, 0, 0.5], [9, 0, 0]], np.float32)
     expected = [(0.3 - 0.15) / 0.05, 0.0, (0.4 - 0.2) / 0.05, -0.15 / 0.05, FAR]
-    np.testing.assert_allclose(outside(points, bone), expected, atol=1e-4)
+    np.testing.assert_allclose(distance_outside(points, bone), expected, atol=1e-4)
 
 
 def test_outside_passes_over_no_bone_that_counts():
     joints = stick_person()
-    bones = bones_of(joints)
+    bones = build_bones(joints)
     points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 2], (3000, 3)).astype(np.float32)
     start, along = bones[:, :3], bones[:, 3:6] - bones[:, :3]
     share = np.einsum("nbj,bj->nb", points[:, None] - start, along)
@@ -77,16 +92,16 @@ def test_outside_passes_over_no_bone_that_counts():
     away = np.linalg.norm(points[:, None] - start - share[..., None] * along, axis=-1)
     radius = bones[:, 6] + share * (bones[:, 7] - bones[:, 6])
     brute = np.minimum(((away - radius) / bones[:, 8]).min(1), FAR)
-    np.testing.assert_allclose(outside(points, bones), brute, atol=2e-3)
+    np.testing.assert_allclose(distance_outside(points, bones), brute, atol=2e-3)
 
 
 def test_bones_without_an_end_are_left_out():
     joints = np.full((135, 3), np.nan)
-    assert bones_of(joints).shape == (0, 9)
-    assert (outside(np.zeros((3, 3), np.float32), bones_of(joints)) == FAR).all()
+    assert build_bones(joints).shape == (0, 9)
+    assert (distance_outside(np.zeros((3, 3), np.float32), build_bones(joints)) == FAR).all()
     blind = stick_person()
     blind[25:67] = np.nan
-    assert 0 < len(bones_of(blind)) < len(bones_of(stick_person()))
+    assert 0 < len(build_bones(blind)) < len(build_bones(stick_person()))
 
 
 # --- depth ---------------------------------------------------------------------------------------
@@ -117,9 +132,9 @@ def test_a_thing_that_gives_way_is_no_background():
     reach = np.full(steady.shape, 5000, np.uint16)
     background = DepthBackground.of(thing, [thing] * 20 + [empty] * 4, reach)
     assert (background.depth[12:28, 22:38] == 0).all() and background.depth[0, 0] == 3000
-    before = np.zeros(steady.shape, bool)
-    before.ravel()[background.before(thing)] = True
-    assert before[12:28, 22:38].all() and before.sum() <= 400
+    foreground = np.zeros(steady.shape, bool)
+    foreground.ravel()[background.before(thing)] = True
+    assert foreground[12:28, 22:38].all() and foreground.sum() <= 400
     assert background.shows(thing)[:8].all() and not background.shows(thing)[12:28, 22:38].any()
     kept = DepthBackground.of(thing, [thing] * 24, reach)
     assert (kept.depth == thing).all() and not len(kept.before(thing))
@@ -170,7 +185,7 @@ def test_static_things_near_the_person_and_on_a_table():
         image = to_millimetres(room, rng)
         backgrounds.append(DepthBackground.of(image, [image], view.reach_mm(LOW, HIGH)))
     person = stick_person() + np.array([0.0, 0.55, 0.0])
-    scene = find_static_things(views, backgrounds, LOW, HIGH, person)
+    scene = find_static_objects(views, backgrounds, LOW, HIGH, person)
     sizes = [thing.extent_m for thing in scene.things]
     assert len(scene.things) == 3
     for box, on_top, carries in ((table, False, True), (mug, True, False), (stool, False, False)):
@@ -216,7 +231,7 @@ def test_nearer_pixels_hide_farther_ones_and_holes_close_over_nobody_else():
         [view.points(image, index[image.ravel() > 0])[1] for image in (near, far)]
     )
     first = np.arange(len(local)) < (near > 0).sum()
-    projected = Projected.of(Cells.of(local, camera))
+    projected = ProjectedCells.of(ColourCells.of(local, camera))
     front = masks.decode(projected.rle(first, ~first), 1080, 1920)
     back = masks.decode(projected.rle(~first, first), 1080, 1920)
     assert front.any() and back.sum() > front.sum() and not (front & back).any()
@@ -242,7 +257,7 @@ def test_median_without_the_person_and_with_changing_exposure():
         image[where] = 20
         images.append(np.clip(image, 0, 255).astype(np.uint8))
         people.append(where)
-    median, known = median_without(np.stack(images), np.stack(people))
+    median, known = median_background(np.stack(images), np.stack(people))
     assert known.all()
     assert np.median(np.abs(median / images[0][0, 0].mean() - room / room[0, 0].mean())) < 0.05
     assert np.abs(median - 0.8 * room).max() < 12
@@ -257,7 +272,7 @@ def test_a_shadow_or_another_exposure_is_not_before_the_scene_but_a_thing_is():
     image[60:100, 20:60] *= 0.7
     image[20:50, 90:120] = (200, 40, 40)
     image[60:90, :15] = (200, 40, 40)  # where nothing is known of the background
-    found = before(np.clip(image, 0, 255).astype(np.uint8), room, known)
+    found = find_foreground(np.clip(image, 0, 255).astype(np.uint8), room, known)
     assert found[22:48, 92:118].mean() > 0.9
     found[20:50, 90:120] = False
     assert found.mean() < 0.01
@@ -266,16 +281,16 @@ def test_a_shadow_or_another_exposure_is_not_before_the_scene_but_a_thing_is():
 def test_the_person_is_drawn_where_the_points_within_the_body_are_seen():
     camera = RIG[2]
     joints = apply(invert(UP), stick_person())
-    bones = bones_of(joints)
-    mask = drawn(bones, camera, (540, 960), 0.0)
+    bones = build_bones(joints)
+    mask = draw_volume(bones, camera, (540, 960), 0.0)
     points = np.random.default_rng(4).uniform([-0.4, -0.5, 0], [0.4, 0.5, 1.8], (4000, 3))
     in_master = apply(invert(UP), points)
-    away = outside(in_master.astype(np.float32), bones)
+    away = distance_outside(in_master.astype(np.float32), bones)
     pixel = np.rint(camera.colour.project(apply(camera.colour_from_master, in_master)) / 2)
     column, row = np.clip(pixel.astype(int), 0, (959, 539)).T
     assert mask[row[away < -0.5], column[away < -0.5]].mean() > 0.97
     assert mask.mean() < 0.1
-    assert not drawn(bones[:0], camera, (540, 960), 0.0).any()
+    assert not draw_volume(bones[:0], camera, (540, 960), 0.0).any()
     behind = bones.copy()
     behind[:, [2, 5]] -= 20
-    assert not drawn(behind, camera, (540, 960), 0.0).all()
+    assert not draw_volume(behind, camera, (540, 960), 0.0).all()

@@ -7,8 +7,11 @@ import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.camera.triangulation import reproject, spread, triangulate
-from intercap_core.person.segmentation.moving_person import MovingPerson
-from intercap_core.person.segmentation.person_volume import bones_of, outside
+from intercap_core.person.segmentation.person_volume import (
+    MovingPerson,
+    build_bones,
+    distance_outside,
+)
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import stick_person
 
@@ -41,14 +44,14 @@ def test_a_fast_hand_is_where_a_late_camera_sees_it() -> None:
     late[HAND, 0] += 0.012 * SPEED
     tip = late[[WRIST]].astype(np.float32)
     moving = person(0.0, 0.0)
-    np.testing.assert_allclose(moving.bones(4, 1), bones_of(late), atol=1e-5)
-    np.testing.assert_allclose(moving.bones(4, 0), bones_of(joints[4]), atol=1e-6)
-    assert outside(tip, moving.bones(4, 0)) > outside(tip, moving.bones(4, 1)) + 1
+    np.testing.assert_allclose(moving.bones(4, 1), build_bones(late), atol=1e-5)
+    np.testing.assert_allclose(moving.bones(4, 0), build_bones(joints[4]), atol=1e-6)
+    assert distance_outside(tip, moving.bones(4, 0)) > distance_outside(tip, moving.bones(4, 1)) + 1
 
 
 def test_margins_grow_by_what_keypoints_and_times_are_off_by() -> None:
     joints, _ = swinging()
-    usual = bones_of(joints[4])[:, 8]
+    usual = build_bones(joints[4])[:, 8]
     np.testing.assert_allclose(
         person(0.03, 0.0).bones_at(4)[:, 8], np.hypot(usual, 0.03), rtol=1e-5
     )

@@ -1,7 +1,12 @@
-"""Body keypoints of several views as constraints on the camera poses.
+"""Further terms of the registration of a rig: body keypoints and one common floor.
 
-A bundle adjustment whose points are eliminated (Schur complement), so that the cameras' system
-stays small however many points there are.
+Each constraint returns the normal equations of its residuals with respect to the cameras' poses.
+Its own unknowns (points of the body, the plane) are eliminated by the Schur complement, so the
+camera system stays small.
+
+- :class:`BodyConstraint`: bundle adjustment of the subject's keypoints.
+- :class:`FloorConstraint`: all cameras see the same plane. It fixes height and tilt of cameras that
+  see no common part of the floor.
 """
 
 from __future__ import annotations
@@ -14,17 +19,26 @@ import numpy as np
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.person.sides import BODY_POINTS
-from intercap_core.scene.constants import (
-    KEYPOINT_ERROR_TIME_S,
-    KEYPOINT_SIGMA_FLOOR_PX,
-    MIN_BODY_VIEWS,
-    POINT_STEPS,
-    ROBUST_SIGMA,
-)
+from intercap_core.scene.ground import FLOOR_COSINE, GroundPlane
 from intercap_core.scene.subject_views import SubjectViews
+from intercap_core.scene.surfaces import DepthSurface
+
+FLOOR_SIGMA_M = 0.005  # floors are not flat and depth is biased; tuned on the studio
+KEYPOINT_SIGMA_FLOOR_PX = 3.0  # of reprojection with each joint's bias in; tuned on the studio
+ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
+KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
+POINT_STEPS = 2  # Gauss-Newton steps of keypoints' points before each of the cameras'
+MAX_FLOOR_POINTS = 1000  # of a camera, in the common floor's constraint
+MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
+# Two views of a larger rig say little of their own relative pose; of a rig of two they are all that
+# there is: five of its six freedoms, the prior holds the distance.
+MIN_BODY_VIEWS = 3
+NEAR_FLOOR_M = 0.06  # of the floor at poses that are not yet refined; tuned on the studio
+MIN_FLOOR_POINTS = 200  # of a camera's 3 cm cells: a fifth of a square metre
+FLOOR_EFFECTIVE_POINTS = 10.0  # of one camera: its errors are those of its lens and bias
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,3 +188,82 @@ def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
     zero = np.zeros_like(x)
     rows = [np.stack(r, -1) for r in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return np.stack(rows, -2)
+
+
+class FloorConstraint:
+    """Adds the normal equations of one common floor; ``points`` by camera, its depth frame."""
+
+    def __init__(self, rig: Rig, points: dict[int, np.ndarray], up: np.ndarray) -> None:
+        self._rig = rig
+        self._points = points
+        self._up = up
+
+    @property
+    def cameras(self) -> frozenset[int]:
+        """Those that see the floor."""
+        return frozenset(self._points)
+
+    @classmethod
+    def of(
+        cls, rig: Rig, surfaces: dict[int, DepthSurface], ground: GroundPlane
+    ) -> FloorConstraint | None:
+        """The floor points near ``ground`` at the rig's poses; None where fewer than two cameras
+        see it."""
+        if not ground.found:
+            return None
+        points = {}
+        for c, surface in surfaces.items():
+            pose = rig[c].master_from_depth
+            height = (apply(pose, surface.points) - ground.point) @ ground.normal
+            facing = surface.normals @ pose[:3, :3].T @ ground.normal
+            rows = np.flatnonzero((np.abs(height) < NEAR_FLOOR_M) & (facing > FLOOR_COSINE))
+            if len(rows) >= MIN_FLOOR_POINTS:
+                rows = np.random.default_rng(0).permutation(rows)[:MAX_FLOOR_POINTS]
+                points[c] = surface.points[rows]
+        return cls(rig, points, ground.normal) if len(points) >= 2 else None
+
+    def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` has no say.
+
+        Raises ValueError for poses of another rig.
+        """
+        if len(poses) != len(self._rig):
+            raise ValueError(f"{len(poses)} poses for {len(self._rig)} cameras")
+        count = len(self._rig)
+        own = {c: self._in_master(c, poses[c]) for c in self._points}
+        everything = np.concatenate(list(own.values()))
+        middle = everything.mean(0)
+        axes = np.linalg.svd(everything - middle, full_matrices=False)[2]
+        normal = axes[2] * np.sign(axes[2] @ self._up)
+        matrix = np.zeros((count * 6, count * 6))
+        gradient = np.zeros(count * 6)
+        by_plane = np.zeros((3, 3))
+        cross = np.zeros((3, count * 6))
+        slope = np.zeros(3)
+        for c, points in own.items():
+            residual = (points - middle) @ normal
+            robust = geman_mcclure_weight(residual**2, ROBUST_SIGMA * FLOOR_SIGMA_M)
+            weight = robust * min(1.0, FLOOR_EFFECTIVE_POINTS / len(points)) / FLOOR_SIGMA_M**2
+            arm = points - poses[c, :3, 3]
+            by_pose = np.column_stack(
+                [np.cross(arm, normal), np.broadcast_to(normal, points.shape)]
+            )
+            plane = np.column_stack(
+                [(points - middle) @ axes[0], (points - middle) @ axes[1], -np.ones(len(points))]
+            )
+            at = slice(6 * c, 6 * c + 6)
+            weighted = by_pose * weight[:, None]
+            matrix[at, at] += weighted.T @ by_pose
+            gradient[at] += weighted.T @ residual
+            cross[:, at] += plane.T @ weighted
+            by_plane += plane.T @ (plane * weight[:, None])
+            slope += plane.T @ (weight * residual)
+        solved = np.linalg.solve(by_plane, np.column_stack([cross, slope]))
+        matrix -= cross.T @ solved[:, :-1]
+        gradient -= cross.T @ solved[:, -1]
+        return matrix.reshape(count, 6, count, 6), gradient.reshape(count, 6)
+
+    def _in_master(self, camera: int, pose: np.ndarray) -> np.ndarray:
+        between = self._rig[camera].colour_from_depth
+        assert between is not None
+        return apply(pose @ between, self._points[camera])

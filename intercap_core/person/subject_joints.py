@@ -1,15 +1,19 @@
-"""Limbs whose left and right a detector exchanged.
+"""Triangulates the subject's keypoints, with left and right corrected.
 
-The views of each set are made to agree (:mod:`.agreement`), then all sets together tell which side
-is the left (:mod:`.facing`). After that a view's limb counts as exchanged where its reprojection
-error is much smaller with the sides exchanged. With few views there is no agreement to rely on:
-the sides of least motion in the image are taken, since an exchange jumps there and back.
+1. :func:`steady_sides`: with few views, limbs that jump between the sides are corrected in each
+   view by the least image motion.
+2. :func:`at_set_times`: keypoints are moved from each camera's exposure to the time of the set.
+3. :func:`triangulate_people`: the views of each set are made consistent, the sides of all sets are
+   chosen (:mod:`.left_right`), then a limb of a view counts as exchanged if its reprojection error
+   is much lower with the sides exchanged.
+4. :func:`fill_middles`: neck and mid hip from shoulders and hips.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import (
     Triangulation,
@@ -17,21 +21,71 @@ from intercap_core.geometry.camera.triangulation import (
     reproject,
     triangulate,
 )
+from intercap_core.geometry.solve.velocity import limited_velocity
 from intercap_core.geometry.solve.viterbi import cheapest_sequence
-from intercap_core.person.agreement import agree
-from intercap_core.person.constants import (
-    EXCHANGE_ROUNDS,
-    EXCHANGED_PX_AT_1080P,
-    FEW_VIEWS,
-    JUMP_PX_AT_1080P,
-    MIN_LIMB_COST,
-    MIN_LIMB_POINTS,
-    MUCH_BETTER,
-    OPEN_EXCHANGE_PX_AT_1080P,
-    TRUNCATED_AT,
-)
-from intercap_core.person.facing import mirrored
+from intercap_core.person.left_right import find_mirrored, make_views_agree
 from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
+
+# Hands reach some 5 m/s in everyday tasks and people stand two metres from a capture ring's
+# cameras: what moves faster in an image is another detection. Radians a second.
+MAX_IMAGE_SPEED_RAD_S = 2.5
+EXCHANGE_ROUNDS = 2  # of exchanging limbs and triangulating again
+MUCH_BETTER = 0.5  # cost exchanged over cost as detected, at most; tuned on the studio
+# Mean truncated squared error, in units of the inlier limit, from which a limb may be exchanged:
+# half of its points are off by the limit or more.
+MIN_LIMB_COST = 0.25
+# In units of the inlier limit; well beyond it, so that an exchange differs from another mistake.
+TRUNCATED_AT = 4.0
+MIN_LIMB_POINTS = 2  # of a limb that is compared
+FEW_VIEWS = 4  # with at most so many, limbs that jump between the sides are steadied; tuned
+EXCHANGED_PX_AT_1080P = 3.0  # cost of a set exchanged: detectors are mostly right; tuned
+# Cost of an exchange with which the recording begins or ends: it shows one jump alone, as a fast
+# turn does. Tuned on the studio.
+OPEN_EXCHANGE_PX_AT_1080P = 100.0
+JUMP_PX_AT_1080P = 120.0  # motion from set to set counts as this at most; tuned on the studio
+
+
+def at_set_times(
+    keypoints: np.ndarray,
+    times: np.ndarray,
+    time_offset: np.ndarray,
+    rig: Rig,
+    *,
+    min_confidence: float,
+) -> np.ndarray:
+    """Keypoints (T, C, K, 3) as they would be had every camera exposed at ``times`` (T,).
+
+    ``keypoints`` (T, C, K, 3) x, y, confidence as exposed, ``time_offset`` (C,) seconds later.
+    Moved by the velocity in the image, from neighbouring sets and limited where one of them jumps.
+    """
+    result = keypoints.copy()
+    known = keypoints[..., 2] >= min_confidence
+    for c in np.flatnonzero(time_offset):
+        speed = MAX_IMAGE_SPEED_RAD_S * rig[int(c)].colour.fx
+        seen = keypoints[:, c, :, :2]
+        velocity = limited_velocity(seen, times, max_speed=speed, known=known[:, c])
+        result[:, c, :, :2] = seen - time_offset[c] * velocity
+    return result
+
+
+_INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
+# OpenPose learnt both points as these middles of COCO's.
+_MIDDLES = tuple(
+    (_INDEX[middle], [_INDEX[f"left_{end}"], _INDEX[f"right_{end}"]])
+    for middle, end in (("neck", "shoulder"), ("mid_hip", "hip"))
+)
+
+
+def fill_middles(points: np.ndarray) -> None:
+    """Fill in place what is NaN in ``points`` (..., 135, 3) from shoulders and hips, if known.
+
+    Only in space, not in the images: the body's initial pose and its volume use them, while the
+    fit, whose evidence is the keypoints in images, does not count the shoulders' and hips' errors
+    twice.
+    """
+    for middle, ends in _MIDDLES:
+        at = points[..., middle, :]
+        at[...] = np.where(np.isnan(at), points[..., ends, :].mean(-2), at)
 
 
 def triangulate_people(
@@ -49,13 +103,13 @@ def triangulate_people(
     exchanged back, and the triangulation of T * 135 points, set by set.
     """
     keypoints = keypoints.copy()
-    agreed = agree(keypoints, rig, min_confidence=min_confidence)
+    agreed = make_views_agree(keypoints, rig, min_confidence=min_confidence)
     found = _triangulate(keypoints, rig, min_confidence, max_error_px)
     seeing = np.stack(
         [(keypoints[:, :, limb, 2] >= min_confidence).any(2).sum(1) for limb in LIMBS], 1
     )
     share = agreed.sum(1) / np.maximum(seeing, 1)
-    turned = mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
+    turned = find_mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
     if turned.any():
         keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
         found = Triangulation(

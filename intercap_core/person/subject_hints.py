@@ -1,4 +1,4 @@
-"""The detections that a user names by points in images (annotation ``subject``)."""
+"""Which detections are the subject: points named by the user, and contact with the object."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.body.keypoints import SKELETON, keypoint_pairs
+from intercap_core.body.keypoints import BODY, LEFT_HAND, RIGHT_HAND, SKELETON, keypoint_pairs
 from intercap_core.config import SubjectPoint
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Detections
-from intercap_core.person.constants import NAMED_REACH
 from intercap_core.person.sides import BODY_POINTS
-from intercap_core.person.subject import Named
+from intercap_core.person.subject import NamedDetection, Touches
+
+TOUCH_REACH = 0.03  # of a person's height in an image, beyond the keypoints: a hand's breadth
+NAMED_REACH = 0.15  # of a person's height in an image, from bones to the point that names it
+
 
 _BONES = keypoint_pairs(SKELETON)
 
@@ -23,7 +27,7 @@ def named_people(
     image_of: np.ndarray,
     *,
     min_confidence: float,
-) -> list[Named]:
+) -> list[NamedDetection]:
     """Who is at each point: the person whose bones are nearest, for their size in the image.
 
     ``detections`` by moment, ``image_of`` (T, C) of the scene artefact: the frame whose image shows
@@ -42,7 +46,7 @@ def _named(
     detections: Detections,
     image_of: np.ndarray,
     min_confidence: float,
-) -> Named:
+) -> NamedDetection:
     names = detections.camera_names
     sizes = {
         name: (int(w), int(h)) for name, (w, h) in zip(names, detections.image_sizes, strict=True)
@@ -71,7 +75,7 @@ def _named(
             f"{told} is at x {point.x:g}, y {point.y:g} of {where}, where nobody was detected; "
             f"there are people at {places or 'no place of it'}"
         )
-    return Named(t, c, nearest, entry)
+    return NamedDetection(t, c, nearest, entry)
 
 
 def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> float:
@@ -86,3 +90,33 @@ def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> f
     share = np.clip(((point - start) * along).sum(1) / length, 0, 1)
     away = np.linalg.norm(start + share[:, None] * along - point, axis=1).min()
     return float(away / max(np.ptp(person[seen, :2], axis=0).max(), 1.0))
+
+
+_POINTS = np.r_[BODY, LEFT_HAND, RIGHT_HAND]
+_AROUND = np.array([(0, 0), *((np.cos(a), np.sin(a)) for a in np.arange(8) * np.pi / 4)])
+
+
+def touch_test(
+    detections: Detections, labels: tuple[str, ...], *, min_confidence: float
+) -> Touches:
+    """Who touches a candidate that has one of the object's ``labels``; none = any but a person's.
+
+    Somebody touches it whose keypoints, or places a hand's breadth beside them, lie in its mask. In
+    a view from behind that is so by chance; most views tell.
+    """
+
+    def touches(t: int, c: int, person: int) -> bool | None:
+        things = [
+            candidate
+            for candidate in detections.candidates(t, c)
+            if candidate.label != PERSON_LABEL and (candidate.label in labels or not labels)
+        ]
+        points = detections.people(t, c)[person][_POINTS]
+        points = points[points[:, 2] >= min_confidence, :2]
+        if not things or not len(points):
+            return None
+        reach = TOUCH_REACH * float(np.ptp(points, axis=0).max())
+        x, y = np.rint(points[:, None] + reach * _AROUND).astype(np.int64).reshape(-1, 2).T
+        return any(bool(thing.runs.sample(x, y).any()) for thing in things)
+
+    return touches

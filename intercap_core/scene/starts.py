@@ -1,7 +1,7 @@
-"""Starts of cameras that somebody states, or that the sound tells, beside the keypoints'.
+"""Start times of cameras: stated by the user or by sound, and as found from the keypoints.
 
-What is stated is where the search begins (:mod:`intercap_core.scene.start_times`), and a prior of
-the time offsets. Where the keypoints surely say otherwise they are followed.
+A stated start is where the search of :mod:`.start_times` begins, and a prior of the time offset. It
+is rejected if the keypoints clearly contradict it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
-from intercap_core.scene.constants import (
-    DENIED_SIGMAS,
-    FEWEST_SETS_APART,
-    IN_STEP_SIGMAS,
-    MIN_SHARED_S,
-)
+from intercap_core.formats.detections.read import PeopleOfImages
+
+PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of a period of 1/30 s
+FEWEST_SETS_APART = 2  # fewer sets are a slip or an offset, not a late start; tuned
+MIN_SHARED_S = 1.0  # that two cameras must both have recorded, to tell when they started
+# Of what is stated of a start and what keypoints say, together: beyond, they are followed. With a
+# smaller number one honest statement in some thousand would be overruled, and told.
+DENIED_SIGMAS = 4.0
+# Of starts by the sound: within, images whose times are in step are left so. Of five cameras in
+# step one exceeds it in one recording of 75.
+IN_STEP_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +103,7 @@ class StatedStarts:
         for c in np.flatnonzero(self.known).tolist():
             if abs(self.late[c]) > lasts - min(MIN_SHARED_S, lasts / 2):
                 raise UserError(
-                    f"{self.source[c]} has camera {names[c]} start {when(self.late[c])}, and the "
+                    f"{self.source[c]} has camera {names[c]} start {describe_start(self.late[c])}, and the "
                     f"recording lasts {lasts:.1f} s: hardly any of it would be in common; state "
                     "the starts in seconds, of one clock"
                 )
@@ -113,24 +119,111 @@ class StatedStarts:
                 continue
             if abs(late[c] - other.late[c]) > DENIED_SIGMAS * np.hypot(sigma[c], other.sigma[c]):
                 odd[c] = (
-                    f"{source[c]} has it start {when(late[c])}, {other.source[c]} "
-                    f"{when(other.late[c])}: the first was taken"
+                    f"{source[c]} has it start {describe_start(late[c])}, {other.source[c]} "
+                    f"{describe_start(other.late[c])}: the first was taken"
                 )
                 continue
-            late[c], sigma[c] = combined((late[c], sigma[c]), (other.late[c], other.sigma[c]))
+            late[c], sigma[c] = combine_estimates(
+                (late[c], sigma[c]), (other.late[c], other.sigma[c])
+            )
             source[c] = f"{source[c]} and {other.source[c]}"
         return StatedStarts(late, sigma, tuple(source)), odd
 
 
-def combined(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+def combine_estimates(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
     """The mean of two values by their standard deviations, and its own."""
     weights = one[1] ** -2.0, other[1] ** -2.0
     total = sum(weights)
     return (weights[0] * one[0] + weights[1] * other[0]) / total, total**-0.5
 
 
-def when(late: float) -> str:
+def describe_start(late: float) -> str:
     """When a camera started whose images are ``late`` s older than their times say."""
     if abs(late) < 0.0005:
         return "as its times say"
     return f"{abs(late):.3f} s {'earlier' if late > 0 else 'later'} than its times say"
+
+
+@dataclass(frozen=True, eq=False)
+class StartTimes:
+    """By how much each camera's images are older than their sets say, all along: ``late`` (C,) s,
+    the master's 0, and the nearest whole number of ``sets`` (C,). ``apart``: the cameras were not
+    started together. ``in_doubt`` (C,): then this camera's time could not be told. ``sigma`` (C,) s
+    that ``late`` is off by where it rests on what was stated, else NaN; ``denied`` (C,): something
+    was stated, and the keypoints say otherwise."""
+
+    late: np.ndarray
+    sets: np.ndarray
+    in_doubt: np.ndarray
+    apart: bool
+    step_s: float
+    sigma: np.ndarray
+    denied: np.ndarray
+
+    @classmethod
+    def as_stated(cls, stated: StatedStarts, step_s: float) -> StartTimes:
+        """What is stated, and of other cameras what their images' times say."""
+        none = np.zeros(len(stated.late), bool)
+        late = np.nan_to_num(stated.late)
+        return cls(late, stated.sets(step_s), none, False, step_s, stated.sigma.copy(), none.copy())
+
+    @property
+    def offset(self) -> np.ndarray:
+        """(C,) s after which cameras expose, once images are moved by whole numbers of sets."""
+        return self.sets * self.step_s - self.late
+
+    @property
+    def offset_sigma(self) -> np.ndarray | None:
+        """(C,) s that these offsets are off by: what was stated, else half a set of cameras that
+        started apart; None where nothing is stated and nothing started apart."""
+        stated = np.isfinite(self.sigma)
+        if not self.apart and not stated.any():
+            return None
+        return np.where(stated, self.sigma, self.step_s / 2 if self.apart else PRIOR_OFFSET_S)
+
+    def in_step(self, values: np.ndarray) -> np.ndarray:
+        """Values (T, C, ...) of images, with each camera's moved to the sets of its moments; 0
+        where there is no image."""
+        return shift_images(values, self.sets)
+
+    def of_images(self, values: np.ndarray) -> np.ndarray:
+        """Values (T, C, ...) of moments, as :meth:`in_step` gives them, moved back."""
+        return shift_images(values, -self.sets)
+
+    def with_slips(self, slip: np.ndarray) -> np.ndarray:
+        """By how many sets (T, C) images are late in all, from slips (T, C) that were found in
+        step."""
+        last = len(slip) - 1
+        place = np.clip(np.arange(len(slip))[:, None] - self.sets, 0, last)
+        return np.take_along_axis(slip, place, 0) + self.sets.astype(slip.dtype)
+
+
+def shift_images(values: np.ndarray, by: np.ndarray, fill: float = 0) -> np.ndarray:
+    """Values (T, C, ...) of images with each camera's ``by`` (C,) sets earlier; ``fill`` where
+    there are none."""
+    sets = len(values)
+    result = np.full_like(values, fill)
+    for c, shift in enumerate(by.tolist()):
+        there = slice(max(0, -shift), max(0, min(sets, sets - shift)))
+        result[there, c] = values[max(0, shift) : max(0, sets + min(0, shift)), c]
+    return result
+
+
+@dataclass(frozen=True)
+class AlignedPeople:
+    """The people of the images that show each set's moment."""
+
+    detections: PeopleOfImages
+    starts: StartTimes
+
+    @property
+    def num_sets(self) -> int:
+        """How many sets there are."""
+        return self.detections.num_sets
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """Keypoints (P, 135, 3) of the people whom camera c sees at set t's moment."""
+        image = t + int(self.starts.sets[c])
+        if 0 <= image < self.num_sets and not self.starts.in_doubt[c]:
+            return self.detections.people(image, c)
+        return np.zeros((0, NUM_KEYPOINTS, 3))

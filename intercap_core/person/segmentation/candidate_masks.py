@@ -1,4 +1,4 @@
-"""Sets of depth pixels as masks of the colour image, at the resolution that depth has there."""
+"""Depth pixels as masks of the colour image (COCO RLE), and the segmentation result of a view."""
 
 from __future__ import annotations
 
@@ -10,13 +10,40 @@ import numpy as np
 
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.person.segmentation.constants import OCCLUDED_BEHIND_M
+
+# Behind the nearest point of its cell by more, a point is occluded, metres: more than a surface's
+# slope within a cell. Tuned on the studio.
+OCCLUDED_BEHIND_M = 0.03
+
+
+@dataclass(frozen=True)
+class ImageCandidate:
+    """A thing in one view: COCO RLE, how likely it is one (0 to 1), its size in space.
+
+    ``component`` is the same in all views that show the same thing.
+    """
+
+    rle: bytes
+    score: float
+    extent_m: float
+    component: int
+
+
+@dataclass(frozen=True)
+class ViewSegments:
+    """The person's RLE, empty = not seen, and candidates of one view. ``beside``: the RLE of where
+    a border of the person's says nothing, empty = it says nothing anywhere."""
+
+    person: bytes
+    candidates: list[ImageCandidate]
+    beside: bytes = b""
+
 
 _CLOSING = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class ColourCells:
     """Where points (N,) lie in a colour image of (height, width) cells of ``scale`` pixels.
 
     ``cell`` (N,) flat, -1 outside the image; ``z`` (N,) depth in the colour camera, metres.
@@ -30,7 +57,7 @@ class Cells:
     colour_size: tuple[int, int]
 
     @classmethod
-    def of(cls, points: np.ndarray, camera: Camera) -> Cells:
+    def of(cls, points: np.ndarray, camera: Camera) -> ColourCells:
         """Of ``points`` (N, 3) float32 in the depth camera's frame."""
         colour, depth = camera.colour, camera.depth
         assert depth is not None and camera.colour_from_depth is not None
@@ -44,19 +71,19 @@ class Cells:
         cell = np.where(inside, row * width + column, -1)
         return cls(cell, moved[:, 2], height, width, scale, (colour.width, colour.height))
 
-    def __getitem__(self, chosen: np.ndarray) -> Cells:
+    def __getitem__(self, chosen: np.ndarray) -> ColourCells:
         """Some of the points."""
         return replace(self, cell=self.cell[chosen], z=self.z[chosen])
 
     @classmethod
-    def joined(cls, parts: list[Cells]) -> Cells:
+    def joined(cls, parts: list[ColourCells]) -> ColourCells:
         """All points of one image, end to end."""
         cell, z = (np.concatenate([getattr(part, key) for part in parts]) for key in ("cell", "z"))
         return replace(parts[0], cell=cell, z=z)
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
+class ProjectedCells:
     """Depth pixels on cells of the colour image.
 
     ``cell`` (N,) flat cell of each pixel, -1 where a nearer pixel or the image's edge hides it;
@@ -70,7 +97,7 @@ class Projected:
     colour_size: tuple[int, int]  # width, height
 
     @classmethod
-    def of(cls, cells: Cells) -> Projected:
+    def of(cls, cells: ColourCells) -> ProjectedCells:
         """The pixels of ``cells``; each hides what is clearly behind it."""
         hidden = _hidden(cells.cell, cells.z, cells.height * cells.width)
         cell = np.where(hidden, -1, cells.cell)

@@ -6,7 +6,7 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY
-from intercap_core.scene.late_views import with_late_views
+from intercap_core.scene.subject_views import add_late_views
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking
 
@@ -34,7 +34,7 @@ def found(offset: np.ndarray) -> np.ndarray:
     someone = OnePerson(offset)
     index = np.zeros((T, len(RIG)), np.int32)
     index[6:9, 2] = NOBODY
-    return with_late_views(index, someone, someone.joints, RIG, TIMES, fps=FPS, min_confidence=0.3)
+    return add_late_views(index, someone, someone.joints, RIG, TIMES, fps=FPS, min_confidence=0.3)
 
 
 def test_a_late_view_is_the_subject():

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.scene.floor_constraint import FloorConstraint
+from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.ground import fit_ground
-from intercap_core.scene.registration import STATIC, Estimate, Layer, Registration
-from intercap_core.scene.surface import Surface, surface_of
-from intercap_core.scene.up import up_hint
+from intercap_core.scene.registration import STATIC, Registration, RigEstimate, SurfaceLayer
+from intercap_core.scene.surfaces import DepthSurface, surface_from_depth
+from intercap_core.scene.up import rough_up
 from tests.helpers.synthetic_capture import perturbed, ring, room_depth, to_millimetres
 
 TRUTH, UP = ring()
@@ -19,12 +19,12 @@ NO_GRAVITY = np.full((6, 3), np.nan)
 
 
 @pytest.fixture(scope="module")
-def patches() -> dict[int, Surface]:
+def patches() -> dict[int, DepthSurface]:
     """Each camera's own sixth of a bare floor: no two cameras share any of it."""
     rng, found = np.random.default_rng(0), {}
     for c, camera in enumerate(TRUTH):
         depth = to_millimetres(room_depth(camera, UP, np.zeros((0, 2, 3)), None), rng, noise=0.3)
-        surface = surface_of(depth, camera.depth, cell_m=0.03, max_depth_m=5.0)
+        surface = surface_from_depth(depth, camera.depth, cell_m=0.03, max_depth_m=5.0)
         world = apply(UP @ camera.master_from_depth, surface.points)
         sector = np.arctan2(world[:, 1], world[:, 0]) - 2 * np.pi * c / 6
         off = np.abs((sector + np.pi) % (2 * np.pi) - np.pi)
@@ -38,7 +38,7 @@ def floor_of(rig, patches) -> FloorConstraint:
     points = [apply(rig[c].master_from_depth, s.points) for c, s in patches.items()]
     normals = [s.normals @ rig[c].master_from_depth[:3, :3].T for c, s in patches.items()]
     ground = fit_ground(
-        np.concatenate(points), np.concatenate(normals), rig, up_hint(rig, NO_GRAVITY),
+        np.concatenate(points), np.concatenate(normals), rig, rough_up(rig, NO_GRAVITY),
         tolerance_m=0.03, cell_m=0.03,
     )  # fmt: skip
     floor = FloorConstraint.of(rig, patches, ground)
@@ -48,9 +48,9 @@ def floor_of(rig, patches) -> FloorConstraint:
 
 def test_height_and_tilt_come_back_without_overlap(patches):
     start = perturbed(TRUTH, np.random.default_rng(2), 0.01, 0.3)
-    registration = Registration(start, [Layer(patches, STATIC)], 0)
-    assert len(registration.residuals(Estimate.start(start), STATIC).pairs) == 0
-    refined = registration.solve(Estimate.start(start), [floor_of(start, patches)]).estimate
+    registration = Registration(start, [SurfaceLayer(patches, STATIC)], 0)
+    assert len(registration.residuals(RigEstimate.start(start), STATIC).pairs) == 0
+    refined = registration.solve(RigEstimate.start(start), [floor_of(start, patches)]).estimate
 
     def errors(poses: np.ndarray) -> tuple[float, float]:
         heights, tilts = [], []
@@ -94,6 +94,6 @@ def test_a_floor_that_one_camera_sees_ties_nobody(patches):
     ground = fit_ground(
         apply(TRUTH[0].master_from_depth, patches[0].points),
         patches[0].normals @ TRUTH[0].master_from_depth[:3, :3].T,
-        TRUTH, up_hint(TRUTH, NO_GRAVITY), tolerance_m=0.03, cell_m=0.03,
+        TRUTH, rough_up(TRUTH, NO_GRAVITY), tolerance_m=0.03, cell_m=0.03,
     )  # fmt: skip
     assert FloorConstraint.of(TRUTH, {0: patches[0]}, ground) is None

@@ -1,0 +1,262 @@
+"""Left and right of the body: made consistent over views, and chosen by build and motion.
+
+A detector that mistakes a back for a front exchanges left and right in a whole view, often in
+several views at once; points triangulated from inconsistent views are wrong.
+
+:func:`make_views_agree` tries, for each limb, all 2^(C-1) assignments of sides to views and takes the one of
+least cost: truncated squared gaps between the rays of every pair of views, plus a cost for each
+exchanged view. Which of the two mirrored bodies is the true one remains open.
+
+:func:`find_mirrored` decides it for arms, legs and head of all sets together, by the Viterbi algorithm
+over the eight ways of exchanging them. Unary costs: knees and ankles bend one way, the nose is in
+front of the ears and of the chest, shoulders and hips face the same way, detectors are mostly
+right. Pairwise costs: motion from set to set, and a change of sides. A hand belongs to the arm
+whose wrist is nearer.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import numpy as np
+
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import midpoints, rays_of
+from intercap_core.geometry.solve.viterbi import cheapest_sequence
+from intercap_core.person.sides import (
+    ARMS,
+    HEAD,
+    LEGS,
+    LIMBS,
+    PARTNER,
+    exchange_limb,
+    exchange_points,
+)
+
+SHORT_BONE_M = 0.03  # vectors shorter than this have no reliable direction; tuned on the studio
+HAND_ROOT_APART_M = 0.08  # body's and hand's wrist of one arm are nearer together; tuned
+MOTION_MEMORY_S = 0.5  # motion is judged over gaps of at most this; tuned on the studio
+STEP_M = 0.04  # motion from set to set that costs 1 (negative log likelihood); tuned on the studio
+LARGEST_STEP_M = 0.3  # motion from set to set counts as this at most; tuned on the studio
+MAX_AGREEING_VIEWS = 10  # all 2^(C-1) assignments of sides are tried over so many views
+# Gap between rays of one point beyond which a pair of views says nothing more, metres; arms, legs,
+# head, hands. Rays of one point pass each other by a few centimetres (detectors' biases,
+# calibration), those of a left and a right point by up to a body's breadth, or a face's.
+SIDE_GAPS_M = (0.12, 0.12, 0.05, 0.12)
+UNKNOWN_SIDE_COST = 0.25  # squared share of that gap, where there is nothing to compare; tuned
+# Cost of each view exchanged: more than noise alone gains on a small limb; tuned on the studio.
+EXCHANGED_VIEW_COST = 0.5
+# The body's build is certain, a turned head and a twisted back (each up to some 80 degrees) less
+# so; detectors exchange the sides in most views of about one set in twenty.
+HINGE_COST, HEAD_COST, TWIST_COST, NOSE_COST = 8.0, 6.0, 6.0, 3.0
+DETECTED_COST = 3.0  # of contradicting the detector in all views: -log(1/20)
+CHANGE_COST = 1.0  # of a limb's sides changing from set to set
+CROSSED_HANDS_RATIO = 0.5  # hands are exchanged where the other arm is nearer by this factor
+
+
+_LIKE_ARMS = 2  # first of the limbs that are named as the arms are
+
+
+def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
+    """Exchange limbs of ``keypoints`` (T, C, 135, 3 or more) in place, set by set.
+
+    Of two mirrored ways the one that exchanges fewer views is taken (of head and hands, where
+    it is nearer: the one that exchanges those whose arms are). Returns which limbs were
+    exchanged, (T, C, 4) bool in the order of LIMBS.
+    """
+    sets, views = keypoints.shape[:2]
+    exchanged = np.zeros((sets, views, len(LIMBS)), bool)
+    weight = np.where(keypoints[..., 2] >= min_confidence, keypoints[..., 2], 0)
+    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:MAX_AGREEING_VIEWS]
+    order = np.sort(seeing[(weight[:, seeing] > 0).any((0, 2))])
+    if len(order) < 2:
+        return exchanged
+    rays = np.swapaxes(rays_of(keypoints[..., :2], rig), 0, 1)
+    centres = rig.master_from_colour[:, :3, 3]
+    ways = np.array([(False, *rest) for rest in product((False, True), repeat=len(order) - 1)])
+    for number, (limb, gap) in enumerate(zip(LIMBS, SIDE_GAPS_M, strict=True)):
+        cost = np.zeros((sets, len(ways)))
+        for i, j in combinations(range(len(order)), 2):
+            a, b = order[i], order[j]
+            same, other = (
+                _cost(
+                    rays[a][:, limb],
+                    rays[b][:, side],
+                    weight[:, a, limb],
+                    weight[:, b, side],
+                    centres[a],
+                    centres[b],
+                    gap,
+                )
+                for side in (limb, PARTNER[limb])
+            )
+            apart = ways[:, i] != ways[:, j]
+            cost += np.where(apart, (other - same)[:, None], 0)
+        seen = np.asarray((weight[:, order][:, :, limb] > 0).any(2))
+        count = seen.sum(1)[:, None]
+        plain = seen.astype(int) @ ways.T
+        unusual, opposite = plain, count - plain
+        if number >= _LIKE_ARMS:
+            # what takes a back for a front names head and hands as it does the arms
+            arms = exchanged[:, order, 0]
+            unlike = ((ways[None] ^ arms[:, None]) & seen[:, None]).sum(2)
+            unusual = np.minimum(unusual, unlike)
+            opposite = np.minimum(opposite, count - unlike)
+        best = (cost + EXCHANGED_VIEW_COST * np.minimum(unusual, opposite)).argmin(1)
+        sets_at = (np.arange(sets), best)
+        other = (opposite[sets_at] < unusual[sets_at])[:, None]
+        chosen = (ways[best] ^ other) & seen
+        exchanged[:, order, number] = chosen
+        t, c = np.nonzero(exchanged[..., number])
+        exchange_limb(keypoints, t, c, limb)
+    return exchanged
+
+
+def _cost(
+    first: np.ndarray,
+    second: np.ndarray,
+    first_weight: np.ndarray,
+    second_weight: np.ndarray,
+    from_first: np.ndarray,
+    from_second: np.ndarray,
+    limit: float,
+) -> np.ndarray:
+    """How badly rays (T, n, 3) of two views meet, (T,), summed over points by weights (T, n)."""
+    _, gap = midpoints(first, second, from_first, from_second)
+    square = np.minimum(np.nan_to_num(gap, nan=limit) / limit, 1.0) ** 2
+    weight = first_weight * second_weight
+    return (weight * (square - UNKNOWN_SIDE_COST)).sum(1)
+
+
+_AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
+_LIMBS = (ARMS, LEGS, HEAD)
+_STATES = np.array(list(product((False, True), repeat=len(_LIMBS))))
+
+
+def find_mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | None) -> np.ndarray:
+    """Which limbs of triangulated points (T, 135, 3), NaN = not known, have left for right.
+
+    ``share`` (T, 3): of the views that see arms, legs and head, how many had them exchanged so far;
+    ``times`` (T,) seconds, None = each set stands alone. Returns (T, 4) bool, by LIMBS.
+    """
+    result = np.zeros((len(points), len(LIMBS)), bool)
+    if not len(points):
+        return result
+    cost = _build(points) + _detected(points, share)
+    if times is None:
+        states = cost.argmin(1)
+    else:
+        states = cheapest_sequence(cost[0], _steps(points, times) + cost[1:, None])
+    result[:, :3] = _STATES[states]
+    result[:, 3] = _other_hands(exchange_points(points, result))
+    return result
+
+
+def excess_build_cost(points: np.ndarray) -> np.ndarray:
+    """By how much (T,) another way of exchanging arms, legs and head suits the body's build better
+    than triangulated points (T, 135, 3) as they are; negative log likelihood, 0 = none does.
+    """
+    cost = _build(points)
+    return np.asarray(cost[:, 0] - cost.min(1))
+
+
+def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Cost (T, 8) of contradicting the detector, by the share of views."""
+    known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)
+    wrong = np.where(_STATES, 1 - share[:, None], share[:, None])
+    return DETECTED_COST * np.where(known[:, None], wrong, 0).sum(2)
+
+
+def _build(points: np.ndarray) -> np.ndarray:
+    """Cost (T, 8) of anatomically impossible bodies, for each way of exchanging limbs."""
+
+    def between(start: str, end: str) -> np.ndarray:
+        return points[:, _AT[end]] - points[:, _AT[start]]
+
+    hips, shoulders = between("right_hip", "left_hip"), between("right_shoulder", "left_shoulder")
+    ears = between("right_ear", "left_ear")
+    up = between("mid_hip", "neck")
+    nose = points[:, _AT["nose"]] - points[:, [_AT["left_ear"], _AT["right_ear"]]].mean(1)
+    # whichever way a leg is stretched, its knee and its ankle turn about the line of the hips
+    hinges = np.zeros(len(points))
+    for side in ("left", "right"):
+        thigh, shin = (
+            between(f"{side}_hip", f"{side}_knee"),
+            between(f"{side}_knee", f"{side}_ankle"),
+        )
+        foot = between(f"{side}_heel", f"{side}_big_toe")
+        hinges += 0.5 * (_cosine(_hinge(thigh, shin), hips) + _cosine(_hinge(foot, shin), hips))
+    twist = _cosine(_unit(_perpendicular(shoulders, up)), _perpendicular(hips, up))
+    chest = np.cross(_unit(shoulders), _unit(up))
+    looks = _cosine(chest, nose)
+    head = _cosine(np.cross(_unit(up), _unit(nose)), ears)
+    arms, legs, turned = np.where(_STATES, -1.0, 1.0).T
+    return (
+        HINGE_COST * np.maximum(0, -legs * hinges[:, None])
+        + TWIST_COST * np.maximum(0, -arms * legs * twist[:, None])
+        + NOSE_COST * np.maximum(0, -arms * looks[:, None])
+        + HEAD_COST * np.maximum(0, -turned * head[:, None])
+    )
+
+
+def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Cost (T - 1, 8, 8) of going from one state of the sides to the next: change and motion."""
+    steps = np.empty((len(points) - 1, len(_STATES), len(_STATES)))
+    steps[:] = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
+    last, when = points[0].copy(), np.full(points.shape[1], times[0])
+    for t, step in enumerate(steps, start=1):
+        last[times[t] - when > MOTION_MEMORY_S] = np.nan
+        for number, limb in enumerate(_LIMBS):
+            straight = _motion(last[limb], points[t, limb])
+            crossed = _motion(last[PARTNER[limb]], points[t, limb])
+            differ = _STATES[:, None, number] != _STATES[None, :, number]
+            step += np.where(differ, crossed, straight)
+        known = np.isfinite(points[t, :, 0])
+        last[known], when[known] = points[t, known], times[t]
+    return steps
+
+
+def _motion(before: np.ndarray, now: np.ndarray) -> float:
+    """Cost of moving points (n, 3) so far; 0 where fewer than two are known."""
+    step = np.linalg.norm(now - before, axis=1)
+    step = step[np.isfinite(step)]
+    return float(np.minimum(step, LARGEST_STEP_M).mean() / STEP_M) if len(step) > 1 else 0.0
+
+
+def _other_hands(points: np.ndarray) -> np.ndarray:
+    """Whether the hands (T,) begin where the other side's arm ends."""
+    wrists = points[:, [_AT["left_wrist"], _AT["right_wrist"]]]
+    roots = points[:, [_AT["left_hand_wrist"], _AT["right_hand_wrist"]]]
+    own = np.linalg.norm(wrists - roots, axis=2)
+    other = np.linalg.norm(wrists - roots[:, ::-1], axis=2)
+    both = np.isfinite(own) & np.isfinite(other)
+    count = np.maximum(both.sum(1), 1)
+    own, other = (np.where(both, d, 0).sum(1) / count for d in (own, other))
+    return both.any(1) & (own > HAND_ROOT_APART_M) & (other < CROSSED_HANDS_RATIO * own)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Directions (..., 3), NaN for what is too short to have one."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > SHORT_BONE_M, vectors / np.maximum(length, SHORT_BONE_M), np.nan)
+
+
+def _hinge(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The axis (T, 3) about which one bone (T, 3) turns into another, by the sine of the turn."""
+    return np.cross(_unit(first), _unit(second))
+
+
+def _perpendicular(vectors: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The part of vectors (T, 3) across an axis (T, 3)."""
+    axis = _unit(axis)
+    return vectors - (vectors * axis).sum(-1, keepdims=True) * axis
+
+
+def _cosine(weighted: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Scalar product (T,) of vectors, shortened to length one, and unit directions; 0 = unknown.
+
+    ``weighted`` keeps its length where that is less than one.
+    """
+    length = np.linalg.norm(weighted, axis=-1, keepdims=True)
+    return np.nan_to_num((weighted / np.maximum(length, 1.0) * _unit(direction)).sum(-1))

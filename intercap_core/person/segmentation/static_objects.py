@@ -1,0 +1,219 @@
+"""Objects that never move: components of the static scene above the floor, near the person's path.
+
+A chair that is sat on or a mug left on its table cannot be told from furniture, so every connected
+component of the background that the person comes near is a candidate. What stands on a level
+surface (a table) is segmented from it by height. Components are found on a voxel grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
+
+WITHIN_REACH_M = 0.35  # of a keypoint of the person at some time; tuned on the studio
+MAX_STATIC_THINGS = 8
+MAX_DISTANCE_POINTS = 2000  # of a thing, from which its distance to the person is taken
+VISITED_CELL_M = 0.10  # cells that stand for the places of the person's keypoints
+STATIC_CELL_M = 0.025  # the same in the background; tuned on the studio
+SURFACE_CELL_M, SURFACE_POINTS = 0.02, 2  # cells with so many points hold a surface; tuned
+MIN_STATIC_POINTS = 60  # of a static component, over all views; tuned on the studio
+LARGEST_M = 2.2  # anything larger is no thing that one person handles; tuned
+# A level surface: this share of a component's points within a layer; what stands on it is at least
+# so high above. Metres, share, metres; tuned on the studio.
+LAYER_M, LEVEL_SHARE, ABOVE_M = 0.02, 0.12, 0.012
+
+
+_BITS = 21  # of a cell's coordinate in its key
+
+
+def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int]:
+    """The component of each point (N,) int32 and how many there are.
+
+    Points (N, 3), metres, of cells that touch, if only at a corner, are one component. Components
+    are numbered by size, the one with most cells first.
+    """
+    if not len(points):
+        return np.zeros(0, np.int32), 0
+    occupied, inverse = np.unique(_keys(points, cell_m), return_inverse=True)
+    root = _roots(occupied)
+    _, label, size = np.unique(root, return_inverse=True, return_counts=True)
+    order = np.argsort(-size, kind="stable")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    return rank[label][inverse], len(order)
+
+
+def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.ndarray]:
+    """Indices of the points (N, 3) of each component of at least so many, ascending.
+
+    The component with most cells comes first.
+    """
+    label, count = label_components(points, cell_m)
+    if not count:
+        return []
+    order = np.argsort(label, kind="stable")
+    sizes = np.bincount(label, minlength=count)
+    ends = np.cumsum(sizes)
+    large = np.flatnonzero(sizes >= min_points)
+    return [order[ends[k] - sizes[k] : ends[k]] for k in large]
+
+
+class OccupiedCells:
+    """The cells that points (N, 3) of a surface lie in, and those that share a face with them."""
+
+    def __init__(self, points: np.ndarray, cell_m: float, min_points: int) -> None:
+        self._cell_m = cell_m
+        keys, counts = np.unique(_keys(points, cell_m), return_counts=True)
+        keys = keys[counts >= min_points]
+        steps = [sign * (1 << axis * _BITS) for axis in range(3) for sign in (1, -1)]
+        self._keys = np.unique(np.concatenate([keys, *(keys + step for step in steps)]))
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether each of the points (M, 3) lies in one of the cells: (M,) bool."""
+        if not len(self._keys):
+            return np.zeros(len(points), bool)
+        keys = _keys(points, self._cell_m)
+        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return self._keys[at] == keys
+
+
+def _keys(points: np.ndarray, cell_m: float) -> np.ndarray:
+    """One number (N,) int64 a cell; the same step of it leads to the same neighbour everywhere."""
+    cells = np.floor(points * np.float32(1 / cell_m)).astype(np.int64) + (1 << (_BITS - 1))
+    return (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
+
+
+@numba.njit(cache=True)
+def _roots(keys: np.ndarray) -> np.ndarray:
+    """Index (M,) of the first cell of each cell's component; ``keys`` (M,) ascending."""
+    parent = np.arange(len(keys))
+    # of the 26 neighbours those that come before: the rest find this cell from their side
+    for dx in range(-1, 1):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                step = dx * (1 << 2 * _BITS) + dy * (1 << _BITS) + dz
+                if step >= 0:
+                    continue
+                j = 0
+                for i in range(len(keys)):
+                    wanted = keys[i] + step
+                    while j < len(keys) and keys[j] < wanted:
+                        j += 1
+                    if j < len(keys) and keys[j] == wanted:
+                        a, b = i, j
+                        while parent[a] != a:
+                            parent[a] = parent[parent[a]]
+                            a = parent[a]
+                        while parent[b] != b:
+                            parent[b] = parent[parent[b]]
+                            b = parent[b]
+                        if a < b:
+                            parent[b] = a
+                        elif b < a:
+                            parent[a] = b
+    for i in range(len(keys)):
+        a = i
+        while parent[a] != a:
+            a = parent[a]
+        parent[i] = a
+    return parent
+
+
+@dataclass(frozen=True, eq=False)
+class StaticObject:
+    """A component of the static scene.
+
+    ``extent_m`` its size, ``away_m`` from the nearest place of the person; ``on_top``: it was taken
+    off another one; ``carries``: it is one off which something was taken. ``pixels`` are the flat
+    depth pixels of each view's background that show it, ``cells`` where it is.
+    """
+
+    extent_m: float
+    away_m: float
+    on_top: bool
+    carries: bool
+    pixels: list[np.ndarray]
+    cells: OccupiedCells
+
+
+@dataclass(frozen=True, eq=False)
+class StaticScene:
+    """The things, and ``surface``: where the scene is known to be, whichever view tells."""
+
+    things: list[StaticObject]
+    surface: OccupiedCells
+
+
+def find_static_objects(
+    views: list[DepthView],
+    backgrounds: list[DepthBackground],
+    low: np.ndarray,
+    high: np.ndarray,
+    joints: np.ndarray,
+) -> StaticScene:
+    """Components of the solid background in the box ``low`` to ``high`` (3,), z up, metres.
+
+    ``joints`` (N, 3) are places of the person's keypoints at any time, same frame.
+    """
+    parts, owner, index = [], [], []
+    for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
+        flat = np.flatnonzero(background.depth)
+        points, _ = view.points(background.depth, flat)
+        inside = ((points > low) & (points < high)).all(1)
+        parts.append(points[inside])
+        index.append(flat[inside])
+        owner.append(np.full(int(inside.sum()), number, np.int32))
+    points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+    pixel = np.concatenate(index) if index else np.zeros(0, np.int64)
+    view_of = np.concatenate(owner) if owner else np.zeros(0, np.int32)
+    walked = np.unique(np.round(joints / VISITED_CELL_M), axis=0) * VISITED_CELL_M
+    surface = OccupiedCells(points, SURFACE_CELL_M, SURFACE_POINTS)
+    things: list[StaticObject] = []
+
+    def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
+        own = points[members]
+        size, away = box_diagonal(own), _away(own, walked)
+        if size < LARGEST_M and away < WITHIN_REACH_M:
+            pixels = [pixel[members[view_of[members] == v]] for v in range(len(views))]
+            cells = OccupiedCells(own, SURFACE_CELL_M, SURFACE_POINTS)
+            things.append(StaticObject(size, away, on_top, carries, pixels, cells))
+
+    for members in components(points, STATIC_CELL_M, MIN_STATIC_POINTS):
+        top = _above_level(points, members)
+        above = [top[own] for own in components(points[top], STATIC_CELL_M, MIN_STATIC_POINTS)]
+        add(members, False, bool(above))
+        for standing in above:
+            add(standing, True, False)
+    things.sort(key=lambda thing: thing.away_m)
+    return StaticScene(things[:MAX_STATIC_THINGS], surface)
+
+
+def _away(points: np.ndarray, places: np.ndarray) -> float:
+    """Smallest distance, metres, of points (N, 3) from places (M, 3)."""
+    from scipy.spatial import cKDTree
+
+    sample = points[:: max(1, len(points) // MAX_DISTANCE_POINTS)]
+    return float(cKDTree(places).query(sample)[0].min()) if len(places) else np.inf
+
+
+def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Members of a component above its highest large level surface; none without one."""
+    height = points[members, 2]
+    bottom = float(height.min())
+    counts = np.bincount(((height - bottom) / LAYER_M).astype(int))
+    level = np.flatnonzero(counts > LEVEL_SHARE * len(members))
+    if not len(level):
+        return members[:0]
+    low = bottom + level[-1] * LAYER_M
+    layer = height[(height >= low) & (height < low + LAYER_M)]
+    return members[height > float(np.median(layer)) + ABOVE_M]
+
+
+def box_diagonal(points: np.ndarray) -> float:
+    """Length of the diagonal of the points' box (N, 3), the outermost two per cent left out."""
+    low, high = np.percentile(points, (2, 98), axis=0)
+    return float(np.linalg.norm(high - low))

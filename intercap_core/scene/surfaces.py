@@ -1,0 +1,245 @@
+"""Depth images as thinned surfaces: points with normals, and for the foreground their speed.
+
+Moving surfaces (the person and the object) stand in the middle of the ring and are seen from all
+sides: they connect cameras that share no background. They also observe *when* each camera exposed:
+between two cameras a surface is displaced by its normal speed times the difference in exposure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.scene.background import Background
+
+# A pixel nearer than the background by this much is foreground: above the systematic error of
+# 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and its noise; margin tuned on the studio.
+BEFORE_BACKGROUND_MM = 40.0
+BEFORE_BACKGROUND_SHARE = 0.012  # of depth
+BACKGROUND_MAX_DEPTH_M = 5.0  # beyond, the depth's error is past a centimetre
+MOVING_MAX_DEPTH_M = 4.0  # beyond, the depth's error is past what a body moves between sets
+# Base line of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px); tuned on
+# the studio: shorter is noise, longer crosses edges.
+NORMAL_STEP_RAD = 0.008
+MAX_KINK_M_PER_M = 0.008  # per depth, off the neighbours' mean: an edge; tuned on the studio
+MIN_VIEW_COSINE = 0.26  # 75 degrees: time-of-flight degrades at grazing angles; tuned on the studio
+MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
+BACKGROUND_CELL_M = 0.03  # of thinned surfaces
+MOVING_CELL_M = 0.02  # of thinned moving surfaces; tuned on the studio
+MOVING_MOMENTS = 16  # frame sets looked at, each with the one before and the one after
+MOVING_SEARCHES = 3  # nearest neighbours until the displacement along the normal settles
+NEIGHBOUR_PIXEL_STEP = 2  # every second pixel of the neighbouring sets, both ways, is enough
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSurface:
+    """``points`` (N, 3) metres, ``normals`` (N, 3) unit, towards the camera, ``rays`` (N, 3) what a
+    point moves by for one metre of depth: all in one camera's depth frame, float64. ``speed``
+    (N,) m/s along the normal, 0 of what stands still."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    rays: np.ndarray
+    speed: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def joined(cls, parts: Sequence[DepthSurface]) -> DepthSurface:
+        """All parts (one or more), end to end."""
+        names = ("points", "normals", "rays", "speed")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def subset(self, rows: np.ndarray) -> DepthSurface:
+        """The rows chosen."""
+        return DepthSurface(
+            self.points[rows], self.normals[rows], self.rays[rows], self.speed[rows]
+        )
+
+
+def surface_from_depth(
+    depth: np.ndarray,
+    lens: Intrinsics,
+    *,
+    keep: np.ndarray | None = None,
+    window: tuple[slice, slice] = (slice(None), slice(None)),
+    cell_m: float,
+    max_depth_m: float,
+) -> DepthSurface:
+    """Thin a depth image (H, W) uint16 mm to one mean point and normal a cell of ``cell_m``.
+
+    ``keep`` (H, W) bool says which pixels take part, ``window`` (rows, columns) which part of the
+    image is looked at. Edges, grazing views and what is farther than ``max_depth_m`` are left out.
+    """
+    depth, table = depth[window], lens.rays[window]
+    usable = (depth > 0) & (depth <= max_depth_m * 1000)
+    if keep is not None:
+        usable &= keep[window]
+    z = depth.astype(np.float32) * np.float32(1e-3)
+    grid = np.dstack([table * z[..., None], z])
+    step = max(1, round(NORMAL_STEP_RAD * lens.fx))
+    middle = np.s_[step:-step, step:-step]
+    left, right = np.s_[step:-step, : -2 * step], np.s_[step:-step, 2 * step :]
+    up, down = np.s_[: -2 * step, step:-step], np.s_[2 * step :, step:-step]
+    flat = usable[middle].copy()
+    for one, other in ((left, right), (up, down)):
+        flat &= usable[one] & usable[other]
+        kink = np.abs((z[one] + z[other]) / 2 - z[middle])
+        flat &= kink <= MAX_KINK_M_PER_M * z[middle]
+    row, column = np.nonzero(flat)
+    row, column = row + step, column + step
+    points = grid[row, column].astype(np.float64)
+    across = grid[row, column + step] - grid[row, column - step]
+    along = grid[row + step, column] - grid[row - step, column]
+    normals = np.cross(along, across).astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
+    good = np.isfinite(points).all(1) & (facing >= MIN_VIEW_COSINE)
+    along_z = np.column_stack([table[row, column], np.ones(len(row))])
+    still = np.zeros(np.count_nonzero(good))
+    return thin_surface(DepthSurface(points[good], normals[good], along_z[good], still), cell_m)
+
+
+def thin_surface(surface: DepthSurface, cell_m: float) -> DepthSurface:
+    """One mean point, normal and ray for each cell of ``cell_m``, in a fixed order."""
+    if not len(surface):
+        return surface
+    cell = np.floor(surface.points / cell_m).astype(np.int64) + (1 << 19)
+    key = (cell[:, 0] << 40) + (cell[:, 1] << 20) + cell[:, 2]
+    _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = [np.bincount(inverse, values[:, i], len(counts)) for i in range(3)]
+        return np.stack(sums, 1) / counts[:, None]
+
+    normals = mean(surface.normals)
+    length = np.linalg.norm(normals, axis=1)
+    whole = length > 0.8  # a cell across an edge has no single normal
+    normals = normals[whole] / length[whole, None]
+    speed = np.bincount(inverse, surface.speed, len(counts)) / counts
+    return DepthSurface(
+        mean(surface.points)[whole], normals, mean(surface.rays)[whole], speed[whole]
+    )
+
+
+def background_surfaces(
+    rig: Rig, backgrounds: Sequence[Background | None]
+) -> dict[int, DepthSurface]:
+    """The static surface that each camera sees, in its depth camera's frame, by camera index."""
+    surfaces = {}
+    for c, background in enumerate(backgrounds):
+        lens = rig[c].depth
+        if background is not None and lens is not None:
+            surfaces[c] = surface_from_depth(
+                background.depth,
+                lens,
+                keep=background.static,
+                cell_m=BACKGROUND_CELL_M,
+                max_depth_m=BACKGROUND_MAX_DEPTH_M,
+            )
+    return surfaces
+
+
+def moving_surfaces(
+    frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
+) -> list[dict[int, DepthSurface]]:
+    """The moving surfaces of up to :data:`MOVING_MOMENTS` sets, by camera index, depth frame.
+
+    ``rig`` has the lenses; ``image_of`` (T, C): the set whose image of a camera shows each set's
+    moment, -1 = none. Surfaces whose speed cannot be told, for want of a set before or after, are
+    left out.
+    """
+    depth_image = _with_depth(frames, image_of)
+    whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after
+    whole[1:-1] = (depth_image[:-2] >= 0) & (depth_image[1:-1] >= 0) & (depth_image[2:] >= 0)
+    usable = np.flatnonzero(whole.sum(1) >= 2)
+    if len(usable) > MOVING_MOMENTS:
+        usable = usable[np.linspace(0, len(usable) - 1, MOVING_MOMENTS).round().astype(int)]
+    found = []
+    for t in usable:
+        at_once = {}
+        for c in np.flatnonzero(whole[t]):
+            background, lens = backgrounds[c], rig[int(c)].depth
+            if background is None or lens is None:
+                continue
+            images = [frames.depth(int(depth_image[k, c]), int(c)) for k in (t - 1, t, t + 1)]
+            gaps = frames.time_s[[t, t + 1]] - frames.time_s[[t - 1, t]]
+            surface = _moving(images, background, lens, gaps)
+            if len(surface):
+                at_once[int(c)] = surface
+        if len(at_once) >= 2:
+            found.append(at_once)
+    return found
+
+
+def _with_depth(frames: Frames, image_of: np.ndarray) -> np.ndarray:
+    """``image_of`` (T, C), -1 where that image has no depth."""
+    available = frames.depth_available
+    has = available[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
+    return np.where((image_of >= 0) & has, image_of, -1)
+
+
+def _moving(
+    images: list[np.ndarray | None], background: Background, lens: Intrinsics, gaps: np.ndarray
+) -> DepthSurface:
+    """The surface of the middle one of three depth images, ``gaps`` (2,) seconds apart."""
+    before, now, after = (_foreground(image, background) for image in images)
+    surface = surface_from_depth(
+        now, lens, window=_box(now), cell_m=MOVING_CELL_M, max_depth_m=MOVING_MAX_DEPTH_M
+    )
+    if not len(surface):
+        return surface
+    earlier = _along_normals(surface, _points(before, lens))
+    later = _along_normals(surface, _points(after, lens))
+    speed = (later - earlier) / gaps.sum()
+    return replace(surface, speed=speed).subset(np.flatnonzero(np.isfinite(speed)))
+
+
+def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
+    """The depth image (H, W) uint16 mm where it is in front of the background, 0 elsewhere."""
+    assert image is not None
+    behind = background.depth
+    limit = behind * (1 - BEFORE_BACKGROUND_SHARE) - BEFORE_BACKGROUND_MM
+    return np.where((behind == 0) | (image < limit), image, 0).astype(np.uint16)
+
+
+def _box(image: np.ndarray) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(image.any(1)), np.flatnonzero(image.any(0))
+    if not len(rows):
+        return slice(0, 1), slice(0, 1)
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
+    thin = np.s_[::NEIGHBOUR_PIXEL_STEP, ::NEIGHBOUR_PIXEL_STEP]
+    z = image[thin].astype(np.float64) * 1e-3
+    keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)
+    points = np.column_stack([lens.rays[thin][keep] * z[keep, None], z[keep]])
+    return points[np.isfinite(points).all(1)]
+
+
+def _along_normals(surface: DepthSurface, points: np.ndarray) -> np.ndarray:
+    """How far along its normal each point's surface has gone (N,), metres; NaN = not found.
+
+    The nearest point is nearer than the one on the normal: it is sought again from where the last
+    one puts the surface.
+    """
+    away, lost = np.zeros(len(surface)), np.zeros(len(surface), bool)
+    if not len(points):
+        return np.full(len(surface), np.nan)
+    tree = cKDTree(points, balanced_tree=False)
+    for _ in range(MOVING_SEARCHES):
+        sought = surface.points + away[:, None] * surface.normals
+        distance, nearest = tree.query(sought, distance_upper_bound=MOVING_SEARCH_M)
+        lost |= ~np.isfinite(distance)
+        offset = points[np.where(lost, 0, nearest)] - surface.points
+        away = np.where(lost, 0.0, (offset * surface.normals).sum(1))
+        lost |= np.abs(away) > MOVING_SEARCH_M
+    return np.where(lost, np.nan, away)
