@@ -26,6 +26,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
+from bench.ablation_pictures import (
+    EVERYTHING,
+    WITHOUT_CONTACT,
+    WITHOUT_SMOOTHNESS,
+    WITHOUT_STICK,
+    draw_pictures,
+)
 from bench.again import artefacts_of, check_run, compute_once
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
@@ -33,9 +40,7 @@ from intercap_core.project import Project, load_project
 
 SETTINGS = Path("config/evaluation/quick.yaml")
 STAGES = ("joint", "metrics")  # what is computed for each variant
-EVERYTHING, SEQUENTIAL = "everything", "sequential only"
-WITHOUT_CONTACT, WITHOUT_STICK = "without contact and stick", "without stick"
-WITHOUT_SMOOTHNESS = "without smoothness"
+SEQUENTIAL = "sequential only"
 # Settings of `joint` that differ from the project's, by the variant's name.
 VARIANTS: dict[str, dict[str, Any]] = {
     EVERYTHING: {},
@@ -188,8 +193,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--folder", type=Path, default=Path("results/ablation"))
     told = parser.parse_args(arguments)
     try:
-        from bench.ablation_pictures import draw_pictures
-
         names = told.sequences or list(load_project(told.settings).sequences)
         variants = told.variants or list(VARIANTS)
         paths, figures = ablate(told.settings, names, variants, told.folder)

@@ -10,8 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.ablation import EVERYTHING, WITHOUT_CONTACT, WITHOUT_SMOOTHNESS, WITHOUT_STICK
-from bench.figures import figure_class
+from bench.command import figure_class
 from intercap_core import artefacts
 from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.proximity import PosedObject
@@ -23,6 +22,10 @@ from intercap_core.project import Project
 from intercap_core.schemas import SCENE
 
 Paths = Mapping[str, Mapping[str, Mapping[str, Path]]]  # by variant, sequence and stage
+# Variants of the ablation that the pictures show
+EVERYTHING = "everything"
+WITHOUT_CONTACT, WITHOUT_STICK = "without contact and stick", "without stick"
+WITHOUT_SMOOTHNESS = "without smoothness"
 _COLOURS = {"truth": "#222222", "sequential": "#b0b6bf", "without": "#e07a1f", "joint": "#2f6fdb"}
 _MIN_HOLD_S = 0.5  # shorter holds have no path to look at
 _HEAD_PX, _INK = 24, (52, 44, 40)

@@ -1,4 +1,4 @@
-"""What the comparisons share: their command line, and where their figures go."""
+"""Command line, output file and figure class that the comparisons share."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from intercap_core.commands import bench as commands
 from intercap_core.errors import UserError
@@ -38,3 +39,15 @@ def from_command_line(
     except UserError as error:
         print(error, file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def figure_class() -> Any:
+    """matplotlib's class of figures; raises UserError where it is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError(
+            "pictures of comparisons are drawn by matplotlib, which is not installed; install it "
+            "with pip install 'intercap-core[bench]'"
+        ) from error
+    return Figure

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.joint_clip import JointClip
+from bench.clips import JointClip
 from bench.object_baseline import COVERED, Crops, Project
 from bench.object_baseline import Recipe as ObjectRecipe
 from bench.soft_rasteriser import OverdrawRasteriser, Pixels

@@ -25,9 +25,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from bench.clips import JointClip, JointErrors, read_state
 from bench.command import add_figures, from_command_line
 from bench.joint_baseline import STEPS, Energy, refine
-from bench.joint_clip import Errors, JointClip, read_state
 from bench.joint_long import peak_memory_mb
 from intercap_core.joint.state import State
 from intercap_core.pipeline.step import run_step
@@ -114,7 +114,7 @@ def measure(settings: Path, output: Path, steps: int) -> None:
     print(output)
 
 
-def _errors(prefix: str, errors: Errors) -> dict[str, float]:
+def _errors(prefix: str, errors: JointErrors) -> dict[str, float]:
     return {f"{prefix}pve_mm": errors.pve, f"{prefix}object_translation_mm": errors.object_}
 
 
@@ -125,7 +125,7 @@ def _known(output: Path, key: str) -> dict[str, float]:
 
 
 def _print(
-    title: str, rows: dict[str, tuple[float, int, Errors]], figures: dict[str, float]
+    title: str, rows: dict[str, tuple[float, int, JointErrors]], figures: dict[str, float]
 ) -> None:
     console = Console()
     heads = ("joint", "seconds", "times ours", "steps", "body, mm", "object, mm", "mean")

@@ -1,0 +1,418 @@
+"""Recordings in memory as the object's tracker, the body's fit and the joint stage see them.
+
+Each clip also holds the truth. It reads the artefacts of the stages before the measured stage, so
+that the comparisons with the paper's recipes do not time the decoding of images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core import artefacts
+from intercap_core.artefacts import read
+from intercap_core.body.artefact import load_model, load_pose_prior
+from intercap_core.body.loading import OPEN_BODY
+from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.body_samples import choose_samples
+from intercap_core.body_fit.observations import (
+    Observations,
+    PersonCloud,
+    person_clouds,
+    read_observations,
+)
+from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.body_fit.schedule import Fitter, Settled
+from intercap_core.body_fit.torch_terms import TorchTerms
+from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
+from intercap_core.errors import UserError
+from intercap_core.evaluation import object_pose
+from intercap_core.evaluation.body import vertex_error
+from intercap_core.evaluation.truth import Truth
+from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.twist import moved
+from intercap_core.joint.contact.detect import contact_probability
+from intercap_core.joint.contact.motion import region_motion
+from intercap_core.joint.contact.patches import contact_patches
+from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.sequential import SequentialFits
+from intercap_core.joint.state import State
+from intercap_core.joint.terms.ground import Ground
+from intercap_core.object_track.constants import TRACKING_FACES
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.recording import ObjectRecording
+from intercap_core.object_track.tracker import Tracker
+from intercap_core.object_track.view import View
+from intercap_core.project import Project
+from intercap_core.schemas import BODY_FIT, FRAMES, JOINT, OBJECT_TRACK, SCENE
+
+# Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
+ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)
+SEEN_VIEWS = 2  # frames that fewer truly see are not counted, as in the evaluation
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectClip:
+    """T consecutive frame sets with C views each.
+
+    ``whole`` is the object's mesh, ``mesh`` the one that is tracked; ``true_rotation`` (T, 3, 3),
+    ``true_translation`` (T, 3) and ``true_views`` (T,) are of the recording's truth.
+    """
+
+    whole: ObjectMesh
+    mesh: ObjectMesh
+    views: list[list[View]]
+    times: np.ndarray
+    up: np.ndarray | None
+    joints: np.ndarray
+    labels: tuple[str, ...]
+    settings: ObjectTrackSettings
+    true_rotation: np.ndarray
+    true_translation: np.ndarray
+    true_views: np.ndarray
+
+    @classmethod
+    def load(cls, project: Project, sequence: str, count: int) -> ObjectClip:
+        """The first ``count`` frame sets from the first that shows the object well.
+
+        Raises UserError where the sequence has no truth or an artefact is missing.
+        """
+        row = project.sequences[sequence]
+        if row.truth is None:
+            raise UserError(f"sequence {sequence} has no truth; measure a virtual recording")
+        entry = project.objects[row.object]
+        whole = ObjectMesh.load(entry)
+        with Frames.open(project.artefact(sequence, "frames")) as frames:
+            source = ObjectRecording(
+                frames,
+                Detections.load(project.artefact(sequence, "detections")),
+                project.artefact(sequence, "scene"),
+                project.artefact(sequence, "person"),
+                whole.diameter,
+            )
+            truth = Truth.load(row.truth, frames.time_s, frames.fps, 0)
+            first = int(np.argmax(truth.object_views >= SEEN_VIEWS))
+            kept = slice(first, min(first + count, frames.num_sets))
+            views = [source.views(t) for t in range(kept.start, kept.stop)]
+            return cls(
+                whole,
+                whole.simplified(TRACKING_FACES),
+                views,
+                frames.time_s[kept],
+                source.up if np.isfinite(source.up).all() else None,
+                source.joints[kept],
+                entry.labels,
+                project.config.object_track,
+                truth.rotation[kept],
+                truth.translation[kept],
+                truth.object_views[kept],
+            )
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def annotated(self) -> np.ndarray:
+        """The first frame's pose (4, 4) as a person might set it: off by 10 mm and 5 degrees."""
+        pose = rigid(self.true_rotation[0], self.true_translation[0])
+        return moved(pose, ANNOTATION_ERROR)
+
+    @property
+    def step_s(self) -> float:
+        """Seconds between frames."""
+        return float(np.median(np.diff(self.times)))
+
+    def tracker(self) -> Tracker:
+        """The project's tracker on these frames."""
+        return Tracker(
+            self.mesh,
+            self.views.__getitem__,
+            self._labels_by_view,
+            self.settings,
+            times=self.times,
+            labels=self.labels,
+            up=self.up,
+            joints=self.joints,
+        )
+
+    def observer(self) -> Observer:
+        """What the tracker asks of the images, for one pass of it."""
+        return Observer(
+            self.mesh,
+            self.views.__getitem__,
+            self._labels_by_view,
+            self.settings,
+            self.labels,
+            self.up,
+            self.joints,
+        )
+
+    @cached_property
+    def _labels_by_view(self) -> list[list[list[str]]]:
+        return [[[k.label for k in view.candidates] for view in views] for views in self.views]
+
+    def errors(self, poses: np.ndarray, frames: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of poses (..., 4, 4) in the given frame or frames: millimetres, degrees (...)."""
+        centre = self.whole.centre_of_mass
+        rotation = np.broadcast_to(self.true_rotation[frames], (*poses.shape[:-2], 3, 3))
+        apart = object_pose.centre_error(
+            object_pose.posed_point(poses[..., :3, :3], poses[..., :3, 3], centre),
+            object_pose.posed_point(rotation, self.true_translation[frames], centre),
+        )
+        turned = object_pose.rotation_error_deg(poses[..., :3, :3], rotation, self.mesh.symmetry)
+        return 1e3 * apart, turned
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Frames (T,) bool that count: enough views truly see the object."""
+        return self.true_views >= SEEN_VIEWS
+
+
+_BY_FRAME = (
+    "keypoints", "confidence", "joints", "joint_views", "mask_source", "image_of", "times",
+)  # fmt: skip
+_TENSORS = ("points", "normals", "trust", "view")  # of a cloud
+_CHUNK = 32  # bodies posed at once
+
+
+@dataclass(frozen=True, eq=False)
+class BodyClip:
+    """T consecutive frame sets.
+
+    ``seen`` and ``clouds`` (T entries) are what the fit reads; ``true_vertices`` (T, V, 3) the
+    points of the true skin that correspond to the model's vertices, metres, master frame.
+    """
+
+    model: BodyModel
+    seen: Observations
+    clouds: list[PersonCloud | None]
+    settings: BodyFitSettings
+    true_vertices: np.ndarray
+
+    @classmethod
+    def load(cls, project: Project, sequence: str) -> BodyClip:
+        """All frame sets of a sequence.
+
+        Raises UserError where it has no truth for this body model or an artefact is missing.
+        """
+        row = project.sequences[sequence]
+        gender = project.subjects[row.subject].gender
+        model = BodyModel.load(project.config.body_models.of(gender) or OPEN_BODY)
+        settings = project.config.body_fit
+        frames, scene, person = (
+            project.artefact(sequence, stage) for stage in ("frames", "scene", "person")
+        )
+        seen = read_observations(scene, person)
+        with read(frames, FRAMES) as artefact:
+            fps = float(artefact.attributes["fps"])
+        truth = row.truth and Truth.load(row.truth, seen.times, fps, model.num_vertices)
+        if truth is None or truth.vertices is None:
+            raise UserError(
+                f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
+                "recording with the body model that it was made for"
+            )
+        clouds = person_clouds(frames, seen, settings.points_per_frame, model.device)
+        return cls(model, seen, clouds, settings, truth.vertices)
+
+    def __len__(self) -> int:
+        return len(self.clouds)
+
+    def part(self, frames: slice) -> BodyClip:
+        """Some of the frames as a clip of their own."""
+        numbers, cameras = range(len(self))[frames], len(self.seen.rig)
+        seen = replace(
+            self.seen,
+            **{
+                name: [
+                    getattr(self.seen, name)[t * cameras + c]
+                    for t in numbers
+                    for c in range(cameras)
+                ]
+                for name in ("masks", "beside")
+            },
+            **{name: getattr(self.seen, name)[frames] for name in _BY_FRAME},
+        )
+        return replace(
+            self, seen=seen, clouds=self.clouds[frames], true_vertices=self.true_vertices[frames]
+        )
+
+    def on(self, device: torch.device) -> BodyClip:
+        """The same with model and clouds on another device."""
+        model = BodyModel.load(self.model.path, device=device)
+        clouds = [
+            cloud and replace(cloud, **{name: getattr(cloud, name).to(device) for name in _TENSORS})
+            for cloud in self.clouds
+        ]
+        return replace(self, model=model, clouds=clouds)
+
+    def errors(self, vectors: Tensor, frames: np.ndarray, *, step: int = 1) -> np.ndarray:
+        """PVE (N,) in millimetres of bodies (N, P) in ``frames`` (N,), of every step-th vertex."""
+        ids = np.arange(0, self.model.num_vertices, step)
+        found = []
+        for start in range(0, len(vectors), _CHUNK):
+            at = slice(start, start + _CHUNK)
+            chosen = None if step == 1 else ids
+            params = self.model.parameters(vectors[at])
+            with torch.no_grad():
+                vertices = self.model.forward(params, vertex_ids=chosen).vertices
+            true = self.true_vertices[frames[at]][:, ids]
+            found.append(1e3 * vertex_error(vertices.cpu().numpy(), true))
+        return np.concatenate(found)
+
+
+SURE = 0.5  # probability over which a region touches
+_SETTLED = ("keypoint_offsets", "covering", "keypoint_sigma", "covering_noise", "keypoint_doubt")
+_POSE = (
+    "global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "left_hand_pose",
+    "right_hand_pose", "transl",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class BodyEvidence:
+    """E_B: ``fitter`` takes correspondences of ``problem``, whose terms are plain torch and whose
+    constants are those that the body's fit has settled."""
+
+    fitter: Fitter
+    problem: BodyProblem
+
+
+@dataclass(frozen=True, eq=False)
+class JointClip:
+    """T frame sets with C views each; ``start`` is the state of the sequential fits.
+
+    ``tracked`` is the object's mesh with fewer faces, ``views`` what E_O compares it with;
+    ``touching`` (T, R) the regions that touch at the start by the stage's own detection.
+    """
+
+    geometry: Geometry
+    start: State
+    body: BodyEvidence
+    tracked: ObjectMesh
+    views: list[list[View]]
+    labels: tuple[str, ...]
+    object_settings: ObjectTrackSettings
+    touching: np.ndarray
+    floor: Ground | None
+    fps: float
+    settings: JointSettings
+    truth: Truth
+
+    @classmethod
+    def load(cls, project: Project, sequence: str) -> JointClip:
+        """All frame sets of a sequence.
+
+        Raises UserError where it has no truth for its body model, an artefact is missing or a frame
+        has no person.
+        """
+        row = project.sequences[sequence]
+        paths = {
+            name: project.artefact(sequence, name)
+            for name in ("frames", "detections", "scene", "person", "object_track", "body_fit")
+        }
+        mesh = ObjectMesh.load(project.objects[row.object])
+        settings, models = project.config.body_fit, project.config.body_models
+        with (
+            artefacts.read(paths["body_fit"], BODY_FIT) as fitted,
+            artefacts.read(paths["object_track"], OBJECT_TRACK) as track,
+            artefacts.read(paths["scene"], SCENE) as scene,
+        ):
+            model = load_model(models, str(fitted.attributes["gender"]), fitted, device="cpu")
+            sequential = SequentialFits.read(fitted, track, scene)
+            settled = Settled(*(torch.from_numpy(fitted[name]) for name in _SETTLED))
+            failed = fitted["failed"]
+            found = bool(scene.attributes["ground_found"])
+            floor = Ground(scene["ground_point"], scene["ground_normal"]) if found else None
+            fps = float(scene.attributes["fps"])
+        seen = read_observations(paths["scene"], paths["person"])
+        clouds = person_clouds(paths["frames"], seen, settings.points_per_frame, model.device)
+        terms = TorchTerms(model, choose_samples(model))
+        fitter = Fitter(model, seen, clouds, settings, load_pose_prior(models, model), terms)
+        start = sequential.state
+        if failed.any() or len(fitter.frames) != len(start):
+            raise UserError(f"{sequence}: frames without a person cannot be compared")
+        problem = fitter.resume(start.parameters(model).vector(), settled)
+        problem.columns = torch.arange(start.body.shape[1])
+        field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+        geometry = Geometry(model, mesh, field, contact_patches(model))
+        truth = row.truth and Truth.load(row.truth, seen.times, fps, model.num_vertices)
+        if truth is None or truth.vertices is None:
+            raise UserError(
+                f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
+                "recording with the body model that it was made for"
+            )
+        with Frames.open(paths["frames"]) as frames:
+            source = ObjectRecording(
+                frames, Detections.load(paths["detections"]), paths["scene"], paths["person"],
+                mesh.diameter,
+            )  # fmt: skip
+            views = [source.views(t) for t in range(len(start))]
+        return cls(
+            geometry, start, BodyEvidence(fitter, problem), mesh.simplified(TRACKING_FACES), views,
+            project.objects[row.object].labels, project.config.object_track,
+            _touching_regions(geometry, sequential, fps), floor, fps, project.config.joint, truth,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def errors(self, state: State) -> JointErrors:
+        """How far ``state`` is from the truth."""
+        model, true = self.geometry.model, self.truth
+        assert true.vertices is not None
+        with torch.no_grad():
+            vertices = model(state.parameters(model)).vertices.numpy()
+        centre = self.geometry.mesh.centre_of_mass
+        apart = object_pose.centre_error(
+            object_pose.posed_point(state.rotation, state.translation, centre),
+            object_pose.posed_point(true.rotation, true.translation, centre),
+        )
+        return JointErrors(
+            1e3 * float(vertex_error(vertices, true.vertices).mean()),
+            1e3 * float(apart[true.object_views >= SEEN_VIEWS].mean()),
+        )
+
+
+@dataclass(frozen=True)
+class JointErrors:
+    """Millimetres: ``pve`` the mean over frames and skin vertices; ``object_`` the mean over the
+    frames that enough views see, at the centre of mass."""
+
+    pve: float
+    object_: float
+
+    @property
+    def mean(self) -> float:
+        """Mean of the two: what a state is judged by."""
+        return (self.pve + self.object_) / 2
+
+
+def read_state(joint: Path) -> State:
+    """The state that the joint stage has written."""
+    with artefacts.read(joint, JOINT) as found:
+        body = np.concatenate([found[name] for name in _POSE], axis=1).astype(float)
+        return State(
+            body, found["betas"].astype(float), found["expression"].astype(float),
+            found["rotation"], found["translation"],
+        )  # fmt: skip
+
+
+def _touching_regions(geometry: Geometry, sequential: SequentialFits, fps: float) -> np.ndarray:
+    """(T, R) regions that touch where the sequential fits end, as the stage detects them."""
+    state = sequential.state
+    posed, at_patch = geometry.at(state), geometry.skin.patch
+    motion = region_motion(
+        geometry.patches, posed.skin[:, at_patch], posed.proximity.at(at_patch), state.rotation,
+        state.translation, sequential.joint_sigma, sequential.object_sigma, fps,
+    )  # fmt: skip
+    given = np.zeros((len(state), int(geometry.patches.region.max()) + 1))
+    return contact_probability(motion, fps, given=given) > SURE
